@@ -9,6 +9,7 @@ import click
 
 from adacd_hil import __version__
 from adacd_hil.cli.commands.compare_command import compare
+from adacd_hil.cli.commands.config_command import config
 from adacd_hil.cli.commands.history_command import history
 from adacd_hil.cli.commands.identify_command import identify
 from adacd_hil.cli.commands.log_command import log
@@ -16,6 +17,7 @@ from adacd_hil.cli.commands.play_command import play
 from adacd_hil.cli.commands.replay_command import replay
 from adacd_hil.cli.commands.sweep_command import sweep
 from adacd_hil.cli.commands.tune_command import tune
+from adacd_hil.cli.completion import complete_run, complete_scenario, is_completing, prepare_completion
 from adacd_hil.cli.options import (
     clock_option,
     config_option,
@@ -53,6 +55,7 @@ def cli() -> None:
     show_default=True,
     metavar="NAME|FILE",
     help="What happens: one that `firmware-sim list` names, or a TOML file.",
+    shell_complete=complete_scenario,
 )
 @run_folder_option("demo")
 @click.option("--seed", type=click.IntRange(min=0), default=None, help="Noise of the emulated sensors.")
@@ -148,7 +151,7 @@ def tare(
 
 
 @cli.command(epilog=EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=GivenPath())
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
 @click.option("--out", type=WrittenPath(file_okay=False), help="Folder; default: beside each log.")
 @json_option
 @explained
@@ -173,7 +176,7 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Ti
 
 
 @cli.command(epilog=EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=GivenPath())
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
 @click.option(
     "--rate-per-h",
     type=click.FloatRange(1e-6, 1e4),
@@ -363,6 +366,7 @@ def monitor(
     return watch_live(place, listened_s, listened_s is None, as_json)
 
 
+cli.add_command(config)
 cli.add_command(history)
 cli.add_command(identify)
 cli.add_command(play)
@@ -375,7 +379,10 @@ cli.add_command(tune)
 
 def main() -> NoReturn:
     """Run the command line and exit with a documented status; `adacd_hil.cli.start_host` comes here."""
-    open_terminals()
+    if is_completing():  # the shell reads what click writes
+        prepare_completion()
+    else:
+        open_terminals()
     try:
         code = cli.main(prog_name="adacd-hil", standalone_mode=False)
     except click.ClickException as error:

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from adacd_hil.cli.completion import complete_channel, complete_configuration, complete_interface
 from adacd_hil.cli.output import CommandError, ExitCode, explained
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.log.recording.processes import MOST_VIEWERS
+from adacd_hil.log.log_files import MOST_VIEWERS
 from adacd_hil.remedies import install_command
-from adacd_hil.settings.configuration import builtin_names
+from adacd_hil.settings.toml_files import builtin_names
 
 if TYPE_CHECKING:
     from adacd_hil.control.session import LiveAddress
@@ -24,6 +25,7 @@ config_option = click.option(
     show_default=True,
     metavar="NAME|FILE",
     help=f"One of {builtin_names()}, or a TOML file.",
+    shell_complete=complete_configuration,
 )
 profile_option = click.option(
     "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
@@ -75,8 +77,20 @@ _BUS_OPTIONS = (  # last first: click lists them the other way round
 
 def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
     return (
-        click.option("-c", "--channel", required=is_required, help="Channel of that interface, such as can0."),
-        click.option("-i", "--interface", required=is_required, help="python-can interface, such as socketcan."),
+        click.option(
+            "-c",
+            "--channel",
+            required=is_required,
+            help="Channel of that interface, such as can0.",
+            shell_complete=complete_channel,
+        ),
+        click.option(
+            "-i",
+            "--interface",
+            required=is_required,
+            help="python-can interface, such as socketcan.",
+            shell_complete=complete_interface,
+        ),
     )
 
 

@@ -20,13 +20,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
-from adacd_hil.log.log_files import LogError, LogExistsError
 from adacd_hil.log.recording.run_folder import check_free, is_there
-from adacd_hil.records import FaultReason
-from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import fit_table, in_line, one_line, terminal_columns
-from adacd_hil.wire.bus import BusError, BusMissingError
-from adacd_hil.wire.codec import CodecError
 
 if TYPE_CHECKING:
     from adacd_hil.control.session import SessionSummary  # it compiles: seconds that a command without a run can spare
@@ -61,6 +56,8 @@ class CommandError(Exception):
 
 def exit_code(summary: "SessionSummary") -> ExitCode:
     """Choose the exit code of a run; the gravest reason wins."""
+    from adacd_hil.records import FaultReason
+
     if summary.result is None:
         return ExitCode.SAFETY_STOP if summary.has_started else ExitCode.BUS_MISSING
     if summary.result.fault is not FaultReason.NONE:
@@ -70,17 +67,27 @@ def exit_code(summary: "SessionSummary") -> ExitCode:
     return ExitCode.INTERRUPTED if summary.result.is_interrupted else ExitCode.OK
 
 
-_CODES = (
-    (ConfigError, ExitCode.USAGE),
-    (CodecError, ExitCode.USAGE),
-    (BusMissingError, ExitCode.BUS_MISSING),
-    (BusError, ExitCode.SAFETY_STOP),
-    (LogExistsError, ExitCode.USAGE),
-    (LogError, ExitCode.FAILURE),
-    (OSError, ExitCode.FAILURE),
-    (MemoryError, ExitCode.FAILURE),
-)
-_EXPECTED = (KeyboardInterrupt, CommandError, *(kind for kind, _ in _CODES))
+def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
+    """List what may end a command, with its exit code; the first that fits counts.
+
+    Imported once something has ended one: numpy and cantools take longer to import than help takes to print.
+    """
+    from adacd_hil.log.log_files import LogError, LogExistsError
+    from adacd_hil.settings.schema import ConfigError
+    from adacd_hil.wire.bus import BusError, BusMissingError
+    from adacd_hil.wire.codec import CodecError
+
+    return (
+        (CommandError, ExitCode.FAILURE),
+        (ConfigError, ExitCode.USAGE),
+        (CodecError, ExitCode.USAGE),
+        (BusMissingError, ExitCode.BUS_MISSING),
+        (BusError, ExitCode.SAFETY_STOP),
+        (LogExistsError, ExitCode.USAGE),
+        (LogError, ExitCode.FAILURE),
+        (OSError, ExitCode.FAILURE),
+        (MemoryError, ExitCode.FAILURE),
+    )
 
 
 def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
@@ -90,7 +97,7 @@ def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
     def run(*args: Any, **kwargs: Any) -> None:
         try:
             code = command(*args, **kwargs)
-        except _EXPECTED as error:
+        except (Exception, KeyboardInterrupt) as error:
             code = complain(error)
         sys.exit(code)
 
@@ -98,17 +105,17 @@ def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
 
 
 def complain(error: BaseException) -> ExitCode:
-    """Say in one line what ended a command; return its exit code."""
-    is_interrupted = isinstance(error, KeyboardInterrupt)
-    line = "interrupted" if is_interrupted else in_words(error) or type(error).__name__
-    print(f"adacd-hil: {one_line(line)}", file=sys.stderr)
-    if is_interrupted:
+    """Say in one line what ended a command; return its exit code. Raises what no command is to be ended by."""
+    if isinstance(error, KeyboardInterrupt):
+        print("adacd-hil: interrupted", file=sys.stderr)
         return ExitCode.INTERRUPTED
+    code = next((code for kind, code in _expected() if isinstance(error, kind)), None)
+    if code is None:
+        raise error
+    print(f"adacd-hil: {one_line(in_words(error) or type(error).__name__)}", file=sys.stderr)
     if is_disk_full(error):
         return ExitCode.PARTIAL
-    if isinstance(error, CommandError):
-        return error.code
-    return next(code for kind, code in _CODES if isinstance(error, kind))
+    return error.code if isinstance(error, CommandError) else code
 
 
 def format_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:

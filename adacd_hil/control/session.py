@@ -21,8 +21,8 @@ from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import place_file
-from adacd_hil.log.log_files import LOG_NAME, arithmetic
-from adacd_hil.log.recording.processes import MOST_VIEWERS, LiveSetup
+from adacd_hil.log.log_files import LOG_NAME, MOST_VIEWERS, arithmetic
+from adacd_hil.log.recording.processes import LiveSetup
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
 from adacd_hil.log.viewer.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout

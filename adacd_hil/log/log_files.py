@@ -52,6 +52,8 @@ TRUTH_NAME = "truth.mcap"
 """The emulator's."""
 CONFIG_DIGEST_KEY = "host_config_sha256"
 """Metadata of the emulator's log where the host is in the same process: of its configuration."""
+MOST_VIEWERS = 8
+"""Viewers of a run's live view at a time, unless --live-viewers says otherwise."""
 _DIGITS, _MOST_DIGITS = 3, 5
 
 

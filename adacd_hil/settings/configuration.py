@@ -1,10 +1,10 @@
 """A configuration: all sections as one value, from a built-in name or a TOML file and what that extends."""
 
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from adacd_hil.settings.scheme_settings import (
     FilterSettings,
     TerminationSettings,
 )
-from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
+from adacd_hil.settings.toml_files import builtin_folder, builtin_names, find_toml, read_toml
 
 _LONGEST_CHAIN = 8
 """Configurations that extend each other."""
@@ -62,6 +62,7 @@ class Settings:
     tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
     history: HistorySettings = setting(HistorySettings, meaning="the arm's last certificate")
     log: LogSettings = setting(LogSettings, meaning="the log")
+    assumed: tuple[str, ...] = setting((), meaning="keys whose values are guesses; `doctor` asks for each of them")
 
     @property
     def blind_cycles(self) -> int:
@@ -152,13 +153,11 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _builtin_folder() -> Traversable:
-    return resources.files("adacd_hil") / "configs"
+class ConfigurationLayer(NamedTuple):
+    """What one file says, or one profile of it; `origin` names it."""
 
-
-def builtin_names() -> list[str]:
-    """Name the configurations that come with the package."""
-    return toml_names(_builtin_folder())
+    origin: str
+    table: dict[str, Any]
 
 
 def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Settings:
@@ -166,15 +165,37 @@ def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Se
 
     `profile` picks the `[profiles.X]` table that is laid over the rest. Raises ConfigError.
     """
-    table = _load_table(name_or_file)
+    return parse(Settings, resolved_table(configuration_layers(name_or_file, profile)))
+
+
+def resolved_table(layers: Sequence[ConfigurationLayer]) -> dict[str, Any]:
+    """Lay the layers of a configuration over each other."""
+    return functools.reduce(merge, (layer.table for layer in layers), {})
+
+
+def configuration_layers(name_or_file: str, profile: str | None = None) -> list[ConfigurationLayer]:
+    """Read a configuration and all that it extends, the undermost first. Raises ConfigError.
+
+    What the files say of the arm outweighs the profiles' own values, not the other way round.
+    """
+    files = _load_chain(name_or_file)
+    table = resolved_table(files)
     profiles = _table_in(table, "profiles", "`profiles`")
-    table.pop("profiles", None)
     chosen = profile or _table_in(table, "arm", "`arm`").get("profile", "P")
     if not isinstance(chosen, str) or chosen not in profiles:
         raise ConfigError(f"profile {chosen!r} is not in configuration {name_or_file}; known: {', '.join(profiles)}")
-    _table_in(profiles, chosen, f"`profiles.{chosen}`")
-    # What the file says of the arm outweighs the profile's own values, not the other way round.
-    return parse(Settings, merge(merge(profiles[chosen], table), {"arm": {"profile": chosen}}))
+    layers = []
+    for layer in files:
+        own = _table_in(_table_in(layer.table, "profiles", "`profiles`"), chosen, f"`profiles.{chosen}`")
+        if own:
+            layers.append(ConfigurationLayer(f"{layer.origin} [profiles.{chosen}]", own))
+    layers += [
+        ConfigurationLayer(origin, {key: value for key, value in said.items() if key != "profiles"})
+        for origin, said in files
+    ]
+    if profile is not None:
+        layers.append(ConfigurationLayer("--profile", {"arm": {"profile": chosen}}))
+    return layers
 
 
 def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
@@ -185,20 +206,20 @@ def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
     return value
 
 
-def _load_table(name_or_file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[ConfigurationLayer]:
     """Read a configuration and all that it extends; a relative path is taken from the file that names it."""
     if name_or_file in seen:
         raise ConfigError(f"configuration {name_or_file} extends itself")
     if len(seen) > _LONGEST_CHAIN:
         raise ConfigError(f"configuration {seen[0]} extends more than {_LONGEST_CHAIN} others, one by one")
-    path = find_toml("configuration", name_or_file, _builtin_folder())
+    path = find_toml("configuration", name_or_file, builtin_folder())
     table = read_toml(path)
     table.setdefault("name", path.stem)
     if "extends" not in table and name_or_file in builtin_names():
-        return table
+        return [ConfigurationLayer(name_or_file, table)]
     extended = table.pop("extends", "paper")
     if not isinstance(extended, str):
         raise ConfigError(f"`extends` = {extended!r} must be the name of a configuration or a file")
     if extended not in builtin_names() and Path(extended).suffix:
         extended = str(path.parent / extended)
-    return merge(_load_table(extended, (*seen, name_or_file)), table)
+    return [*_load_chain(extended, (*seen, name_or_file)), ConfigurationLayer(name_or_file, table)]

@@ -21,6 +21,7 @@ SUCCESSORS = {
     "certified.collision_Nm": "`detector.collision_Nm`",
     "certified.deviations": "`certified.noise_sigmas` and `certified.model_sigmas`",
     "certified.sigmas": "`certified.noise_sigmas` and `certified.model_sigmas`",
+    "safety.commission_cycles": "`safety.commission_s`",
 }
 """Keys that are gone, and by what they are replaced, as an error says it."""
 
@@ -164,7 +165,32 @@ def _check_bounds(value: float, key: str, metadata: Any) -> None:
     unit = f" {metadata['unit']}" if metadata["unit"] else ""
     if not math.isfinite(value):
         raise ConfigError(f"`{key}` = {value} is not finite")
-    if value < metadata["low"]:
-        raise ConfigError(f"`{key}` = {value}{unit} is below {metadata['low']:g}{unit}")
-    if value > metadata["high"]:
-        raise ConfigError(f"`{key}` = {value}{unit} is above {metadata['high']:g}{unit}")
+    for is_outside, word, bound in (
+        (value < metadata["low"], "below", metadata["low"]),
+        (value > metadata["high"], "above", metadata["high"]),
+    ):
+        if is_outside:
+            raise ConfigError(f"`{key}` = {value}{unit} is {word} {bound:g}{unit}{_other_unit(value, metadata)}")
+
+
+_OTHER_UNITS = {
+    "m": (("mm", 1e-3), ("cm", 1e-2)),
+    "kg": (("g", 1e-3),),
+    "Nm": (("Nmm", 1e-3), ("Ncm", 1e-2)),
+    "s": (("ms", 1e-3), ("µs", 1e-6)),
+    "ms": (("s", 1e3),),
+    "µs": (("ms", 1e3), ("s", 1e6)),
+    "deg": (("rad", math.degrees(1.0)),),
+    "deg/s": (("rad/s", math.degrees(1.0)),),
+    "rad": (("deg", math.radians(1.0)),),
+    "rad/s": (("Hz", math.tau), ("deg/s", math.radians(1.0))),
+}
+"""Units that a value may have been meant in, with their worth in the setting's own."""
+
+
+def _other_unit(value: float, metadata: Any) -> str:
+    """Say what a value out of bounds would be in another unit, if it is within them then."""
+    for unit, worth in _OTHER_UNITS.get(metadata["unit"], ()):
+        if value and metadata["low"] <= value * worth <= metadata["high"]:
+            return f"; {value:g} {unit} are {value * worth:g} {metadata['unit']}"
+    return ""

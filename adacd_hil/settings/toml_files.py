@@ -3,6 +3,7 @@
 import dataclasses
 import re
 import tomllib
+from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,16 @@ def _check_extent(table: dict[str, Any]) -> None:
             waiting += [(key, item, depth + 1) for item in value]
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             raise ConfigError(f"`{key}` is an integer of more than 64 bits")
+
+
+def builtin_folder() -> Traversable:
+    """Return the folder of the configurations that come with the package."""
+    return resources.files("adacd_hil") / "configs"
+
+
+def builtin_names() -> list[str]:
+    """Name the configurations that come with the package."""
+    return toml_names(builtin_folder())
 
 
 def toml_names(folder: Traversable) -> list[str]:

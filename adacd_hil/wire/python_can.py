@@ -12,6 +12,11 @@ from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID, Bus, BusError, Bu
 _ECHOING_INTERFACES = ("udp_multicast",)
 
 
+def interface_names() -> list[str]:
+    """Name the interfaces that python-can knows, plugins included."""
+    return sorted(can.VALID_INTERFACES)
+
+
 class PythonCanBus(Bus):
     """Any other python-can interface. How CAN FD's second bit rate is set, python-can leaves to its own settings."""
 
@@ -22,7 +27,7 @@ class PythonCanBus(Bus):
         if interface in _ECHOING_INTERFACES:
             raise BusMissingError(f"interface {interface} echoes own frames and can't carry a cycle; use socketcan")
         if interface not in can.VALID_INTERFACES:
-            known = sorted(can.VALID_INTERFACES)
+            known = interface_names()
             nearest = nearest_name(interface, known)
             hint = f"did you mean {nearest!r}?" if nearest else f"known: {', '.join(known)}"
             raise BusMissingError(f"unknown interface {interface!r}; {hint}")

@@ -18,8 +18,9 @@ from adacd_hil.cli.connection import check_autonomy, check_clock, on_interrupt
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
-from adacd_hil.settings.configuration import Settings, builtin_names, load_settings
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings
+from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.wire.can_interface import is_virtual
 
 

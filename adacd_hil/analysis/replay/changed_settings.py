@@ -8,12 +8,12 @@ import dataclasses
 import itertools
 import tomllib
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from adacd_hil.remedies import nearest_name
+from adacd_hil.settings.catalogue import explain_unknown, known_keys
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 
 _FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", "rated_torque_Nm")
@@ -26,15 +26,15 @@ def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
     Raises ConfigError, of an unknown key with the nearest known one.
     """
     table = tomllib.loads(to_toml(settings))
+    known = known_keys()
     for key, text in changes.items():
-        kind = _known_keys().get(key)
-        if kind is None:
-            raise ConfigError(_unknown(key))
+        if key not in known or known[key].is_in_row:
+            raise ConfigError(explain_unknown(key))
         parts = key.split(".")
         section: dict[str, Any] = table
         for part in parts[:-1]:
             section = section.setdefault(part, {})
-        section[parts[-1]] = _spread(_read_value(key, text), kind, section.get(parts[-1]))
+        section[parts[-1]] = _spread(_read_value(key, text), known[key].kind, section.get(parts[-1]))
     return parse(Settings, table)
 
 
@@ -44,40 +44,6 @@ def refuse_facts(changes: Mapping[str, str]) -> None:
     for key in changes:
         if key in facts or key.startswith("devices."):
             raise ConfigError(f"`{key}` made the numbers of the log; a replay can't change it")
-
-
-def _known_keys() -> dict[str, Any]:
-    """Return the type of every key."""
-    return dict(_keys(Settings, ""))
-
-
-def _keys(section: type[Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    hints = typing.get_type_hints(section)
-    for field in dataclasses.fields(section):
-        kind = hints[field.name]
-        if dataclasses.is_dataclass(kind):
-            yield from _keys(typing.cast(type[Any], kind), f"{prefix}{field.name}.")
-        else:
-            yield f"{prefix}{field.name}", kind
-
-
-def _unknown(key: str) -> str:
-    keys = list(_known_keys())
-    below = [known for known in keys if known.startswith(f"{key}.")]
-    if below:
-        return f"`{key}` is a section; its keys are {', '.join(below)}"
-    if key in SUCCESSORS:
-        return f"unknown key `{key}`; its successor is {SUCCESSORS[key]}"
-    section, _, last = key.rpartition(".")
-    by_name = {known.rpartition(".")[2]: known for known in reversed(keys)}
-    found = nearest_name(key, keys) or by_name.get(nearest_name(last, by_name) or "")
-    if found:
-        return f"unknown key `{key}`; did you mean `{found}`?"
-    beside = [known.rpartition(".")[2] for known in keys if section and known.rpartition(".")[0] == section]
-    if beside:
-        return f"unknown key `{key}`; `{section}` has {', '.join(beside)}"
-    sections = dict.fromkeys(known.partition(".")[0] for known in keys)
-    return f"unknown key `{key}`; it begins with a section: {', '.join(sections)}"
 
 
 def _read_value(key: str, text: str) -> Any:

@@ -54,9 +54,9 @@ from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import replace_files
 from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
-from adacd_hil.settings.configuration import Settings, builtin_names, load_settings
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_files import builtin_names, to_toml
 
 FARTHEST: Final = 100.0
 """Extrapolation beyond which filters and gains are not told apart: thresholds of equal ones differ by a factor of 4."""

@@ -10,7 +10,6 @@ from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import ExitCode, Progress, explained, format_table
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
-from adacd_hil.records import Location
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -78,6 +77,8 @@ def _as_text(found: "LogComparison") -> str:
 def _contact(contact: "ComparedContact | None") -> str:
     if contact is None:
         return "–"
+    from adacd_hil.records import Location
+
     is_known = contact.location in Location.__members__.values()  # a later version may have others
     force = Location(contact.location).force_text(contact.force_N) if is_known else f"{contact.force_N:.1f}"
     return f"{contact.time_s:.3f} s, link {contact.link}" + ("" if force == "–" else f", {force} N")

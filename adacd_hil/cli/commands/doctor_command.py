@@ -7,6 +7,7 @@ from adacd_hil.cli.connection import Connection, on_interrupt, raise_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination
+from adacd_hil.commission.configuration_check import configuration_checks
 from adacd_hil.commission.diagnosis import Finding, Status, diagnose, summarise
 from adacd_hil.commission.host_checks import HOST_CHECKS, Host
 from adacd_hil.scheduling import request_realtime
@@ -38,7 +39,8 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
         lambda: request_realtime(settings.realtime_request),
         settings.realtime.cpu,
     )
-    findings = diagnose(HOST_CHECKS, host, _report)
+    findings = diagnose(configuration_checks(settings), settings, _report)
+    findings += diagnose(HOST_CHECKS, host, _report)
     patient = ArmExamination(
         settings,
         codec,

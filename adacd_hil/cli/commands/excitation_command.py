@@ -8,9 +8,9 @@ from typing import NamedTuple
 from adacd_hil.analysis.excitation_search import ExcitationLimits, Figures, NoExcitationError, Search
 from adacd_hil.cli.output import CommandError, ExitCode, Progress, format_table
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.settings.configuration import builtin_names, load_settings
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_files import builtin_names, to_toml
 
 _LABELS = (
     ("excitation_Nm2s", "smallest eigenvalue, Nm² s", "{:.3g}"),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.commands.log_export import export
+from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table
 from adacd_hil.given_path import GivenPath, WrittenPath
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from adacd_hil.log.log_files import TimeWindow
 
 _TOLD_FAULTS = 5
-_log_argument = click.argument("log", type=GivenPath(dir_okay=False))
+_log_argument = click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
 _out_option = click.option("--out", type=WrittenPath(dir_okay=False), metavar="FILE")
 
 
@@ -34,7 +35,7 @@ def log() -> None:
 
 
 @log.command(epilog="Exit status: 0 done; 1 a log can't be read; 2 wrong usage; 3 a log is cut or lacks a part.")
-@click.argument("logs", nargs=-1, required=True, type=GivenPath())
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
 @json_option
 @explained
 def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
@@ -54,7 +55,7 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 
 
 @log.command(epilog="Exit status: 0 clean; 1 an error, or a log can't be read; 2 wrong usage; 3 warnings only.")
-@click.argument("logs", nargs=-1, required=True, type=GivenPath())
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
 @json_option
 @explained
 def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
@@ -139,7 +140,7 @@ def _finite(value: float) -> float | str | None:
 
 
 @log.command(epilog="Exit status: 0 done; 1 a log is damaged or can't be read; 2 wrong usage.")
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(dir_okay=False))
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(dir_okay=False), shell_complete=complete_run)
 @click.option("--out", type=WrittenPath(dir_okay=False), default=Path("merged.mcap"), show_default=True)
 @click.option("--prefix", "has_prefix", is_flag=True, help="Put each log's name before its topics, as /NAME/topic.")
 @json_option

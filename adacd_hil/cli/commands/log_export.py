@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import CommandError, ExitCode, explained
 from adacd_hil.given_path import GivenPath, WrittenPath
@@ -56,7 +57,7 @@ dbc_option = click.option(
     epilog="Exit status: 0 done; 1 the recording can't be read or lacks a topic, or a file is in the way; 2 wrong "
     "usage or contract; 3 the recording is damaged, or a disk is full; 130 interrupted.",
 )
-@click.argument("log", type=GivenPath(dir_okay=False))
+@click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
 @click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Of the output.")
 @click.option("--out", type=WrittenPath(), help="Folder of the tables, or file of the frames.")
 @click.option(

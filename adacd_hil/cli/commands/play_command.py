@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
 from adacd_hil.cli.commands.log_export import contract_of, dbc_option, id_option, only_option
+from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained
 from adacd_hil.clock import MonotonicClock
@@ -25,6 +24,8 @@ from adacd_hil.wire.bus import Bus, BusError, open_bus
 from adacd_hil.wire.can_interface import is_virtual
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from adacd_hil.log.formats.frame_export import FrameChoice
     from adacd_hil.wire.playback import PlayedFrame
 
@@ -36,9 +37,17 @@ _SWITCH_S = 50e-6
 
 
 @click.command("play", epilog=EPILOG)
-@click.argument("log", type=GivenPath(dir_okay=False))
-@click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
-@click.option("-c", "--channel", required=True, help="Channel of that interface, such as vcan0.")
+@click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
+@click.option(
+    "-i",
+    "--interface",
+    required=True,
+    help="python-can interface, such as socketcan.",
+    shell_complete=complete_interface,
+)
+@click.option(
+    "-c", "--channel", required=True, help="Channel of that interface, such as vcan0.", shell_complete=complete_channel
+)
 @click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")
 @click.option("--fd", "is_fd", is_flag=True, help="Open the bus for CAN FD; default: as the contract is.")
 @click.option("--speed", type=click.FloatRange(0.001, 1000.0), default=1.0, show_default=True, help="Of the times.")
@@ -121,7 +130,9 @@ class Playback:
                 for t_ns, can_id, length, data in zip(*(block[n].tolist() for n in names), block["data"], strict=True):
                     yield PlayedFrame(t_ns, can_id, data[:length].tobytes())
 
-    def _pieces(self) -> Iterator[NDArray[Any]]:
+    def _pieces(self) -> "Iterator[NDArray[Any]]":
+        import numpy as np
+
         from adacd_hil.log.formats.frame_log import open_frames
         from adacd_hil.log.types.record_arrays import is_sendable
 
@@ -206,12 +217,12 @@ def may_move_an_arm(interface: str, channel: str) -> bool:
     return not is_virtual(interface, channel)
 
 
-def _ahead(pieces: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+def _ahead(pieces: "Iterable[NDArray[Any]]") -> "Iterator[NDArray[Any]]":
     """Give what a thread takes from an iterator some pieces ahead. Raises what that raises."""
     waiting: queue.Queue[NDArray[Any] | LogError | None] = queue.Queue(_PIECES_AHEAD)
     is_over = threading.Event()
 
-    def put(item: NDArray[Any] | LogError | None) -> bool:
+    def put(item: "NDArray[Any] | LogError | None") -> bool:
         while not is_over.is_set():
             try:
                 waiting.put(item, timeout=0.1)

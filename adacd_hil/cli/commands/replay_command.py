@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from adacd_hil.cli.completion import complete_run, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, stretch_options
 from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table
 from adacd_hil.given_path import GivenPath
@@ -27,11 +28,22 @@ _MOST_COLUMNS = 6
 
 
 @click.command(epilog=_EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=GivenPath())
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
 @click.option(
-    "--set", "changes", multiple=True, metavar="KEY=VALUE", help="Change a setting, such as filter.a_rad_s=50."
+    "--set",
+    "changes",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change a setting, such as filter.a_rad_s=50.",
+    shell_complete=complete_setting,
 )
-@click.option("--vary", multiple=True, metavar="KEY=A,B,C", help="Replay once for each value; of several, every pair.")
+@click.option(
+    "--vary",
+    multiple=True,
+    metavar="KEY=A,B,C",
+    help="Replay once for each value; of several, every pair.",
+    shell_complete=complete_setting,
+)
 @click.option("--config", metavar="NAME|FILE", help="Settings as a whole; needed for recordings without a log.")
 @profile_option
 @click.option("--dbc", type=GivenPath(dir_okay=False), help="Contract of a recording without a log.")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
 from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
@@ -26,10 +27,23 @@ _SIMULATED_CONFIG = "certified"
     epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` says why; 1 the cluster is "
     "lost, or the folder can't be written; 2 wrong usage or configuration; 130 interrupted: the same command goes on."
 )
-@click.argument("logs", nargs=-1, type=GivenPath())
-@click.option("--scenario", "scenarios", multiple=True, metavar="NAME", help="Play this scenario instead; repeatable.")
+@click.argument("logs", nargs=-1, type=GivenPath(), shell_complete=complete_run)
+@click.option(
+    "--scenario",
+    "scenarios",
+    multiple=True,
+    metavar="NAME",
+    help="Play this scenario instead; repeatable.",
+    shell_complete=complete_scenario,
+)
 @click.option("--seeds", default="1", show_default=True, metavar="N|A:B", help="Seeds of the scenarios, A to B.")
-@click.option("--vary", multiple=True, metavar="KEY=A,B,...", help="A setting's values; every combination is a row.")
+@click.option(
+    "--vary",
+    multiple=True,
+    metavar="KEY=A,B,...",
+    help="A setting's values; every combination is a row.",
+    shell_complete=complete_setting,
+)
 @click.option("--config", default="", metavar="NAME|FILE", help="Configuration; default: each log's own, or certified.")
 @profile_option
 @click.option("--workers", type=click.IntRange(1, 1024), help="Processes on this machine; default: its processors.")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table, tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     epilog="Exit status: 0 found, and the half to check on shows the wanted rate; 3 it can't show it, or no candidate "
     "is fit; 1 a log can't be read, or has no motion that counts; 2 wrong usage or configuration; 130 interrupted."
 )
-@click.argument("logs", nargs=-1, required=True, type=GivenPath())
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
 @click.option(
     "--rate-per-h",
     type=click.FloatRange(1e-6, 1e4),

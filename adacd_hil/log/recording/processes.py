@@ -15,12 +15,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from adacd_hil.log.log_files import MOST_VIEWERS
 from adacd_hil.log.types.message_types import MessageType
 from adacd_hil.log.types.topics import LogChannel
 from adacd_hil.wire.codec_columns import MessageTable, SignalCodec
-
-MOST_VIEWERS = 8
-"""Viewers of a live view at a time, unless --live-viewers says otherwise."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,171 @@
+"""Configurations: what one says and from where each value is, what is wrong with one, what a key means."""
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from adacd_hil.cli.completion import complete_configuration, complete_setting
+from adacd_hil.cli.options import json_option, profile_option
+from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table
+from adacd_hil.terminal import in_line
+
+if TYPE_CHECKING:
+    from adacd_hil.settings.catalogue import KnownKey
+
+EPILOG = "Exit status: 0 done, warnings included; 2 wrong usage, or a configuration that can't be used."
+
+
+@click.group("config")
+def config() -> None:
+    """Show, check and explain configurations."""
+
+
+@config.command(epilog=EPILOG)
+@click.argument("keys", nargs=-1, metavar="[GROUP|KEY]...", shell_complete=complete_setting)
+@click.option(
+    "--config",
+    "name",
+    default="certified",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="Built-in name or TOML file.",
+    shell_complete=complete_configuration,
+)
+@profile_option
+@click.option(
+    "--set",
+    "changes",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change a setting, such as filter.a_rad_s=50.",
+    shell_complete=complete_setting,
+)
+@click.option("--changed", "is_changed", is_flag=True, help="Only settings that differ from their default.")
+@json_option
+@explained
+def show(
+    keys: tuple[str, ...], name: str, profile: str | None, changes: tuple[str, ...], is_changed: bool, as_json: bool
+) -> ExitCode:
+    """Show the settings in force, and where each is from: the default, a file or a profile of one, or --set.
+
+    GROUP or KEY: these only.
+    """
+    rows = effective(name, profile, changes, keys)
+    if is_changed:
+        rows = [row for row in rows if row["value"] != row["default"]]
+    if as_json:
+        print(json.dumps(rows, indent=2))
+    elif rows:
+        print(format_table(("key", "value", "from"), [(row["key"], row["value"], row["origin"]) for row in rows]))
+    return ExitCode.OK
+
+
+def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
+    """Give the settings in force with value and default as TOML, and origin. Raises ConfigError, CommandError."""
+    from adacd_hil.analysis.replay.changed_settings import apply_settings, parse_changes
+    from adacd_hil.commission.configuration_check import origins_of
+    from adacd_hil.settings.catalogue import in_words, value_of
+    from adacd_hil.settings.configuration import Settings, configuration_layers, resolved_table
+    from adacd_hil.settings.schema import parse
+
+    layers = configuration_layers(name, profile)
+    changes = parse_changes(given)
+    settings = parse(Settings, resolved_table(layers))
+    settings = apply_settings(settings, changes) if changes else settings
+    origins = origins_of(layers) | dict.fromkeys(changes, "--set")
+    return [
+        {
+            "key": known.key,
+            "value": in_words(value_of(settings, known.key)),
+            "default": known.default,
+            "origin": origins.get(known.key, "default"),
+        }
+        for known in _chosen(keys)
+        if not known.is_in_row
+    ]
+
+
+@config.command(epilog=EPILOG)
+@click.argument("names", nargs=-1, required=True, metavar="NAME|FILE...", shell_complete=complete_configuration)
+@profile_option
+@json_option
+@explained
+def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCode:
+    """Say everything that is wrong with configurations at once, a line each, and what is likely a mistake."""
+    from adacd_hil.commission.configuration_check import examine_configuration
+
+    findings = {name: examine_configuration(name, profile) for name in names}
+    if as_json:
+        told = {name: {"errors": found.errors, "warnings": found.warnings} for name, found in findings.items()}
+        print(json.dumps(told, indent=2))
+    else:
+        for name, found in findings.items():
+            for kind, lines in (("error", found.errors), ("warning", found.warnings)):
+                for line in lines:
+                    print(f"{in_line(name)}: {kind}: {in_line(line)}")
+            print(
+                f"{in_line(name)}: {_counted(len(found.errors), 'error')}, {_counted(len(found.warnings), 'warning')}"
+            )
+    return ExitCode.USAGE if any(found.errors for found in findings.values()) else ExitCode.OK
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+@config.command(epilog=EPILOG)
+@click.argument("keys", nargs=-1, metavar="[GROUP|KEY]...", shell_complete=complete_setting)
+@json_option
+@explained
+def docs(keys: tuple[str, ...], as_json: bool) -> ExitCode:
+    """Explain settings: meaning, unit, bounds, default. Without GROUP or KEY: list the groups."""
+    if not keys:
+        _list_groups(as_json)
+        return ExitCode.OK
+    rows = _chosen(keys)
+    if as_json:
+        told = [{name: getattr(row, name) for name in ("key", "default", "bounds", "meaning")} for row in rows]
+        print(json.dumps(told, indent=2))
+    elif len(rows) == 1:
+        (row,) = rows
+        print(
+            f"{row.key}\n  {row.meaning}\n  default: {row.default}" + (f"\n  bounds: {row.bounds}" * bool(row.bounds))
+        )
+    else:
+        table = [(row.key, row.default, row.bounds, row.meaning) for row in rows]
+        print(format_table(("key", "default", "bounds", "meaning"), table))
+    return ExitCode.OK
+
+
+def _list_groups(as_json: bool) -> None:
+    from adacd_hil.settings.catalogue import keys_of, sections
+
+    groups: list[dict[str, Any]] = [
+        {"group": name or "(top)", "keys": sum(1 for _ in keys_of(section, "")), "meaning": meaning}
+        for name, section, meaning in sections()
+    ]
+    if as_json:
+        print(json.dumps(groups, indent=2))
+    else:
+        rows = [(group["group"], str(group["keys"]), group["meaning"]) for group in groups]
+        print(format_table(("group", "keys", "meaning"), rows, right=(1,)))
+
+
+def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":
+    """Give the settings of these groups and keys, all where there are none. Raises CommandError."""
+    from adacd_hil.settings.catalogue import explain_unknown, known_keys, sections
+
+    known = known_keys()
+    if not keys:
+        return list(known.values())
+    groups = {name for name, *_ in sections() if name}
+    chosen: list[KnownKey] = []
+    for key in keys:
+        if key in groups:
+            chosen += [row for name, row in known.items() if name.startswith(f"{key}.")]
+        elif key in known:
+            chosen.append(known[key])
+        else:
+            raise CommandError(explain_unknown(key), ExitCode.USAGE)
+    return list(dict.fromkeys(chosen))

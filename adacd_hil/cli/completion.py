@@ -1,0 +1,158 @@
+"""What a shell completes by itself: configurations, scenarios, keys and values of settings, interfaces, run folders.
+
+Everything is imported when it is asked for: a shell waits for each answer.
+"""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from click import Context, Parameter
+from click.shell_completion import BashComplete, CompletionItem, ZshComplete, add_completion_class
+
+_ASKED = "_ADACD_HIL_COMPLETE"
+"""The variable by which click knows that a shell asks, and what."""
+_FILE = "file"
+_MOST_RUNS = 30
+
+
+def complete_configuration(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
+    """Give the built-in configurations and TOML files."""
+    from adacd_hil.settings.toml_files import builtin_names
+
+    return [*_starting(builtin_names(), incomplete), *_toml_files(incomplete)]
+
+
+def complete_scenario(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
+    """Give the built-in scenarios and TOML files."""
+    from importlib import resources
+
+    from adacd_hil.settings.toml_files import toml_names
+
+    names = toml_names(resources.files("firmware_sim") / "scenarios")
+    return [*_starting(names, incomplete), *_toml_files(incomplete)]
+
+
+def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:
+    """Give groups and keys; of an option KEY=VALUE keys with `=`, and the values of a key that has choices."""
+    from adacd_hil.settings.catalogue import known_keys, sections
+
+    known = {key: row for key, row in known_keys().items() if not row.is_in_row}
+    if param.param_type_name == "argument":
+        groups = [CompletionItem(name, help=meaning) for name, _, meaning in sections() if name.startswith(incomplete)]
+        keys = [CompletionItem(key, help=row.meaning) for key, row in known.items() if key.startswith(incomplete)]
+        return [item for item in groups if item.value] + (keys if "." in incomplete or not groups else [])
+    key, equals, value = incomplete.partition("=")
+    if equals:
+        choices = known[key].choices if key in known else ()
+        before, comma, last = value.rpartition(",")
+        return [CompletionItem(f"{key}={before}{comma}{choice}") for choice in choices if choice.startswith(last)]
+    return [CompletionItem(f"{name}=", help=row.meaning) for name, row in known.items() if name.startswith(incomplete)]
+
+
+def complete_interface(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
+    """Give python-can's interfaces, SocketCAN first."""
+    from adacd_hil.wire.python_can import interface_names
+
+    return _starting(("socketcan", *(name for name in interface_names() if name != "socketcan")), incomplete)
+
+
+def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
+    """Give the CAN interfaces of this machine, where the interface is SocketCAN or not said yet."""
+    if ctx.params.get("interface") not in (None, "socketcan"):
+        return []
+    from adacd_hil.wire.can_interface import can_interfaces
+
+    return _starting(can_interfaces(), incomplete)
+
+
+def complete_run(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
+    """Give the folders below `runs` that have a log, the newest first, and files."""
+    from adacd_hil.cli.output import RUNS
+    from adacd_hil.log.log_files import LOG_NAME
+
+    try:
+        found = sorted((path for path in RUNS.iterdir() if (path / LOG_NAME).is_file()), reverse=True)
+    except OSError:
+        found = []
+    # Bash forgets what came before a file, and looks for files where nothing else fits.
+    return [CompletionItem(incomplete, type=_FILE), *_starting(map(str, found[:_MOST_RUNS]), incomplete)]
+
+
+def _starting(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
+    return [CompletionItem(name) for name in names if name.startswith(incomplete)]
+
+
+def _toml_files(incomplete: str) -> list[CompletionItem]:
+    """Give the TOML files and the folders that a path begins; built-in names need no slash."""
+    folder, slash, _ = incomplete.rpartition("/")
+    found = []
+    try:
+        for path in sorted(Path(folder or ("/" if slash else ".")).iterdir()):
+            name = f"{folder}{slash}{path.name}"
+            if not name.startswith(incomplete) or (path.name.startswith(".") and not incomplete):
+                continue
+            if path.is_dir():
+                found.append(CompletionItem(f"{name}/"))
+            elif path.suffix == ".toml":
+                found.append(CompletionItem(name))
+    except OSError:
+        pass
+    return found
+
+
+_CHANGES = ("--set", "--vary")
+"""Options whose value is KEY=VALUE."""
+
+
+class BashWithEquals(BashComplete):
+    """Bash's completion, which takes `KEY=VALUE` for three words: they are one again, and only the last is replaced."""
+
+    source_template = BashComplete.source_template.replace(
+        "    return 0",
+        "    [[ ${#COMPREPLY[@]} -eq 1 && ${COMPREPLY[0]} == *[=/] ]] && compopt -o nospace\n\n    return 0",
+    )
+    _kept = ""
+    """What bash keeps of the word in front of what it replaces."""
+
+    def get_completion_args(self) -> tuple[list[str], str]:
+        """Give the words before the cursor, and the one it is in."""
+        args, incomplete = super().get_completion_args()
+        words: list[str] = []
+        for word in [*args, incomplete]:
+            is_part = len(words) > 1 and words[-2] in _CHANGES and (word == "=" or words[-1].endswith("="))
+            if is_part:
+                words[-1] += word
+                self._kept = words[-1].partition("=")[0] + "="
+            else:
+                self._kept = ""
+                words.append(word)
+        return words[:-1], words[-1]
+
+    def format_completion(self, item: CompletionItem) -> str:
+        """Write what takes the place of the word that bash sees."""
+        return super().format_completion(CompletionItem(item.value.removeprefix(self._kept), item.type))
+
+
+class ZshWithEquals(ZshComplete):
+    """Zsh's completion, without a space behind `KEY=` and `folder/`."""
+
+    source_template = ZshComplete.source_template.replace(
+        '    if [ -n "$completions" ]',
+        "    local -a stay\n"
+        "    stay=(${(M)completions:#*/})\n"
+        "    completions=(${completions:#*/})\n"
+        "    (( $#stay )) && compadd -U -S '' -V unsorted -a stay\n"
+        '    if [ -n "$completions" ]',
+    ).replace("completions_with_descriptions -U", "completions_with_descriptions -U -S '' -r ' '")
+
+
+def is_completing() -> bool:
+    """Whether a shell has started this process, for its script or for an answer."""
+    return _ASKED in os.environ
+
+
+def prepare_completion() -> None:
+    """Let click answer bash and zsh by the classes above."""
+    add_completion_class(BashWithEquals)
+    add_completion_class(ZshWithEquals)

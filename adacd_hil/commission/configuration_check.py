@@ -1,0 +1,188 @@
+"""What is wrong with a configuration, and what is odd about it: all of it at once, a line each, without a bus."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from adacd_hil.commission.diagnosis import Check, CheckOutcome, ok, warning
+from adacd_hil.device.contract import load_contract
+from adacd_hil.device.profile import load_profile
+from adacd_hil.records import JOINTS
+from adacd_hil.settings.catalogue import KnownKey, explain_unknown, in_words, known_keys, value_of
+from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
+from adacd_hil.settings.schema import ConfigError, find_problems, parse
+from adacd_hil.settings.toml_files import builtin_names
+from adacd_hil.wire.budget import check_budget
+from adacd_hil.wire.codec import Codec, CodecError
+
+Pair = tuple[float, float]
+
+_ARMS_OWN = ("arm.cad_theta", "controller.Kp", "controller.Kd")
+"""Keys that the built-in profiles give for an emulated arm."""
+_MOST_RAD = 2.0 * math.pi
+"""A limit in degrees below this is less than a hand's breadth of motion, and likely radians."""
+
+
+class ConfigurationFindings(NamedTuple):
+    """errors: why it can't be used. warnings: what it may not mean. `settings`: None with errors."""
+
+    errors: list[str]
+    warnings: list[str]
+    settings: Settings | None
+
+
+def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
+    """Look for everything that keeps a configuration from being used, and for what is likely a mistake."""
+    try:
+        layers = configuration_layers(name_or_file, profile)
+    except ConfigError as error:
+        return ConfigurationFindings([str(error)], [], None)
+    table = resolved_table(layers)
+    if problems := find_problems(Settings, table):
+        return ConfigurationFindings(problems, [], None)
+    settings = parse(Settings, table)
+    if problems := _device_problems(settings):
+        return ConfigurationFindings(problems, [], None)
+    try:
+        codec = load_contract(settings)
+    except (ConfigError, CodecError) as error:
+        return ConfigurationFindings([str(error)], [], None)
+    warnings = [
+        *_oddities(settings),
+        *_assumptions(settings),
+        *_layer_warnings(layers),
+        *_budget_warnings(codec, settings),
+    ]
+    return ConfigurationFindings([], warnings, settings)
+
+
+def configuration_checks(settings: Settings) -> list[Check[Settings]]:
+    """Make doctor's checks of a configuration: what it may not mean, and one for each value that is a guess."""
+    known = known_keys()
+    guesses = [key for key in settings.assumed if key in known]
+    return [Check("settings", _check_oddities), *(Check(f"`{key}`", _asking_for(known[key])) for key in guesses)]
+
+
+def _check_oddities(settings: Settings) -> CheckOutcome:
+    odd = _oddities(settings)
+    if odd:
+        return warning("; ".join(odd), "correct the configuration; `adacd-hil config check` looks at it without a bus")
+    return ok(f"configuration {settings.name}")
+
+
+def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
+    def ask(settings: Settings) -> CheckOutcome:
+        value = value_of(settings, known.key)
+        told = "nothing is given" if value is None else f"{in_words(value)} is a guess"
+        remedy = f"measure it or look it up, write it, and take `{known.key}` off `assumed`"
+        return warning(f"{told}: {known.meaning}", remedy)
+
+    return ask
+
+
+def _oddities(settings: Settings) -> list[str]:
+    return [line for look in _LOOKS for line in look(settings)]
+
+
+def _assumptions(settings: Settings) -> list[str]:
+    if not settings.assumed:
+        return []
+    return [f"assumed, not known: {', '.join(f'`{key}`' for key in settings.assumed)}"]
+
+
+def _device_problems(settings: Settings) -> list[str]:
+    devices = settings.devices
+    problems: dict[str, None] = {}
+    for kind, names in (("drive", devices.drive), ("sensor", devices.sensor)):
+        for name in names:
+            try:
+                load_profile(name, kind)
+            except ConfigError as error:
+                problems[str(error)] = None
+    return list(problems)
+
+
+def _torque_limits(settings: Settings) -> Iterator[str]:
+    arm = settings.arm
+    yield from _over("arm.torque_limit_Nm", arm.torque_limit_Nm, "arm.rated_torque_Nm", arm.rated_torque_Nm, "Nm")
+
+
+def _travel(settings: Settings) -> Iterator[str]:
+    amplitude, limit = settings.trajectory.amplitude_deg, settings.arm.position_limit_deg
+    for line in _over("trajectory.amplitude_deg", amplitude, "arm.position_limit_deg", limit, "deg"):
+        yield f"{line}; the motion would end in a fault"
+
+
+def _speed(settings: Settings) -> Iterator[str]:
+    speed, limit = settings.reaction.velocity_limit_deg_s, settings.arm.velocity_limit_deg_s
+    for line in _over("reaction.velocity_limit_deg_s", speed, "arm.velocity_limit_deg_s", limit, "deg/s"):
+        yield f"{line}; a withdrawal would end in a fault"
+
+
+def _radians(settings: Settings) -> Iterator[str]:
+    for key in ("arm.position_limit_deg", "trajectory.amplitude_deg", "arm.velocity_limit_deg_s"):
+        values = value_of(settings, key)
+        if 0.0 < max(values) <= _MOST_RAD:
+            unit = "rad/s" if key.endswith("_s") else "rad"
+            meant = " and ".join(f"{math.degrees(value):.3g}" for value in values)
+            yield f"`{key}` = {_pair(values)} looks like {unit}; in degrees that would be {meant}"
+
+
+def _unknown_assumptions(settings: Settings) -> Iterator[str]:
+    known = known_keys()
+    for key in settings.assumed:
+        if key not in known:
+            yield f"`assumed` names no setting: {explain_unknown(key)}"
+
+
+_LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (
+    _torque_limits,
+    _travel,
+    _speed,
+    _radians,
+    _unknown_assumptions,
+)
+
+
+def _over(key: str, values: Pair, bound_key: str, bounds: Pair, unit: str) -> Iterator[str]:
+    for joint in range(JOINTS):
+        if values[joint] > bounds[joint]:
+            bound = f"`{bound_key}[{joint}]` = {bounds[joint]:g} {unit}"
+            yield f"`{key}[{joint}]` = {values[joint]:g} {unit} exceeds {bound}"
+
+
+def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
+    """Look at who says what: a file of one's own arm with numbers of the emulated one."""
+    own = [layer for layer in layers if layer.origin not in builtin_names() and "[profiles." not in layer.origin]
+    if not own:
+        return
+    if not any("scheme" in layer.table for layer in layers if layer.origin != "paper"):
+        yield 'the scheme is the paper\'s, which certifies nothing; `extends = "certified"` gives the certified one'
+    if not any("arm" in layer.table or "devices" in layer.table for layer in own):
+        return
+    origins = origins_of(layers)
+    for key in _ARMS_OWN:
+        if "[profiles." in origins.get(key, ""):
+            remedy = "give your arm's, or [] for none" if key == "arm.cad_theta" else "give your arm's"
+            yield f"`{key}` is that of an emulated arm, from {origins[key]}; {remedy}"
+
+
+def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
+    """Say for each key that a layer gives which one it is from: the uppermost."""
+    found = {}
+    for origin, table in layers:
+        for section, content in table.items():
+            for key in [f"{section}.{name}" for name in content] if isinstance(content, dict) else [section]:
+                found[key] = origin
+    return found
+
+
+def _budget_warnings(codec: Codec, settings: Settings) -> Iterator[str]:
+    if b'"Trigger"' in codec.text:
+        budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
+        if not budget.is_fit:
+            yield f"contract {codec.path.stem}: {budget.line}"
+
+
+def _pair(values: Sequence[float]) -> str:
+    return f"[{', '.join(f'{value:g}' for value in values)}]"

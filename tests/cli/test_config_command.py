@@ -1,0 +1,140 @@
+"""`config show|check|docs`: where each value is from, all that is wrong at once, what a key means."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from adacd_hil.cli.main import cli
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.toml_files import builtin_names
+
+USAGE = 2
+
+
+def config(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["config", *arguments])
+
+
+def shown(*arguments: str) -> dict[str, tuple[str, str]]:
+    """Value and origin of each key that `show` tells."""
+    result = config("show", "--json", *arguments)
+    assert result.exit_code == 0
+    return {row["key"]: (row["value"], row["origin"]) for row in json.loads(result.stdout)}
+
+
+@pytest.fixture
+def own_arm(tmp_path: Path) -> str:
+    path = tmp_path / "my-arm.toml"
+    path.write_text('extends = "certified"\n[arm]\nlink_length_m = [0.4, 0.25]\ncad_theta = []\n')
+    return str(path)
+
+
+def test_each_value_is_told_with_where_it_is_from(own_arm: str) -> None:
+    told = shown("--config", own_arm, "--set", "filter.a_rad_s=12")
+    assert told["arm.link_length_m"] == ("[0.4, 0.25]", own_arm)
+    assert told["filter.a_rad_s"] == ("12", "--set")
+    assert told["reaction.start"] == ('"measured"', "certified")
+    assert told["filter.b_rad_s"] == ("10", "paper")
+    assert told["controller.Kp"] == ("[250, 20]", "paper [profiles.P]")
+    assert told["log.part_MiB"] == ("512", "default")
+
+
+def test_only_what_differs_from_its_default_is_told(own_arm: str) -> None:
+    told = shown("--config", own_arm, "--changed", "arm", "log")
+    assert told == {"arm.link_length_m": ("[0.4, 0.25]", own_arm)}
+
+
+def test_the_profile_of_the_command_line_is_told() -> None:
+    told = shown("--profile", "S", "arm.profile", "controller.Kp")
+    assert told == {"arm.profile": ('"S"', "--profile"), "controller.Kp": ("[500, 40]", "paper [profiles.S]")}
+
+
+@pytest.mark.parametrize("name", builtin_names())
+def test_what_comes_with_the_package_has_no_error_and_no_warning(name: str) -> None:
+    result = config("check", name)
+    assert (result.exit_code, result.stdout) == (0, f"{name}: 0 errors, 0 warnings\n")
+
+
+def test_all_errors_are_told_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(
+        "[arm]\nlink_length_m = [350, 300]\nrated_torque = [12, 6]\n[bus]\nperiod_us = 1\n"
+        "[certified]\nsigmas = 5.0\n[safety]\ncommission_cycles = 200\n"
+    )
+    result = config("check", str(path))
+    assert result.exit_code == USAGE
+    lines = [line.removeprefix(f"{path}: ") for line in result.stdout.splitlines()]
+    assert lines == [
+        "error: unknown key `arm.rated_torque`; did you mean `arm.rated_torque_Nm`?",
+        "error: `arm.link_length_m[0]` = 350.0 m is above 5 m; 350 mm are 0.35 m",
+        "error: `bus.period_us` = 1 µs is below 500 µs; 1 ms are 1000 µs",
+        "error: unknown key `certified.sigmas`; its successor is `certified.noise_sigmas` and `certified.model_sigmas`",
+        "error: unknown key `safety.commission_cycles`; its successor is `safety.commission_s`",
+        "5 errors, 0 warnings",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("[arm]\nposition_limit_deg = [1.31, 2.09]", "looks like rad; in degrees that would be 75.1 and 120"),
+        ("[arm]\nposition_limit_deg = [25, 120]", "`trajectory.amplitude_deg[0]` = 30 deg exceeds"),
+        ("[arm]\ntorque_limit_Nm = [12, 7]", "`arm.torque_limit_Nm[1]` = 7 Nm exceeds `arm.rated_torque_Nm[1]` = 6 Nm"),
+        ("[arm]\nvelocity_limit_deg_s = [90, 300]", "`reaction.velocity_limit_deg_s[0]` = 100 deg/s exceeds"),
+        ("[arm]\nlink_length_m = [0.4, 0.3]", "`arm.cad_theta` is that of an emulated arm, from paper [profiles.P]"),
+        ("[arm]\nlink_length_m = [0.4, 0.3]", "`controller.Kp` is that of an emulated arm"),
+        ("[filter]\na_rad_s = 11", "the scheme is the paper's, which certifies nothing"),
+        ("assumed = ['arm.link_length_m']", "assumed, not known: `arm.link_length_m`"),
+        ("assumed = ['arm.link_length']", "`assumed` names no setting: unknown key `arm.link_length`; did you mean"),
+    ],
+)
+def test_what_is_likely_a_mistake_is_a_warning(tmp_path: Path, text: str, line: str) -> None:
+    path = tmp_path / "odd.toml"
+    path.write_text(text)
+    result = config("check", str(path))
+    assert result.exit_code == 0
+    assert line in result.stdout
+
+
+def test_devices_and_contract_are_looked_at(tmp_path: Path) -> None:
+    path = tmp_path / "devices.toml"
+    path.write_text('[devices]\ndrive = ["stok-drive", "int32-sensor"]\n')
+    result = config("check", str(path))
+    assert result.exit_code == USAGE
+    assert "did you mean 'stock-drive'?" in result.stdout
+    assert "int32-sensor is a sensor, a drive is needed" in result.stdout
+    path.write_text('[devices]\ndrive = ["stock-drive", "stock-drive"]\n')
+    assert "Drive1" in config("check", str(path)).stdout
+
+
+def test_several_files_are_checked_each() -> None:
+    result = config("check", "certified", "papper")
+    assert result.exit_code == USAGE
+    assert result.stdout.splitlines()[0] == "certified: 0 errors, 0 warnings"
+    assert "did you mean 'paper'?" in result.stdout
+
+
+def test_the_groups_a_group_and_a_key_are_explained() -> None:
+    assert "certified" in config("docs").stdout
+    assert "arm.position_limit_deg" in config("docs", "arm").stdout
+    assert config("docs", "certified.noise_sigmas").stdout == (
+        "certified.noise_sigmas\n  threshold in deviations of the torque's noise\n  default: 6.5\n  bounds: 1 … 50\n"
+    )
+
+
+def test_an_unknown_key_names_the_nearest() -> None:
+    result = config("docs", "certified.noise_sigma")
+    assert result.exit_code == USAGE
+    assert result.stderr == "adacd-hil: unknown key `certified.noise_sigma`; did you mean `certified.noise_sigmas`?\n"
+
+
+def test_the_profile_is_that_of_the_file_and_the_files_outweigh_it(tmp_path: Path) -> None:
+    base, top = tmp_path / "base.toml", tmp_path / "top.toml"
+    base.write_text("[controller]\nKp = [1, 2]\n[profiles.S]\ncontroller.Kd = [3, 4]\n")
+    top.write_text('extends = "base.toml"\n[arm]\nprofile = "S"\n')
+    settings = load_settings(str(top))
+    assert settings.arm.profile == "S"
+    assert (settings.controller.Kp, settings.controller.Kd) == ((1.0, 2.0), (3.0, 4.0))
+    assert settings.name == "top"
