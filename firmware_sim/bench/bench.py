@@ -80,7 +80,7 @@ class Bench:
         self._sync_id = codec.message("Sync").can_id
         self._host_id = codec.node_id("HostHeartbeat")
         for device in self.devices:
-            device.on_pdo_change = self._listen
+            device.pdos.on_refresh = self._listen
         self._services: dict[int, Handler] = {
             codec.message("Nmt").can_id: self._on_nmt,
             codec.message("HostHeartbeat").can_id: self._on_host_heartbeat,

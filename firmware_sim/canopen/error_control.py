@@ -11,11 +11,10 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Protocol
 
 from adacd_hil.wire.contract_frames import NOT_VALID
 from adacd_hil.wire.time_marks import NEVER_NS
-from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, refuse
+from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, one_of, refuse
 
 HISTORY_LENGTH = 4
 """Entries of 0x1003 in the EDS files."""
@@ -43,7 +42,7 @@ class ErrorReporter:
         dictionary.serve(0x1003, 0, lambda: len(self._history))
         for sub in range(1, HISTORY_LENGTH + 1):
             dictionary.serve(0x1003, sub, lambda sub=sub: self._past_error(sub))  # type: ignore[misc]
-        dictionary.watch(0x1003, 0, self._clear_history, _check_zero)
+        dictionary.watch(0x1003, 0, lambda _: self._history.clear(), one_of(0))
         dictionary.watch(0x1014, 0, self._validate, self._check_cob_id)
         dictionary.watch(0x1015, 0, self._set_inhibit)
 
@@ -80,9 +79,6 @@ class ErrorReporter:
             refuse(Abort.NO_DATA)
         return self._history[sub - 1]
 
-    def _clear_history(self, _value: int) -> None:
-        self._history.clear()
-
     def _check_cob_id(self, value: int) -> None:
         if value & ~NOT_VALID != self._cob_id:
             refuse(Abort.VALUE_RANGE)
@@ -92,11 +88,6 @@ class ErrorReporter:
 
     def _set_inhibit(self, tenths_ms: int) -> None:
         self._inhibit_ns = tenths_ms * 100_000
-
-
-def _check_zero(value: int) -> None:
-    if value != 0:
-        refuse(Abort.VALUE_RANGE)
 
 
 class HeartbeatProducer:
@@ -129,25 +120,20 @@ class HeartbeatProducer:
         self.restart(self._now_ns())
 
 
-class HeartbeatListener(Protocol):
-    """The object that is told of the master's heartbeat."""
-
-    now_ns: int
-
-    def lose_heartbeat(self, t_ns: int) -> None:
-        """React to silence."""
-
-    def find_heartbeat(self, t_ns: int) -> None:
-        """React to the end of the silence."""
-
-
 class HeartbeatConsumer:
     """0x1016:1: monitors one node from its first heartbeat on. A lost heartbeat is found again when one arrives."""
 
-    def __init__(self, dictionary: ObjectDictionary, listener: HeartbeatListener) -> None:
+    def __init__(
+        self,
+        dictionary: ObjectDictionary,
+        on_silence: Callable[[int], None],
+        on_return: Callable[[int], None],
+        now_ns: Callable[[], int],
+    ) -> None:
+        """`on_silence`, `on_return`: called with t_ns when the heartbeat stays away, and when it is there again."""
         self.is_lost = False
         """Whether the heartbeat is monitored and missing."""
-        self._listener = listener
+        self._on_silence, self._on_return, self._now_ns = on_silence, on_return, now_ns
         self._node_id = 0
         self._timeout_ns = 0
         self._due_ns = NEVER_NS
@@ -165,19 +151,19 @@ class HeartbeatConsumer:
         if t_ns >= self._due_ns:
             self._due_ns = NEVER_NS
             self.is_lost = True
-            self._listener.lose_heartbeat(t_ns)
+            self._on_silence(t_ns)
         return self._due_ns
 
     def _configure(self, value: int) -> None:
         self._node_id = (value >> 16) & 0x7F
         self._timeout_ns = (value & 0xFFFF) * 1_000_000
         self._due_ns = NEVER_NS
-        self._find(self._listener.now_ns)  # what isn't monitored any more isn't missing
+        self._find(self._now_ns())  # what isn't monitored any more isn't missing
 
     def _find(self, t_ns: int) -> None:
         if self.is_lost:
             self.is_lost = False
-            self._listener.find_heartbeat(t_ns)
+            self._on_return(t_ns)
 
 
 def _check_node(value: int) -> None:

@@ -12,7 +12,6 @@ COB-ID. Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Protocol
 
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.e2e import E2eStatus
@@ -24,8 +23,8 @@ RECEIVE, TRANSMIT = 0x1400, 0x1800
 COUNT = 4
 
 
-class PdoUser(Protocol):
-    """The device's side of its PDOs."""
+class PdoUser:
+    """The device's side of its PDOs. By itself it does nothing."""
 
     def act(self, t_ns: int) -> None:
         """Act on a frame that doesn't wait for SYNC; its values have been written."""
@@ -210,9 +209,8 @@ class Pdos:
         send: Send,
         messages: Mapping[int, MessageCodec],
         longest: int,
-        on_refresh: Callable[[], None],
     ) -> None:
-        """`messages`: the contract's, by identifier. `longest`: frame, in bytes. `on_refresh`: after changes."""
+        """`messages`: the contract's, by identifier. `longest`: frame, in bytes."""
         self.dictionary = dictionary
         self.send = send
         self.longest = longest
@@ -225,7 +223,8 @@ class Pdos:
         """Objects whose changes the device announces by `notify`."""
         self._is_commanded = False  # a command has acted since the last SYNC, without waiting for one
         self._writers: dict[tuple[int, int], Callable[[int], object]] = {}
-        self._on_refresh = on_refresh
+        self.on_refresh: Callable[[], None] = lambda: None
+        """Called when other PDOs are exchanged than before."""
         self._is_operational = False
         self._now_ns = 0
         self.own_ns: Callable[[int], int] = lambda t_ns: t_ns
@@ -296,7 +295,7 @@ class Pdos:
         self.has_compared = bool(self._compared)
         self._waiting = tuple(pdo for pdo in self._receiving if pdo.is_synchronous)
         self._find_commands()
-        self._on_refresh()
+        self.on_refresh()
 
     def _find_commands(self) -> None:
         """Choose the PDOs that count as command: those with target torque, or, without it, with controlword."""

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.contract_frames import NOT_VALID
-from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, refuse
+from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, one_of, refuse
 
 EVENT_DRIVEN = (254, 255)
 """Transmission types."""
@@ -67,7 +67,7 @@ class PdoRecord(ABC):
         self._count = dictionary.value(mapping, 0)
         self._lay_out(self._count)
         dictionary.watch(index, 1, self._identify, self._check_cob_id)
-        dictionary.watch(index, 2, self._set_type, _check_type)
+        dictionary.watch(index, 2, self._set_type, one_of(*_TYPES))
         dictionary.watch(index, 3, self._set_inhibit, self._check_inhibit)
         dictionary.watch(index, 5, self._set_timer)
         # Entries before their number: a reset restores them in this order.
@@ -170,11 +170,6 @@ def _header_bytes(message: MessageCodec) -> int:
     header = message.signals[: len(message.signals) - len(message.values)]
     sizes = {s.container: 1 if s.mask else (s.raw_high - s.raw_low).bit_length() // 8 for s in header}
     return sum(sizes.values())
-
-
-def _check_type(value: int) -> None:
-    if value not in _TYPES:
-        refuse(Abort.VALUE_RANGE)
 
 
 FD_BYTES = FD_LENGTHS[-1]

@@ -5,10 +5,9 @@ the bench's time; a device and its application exchange times of the device's ow
 (services), 7.3 (NMT), 7.5.2.32 (0x1029, error behaviour).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import Protocol
 
 from adacd_hil.wire.bus import CLASSIC_BYTES
 from adacd_hil.wire.codec import MessageCodec
@@ -39,8 +38,13 @@ RESET_NODE, RESET_COMMUNICATION = 129, 130
 _OF_SYNC = {Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH}
 
 
-class Application(PdoUser, Protocol):
-    """The application of a device: everything besides communication."""
+class Application(PdoUser):
+    """The application of a device: everything besides communication. By itself it does nothing."""
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether the device does what its objects must not be changed under."""
+        return False
 
     def leave_operational(self, t_ns: int) -> None:
         """Act on leaving Operational; EMCY messages can still be sent."""
@@ -59,10 +63,6 @@ class Application(PdoUser, Protocol):
 
     def note_error(self) -> None:
         """Take note that the error register, 0x1001, may have changed."""
-
-    @property
-    def is_at_work(self) -> bool:
-        """Whether the device does what its objects must not be changed under."""
 
     def restart(self, is_node_reset: bool) -> None:
         """Begin anew: communication only, or all of the device."""
@@ -99,12 +99,10 @@ class EmulatedDevice(ObjectDictionary):
         """Time of the last request, for what it starts."""
         self.power_on_ns = 0
         """When the device got its power, by its own clock."""
-        self.on_pdo_change: Callable[[], None] = lambda: None
-        """Called when other PDOs are exchanged than before."""
         self._put_on_bus = send
-        self._application: Application | None = None
+        self._application = Application()
         self._producer = HeartbeatProducer(self, self._send, lambda: self.state, lambda: self.now_ns)
-        self._consumer = HeartbeatConsumer(self, self)
+        self._consumer = HeartbeatConsumer(self, self.lose_heartbeat, self.find_heartbeat, lambda: self.now_ns)
         self._errors = ErrorReporter(self, self._send, lambda: self.error_register, lambda: self.state in _EMCY_STATES)
         self.watchdogs = Watchdogs(self)
         self.sync_counts = SyncCounts(self)
@@ -115,7 +113,7 @@ class EmulatedDevice(ObjectDictionary):
         self.watch(0x1019, 0, self._set_overflow, self._check_overflow)
         self.open_at_work = frozenset({_CLEAR_HISTORY})
         """Objects that SDO may write while the device is at work."""
-        self.pdos = Pdos(self, send, messages or {}, longest_pdo, self._announce_pdos)
+        self.pdos = Pdos(self, send, messages or {}, longest_pdo)
         self.pdos.own_ns = self.clock.own_ns
 
     @property
@@ -202,15 +200,13 @@ class EmulatedDevice(ObjectDictionary):
 
     def lose_heartbeat(self, t_ns: int) -> None:
         """React to the master's silence: the application, then Pre-operational (CiA 301, default of 0x1029)."""
-        if self._application is not None:
-            self._application.lose_heartbeat(t_ns)
+        self._application.lose_heartbeat(t_ns)
         if self.is_operational:
             self._enter(NmtState.PRE_OPERATIONAL, t_ns)
 
     def find_heartbeat(self, t_ns: int) -> None:
         """Let the application know that the master is back."""
-        if self._application is not None:
-            self._application.find_heartbeat(t_ns)
+        self._application.find_heartbeat(t_ns)
 
     def note_sync(self, kind: SyncKind, lost: int, t_ns: int) -> None:
         """Take note of a SYNC in Operational, be it taken or not, and of those that were lost before it."""
@@ -227,21 +223,19 @@ class EmulatedDevice(ObjectDictionary):
                 self.clear(Watchdog.SYNC_ORDER, t_ns)
         else:
             self.trip(Watchdog.SYNC_ORDER, t_ns)
-            if not counts.is_time_base and self._application is not None:
+            if not counts.is_time_base:
                 self._application.distrust_sync(t_ns)
 
     def trip(self, watchdog: Watchdog, t_ns: int) -> None:
         """Report a watchdog that trips; once, until it has cleared."""
         self.watchdogs.trip(watchdog, self._errors, t_ns, self._time_ms(t_ns))
-        if self._application is not None:
-            self._application.note_error()
+        self._application.note_error()
 
     def clear(self, watchdog: Watchdog, t_ns: int) -> None:
         """Report that the cause of a tripped watchdog has gone, by an EMCY with code 0."""
         if watchdog in self.watchdogs.tripped:
             self.watchdogs.clear(watchdog, self._errors, t_ns, self._time_ms(t_ns))
-            if self._application is not None:
-                self._application.note_error()
+            self._application.note_error()
 
     def report_fault(self, code: int, t_ns: int) -> None:
         """Send the EMCY of a fault that no watchdog found."""
@@ -257,8 +251,7 @@ class EmulatedDevice(ObjectDictionary):
 
     def _is_locked_at_work(self, index: int, subindex: int) -> bool:
         """Whether SDO may not write an object now: while the device is at work, none but what changes nothing."""
-        is_at_work = self._application is not None and self._application.is_at_work
-        return is_at_work and (index, subindex) not in self.open_at_work
+        return self._application.is_at_work and (index, subindex) not in self.open_at_work
 
     def _check_period(self, period_us: int) -> None:
         """Keep the SYNC period as long as SYNCs are obeyed."""
@@ -275,9 +268,6 @@ class EmulatedDevice(ObjectDictionary):
     def _set_overflow(self, overflow: int) -> None:
         self.sync_overflow = overflow
 
-    def _announce_pdos(self) -> None:
-        self.on_pdo_change()
-
     def _send(self, can_id: int, data: bytes) -> None:
         """Send what isn't a PDO; PDOs are exchanged in Operational only, and there a device is on the bus."""
         if self.is_on_bus:
@@ -288,11 +278,11 @@ class EmulatedDevice(ObjectDictionary):
 
     def _enter(self, state: NmtState, t_ns: int) -> None:
         was_operational, self.is_operational = self.is_operational, state == NmtState.OPERATIONAL
-        if was_operational and not self.is_operational and self._application is not None:
+        if was_operational and not self.is_operational:
             self._application.leave_operational(t_ns)
         self.state = state
         self.pdos.set_operational(self.is_operational, t_ns)
-        if self.is_operational and not was_operational and self._application is not None:
+        if self.is_operational and not was_operational:
             self._application.enter_operational(t_ns)
 
     def _reset(self, is_node_reset: bool) -> None:
@@ -302,8 +292,7 @@ class EmulatedDevice(ObjectDictionary):
         if is_node_reset:
             self.watchdogs.reset()
             self.sync_counts.reset()
-        if self._application is not None:
-            self._application.restart(is_node_reset)
+        self._application.restart(is_node_reset)
 
 
 _BILLION = 1_000_000_000

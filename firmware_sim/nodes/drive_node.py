@@ -18,7 +18,7 @@ from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S, DriveMode
 from firmware_sim.canopen.error_control import ERROR_CODES, WARNINGS, Watchdog
 from firmware_sim.canopen.object_dictionary import Abort, one_of, refuse
-from firmware_sim.nodes.device import EmulatedDevice
+from firmware_sim.nodes.device import Application, EmulatedDevice
 from firmware_sim.nodes.drive_profile import (
     DISABLE,
     FAULT_REACTIONS,
@@ -51,7 +51,7 @@ _RAMPED = {DriveEvent.SHUTDOWN: 0x605B, DriveEvent.SWITCH_ON: 0x605C}  # option 
 _EVENTS = frozenset({(0x6041, 0), (0x6061, 0), (0x603F, 0)})
 
 
-class DriveNode:
+class DriveNode(Application):
     """One drive on the bus. `motor_mode` and `torque_Nm` are the motor's command until the next SYNC."""
 
     def __init__(
@@ -280,9 +280,6 @@ class DriveNode:
         """Fault when enabled: torque that acts at SYNC has no time."""
         if self.is_enabled:
             self._fault(Watchdog.SYNC, t_ns)
-
-    def note_error(self) -> None:
-        """Do nothing: a drive's status has no error register."""
 
     def restart(self, is_node_reset: bool) -> None:
         """Forget the last command; a node reset also runs the state machine from its start (0, 1)."""

@@ -15,7 +15,7 @@ from adacd_hil.wire.codec import Codec
 from firmware_sim.arm.sensing import TORQUE_COUNTS, TORQUE_LSB_NM
 from firmware_sim.canopen.error_control import Watchdog
 from firmware_sim.canopen.object_dictionary import Abort, refuse
-from firmware_sim.nodes.device import EmulatedDevice
+from firmware_sim.nodes.device import Application, EmulatedDevice
 
 STATUS_NOT_VALID = 0x01
 STATUS_POSITIVE_OVERLOAD = 0x02
@@ -30,8 +30,8 @@ ROOM_TEMPERATURE_C = 25.0
 _EVENTS = frozenset({(0x6150, 1), (0x1001, 0)})
 
 
-class SensorNode:
-    """One torque sensor on the bus."""
+class SensorNode(Application):
+    """One torque sensor on the bus. It takes no commands, and who measures by SYNC is told of odd ones."""
 
     def __init__(
         self,
@@ -103,18 +103,6 @@ class SensorNode:
             self._pdos.notify()
         return clock.bench_ns(min(due_ns, self._pdos.poll(t_ns)))
 
-    def act(self, t_ns: int) -> None:
-        """Do nothing: a sensor takes no commands."""
-
-    def mind_length(self, is_right: bool, t_ns: int) -> None:
-        """Do nothing: a sensor takes no commands."""
-
-    def leave_operational(self, t_ns: int) -> None:
-        """Do nothing: the frames end by themselves."""
-
-    def enter_operational(self, t_ns: int) -> None:
-        """Do nothing: the frames begin by themselves."""
-
     def lose_heartbeat(self, t_ns: int) -> None:
         """Report it."""
         self.device.trip(Watchdog.HEARTBEAT, t_ns)
@@ -122,9 +110,6 @@ class SensorNode:
     def find_heartbeat(self, t_ns: int) -> None:
         """Clear the error."""
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
-
-    def distrust_sync(self, t_ns: int) -> None:
-        """Do nothing: who measures by SYNC has been told."""
 
     def note_error(self) -> None:
         """Let the status frame say so."""
