@@ -20,7 +20,7 @@ from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.terminal import in_line, one_line, open_terminals
+from adacd_hil.terminal import fit_table, in_line, one_line, open_terminals
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from adacd_hil.wire.contract_frames import HOST_NODE, move_contract
@@ -31,7 +31,7 @@ from firmware_sim.bench.injector import Departure, OnEvent
 from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
 from firmware_sim.canopen.contracts import CONTRACTS
 from firmware_sim.canopen.pdo_record import LAST_NODE
-from firmware_sim.cli.scenario_list import as_text, check, describe_all, show, show_as_table
+from firmware_sim.cli.scenario_list import check, describe_all, show, show_as_table
 from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 
@@ -229,7 +229,8 @@ def list_scenarios(as_json: bool) -> int:
     if as_json:
         print(json.dumps(described, indent=2, ensure_ascii=False))
     else:
-        print(as_text([("name", "group", "about"), *((row["name"], row["group"], row["about"]) for row in described)]))
+        columns = ("name", "group", "about")
+        print("\n".join(fit_table([columns, *([row[name] for name in columns] for row in described)])))
     return EmulatorExit.OK
 
 

@@ -1,7 +1,6 @@
 """The command line's output about scenarios: their list, the content of one, and the errors of a file."""
 
 import tomllib
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,16 +38,6 @@ def describe_all() -> list[dict[str, Any]]:
         }
         for one in scenarios
     ]
-
-
-def as_text(rows: Iterable[Sequence[str]]) -> str:
-    """Align rows in columns as wide as what is in them, the last one as it is."""
-    lines = list(rows)
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]) - 1)]
-    return "\n".join(
-        "  ".join([*(cell.ljust(width) for cell, width in zip(line, widths, strict=False)), line[-1]]).rstrip()
-        for line in lines
-    )
 
 
 def show(scenario: Scenario, is_whole: bool) -> str:

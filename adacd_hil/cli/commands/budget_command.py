@@ -6,14 +6,14 @@ from typing import Any, NamedTuple
 from adacd_hil.cli.output import ExitCode
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.settings.configuration import load_settings
-from adacd_hil.terminal import in_line
+from adacd_hil.terminal import fit_table, in_line
 from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, find_budget, us
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.contract_frames import read_contract, share_bus
 
 _COLUMNS = ("id", "message", "bytes", "trigger", "every ms", "bits", "µs", "response µs", "disturbed µs", "deadline µs")
 _WIDTH = 120
-_LEFT_ALIGNED = ("message", "trigger")
+_RIGHT_ALIGNED = [place for place, name in enumerate(_COLUMNS) if name not in ("message", "trigger")]
 _LEGEND = (
     "bits at worst-case stuffing, intermission included; CAN FD: nominal + data rate",
     "response in operation; disturbed: with an SDO frame per cycle and every EMCY at once; > : no bound, at least this",
@@ -75,22 +75,11 @@ def as_text(judgement: Judgement) -> str:
         *(("note", note) for note in judgement.notes),
         ("verdict", budget.line),
     ]
-    lines = [f"{budget.contract.name}, {budget.period_us} µs, {rates}", "", *_table(budget), "", *_LEGEND, ""]
+    table = fit_table([_COLUMNS, *map(_row, budget.frames)], right=_RIGHT_ALIGNED)
+    lines = [f"{budget.contract.name}, {budget.period_us} µs, {rates}", "", *table, "", *_LEGEND, ""]
     for title, finding in findings:
         lines += textwrap.wrap(finding, _WIDTH, initial_indent=f"{title:14}", subsequent_indent=" " * 14)
     return "\n".join(in_line(line) for line in lines)
-
-
-def _table(budget: Budget) -> list[str]:
-    rows = [_COLUMNS, *(_row(entry) for entry in budget.frames)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
-    return [
-        "  ".join(
-            cell.ljust(width) if heading in _LEFT_ALIGNED else cell.rjust(width)
-            for heading, cell, width in zip(_COLUMNS, row, widths, strict=True)
-        ).rstrip()
-        for row in rows
-    ]
 
 
 def _row(entry: FrameBudget) -> tuple[str, ...]:

@@ -129,14 +129,9 @@ def cut(
             raise CommandError("--contact says where to cut: without --from and --until", ExitCode.USAGE)
         stretch = find_contact(log, contact, around_s)
     done = cut_log(log, out or default_out(log), stretch, topics, _tell)
-    result = {"out": str(done.out), "from_s": _finite(stretch.start_s), "until_s": _finite(stretch.end_s)}
-    result["messages"] = done.messages
+    result = {"out": str(done.out), **stretch.as_json(), "messages": done.messages}
     print(json.dumps(result, indent=2) if as_json else in_line(f"{done.out}: {done.messages} messages"))
     return ExitCode.OK
-
-
-def _finite(value: float) -> float | str | None:
-    return None if value in (float("inf"), float("-inf")) else value
 
 
 @log.command(epilog="Exit status: 0 done; 1 a log is damaged or can't be read; 2 wrong usage.")
@@ -162,27 +157,8 @@ log.add_command(export)
 
 def info_as_json(info: "LogInfo") -> dict[str, Any]:
     """Make a table of all that is known."""
-    return {
-        "path": str(info.path),
-        "files": info.files,
-        "size_bytes": info.size_bytes,
-        "start_ns": info.start_ns,
-        "duration_s": info.duration_s,
-        "messages": info.messages,
-        "cycles": info.cycles,
-        "frames": info.frames,
-        "dropped": info.dropped,
-        "ending": info.ending,
-        "contacts": info.contacts,
-        "collisions": info.collisions,
-        "faults": info.faults,
-        "events": dict(info.events),
-        "topics": [topic._asdict() for topic in info.topics],
-        "attachments": info.attachments,
-        "metadata": info.metadata,
-        "summary": info.summary,
-        "problems": info.problems,
-    }
+    topics = [topic._asdict() for topic in info.topics]
+    return {**vars(info), "path": str(info.path), "duration_s": info.duration_s, "topics": topics}
 
 
 def info_as_text(info: "LogInfo") -> str:
@@ -225,14 +201,8 @@ def _bytes(count: int | None) -> str:
 
 def check_as_json(check: "LogCheck") -> dict[str, Any]:
     """Make a table of what was found."""
-    return {
-        "path": str(check.path),
-        "files": check.files,
-        "messages": check.messages,
-        "errors": check.errors,
-        "warnings": check.warnings,
-        "findings": [finding._asdict() for finding in check.findings],
-    }
+    findings = [finding._asdict() for finding in check.findings]
+    return {**check._asdict(), "path": str(check.path), "findings": findings}
 
 
 def check_as_text(check: "LogCheck") -> str:
