@@ -19,7 +19,7 @@ from adacd_hil.commission.communication_test import (
     ZeroTorqueCycle,
     ZeroTorqueLoop,
 )
-from adacd_hil.commission.diagnosis import Check, CheckOutcome, failed, ok, skipped, warning
+from adacd_hil.commission.host_checks import Check, CheckOutcome, failed, ok, skipped, warning
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import read_object

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from adacd_hil.commission.diagnosis import Check, CheckOutcome, ok, warning
+from adacd_hil.commission.host_checks import Check, CheckOutcome, ok, warning
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
 from adacd_hil.records import JOINTS

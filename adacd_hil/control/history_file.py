@@ -21,8 +21,8 @@ from adacd_hil.device.network import Identity
 from adacd_hil.file_access import dangling_link, read_input, replacing
 from adacd_hil.records import Event
 from adacd_hil.scheme.identify.certificate import Certificate
-from adacd_hil.settings.commission_settings import HistorySettings
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.run_settings import HistorySettings
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.control.cycle import Cycle, RunResult
+from adacd_hil.control.fault_recovery import Recovery
 from adacd_hil.control.history_file import HISTORY_NAME, UsedHistory
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.pacing import Pacer, make_pacer, prepare_spin
-from adacd_hil.control.recovery import Recovery
 from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
@@ -25,7 +25,7 @@ from adacd_hil.log.log_files import LOG_NAME, MOST_VIEWERS, arithmetic
 from adacd_hil.log.recording.processes import LiveSetup
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
 from adacd_hil.log.viewer.robot_description import ROBOT_NAME, robot_description
-from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout
+from adacd_hil.log.viewer.scene import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
 from adacd_hil.scheme.identify.certificate import Certificate

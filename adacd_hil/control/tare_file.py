@@ -16,8 +16,8 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.file_access import read_input, replacing
 from adacd_hil.records import JOINTS, Event
-from adacd_hil.settings.commission_settings import TareSettings
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.run_settings import TareSettings
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import read_toml, to_toml
 

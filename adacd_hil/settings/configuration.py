@@ -11,14 +11,16 @@ import numpy as np
 from adacd_hil.records import JOINTS, POSITION_TERMS, Vector
 from adacd_hil.scheduling import RealtimeRequest
 from adacd_hil.settings.arm_settings import ArmSettings, BusSettings, DataSettings, DevicesSettings, LockstepSettings
-from adacd_hil.settings.commission_settings import HistorySettings, SafetySettings, TareSettings
 from adacd_hil.settings.run_settings import (
     ControllerSettings,
     ExcitationSettings,
+    HistorySettings,
     LogSettings,
     OperatorSettings,
     ReactionSettings,
     RealtimeSettings,
+    SafetySettings,
+    TareSettings,
     TrajectorySettings,
 )
 from adacd_hil.settings.schema import ConfigError, parse, setting

@@ -6,8 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from adacd_hil.analysis.replay.replayed_outcome import Replay
-from adacd_hil.analysis.sweep.plan import Plan, plan_logs, plan_scenarios
-from adacd_hil.analysis.sweep.sweep import SweepStore, replay_task, run_sweep
+from adacd_hil.analysis.sweep.sweep import Plan, SweepStore, plan_logs, plan_scenarios, replay_task, run_sweep
 from adacd_hil.cli.main import cli
 from adacd_hil.log.log_files import LogError
 

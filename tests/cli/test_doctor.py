@@ -9,7 +9,7 @@ from rig import CODEC, Rig
 
 from adacd_hil.cli.commands.doctor_command import as_json, as_text
 from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
-from adacd_hil.commission.diagnosis import Check, Finding, Status, diagnose, failed, ok, summarise, warning
+from adacd_hil.commission.host_checks import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.nodes.device import NmtState

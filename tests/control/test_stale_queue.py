@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from rig import CycleRig, torque_of
 
+from adacd_hil.control.fault_recovery import Recovery
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.recovery import Recovery
 from adacd_hil.wire.bus import TransmitQueueError
 
 pytestmark = pytest.mark.slow

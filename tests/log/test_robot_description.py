@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.log.viewer.robot_description import GRAVITY_M_S2, robot_description
-from adacd_hil.log.viewer.scene import Shape, transforms_of
-from adacd_hil.log.viewer.viewer_layout import viewer_layout
+from adacd_hil.log.viewer.scene import Shape, transforms_of, viewer_layout
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.model.urdf import read_urdf
 from adacd_hil.settings.configuration import load_settings

@@ -8,8 +8,7 @@ from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination
 from adacd_hil.commission.configuration_check import configuration_checks
-from adacd_hil.commission.diagnosis import Finding, Status, diagnose, summarise
-from adacd_hil.commission.host_checks import HOST_CHECKS, Host
+from adacd_hil.commission.host_checks import HOST_CHECKS, Finding, Host, Status, diagnose, summarise
 from adacd_hil.scheduling import request_realtime
 from adacd_hil.wire.bus import open_bus
 from adacd_hil.wire.can_interface import InterfaceState, read_link

@@ -17,7 +17,7 @@ from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.sweep.plan import Plan, SweepRow, Task, Values
+    from adacd_hil.analysis.sweep.sweep import Plan, SweepRow, Task, Values
 
 _SIMULATED_CONFIG = "certified"
 """Of simulated runs where no --config is given."""
@@ -116,7 +116,7 @@ def _plan(
 ) -> "Plan":
     from adacd_hil import __version__
     from adacd_hil.analysis.replay.changed_settings import apply_settings, parse_variations
-    from adacd_hil.analysis.sweep.plan import plan_logs, plan_scenarios
+    from adacd_hil.analysis.sweep.sweep import plan_logs, plan_scenarios
     from adacd_hil.compiled import program_digest
     from adacd_hil.settings.configuration import load_settings
 
@@ -165,8 +165,7 @@ def simulate_task(task: "Task") -> "list[Values]":
 def _simulate(task: "Task", row: "SweepRow") -> "Values":
     from adacd_hil.analysis.replay.changed_settings import apply_settings
     from adacd_hil.analysis.replay.replay import replay
-    from adacd_hil.analysis.sweep.plan import REFUSALS, failed
-    from adacd_hil.analysis.sweep.sweep import finished
+    from adacd_hil.analysis.sweep.sweep import REFUSALS, failed, finished
     from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 
     subject = task.subject

@@ -22,7 +22,7 @@ from adacd_hil.log.recording.ring import Ring, room_of
 from adacd_hil.log.recording.run_folder import check_free, make_room
 from adacd_hil.log.types.topics import run_channels, truth_channels
 from adacd_hil.log.viewer.robot_description import ROBOT_NAME
-from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout
+from adacd_hil.log.viewer.scene import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame
