@@ -4,7 +4,7 @@
 knows none of it: what fails goes to it as a request for FAULT, so that a log replays to the same decision.
 `FaultReport` gives the causes, by the fault's reason, and what is wrong with the devices.
 
-After a latched fault, drives that go on are stopped (`StopEscalation`), and the user finds the way out of it. Nothing of
+After a latched fault, drives that go on are stopped (`StopEscalation`), and the user finds the way out. Nothing of
 before the fault survives: what waits in the socket and in the interface's transmit queue is dropped, so that no old
 command reaches a drive when the bus comes back; then the devices are booted anew, fresh feedback is awaited, and the
 drives are enabled at the present position with zero torque first.

@@ -71,7 +71,7 @@ class MessageTable:
 
 
 def plain_tables(messages: Iterable[MessageTable]) -> tuple[MessageTable, ...]:
-    """Take the tables of messages without their codecs, to be written as JSON."""
+    """Take the tables of messages without their codecs, to be told to another process."""
     return tuple(MessageTable(one.name, one.can_id, one.length, one.signals) for one in messages)
 
 

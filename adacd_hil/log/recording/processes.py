@@ -1,24 +1,23 @@
 """The processes of a log: how the control process starts the others, the setup of each, and the words between them.
 
-At its start a process reads its setup as JSON from its standard input. It has the messages of the DBC, as far as frames
-are decoded by them: to read a DBC takes longer than all else that the writer does before it is ready.
+At its start a process reads its setup, pickled, from its standard input, which its parent alone writes. It has the
+messages of the DBC, as far as frames are decoded by them: to read a DBC takes longer than all else that the writer does
+before it is ready.
 """
 
-import base64
 import contextlib
-import json
 import os
+import pickle
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from adacd_hil.log.log_files import MOST_VIEWERS
-from adacd_hil.log.types.message_types import MessageType
 from adacd_hil.log.types.topics import LogChannel
-from adacd_hil.wire.codec_columns import MessageTable, SignalCodec
+from adacd_hil.wire.codec_columns import MessageTable
 
 
 @dataclass(frozen=True)
@@ -58,38 +57,11 @@ class WriterSetup:
     metadata: dict[str, str]
     live: LiveSetup | None = None
 
-    def to_json(self) -> bytes:
-        """Write it."""
-        table: dict[str, Any] = asdict(self)
-        table["path"] = str(self.path)
-        table["attachments"] = {name: base64.b64encode(data).decode() for name, data in self.attachments.items()}
-        return json.dumps(table).encode()
-
-    @staticmethod
-    def from_json(text: bytes) -> "WriterSetup":
-        """Read it."""
-        table = json.loads(text)
-        table["path"] = Path(table["path"])
-        table["channels"] = tuple(
-            LogChannel(channel["id"], channel["topic"], MessageType(**{**kind, "fields": tuple(kind["fields"])}))
-            for channel in table["channels"]
-            for kind in (channel["type"],)
-        )
-        table["messages"] = tuple(
-            MessageTable(**{**message, "signals": tuple(SignalCodec(**signal) for signal in message["signals"])})
-            for message in table["messages"]
-        )
-        table["attachments"] = {name: base64.b64decode(data) for name, data in table["attachments"].items()}
-        if live := table["live"]:
-            tuples = {name: tuple(live[name]) for name in ("link_length_m", "origins", "names")}
-            table["live"] = LiveSetup(**{**live, **tuples})
-        return WriterSetup(**table)
-
 
 def start_module(
-    module: str, descriptors: Sequence[int], told: bytes, stderr: int | None = None
+    module: str, descriptors: Sequence[int], told: object, stderr: int | None = None
 ) -> "subprocess.Popen[bytes]":
-    """Run a module of ours with descriptors as its arguments and `told` on its standard input. Raises OSError.
+    """Run a module of ours with descriptors as its arguments and `told` pickled on its standard input. Raises OSError.
 
     It is in a session of its own: Ctrl-C is for the control process. No folder but ours is searched for modules.
     stderr: as of subprocess; None: the one of this process.
@@ -105,8 +77,13 @@ def start_module(
     )
     assert process.stdin is not None
     with contextlib.suppress(BrokenPipeError), process.stdin:  # one that died says so to who waits for its word
-        process.stdin.write(told)
+        pickle.dump(told, process.stdin)
     return process
+
+
+def read_setup() -> Any:
+    """Return what `start_module` was told, in the process that it started."""
+    return pickle.load(sys.stdin.buffer)
 
 
 def _module_path() -> str:

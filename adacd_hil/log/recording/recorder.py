@@ -117,7 +117,7 @@ class Recorder:
         try:
             self._ring = Ring(settings.buffer_MiB * _MIB)
             self._process = start_module(
-                "adacd_hil.log.recording.writer", (theirs.fileno(), file, self._ring.descriptor), setup.to_json()
+                "adacd_hil.log.recording.writer", (theirs.fileno(), file, self._ring.descriptor), setup
             )
         except OSError as error:
             self._socket.close()

@@ -28,7 +28,7 @@ from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS
 from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.log_file import McapFile, Sink
 from adacd_hil.log.recording.packet_writer import Numbers, PacketWriter, Rows
-from adacd_hil.log.recording.processes import WriterSetup
+from adacd_hil.log.recording.processes import WriterSetup, read_setup
 from adacd_hil.log.recording.ring import RingReader, split
 from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.log.viewer.feed import LiveFeed
@@ -276,7 +276,7 @@ def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> 
     connection = socket.socket(fileno=socket_descriptor)
     error = url = ""
     try:
-        setup = WriterSetup.from_json(sys.stdin.buffer.read())
+        setup: WriterSetup = read_setup()
         ring = RingReader(ring_descriptor)
         os.dup(file_descriptor)  # never closed: the lock of the first part lasts as long as this process
         sink = Sink(file_descriptor, setup.path, waits=setup.is_blocking, on_written=ring.count_written)

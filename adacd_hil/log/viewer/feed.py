@@ -44,18 +44,6 @@ class ServerSetup(NamedTuple):
     ids: dict[int, int]
     start_ns: int
 
-    def to_json(self) -> bytes:
-        """Write it."""
-        table = {"setup": self.setup.to_json().decode(), "ids": self.ids, "start_ns": self.start_ns}
-        return json.dumps(table).encode()
-
-    @staticmethod
-    def from_json(text: bytes) -> "ServerSetup":
-        """Read it."""
-        table = json.loads(text)
-        ids = {int(ours): number for ours, number in table["ids"].items()}
-        return ServerSetup(WriterSetup.from_json(table["setup"].encode()), ids, table["start_ns"])
-
 
 def pack_batch(batch: Batch) -> bytes:
     """Write a batch: the number of its records, their times, ends and channels, then their bytes."""
@@ -100,7 +88,7 @@ class LiveFeed:
             notices = os.dup(2)
             try:
                 self.process = start_module(
-                    "adacd_hil.log.viewer.server", (*descriptors, notices), told.to_json(), subprocess.DEVNULL
+                    "adacd_hil.log.viewer.server", (*descriptors, notices), told, subprocess.DEVNULL
                 )
             finally:
                 os.close(notices)

@@ -31,7 +31,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from adacd_hil.log.recording import processes
-from adacd_hil.log.recording.processes import LiveSetup
+from adacd_hil.log.recording.processes import LiveSetup, read_setup
 from adacd_hil.log.recording.ring import RingReader, split
 from adacd_hil.log.viewer.admission import (
     FULL,
@@ -382,7 +382,7 @@ async def _serve(
 def main(socket_descriptor: int, ring_descriptor: int, notices: int) -> None:
     """Serve: say where, show what comes, end with the writer."""
     writer = socket.socket(fileno=socket_descriptor)
-    told = ServerSetup.from_json(sys.stdin.buffer.read())
+    told: ServerSetup = read_setup()
     assert told.setup.live is not None
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
