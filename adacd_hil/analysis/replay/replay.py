@@ -8,9 +8,11 @@ A replay of a stretch begins with the log too, because the state of filters and 
 ends with the stretch, and compares and reports only the cycles in it.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +79,13 @@ def replay_many(
     return replay_source(
         LogSource(path), variants, contacts_beside(path, progress), progress, watch=watch, stretch=stretch
     )
+
+
+class _DecodedPart(NamedTuple):
+    """A part of a log, and the states of each of its stretches, for each of the variants."""
+
+    part: Part
+    arms: list[list[ArmBatch]]
 
 
 class _Player:
@@ -215,29 +224,50 @@ def replay_source(
     decoders = _Decoders(source.codec, variants)
     done = 0
     milestones = Milestones(lambda count: progress(f"{count} cycles replayed"), _PROGRESS_CYCLES)
-    for part in source:
-        cycles, is_over = _replay_part(part, players, decoders, bounds_ns, watch)
-        done += cycles
+    for part in _one_ahead(_decoded(source, decoders, bounds_ns[1])):
+        done += _replay_part(part, players, bounds_ns, watch)
         milestones.reach(done)
-        if is_over:
-            break
     if not stretch.is_whole and not players[0].cycles:
         raise LogError(f"the log has no cycle {stretch.text} that can be replayed")
     return [_result(player, source, tolerance, bounds_ns[0]) for player in players]
 
 
+def _decoded(source: ReplaySource, decoders: "_Decoders", end_ns: int) -> Generator[_DecodedPart]:
+    """Read and decode a source part by part, up to the stretch that has the end of what is told."""
+    for part in source:
+        stretches: list[CycleStretch] = []
+        arms: list[list[ArmBatch]] = []
+        is_over = False
+        for stretch in part.stretches:
+            stretches.append(stretch)
+            arms.append(decoders.read(stretch))
+            is_over = bool(stretch.ticks.t_ns[-1] >= end_ns)
+            if is_over:
+                break
+        yield _DecodedPart(part._replace(stretches=stretches), arms)
+        if is_over:
+            return
+
+
+def _one_ahead(parts: Generator[_DecodedPart]) -> Iterator[_DecodedPart]:
+    """Give what a generator gives, which a thread runs one part ahead: most of either's work needs no Python's lock."""
+    with closing(parts), ThreadPoolExecutor(1, "replay-reader") as thread:
+        coming = thread.submit(next, parts, None)
+        while (part := coming.result()) is not None:
+            coming = thread.submit(next, parts, None)
+            yield part
+
+
 def _replay_part(
-    part: Part,
+    decoded: _DecodedPart,
     players: Sequence[_Player],
-    decoders: "_Decoders",
     bounds_ns: tuple[int, int],
     watch: Watch | None,
-) -> tuple[int, bool]:
-    """Replay a part; return its cycles, and whether it has the end of what is told."""
+) -> int:
+    """Replay a part; return its cycles."""
     exact: list[tuple[int, int]] = []
-    cycles, is_over = 0, False
-    for stretch in part.stretches:
-        all_arms = decoders.read(stretch)
+    cycles, part = 0, decoded.part
+    for stretch, all_arms in zip(part.stretches, decoded.arms, strict=True):
         for mine, rows, is_told in _split(stretch, bounds_ns):
             for place, (player, arms) in enumerate(zip(players, all_arms, strict=True)):
                 batch = player.play(mine, _arms_of(arms, rows), part, is_told)
@@ -246,12 +276,9 @@ def _replay_part(
             if mine.is_exact and is_told:
                 exact.append((int(mine.ticks.t_ns[0]), int(mine.ticks.t_ns[-1])))
         cycles += len(stretch.ticks.cycle)
-        is_over = bool(stretch.ticks.t_ns[-1] >= bounds_ns[1])
-        if is_over:
-            break
     for player in players:
         player.compare_contacts(part.contacts, exact)
-    return cycles, is_over
+    return cycles
 
 
 def _known(requests: NDArray[np.uint8]) -> NDArray[np.uint8]:
