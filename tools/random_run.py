@@ -19,7 +19,7 @@ from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.codec import Codec, load_codec
 from firmware_sim.arm.touch_settings import BODY_REGIONS
 from firmware_sim.bench.fault_plan import FaultPlan
-from firmware_sim.canopen.contracts import CONTRACTS as DBCS
+from firmware_sim.canopen.object_dictionary import CONTRACTS as DBCS
 from firmware_sim.scenario.faults import FRAME_NODES, KINDS, SIGNAL_NODES, FaultSettings
 from firmware_sim.scenario.scenario import Scenario
 

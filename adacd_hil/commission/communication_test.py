@@ -23,9 +23,9 @@ from adacd_hil.clock import Clock
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.pacing import make_pacer
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.cycle_frames import TorqueSensor
 from adacd_hil.device.drive import DISABLE_CYCLES, Drive
 from adacd_hil.device.network import Master
-from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Frame, Tap

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from adacd_hil.device.arm import REMEMBERED_GAPS, Arm
 from adacd_hil.device.canopen_bus import name_error
+from adacd_hil.device.cycle_frames import SensorStatus, TorqueSensor
 from adacd_hil.device.drive import Cia402State, Drive
-from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.records import ArmState, Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.e2e import E2eStatus

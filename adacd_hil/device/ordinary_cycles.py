@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_watch import OPERATIONAL, HeartbeatWatch
-from adacd_hil.device.cycle_frames import lay_out_frames
+from adacd_hil.device.cycle_frames import STATUS_BITS, TorqueSensor, lay_out_frames
 from adacd_hil.device.drive import Drive
-from adacd_hil.device.torque_sensor import STATUS_BITS, TorqueSensor
 from adacd_hil.records import JOINTS, ArmBatch, ArmState, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import MessageCodec

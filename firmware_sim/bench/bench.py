@@ -9,7 +9,7 @@ truth: `firmware_sim.bench.bench_time`.
 
 The first SYNC after boot-up or an NMT reset communication (of all nodes or of drive 1) is cycle `counter` − 1, which is
 0 for a master that begins at 1; from there the counter 1…240 is unwrapped. SYNCs that come twice or out of order:
-`firmware_sim.canopen.sync_order`.
+`firmware_sim.canopen.error_control`.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,8 +24,8 @@ from firmware_sim.bench.bench_time import BenchTime, OnTruth, TruthFeed
 from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS
 from firmware_sim.bench.injector import Handler, Injector, OnEvent, Outbox
 from firmware_sim.body.body import Body
-from firmware_sim.canopen.contracts import EmulatedContract, contract_of
-from firmware_sim.canopen.sync_order import SyncKind, SyncOrder
+from firmware_sim.canopen.error_control import SyncKind, SyncOrder
+from firmware_sim.canopen.object_dictionary import EmulatedContract, contract_of
 from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE
 from firmware_sim.scenario.scenario import Scenario
 

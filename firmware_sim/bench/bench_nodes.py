@@ -10,8 +10,7 @@ from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import Measurement
 from firmware_sim.bench.injector import Handler, Injector
 from firmware_sim.body.sensors import converter_ends
-from firmware_sim.canopen.contracts import EmulatedContract, longest_pdo
-from firmware_sim.canopen.object_dictionary import Abort, refuse
+from firmware_sim.canopen.object_dictionary import Abort, EmulatedContract, longest_pdo, refuse
 from firmware_sim.nodes.device import EmulatedDevice, SyncListeners
 from firmware_sim.nodes.drive_node import DriveNode
 from firmware_sim.nodes.drive_profile import Motor

@@ -21,7 +21,7 @@ from adacd_hil.wire.time_marks import answers_to_sync
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S, DriveMode, Measurement
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_nodes import Movable
-from firmware_sim.canopen.contracts import EmulatedContract
+from firmware_sim.canopen.object_dictionary import EmulatedContract
 from firmware_sim.nodes.sensor_node import ROOM_TEMPERATURE_C
 from firmware_sim.scenario.scenario import Scenario
 

@@ -29,7 +29,7 @@ from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.bench.injector import Departure, OnEvent
 from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
-from firmware_sim.canopen.contracts import CONTRACTS
+from firmware_sim.canopen.object_dictionary import CONTRACTS
 from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.scenario_list import check, describe_all, show, show_as_table
 from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal

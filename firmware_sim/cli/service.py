@@ -13,7 +13,7 @@ from adacd_hil.wire.time_marks import HOST_MARK, NEVER_NS
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import LONGEST_ORPHANAGE_NS
 from firmware_sim.bench.injector import Departure
-from firmware_sim.canopen.contracts import is_fd
+from firmware_sim.canopen.object_dictionary import is_fd
 from firmware_sim.canopen.pdo_record import LISTENED_IDS
 
 _IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs

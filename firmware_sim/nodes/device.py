@@ -13,10 +13,17 @@ from adacd_hil.wire.bus import CLASSIC_BYTES
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 from adacd_hil.wire.time_marks import NEVER_NS
-from firmware_sim.canopen.error_control import ErrorReporter, HeartbeatConsumer, HeartbeatProducer, Watchdog, Watchdogs
+from firmware_sim.canopen.error_control import (
+    ErrorReporter,
+    HeartbeatConsumer,
+    HeartbeatProducer,
+    SyncCounts,
+    SyncKind,
+    Watchdog,
+    Watchdogs,
+)
 from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, refuse
 from firmware_sim.canopen.pdo import Pdos, PdoUser
-from firmware_sim.canopen.sync_order import SyncCounts, SyncKind
 
 _GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
 _RECOVERED_FROM_BUS_OFF = 0x8140

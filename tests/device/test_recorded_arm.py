@@ -14,10 +14,10 @@ from test_two_arms import Rig as TwoArms
 from test_two_arms import settings_of as two_arms_settings
 
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.cycle_frames import TorqueSensor
 from adacd_hil.device.drive import Drive
 from adacd_hil.device.ordinary_cycles import OrdinaryCycles, OrdinaryStretch
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import ArmBatch, FaultReason, SchemeState
 

@@ -1,8 +1,8 @@
 """One joint torque sensor as the host sees it."""
 
 from adacd_hil.device.contract import compose
+from adacd_hil.device.cycle_frames import SensorStatus, TorqueSensor
 from adacd_hil.device.profile import place_devices
-from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.e2e import E2eStatus

@@ -12,7 +12,7 @@ from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
 from firmware_sim.bench.bench import Bench
-from firmware_sim.canopen.contracts import CONTRACTS
+from firmware_sim.canopen.object_dictionary import CONTRACTS
 from firmware_sim.scenario.scenario import Scenario
 
 CODEC = load_codec()

@@ -15,7 +15,7 @@ from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import contract_folder, load_codec, parse_codec
 from firmware_sim.arm.sensing import TORQUE_LSB_NM
-from firmware_sim.canopen.contracts import CONTRACTS, contract_of, playable_contract
+from firmware_sim.canopen.object_dictionary import CONTRACTS, contract_of, playable_contract
 
 BY_DEFAULT = ("arm", "arm_fd")
 """Contracts whose drives need no mapping by a master."""

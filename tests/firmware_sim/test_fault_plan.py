@@ -14,7 +14,7 @@ from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
 from firmware_sim.bench.fault_plan import ActionKind, FaultPlan, NodeAction
 from firmware_sim.bench.fault_rows import EVERYBODY
-from firmware_sim.canopen.contracts import CONTRACTS
+from firmware_sim.canopen.object_dictionary import CONTRACTS
 from firmware_sim.scenario.faults import FaultSettings
 
 MS = 1_000_000

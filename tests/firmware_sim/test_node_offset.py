@@ -14,7 +14,7 @@ from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
 from adacd_hil.wire.contract_frames import move_contract
 from firmware_sim.bench.bench import Bench
-from firmware_sim.canopen.contracts import CONTRACTS
+from firmware_sim.canopen.object_dictionary import CONTRACTS
 
 OFFSETS = (0, 4)
 NODES = ((1, 2, 3, 4), (5, 6, 7, 8))

@@ -15,7 +15,7 @@ from bench_host import (
     quiet_scenario,
 )
 
-from firmware_sim.canopen.sync_order import SyncKind, SyncOrder
+from firmware_sim.canopen.error_control import SyncKind, SyncOrder
 
 NODES = (1, 2, 3, 4)
 TOLERATED, CLEAN_SYNCS = 3, 100  # as docs/protocol.md says

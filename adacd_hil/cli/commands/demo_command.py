@@ -22,7 +22,7 @@ from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.bench_time import TruthLog
-from firmware_sim.canopen.contracts import playable_contract
+from firmware_sim.canopen.object_dictionary import playable_contract
 from firmware_sim.scenario.scenario import Scenario, ScenarioOutcome, load_scenario, named_profile
 
 if TYPE_CHECKING:
