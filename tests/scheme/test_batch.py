@@ -1,4 +1,4 @@
-"""Recorded cycles run at once: the same bits as cycle by cycle, wherever the runs are split."""
+"""Calm cycles, stepped or run at once: the bits of concluding each, wherever the runs are split."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from adacd_hil.control.reference import Excitation
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme.detect.margin import MarginWatch
-from adacd_hil.scheme.pipeline.pipeline import Pipeline, arm_at, layout_of
+from adacd_hil.scheme.pipeline.pipeline import CalmStretch, Pipeline, arm_at, layout_of
 
 REST = 60
 """Cycles at rest, the first of them without drives."""
@@ -119,6 +119,10 @@ def state_of(thing):
     """Return everything that a pipeline remembers, in a form that compares bit by bit."""
     if isinstance(thing, np.ndarray | np.void):
         return thing.tobytes()
+    if isinstance(thing, Pipeline):
+        thing._count_calm()
+    if isinstance(thing, CalmStretch):
+        return thing.count
     if type(thing).__module__.startswith("adacd_hil.scheme") and hasattr(thing, "__dict__"):
         return {name: state_of(value) for name, value in vars(thing).items()}
     return repr(thing)
@@ -126,6 +130,15 @@ def state_of(thing):
 
 def stepped(pipeline, arms, requests):
     return [pipeline.step(arm_at(arms, k), Request(requests[k])) for k in range(len(requests))]
+
+
+def concluded(pipeline, arms, requests):
+    """Step as if no cycle were calm."""
+    outputs = []
+    for k in range(len(requests)):
+        pipeline._count_calm()
+        outputs += stepped(pipeline, part(arms, k, k + 1), requests[k : k + 1])
+    return outputs
 
 
 def rows_of(outputs):
@@ -153,9 +166,9 @@ SCHEMES = ("paper", "certified")
 
 @pytest.fixture(scope="module", params=SCHEMES)
 def lived(request, life):
-    """The scheme's name, its pipeline after the life, and its outputs, step by step."""
+    """The scheme's name, its pipeline after the life, and its outputs, each cycle concluded."""
     pipeline = pipeline_for(request.param)
-    outputs = stepped(pipeline, *life)
+    outputs = concluded(pipeline, *life)
     return request.param, pipeline, outputs
 
 
@@ -170,7 +183,19 @@ def test_the_life_has_all_of_it(lived):
         assert [event.name for event in pipeline._policy._events] == ["certificate", "margin", "touch", "touch"]
 
 
-def test_run_gives_the_bits_of_step(life, lived):
+def test_step_gives_the_bits_of_concluding_each_cycle(life, lived):
+    scheme, pipeline, outputs = lived
+    again = pipeline_for(scheme)
+    looks = []
+    conclude = again._conclude
+    again._conclude = lambda arm, *rest: looks.append(arm.cycle) or conclude(arm, *rest)
+    assert rows_of(stepped(again, *life)) == rows_of(outputs)
+    del again._conclude
+    assert state_of(again) == state_of(pipeline)
+    assert len(looks) < 0.1 * len(outputs)
+
+
+def test_run_gives_the_bits_of_concluding_each_cycle(life, lived):
     scheme, pipeline, outputs = lived
     again = pipeline_for(scheme)
     batch = again.run(*life)
@@ -265,7 +290,7 @@ TAIL = 240
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("place", PLACES_S)
-def test_whatever_disturbs_a_state_is_seen_as_step_sees_it(life, scheme, place):
+def test_whatever_disturbs_a_state_is_seen_as_if_each_cycle_were_concluded(life, scheme, place):
     """Four rows of the table at a time, drawn so that each comes in each state."""
     arms, requests = life
     begin = REST + round(PLACES_S[place] / PERIOD_S)
@@ -282,11 +307,13 @@ def test_whatever_disturbs_a_state_is_seen_as_step_sees_it(life, scheme, place):
                 asked[at] = change
             else:
                 change(tail, at, at + cycles)
-        one, two = pipeline_for(scheme), pipeline_for(scheme)
-        for pipeline in (one, two):
+        one, two, three = (pipeline_for(scheme) for _ in range(3))
+        for pipeline in (one, two, three):
             pipeline.run(part(arms, 0, begin), requests[:begin])
-        assert rows_of_batches([one.run(tail, asked)]) == rows_of(stepped(two, tail, asked)), few
-        assert state_of(one) == state_of(two), few
+        rows = rows_of(concluded(three, tail, asked))
+        assert rows_of_batches([one.run(tail, asked)]) == rows, few
+        assert rows_of(stepped(two, tail, asked)) == rows, few
+        assert state_of(one) == state_of(two) == state_of(three), few
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

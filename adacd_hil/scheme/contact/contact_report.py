@@ -70,8 +70,12 @@ class ContactHistory:
 
     def put(self, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector) -> None:
         """Take in one cycle; vectors (2,)."""
-        put_row(self.rows, self.count % self._size, q, tau_ext_wide_hat, sigma, threshold)
+        self.put_ahead(0, q, tau_ext_wide_hat, sigma, threshold)
         self.count += 1
+
+    def put_ahead(self, passed: int, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector) -> None:
+        """Take in a cycle without counting it, behind so many others that aren't counted either; vectors (2,)."""
+        put_row(self.rows, (self.count + passed) % self._size, q, tau_ext_wide_hat, sigma, threshold)
 
     def last(self, count: int) -> Vector:
         """Return up to `count` rows, the newest last; a view, good until the next cycle."""
@@ -124,8 +128,11 @@ class ContactEvidence(ABC):
     def observe(self) -> None:
         """Take in one cycle, whatever the state is."""
 
+    def observe_calm(self, passed: int) -> None:
+        """Take in a cycle that `pass_by` will count, behind so many others."""
+
     def pass_by(self, cycles: int) -> None:
-        """Count cycles that a compiled loop has taken in."""
+        """Count cycles that were taken in."""
 
     def begin(self) -> None:
         """Take in that a contact is detected in this cycle."""
@@ -243,6 +250,10 @@ class RecalledContact(ContactEvidence):
     def observe(self) -> None:
         """Take in one cycle, whatever the state is."""
         self.history.put(self._q, self.tau_ext, self._sigma, self._threshold)
+
+    def observe_calm(self, passed: int) -> None:
+        """Take in a cycle that `pass_by` will count, behind so many others."""
+        self.history.put_ahead(passed, self._q, self.tau_ext, self._sigma, self._threshold)
 
     def pass_by(self, cycles: int) -> None:
         """Count cycles whose samples are in the history."""

@@ -305,6 +305,7 @@ class ContactCourse:
     """The contact that the arm is about, if there is one. tau_ext_hat (2,): filtered, for the reaction; a view."""
 
     def __init__(self, evidence: ContactEvidence, choice: ReactionChoice, tau_ext_hat: Vector) -> None:
+        self.evidence = evidence
         self._reporter = ContactReporter(evidence)
         self._choice = choice
         self._tau_ext_hat = tau_ext_hat

@@ -137,6 +137,14 @@ class CertifiedPolicy(SchemePolicy):
             return calm
         return calm._replace(cycles=min(calm.cycles, self._second - self._monitored - 1))
 
+    @property
+    def is_calm(self) -> bool:
+        """Whether no model has taken over in this cycle, and no withdrawal has to be judged, as in `run_certified`."""
+        if self._promotions[0] != self._refined:
+            return False
+        (way_1, way_2), least_Nm = self.contacts.judged
+        return bool(self.tau_ext_hat[0] * way_1 + self.tau_ext_hat[1] * way_2 >= least_Nm)
+
     def pass_by(self, cycles: int) -> None:
         """Count calm cycles, and those of monitoring."""
         super().pass_by(cycles)

@@ -4,9 +4,10 @@ A cycle: the state reached so far says what the kernel does, the kernel says whe
 state leaves its traces: an adaptation begins or ends, a contact's report begins or becomes final. Where the schemes
 differ, a policy says what is done: `PaperPolicy`, `CertifiedPolicy`.
 
-**Recorded cycles** go through many at once, with the bits that `step` gives. The supervisor changes its state rarely,
-and its numbers don't depend on it in between. So a compiled loop runs until something could happen (`Calm`), and the
-cycle at which it stops is concluded as `step` concludes it: by the same code.
+**Calm cycles.** The supervisor changes its state rarely, and its numbers don't depend on it in between. Every cycle is
+asked whether something could happen in it (`Calm`); where nothing could, it is only counted. `step` asks cycle by
+cycle; recorded cycles go through a compiled loop up to the first that isn't calm, with the same bits. That one is
+concluded, by the same code.
 
 **The interval** between two samples is that between the SYNCs on which they were taken: a sample that comes late was
 still taken in time. It is 0 where it is unknown or not to be used.
@@ -26,6 +27,7 @@ from adacd_hil.records import (
     Layout,
     Request,
     SchemeOutput,
+    SchemeState,
     Vector,
     certified_layout,
     scheme_layout,
@@ -36,7 +38,7 @@ from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.pipeline.certified_policy import CertifiedPolicy
 from adacd_hil.scheme.pipeline.scheme_policy import PaperPolicy, SchemePolicy
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm, findings_of
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm, finding_of, findings_of
 from adacd_hil.settings.configuration import Settings
 
 
@@ -57,6 +59,11 @@ class SchemeBatch(NamedTuple):
     block: Vector
     contacts: list[ContactReport]
     contact_places: NDArray[np.int64]
+
+
+_LONGEST_CALM = 1024
+"""Cycles that are counted together at most."""
+_NOTHING_CALM = Calm(0, 0, 0)
 
 
 def layout_of(settings: Settings) -> Layout:
@@ -116,6 +123,43 @@ class SampleIntervals:
         return periods_s
 
 
+class CalmStretch:
+    """The calm cycles since the last one that was concluded, which nobody has counted yet."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._bounds = _NOTHING_CALM
+        self._periods = 0
+        self._observations = np.zeros(_LONGEST_CALM, dtype=np.int64)
+        self._passed = np.zeros(_LONGEST_CALM, dtype=np.int64)
+
+    def begin(self, bounds: Calm) -> None:
+        """Draw the bounds for the cycles that follow."""
+        self.count = self._periods = 0
+        self._bounds = bounds
+
+    def holds(self, arm: ArmState, observation: int) -> bool:
+        """Tell whether a cycle is within the bounds; `take` it then."""
+        watched, expected, cycles, periods, due = self._bounds
+        return (
+            self.count < min(cycles, _LONGEST_CALM)
+            and (observation | finding_of(arm)) & watched == expected
+            and self._periods + arm.periods < periods
+            and arm.cycle < due
+        )
+
+    def take(self, arm: ArmState, observation: int) -> None:
+        """Keep what is to be counted of a calm cycle."""
+        self._observations[self.count], self._passed[self.count] = observation, arm.periods
+        self.count += 1
+        self._periods += arm.periods
+
+    @property
+    def taken(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Observations and periods of the cycles (n,)."""
+        return self._observations[: self.count], self._passed[: self.count]
+
+
 class Pipeline:
     """Adaptation and contact detection for one run, by the scheme that the settings ask for."""
 
@@ -127,6 +171,7 @@ class Pipeline:
             else PaperPolicy(settings, self._supervisor)
         )
         self._intervals = SampleIntervals(settings)
+        self._stretch = CalmStretch()
         self._theta_hat = layout_of(settings).slices["theta_hat"]
         block = self.numbers.block[0]
         self._q, self._dq, self._tau_J, self._period_s = (block[name] for name in ("q", "dq", "tau_J", "period_s"))
@@ -165,36 +210,60 @@ class Pipeline:
         self._dq[:] = arm.dq
         self._tau_J[:] = arm.tau_J
         self._period_s[0] = self._intervals.since_last(arm)
-        return self._conclude(arm, request, self._policy.step(int(arm.is_complete), int(arm.steps)))
+        policy, stretch = self._policy, self._stretch
+        observation = policy.step(int(arm.is_complete), int(arm.steps))
+        if request is Request.NONE and stretch.holds(arm, observation) and policy.is_calm:
+            policy.observe_calm(stretch.count)
+            stretch.take(arm, observation)
+            return self._output(arm.cycle, self._supervisor.state, observation, None, self.numbers.values.copy())
+        self._count_calm()
+        output = self._conclude(arm, request, observation)
+        stretch.begin(self._calm(arm.cycle + 1))
+        return output
+
+    def _count_calm(self) -> None:
+        """Let the supervisor and the policy count the calm cycles since the last concluded one."""
+        stretch = self._stretch
+        if stretch.count:
+            self._supervisor.pass_by(*stretch.taken)
+            self._policy.pass_by(stretch.count)
+        stretch.begin(_NOTHING_CALM)
 
     def _conclude(self, arm: ArmState, request: Request, observation: int) -> SchemeOutput:
-        """Do what comes after the numbers in each cycle."""
+        """Do what comes after the numbers in a cycle in which something could happen."""
         policy, supervisor, contacts = self._policy, self._supervisor, self._policy.contacts
         previous = supervisor.state
         observation = policy.take(request, observation)
         block = self.numbers.values.copy()
         supervisor.step(arm, request, observation, contacts.is_reporting, contacts.goes_on)
-        state = policy.follow(previous, arm.cycle, observation)
+        policy.follow(previous, arm.cycle, observation)
         contact = policy.report(arm.cycle, observation)
+        return self._output(arm.cycle, previous, observation, contact, block)
+
+    def _output(
+        self, cycle: int, previous: SchemeState, observation: int, contact: ContactReport | None, block: Vector
+    ) -> SchemeOutput:
+        policy, supervisor = self._policy, self._supervisor
         return SchemeOutput(
-            cycle=arm.cycle,
-            state=state,
-            previous_state=previous,
-            fault=supervisor.fault,
-            contact_joints=observation >> CONTACT_SHIFT,
-            is_model_valid=policy.is_model_valid,
-            theta_hat=block[self._theta_hat],
-            theta_ff=policy.theta_ff,
-            tau_ext_hat=policy.tau_ext_hat.copy(),
-            contact=contact,
-            block=block,
-            reaction=contacts.reaction,
+            cycle,
+            supervisor.state,
+            previous,
+            supervisor.fault,
+            observation >> CONTACT_SHIFT,
+            policy.is_model_valid,
+            block[self._theta_hat],
+            policy.theta_ff,
+            policy.tau_ext_hat.copy(),
+            contact,
+            block,
+            policy.contacts.reaction,
         )
 
     def run(self, arms: ArmBatch, requests: NDArray[np.uint8]) -> SchemeBatch:
         """Take in n cycles, as `step` does one by one. requests (n,): of `Request`."""
         count = arms.cycle.size
         policy, supervisor = self._policy, self._supervisor
+        self._count_calm()
         samples = samples_of(arms, self._intervals.between(arms), findings_of(arms))
         recorded = Recorded(np.zeros(count, dtype=np.int64), np.empty((count, self.numbers.values.size)))
         state, previous_state, fault, reaction = (np.zeros(count, dtype=np.uint8) for _ in range(4))

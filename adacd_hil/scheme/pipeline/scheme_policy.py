@@ -66,6 +66,15 @@ class SchemePolicy(ABC):
         """Narrow the bounds to those within which only `pass_by` is to be called."""
         return calm
 
+    @property
+    def is_calm(self) -> bool:
+        """Whether the numbers of this cycle, beside its observation, leave everything as it is."""
+        return True
+
+    def observe_calm(self, passed: int) -> None:
+        """Take in a calm cycle that `pass_by` will count; `passed`: calm ones before it, not counted yet."""
+        self.contacts.evidence.observe_calm(passed)
+
     def pass_by(self, cycles: int) -> None:
         """Count calm cycles."""
         self.contacts.pass_by(cycles)

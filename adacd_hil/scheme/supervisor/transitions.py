@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import ArmBatch, FaultReason, SchemeState
+from adacd_hil.records import ArmBatch, ArmState, FaultReason, SchemeState
 
 
 class SchemeEvent(IntEnum):
@@ -197,6 +197,10 @@ class ArmFinding(IntFlag):
     OLD = 1 << 44  # a value older than a cycle, which is too old if it stays so or exceeds its budget
 
 
+_ENABLED, _COMPLETE, _LATE, _FAULTY, _OLD = (int(bit) for bit in ArmFinding)
+"""The same bits as plain numbers, which cost less to join."""
+
+
 class Calm(NamedTuple):
     """Bounds within which a cycle only counts; a cycle outside one of them has to be looked at.
 
@@ -224,6 +228,16 @@ def findings_of(arms: ArmBatch) -> NDArray[np.int64]:
     ):
         findings[holds] |= int(bit)
     return findings
+
+
+def finding_of(arm: ArmState) -> int:
+    """Return the bits of `ArmFinding` of one cycle."""
+    findings = (_ENABLED if arm.is_enabled else 0) | (_COMPLETE if arm.is_complete else 0)
+    if arm.is_late:
+        findings |= _LATE
+    if arm.fault is not FaultReason.NONE:
+        findings |= _FAULTY
+    return findings | _OLD if max(*arm.age_q, *arm.age_tau_J) > 1 else findings
 
 
 @compiled
