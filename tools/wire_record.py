@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.clock import Clock
-from adacd_hil.wire.bus import Bus, Frame, QueueBytes
+from adacd_hil.wire.bus import Bus, Frame, Tap
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -37,33 +37,18 @@ class OverdueError(Exception):
     """A run that should have ended long ago."""
 
 
-class WitnessBus(Bus):
+class WitnessBus(Tap):
     """Passes everything on and remembers it, in the order in which the host sent and read it.
 
     `limit_ns`: when the clock is past it, the next frame to send raises OverdueError.
     """
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
-        self.channel = bus.channel
+        super().__init__(bus, clock)
         self.passed: list[Passed] = []
         self.limit_ns = 1 << 62
         self.syncs = 0
         """How many SYNCs the host has sent."""
-        self._bus, self._clock = bus, clock
-
-    @property
-    def waiting_frames(self) -> tuple[int, ...]:
-        """As the bus behind it."""
-        return self._bus.waiting_frames
-
-    @property
-    def frames_lost(self) -> int:
-        """As the bus behind it."""
-        return self._bus.frames_lost
-
-    def queue_bytes(self) -> QueueBytes:
-        """As the bus behind it."""
-        return self._bus.queue_bytes()
 
     def send(self, can_id: int, data: bytes) -> None:
         """Remember and send a frame. Raises BusError, OverdueError."""
@@ -82,14 +67,6 @@ class WitnessBus(Bus):
         if frame is not None and not frame.is_error:
             self.passed.append(Passed(frame.t_ns, False, frame.can_id, frame.data))
         return frame
-
-    def recover(self) -> None:
-        """As the bus behind it. Raises BusError."""
-        self._bus.recover()
-
-    def close(self) -> None:
-        """As the bus behind it."""
-        self._bus.close()
 
     def _remember(self, can_id: int, data: bytes) -> None:
         t_ns = self._clock.now_ns()

@@ -44,10 +44,6 @@ _TEMPERATURE = (0x2111, 0)  # i16, 0.01 °C; of sensors of our own kind
 _OWN_VENDOR = int.from_bytes(b"ADAC", "big")
 
 
-class TareInterruptedError(RuntimeError):
-    """The user ended the tare."""
-
-
 @dataclass
 class TareSession:
     """One tare on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time."""
@@ -82,7 +78,7 @@ class TareSession:
     def run(self) -> Tare:
         """Boot the devices, measure, solve.
 
-        Raises TareRefusedError, TareInterruptedError, DeviceError, BusError, SilenceError.
+        Raises TareRefusedError, DeviceError, BusError, SilenceError; KeyboardInterrupt after `interrupt`.
         """
         self.progress(f"looking for the arm on {self.bus.channel}")
         self._master.reset()
@@ -114,7 +110,7 @@ class TareSession:
 
     def _step(self) -> ArmState:
         if self._is_interrupted:
-            raise TareInterruptedError("interrupted")
+            raise KeyboardInterrupt
         return self._loop.step().state
 
     def _cycles(self, duration_s: float) -> int:

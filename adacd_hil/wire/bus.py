@@ -77,6 +77,7 @@ class Bus(Protocol):
     @property
     def waiting_frames(self) -> tuple[int, ...]:
         """Identifiers of what was sent and would be overtaken by SYNC now, as far as this end can know."""
+        return ()
 
     @property
     def frames_lost(self) -> int:
@@ -123,11 +124,6 @@ class EmbeddedBus(Bus):
         self._clock = clock
         self._received: deque[Frame] = deque()
         self._device: Callable[[Frame], None] | None = None
-
-    @property
-    def waiting_frames(self) -> tuple[int, ...]:
-        """Nothing: what is sent has arrived."""
-        return ()
 
     def attach(self, device: Callable[[Frame], None]) -> None:
         """Connect the device's receiver."""

@@ -47,11 +47,6 @@ class PythonCanBus(Bus):
         except (OSError, can.CanError, ValueError) as error:
             raise BusMissingError(f"interface {self._interface}, channel {self.channel}: {error}") from None
 
-    @property
-    def waiting_frames(self) -> tuple[int, ...]:
-        """Nothing: python-can doesn't say which frames wait."""
-        return ()
-
     def send(self, can_id: int, data: bytes) -> None:
         """Send a frame. Raises BusError."""
         is_long = len(data) > CLASSIC_BYTES

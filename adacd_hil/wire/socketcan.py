@@ -106,11 +106,6 @@ class SocketCanBus(Bus):
         self._received: deque[Frame] = deque()
         self._is_down = False
 
-    @property
-    def waiting_frames(self) -> tuple[int, ...]:
-        """Nothing: the kernel doesn't say which frames wait."""
-        return ()
-
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame for transmission; identifiers beyond 0x7FF are 29-bit ones.
 

@@ -25,6 +25,7 @@ from typing import Final
 
 import numpy as np
 
+from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 
 CLUSTER_S: Final = 0.5
@@ -39,7 +40,7 @@ _BISECTIONS: Final = 60
 _S_PER_H: Final = 3600.0
 
 
-class TooLittleMotionError(ValueError):
+class TooLittleMotionError(LogError):
     """The recorded motion can't give the asked figure; the message says what is missing."""
 
 

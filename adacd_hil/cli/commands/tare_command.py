@@ -11,14 +11,13 @@ from adacd_hil.cli.connection import Connection, check_clock, check_shared, make
 from adacd_hil.cli.output import CommandError, ExitCode, Progress
 from adacd_hil.clock import VirtualClock
 from adacd_hil.commission.tare import TareRefusedError
-from adacd_hil.commission.tare_session import TareInterruptedError, TareSession
+from adacd_hil.commission.tare_session import TareSession
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.terminal import in_line
-from adacd_hil.wire.bus import SilenceError
 
 
 @dataclass(frozen=True)
@@ -86,20 +85,13 @@ def tare_on_bus(
                 tare = session.run()
     except TareRefusedError as reason:
         raise CommandError(f"tare refused: {reason}", ExitCode.FAILURE) from None
-    except TareInterruptedError as reason:
-        raise CommandError(str(reason), ExitCode.INTERRUPTED) from None
     except DeviceError as reason:
         raise CommandError(str(reason), ExitCode.BUS_MISSING) from None
-    except SilenceError as reason:
-        raise CommandError(str(reason), ExitCode.SAFETY_STOP) from None
     return StoredTare(tare, out, write_tare(tare, out))
 
 
 def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
     """Let the command's options outweigh the configuration."""
     tare = settings.tare
-    if poses is not None:
-        tare = dataclasses.replace(tare, poses=poses)
-    if seconds is not None:
-        tare = dataclasses.replace(tare, window_s=seconds)
+    tare = dataclasses.replace(tare, poses=poses or tare.poses, window_s=seconds or tare.window_s)
     return dataclasses.replace(settings, tare=tare)

@@ -5,24 +5,19 @@ import json
 from pathlib import Path
 
 from adacd_hil.analysis.thresholds.detector_comparison import Comparison, compare_detectors
-from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.analysis.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, format_table
+from adacd_hil.cli.output import Progress, format_table
 from adacd_hil.log.log_files import WHOLE, TimeWindow, log_in
 
 
 def find(
     logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: TimeWindow = WHOLE
 ) -> tuple[Thresholds, Comparison | None]:
-    """Find the thresholds, and compare the detectors where asked for. Raises LogError, CommandError."""
+    """Find the thresholds, and compare the detectors where asked for. Raises LogError."""
     paths = [log_in(given) for given in logs]
-    try:
-        with Progress() as progress:
-            thresholds, statistics = thresholds_of_logs(paths, rate_per_h, stretch, progress)
-        comparison = compare_detectors(statistics, rate_per_h) if is_compared else None
-    except TooLittleMotionError as error:
-        raise CommandError(str(error), ExitCode.FAILURE) from None
-    return thresholds, comparison
+    with Progress() as progress:
+        thresholds, statistics = thresholds_of_logs(paths, rate_per_h, stretch, progress)
+    return thresholds, compare_detectors(statistics, rate_per_h) if is_compared else None
 
 
 def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:

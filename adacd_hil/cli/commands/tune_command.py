@@ -55,18 +55,14 @@ def tune(
     from adacd_hil.analysis.replay.log_source import LogSource
     from adacd_hil.analysis.sweep.tune import base_of, suggested_toml
     from adacd_hil.analysis.sweep.tune import tune as find
-    from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 
     paths = [log_in(given) for given in logs]
     if len(set(paths)) < len(paths):
         raise CommandError("a log is given twice: what is chosen on it can't be checked on it", ExitCode.USAGE)
     with tried(out):
         base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
-        try:
-            with Progress() as progress:
-                found = find(paths, rate_per_h, config, progress, stretch)
-        except TooLittleMotionError as error:
-            raise CommandError(str(error), ExitCode.FAILURE) from None
+        with Progress() as progress:
+            found = find(paths, rate_per_h, config, progress, stretch)
         said = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
         if base is None or found.best is None:
             print(said)
