@@ -7,9 +7,10 @@ a payload is one `struct.pack` and a whole topic is one `numpy.frombuffer`.
 ROS field names are lower case, ours are not (`tau_J`): the type keeps ours, and the log stores them beside the
 channel.
 
-Types of others: can_msgs/Frame, ros2_socketcan_msgs/FdFrame, sensor_msgs/JointState, foxglove_msgs/Log. Each is packed
-here to its whole payload. Strings and counts that could vary are constant (no frame_id, two joints), so that the sizes
-of classic frames and joint states are constant too. An FD frame is as long as its data, as ros2_socketcan publishes it.
+Types of others have their text in `messages`: can_msgs/Frame, ros2_socketcan_msgs/FdFrame, sensor_msgs/JointState,
+foxglove_msgs/Log. Each is packed here to its whole payload. Strings and counts that could vary are constant (no
+frame_id, two joints), so that the sizes of classic frames and joint states are constant too. An FD frame is as long as
+its data, as ros2_socketcan publishes it.
 """
 
 import re
@@ -18,6 +19,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
+from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -106,6 +108,12 @@ class MessageType:
         return payload_dtype(self.text, self.fields)
 
 
+def foreign_type(name: str) -> MessageType:
+    """Read the type of others that `messages` has under the last part of its name, with everything it depends on."""
+    file = resources.files("adacd_hil.log.types").joinpath("messages", f"{name.rpartition('/')[2]}.msg")
+    return MessageType(name, file.read_text(encoding="utf-8"))
+
+
 def number_type(name: str, members: Iterable[Member]) -> MessageType:
     """Make the type of a message of numbers, preceded by the stamp. Raises LogError when two fields share a name."""
     lines = ["# Written by adacd-hil.", "builtin_interfaces/Time stamp"]
@@ -182,58 +190,10 @@ def _field_lines(text: str) -> Iterator[tuple[str, int, str]]:
         yield match["type"], int(match["size"] or 1), match["name"]
 
 
-_HEADER_TEXT = f"""{SEPARATOR}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{TIME_TEXT}"""
-
-CAN_FRAME = MessageType(
-    "can_msgs/msg/Frame",
-    f"""std_msgs/Header header
-uint32 id
-bool is_rtr
-bool is_extended
-bool is_error
-uint8 dlc
-uint8[8] data
-{_HEADER_TEXT}""",
-)
-FD_FRAME = MessageType(
-    "ros2_socketcan_msgs/msg/FdFrame",
-    f"""std_msgs/Header header
-uint32 id
-bool is_extended
-bool is_error
-uint8 len
-uint8[<=64] data
-{_HEADER_TEXT}""",
-)
-JOINT_STATE = MessageType(
-    "sensor_msgs/msg/JointState",
-    f"""std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-{_HEADER_TEXT}""",
-)
-LOG = MessageType(
-    "foxglove_msgs/msg/Log",
-    f"""builtin_interfaces/Time timestamp
-uint8 UNKNOWN=0
-uint8 DEBUG=1
-uint8 INFO=2
-uint8 WARNING=3
-uint8 ERROR=4
-uint8 FATAL=5
-uint8 level
-string message
-string name
-string file
-uint32 line
-{TIME_TEXT}""",
-)
+CAN_FRAME = foreign_type("can_msgs/msg/Frame")
+FD_FRAME = foreign_type("ros2_socketcan_msgs/msg/FdFrame")
+JOINT_STATE = foreign_type("sensor_msgs/msg/JointState")
+LOG = foreign_type("foxglove_msgs/msg/Log")
 
 _EMPTY_STRING = struct.pack("<I", 1) + b"\0"
 _FRAME_ID = _EMPTY_STRING + b"\0\0\0"  # padded to the uint32 that follows

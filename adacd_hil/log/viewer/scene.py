@@ -10,7 +10,7 @@ import math
 import struct
 from typing import Any, NamedTuple
 
-from adacd_hil.log.types.message_types import ENCAPSULATION, SEPARATOR, TIME_TEXT, MessageType
+from adacd_hil.log.types.message_types import ENCAPSULATION, MessageType, foreign_type
 from adacd_hil.log.viewer.robot_description import BASE, LINK_NAMES, TIP, WORLD, mount_roll_rad
 from adacd_hil.records import JOINT_NAMES, ContactLevel, ContactReport, Location, SchemeState, Vector
 
@@ -23,91 +23,9 @@ Color = tuple[float, float, float, float]
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
-def _type(name: str, fields: str, *needed: str) -> MessageType:
-    """Make a type of fields, one per ';', and of the texts of the types that it needs."""
-    return MessageType(name, "".join((_lines(fields), *needed)))
-
-
-def _needed(name: str, fields: str) -> str:
-    return f"{SEPARATOR}\nMSG: {name}\n{_lines(fields)}"
-
-
-def _lines(fields: str) -> str:
-    return "\n".join(field.strip() for field in fields.split(";")) + "\n"
-
-
-_XYZ = "float64 x; float64 y; float64 z"
-_VECTOR3 = _needed("geometry_msgs/Vector3", _XYZ)
-_POINT = _needed("geometry_msgs/Point", _XYZ)
-_QUATERNION = _needed("geometry_msgs/Quaternion", f"{_XYZ}; float64 w")
-_POSE = _needed("geometry_msgs/Pose", "geometry_msgs/Point position; geometry_msgs/Quaternion orientation")
-_POSED = "geometry_msgs/Pose pose"
-_SIZED = f"{_POSED}; geometry_msgs/Vector3 size"
-_COLORED = "foxglove_msgs/Color color"
-_POINTS = f"geometry_msgs/Point[] points; {_COLORED}; foxglove_msgs/Color[] colors; uint32[] indices"
-
-STRING = _type("std_msgs/msg/String", "string data")
-TRANSFORMS = _type(
-    "tf2_msgs/msg/TFMessage",
-    "geometry_msgs/TransformStamped[] transforms",
-    _needed(
-        "geometry_msgs/TransformStamped",
-        "std_msgs/Header header; string child_frame_id; geometry_msgs/Transform transform",
-    ),
-    _needed("std_msgs/Header", "builtin_interfaces/Time stamp; string frame_id"),
-    _needed("geometry_msgs/Transform", "geometry_msgs/Vector3 translation; geometry_msgs/Quaternion rotation"),
-    _VECTOR3,
-    _QUATERNION,
-    TIME_TEXT,
-)
-SCENE = _type(
-    "foxglove_msgs/msg/SceneUpdate",
-    "foxglove_msgs/SceneEntityDeletion[] deletions; foxglove_msgs/SceneEntity[] entities",
-    _needed(
-        "foxglove_msgs/SceneEntityDeletion",
-        "builtin_interfaces/Time timestamp; uint8 MATCHING_ID=0; uint8 ALL=1; uint8 type; string id",
-    ),
-    _needed(
-        "foxglove_msgs/SceneEntity",
-        "builtin_interfaces/Time timestamp; string frame_id; string id; builtin_interfaces/Duration lifetime;"
-        "bool frame_locked; foxglove_msgs/KeyValuePair[] metadata; foxglove_msgs/ArrowPrimitive[] arrows;"
-        "foxglove_msgs/CubePrimitive[] cubes; foxglove_msgs/SpherePrimitive[] spheres;"
-        "foxglove_msgs/CylinderPrimitive[] cylinders; foxglove_msgs/LinePrimitive[] lines;"
-        "foxglove_msgs/TriangleListPrimitive[] triangles; foxglove_msgs/TextPrimitive[] texts;"
-        "foxglove_msgs/ModelPrimitive[] models",
-    ),
-    _needed("foxglove_msgs/KeyValuePair", "string key; string value"),
-    _needed(
-        "foxglove_msgs/ArrowPrimitive",
-        f"{_POSED}; float64 shaft_length; float64 shaft_diameter; float64 head_length; float64 head_diameter;"
-        f"{_COLORED}",
-    ),
-    _needed("foxglove_msgs/CubePrimitive", f"{_SIZED}; {_COLORED}"),
-    _needed("foxglove_msgs/SpherePrimitive", f"{_SIZED}; {_COLORED}"),
-    _needed("foxglove_msgs/CylinderPrimitive", f"{_SIZED}; float64 bottom_scale; float64 top_scale; {_COLORED}"),
-    _needed(
-        "foxglove_msgs/LinePrimitive",
-        f"uint8 LINE_STRIP=0; uint8 LINE_LOOP=1; uint8 LINE_LIST=2; uint8 type; {_POSED}; float64 thickness;"
-        f"bool scale_invariant; {_POINTS}",
-    ),
-    _needed("foxglove_msgs/TriangleListPrimitive", f"{_POSED}; {_POINTS}"),
-    _needed(
-        "foxglove_msgs/TextPrimitive",
-        f"{_POSED}; bool billboard; float64 font_size; bool scale_invariant; {_COLORED}; string text",
-    ),
-    _needed(
-        "foxglove_msgs/ModelPrimitive",
-        f"{_POSED}; geometry_msgs/Vector3 scale; {_COLORED}; bool override_color; string url; string media_type;"
-        "uint8[] data",
-    ),
-    _needed("foxglove_msgs/Color", "float64 r; float64 g; float64 b; float64 a"),
-    _POSE,
-    _POINT,
-    _VECTOR3,
-    _QUATERNION,
-    _needed("builtin_interfaces/Duration", "int32 sec; uint32 nanosec"),
-    TIME_TEXT,
-)
+STRING = MessageType("std_msgs/msg/String", "string data\n")
+TRANSFORMS = foreign_type("tf2_msgs/msg/TFMessage")
+SCENE = foreign_type("foxglove_msgs/msg/SceneUpdate")
 
 
 class Transform(NamedTuple):
