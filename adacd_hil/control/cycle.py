@@ -39,7 +39,8 @@ from adacd_hil.records import (
 )
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
-from adacd_hil.scheme.supervisor.supervisor import KEPT_IN, POWERED
+from adacd_hil.scheme.supervisor.kept_request import KeptRequest
+from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Tap
 
@@ -107,18 +108,16 @@ class Cycle:
         self._interrupts = 0
         self._is_finishing = False
         self._finish_cycle = 0
-        self._carried: Request | None = None
-        self._unserved = Request.NONE
+        self._kept = KeptRequest()
 
     def carry(self, request: Request) -> None:
         """Ask what was asked of an attempt before and not served, once the drives are enabled. Before `run`."""
-        self._carried = None if request is Request.NONE else request
-        self._unserved = request
+        self._kept = KeptRequest(request)
 
     @property
     def unserved(self) -> Request:
         """What the user has asked for and not got: the end of the run, or a stop to change the payload; else NONE."""
-        return self._unserved
+        return self._kept.request
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
@@ -182,13 +181,9 @@ class Cycle:
         if self._interrupts and not self._is_finishing:
             return self._finish()
         elapsed_s = None if self._enabled_cycle is None else (cycle - self._enabled_cycle) * self._period_s
-        if self._carried is not None and elapsed_s is not None:
-            request, self._carried = self._carried, None
-        else:
-            request = self._operator.request(elapsed_s, self._state)
-        is_kept = request is Request.FINISH or (request is Request.PAYLOAD and self._state in KEPT_IN[request])
-        if is_kept and self._unserved is not Request.FINISH:
-            self._unserved = request
+        carried = Request.NONE if elapsed_s is None else self._kept.take()
+        request = carried or self._operator.request(elapsed_s, self._state)
+        self._kept.ask(request, self._state)
         return self._finish() if request is Request.FINISH else request
 
     def _finish(self) -> Request:
@@ -280,8 +275,7 @@ class Cycle:
             self._enabled_cycle = cycle
         if state is SchemeState.FAULT:
             self._faulted_cycle = cycle
-        if state is SchemeState.PAYLOAD and self._unserved is Request.PAYLOAD:
-            self._unserved = Request.NONE
+        self._kept.serve((state,))
 
     def _is_over(self, output: SchemeOutput | None) -> bool:
         if output is None:

@@ -1,10 +1,18 @@
 """What was asked in a run, against what its configuration's script asks."""
 
-import numpy as np
+import dataclasses
+from pathlib import Path
 
+import numpy as np
+from analysis.replay_rig import record, settings_of_run
+
+from adacd_hil.analysis.replay.replay import replay
 from adacd_hil.analysis.replay.scheme_comparison import RequestCheck
+from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.log.reader import read_log
 from adacd_hil.records import Request
+from adacd_hil.settings.run_settings import RequestSettings
 
 
 def unexplained(logged: dict[int, Request], asked: dict[int, Request]) -> list[tuple[int, int, int]]:
@@ -34,3 +42,14 @@ def test_two_that_are_not_in_the_script_are_not_both_interrupts() -> None:
 
 def test_what_the_hosts_own_checks_ask_for_is_in_no_script() -> None:
     assert unexplained({20: Request.FAULT_TORQUE}, {}) == []
+
+
+def test_what_the_user_asked_before_a_fault_and_asks_again_after_it_is_the_scripts(tmp_path: Path) -> None:
+    settings = settings_of_run()
+    script = (RequestSettings(at_s=0.2, request="payload"), RequestSettings(at_s=1.9, request="finish"))
+    operator = dataclasses.replace(settings.operator, script=script)
+    path = record(tmp_path, dataclasses.replace(settings, operator=operator))
+    assert np.count_nonzero(read_log(path).scheme["request"] == Request.PAYLOAD) == 2
+    replayed = replay(path, script_of=ScriptedOperator)
+    assert replayed.mismatches == ()
+    assert replayed.compared > 1000

@@ -166,9 +166,9 @@ class _Player:
         for row, cycle in enumerate(stretch.ticks.cycle.tolist()):
             request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)
             output = self._pipeline.step(arm_at(arms, row), request)
-            self._state = output.state
             if self._asking is not None:
-                self._asking.note(cycle, self._state)
+                self._asking.note(cycle, request, self._state, output.state)
+            self._state = output.state
             outputs.append(output)
         return _columns(outputs)
 

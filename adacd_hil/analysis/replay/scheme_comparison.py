@@ -24,6 +24,7 @@ from adacd_hil.log.log_files import LogError, arithmetic
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.records import JOINTS, ContactReport, Event, Layout, Request, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
+from adacd_hil.scheme.supervisor.kept_request import KeptRequest
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.run_settings import OperatorSettings
 
@@ -231,19 +232,24 @@ class Asking:
         self._period_s = settings.bus.period_s
         self._enabled: int | None = None
         self._was_stopped = False
+        self._kept = KeptRequest()
 
     def begin(self) -> None:
         """Begin another attempt."""
         self._enabled = None
         self._was_stopped = False
+        self._kept = KeptRequest(self._kept.request)
 
     def ask(self, cycle: int, state: SchemeState) -> Request:
         """Return what is asked in a cycle; state: that of the cycle before."""
         elapsed_s = None if self._enabled is None else (cycle - self._enabled) * self._period_s
-        return self._script.request(elapsed_s, state)
+        carried = Request.NONE if elapsed_s is None else self._kept.take()
+        return carried or self._script.request(elapsed_s, state)
 
-    def note(self, cycle: int, state: SchemeState) -> None:
-        """Take note of the state that a cycle has led to."""
+    def note(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
+        """Take note of a request, of the state that it met and of the one that the cycle has led to."""
+        self._kept.ask(request, previous)
+        self._kept.serve((state,))
         if state is SchemeState.ADAPT and self._enabled is None:
             self._enabled = cycle
 
@@ -258,14 +264,21 @@ class Asking:
             first = int(enabled[0]) + 1
         else:
             first = 0
+        served = 0
         for row in self._rows(ticks, batch, first):
-            asked[row] = self.ask(int(ticks.cycle[row]), SchemeState(batch.previous_state[row]))
+            self._kept.serve(batch.state[served:row])
+            served = row
+            previous = SchemeState(batch.previous_state[row])
+            asked[row] = request = self.ask(int(ticks.cycle[row]), previous)
+            self._kept.ask(request, previous)
+        self._kept.serve(batch.state[served:])
         return asked
 
     def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
         """List the rows from the first one on in which something could be asked, or the wait for it begins anew."""
         assert self._enabled is not None
         is_due = np.zeros(len(ticks.cycle), np.bool_)
+        is_due[first : first + 1] = True  # what the attempt before has left, in the first cycle of an enabled arm
         if self._acknowledges:
             is_stopped = batch.previous_state == SchemeState.STOPPED
             is_due |= is_stopped | np.concatenate(([self._was_stopped], is_stopped[:-1]))
