@@ -10,6 +10,8 @@ import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import cache
+from importlib import resources
 from typing import Any, Final, NamedTuple
 
 import matplotlib as mpl
@@ -49,56 +51,33 @@ COLOURS: Final = {
 }
 PAPER: Final = "#ffffff"
 _DOTS_PER_INCH: Final = 150
-_FONT: Final = "DejaVu Sans"
 _ENVELOPE_BINS: Final = 1000
 """Two points each: as fine as the widest screen on which the report is read."""
 PANEL_BINS: Final = 250
 """The same for a panel of which four share the width."""
 
-_STYLE: Final[dict[Any, Any]] = {
-    "font.family": _FONT,
-    "font.size": 8.5,
-    "mathtext.fontset": "dejavusans",
-    "axes.titlesize": 9.0,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.titlepad": 5.0,
-    "axes.titley": 1.0,  # said, it need not be sought among ticks: a fifth of the time to draw
-    "axes.labelsize": 8.5,
+_COLOURED: Final = {
     "axes.labelcolor": COLOURS["muted"],
     "axes.edgecolor": COLOURS["rule"],
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "axes.xmargin": 0.0,
-    "axes.unicode_minus": True,
     "axes.titlecolor": COLOURS["ink"],
     "grid.color": COLOURS["grid"],
-    "grid.linewidth": 0.6,
     "text.color": COLOURS["ink"],
     "xtick.color": COLOURS["rule"],
     "ytick.color": COLOURS["rule"],
     "xtick.labelcolor": COLOURS["muted"],
     "ytick.labelcolor": COLOURS["muted"],
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "xtick.major.size": 3.0,
-    "ytick.major.size": 3.0,
-    "legend.frameon": False,
-    "legend.handlelength": 1.6,
-    "legend.borderpad": 0.0,
-    "legend.borderaxespad": 0.0,
-    "lines.solid_joinstyle": "round",
-    "path.simplify": False,
-    "svg.fonttype": "none",
 }
+
+
+@cache
+def _style() -> dict[Any, Any]:
+    with resources.as_file(resources.files("adacd_hil.analysis") / "figures.mplstyle") as file:
+        return {**mpl.rcParamsDefault, **mpl.rc_params_from_file(file, use_default_template=False), **_COLOURED}
 
 
 def style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
     """Apply the figures' style for a while, whatever the user's own matplotlib configuration says."""
-    return mpl.rc_context({**mpl.rcParamsDefault, **_STYLE, **(more or {}), "backend": mpl.rcParams["backend"]})
+    return mpl.rc_context({**_style(), **(more or {}), "backend": mpl.rcParams["backend"]})
 
 
 class SvgFragment(NamedTuple):
