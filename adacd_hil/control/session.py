@@ -1,5 +1,6 @@
 """One run from the first check to the closed log: boot the devices, compile, enable, cycle, disable."""
 
+import json
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,7 @@ from adacd_hil.file_access import place_file
 from adacd_hil.log.log_files import LOG_NAME, MOST_VIEWERS, arithmetic
 from adacd_hil.log.recording.processes import LiveSetup
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
+from adacd_hil.log.types.topics import CERTIFIED_MODEL
 from adacd_hil.log.viewer.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.viewer.scene import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import Event, FaultReason
@@ -210,6 +212,8 @@ class Session:
             self.progress(ending.error)
         for line in (*ArmReport(arm).describe_checks(), *master.describe_checks()):
             recorder.event(self.clock.now_ns(), Event("info", "frame checks", line))
+        for certificate in cycle.certificates:  # as numbers, for whoever compares runs
+            recorder.event(self.clock.now_ns(), Event("info", CERTIFIED_MODEL, json.dumps(certificate._asdict())))
         return ending
 
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:

@@ -78,7 +78,9 @@ def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
 
 def _evidence_json(evidence: CertifiedEvidence) -> dict[str, Any]:
     """Give what only the certified scheme has; the keys are described in `adacd_hil.analysis.score.margins`."""
-    return {**dataclasses.asdict(evidence), "smallest_margin": evidence.smallest_margin}
+    certificates = [certificate._asdict() for certificate in evidence.certificates]
+    margin = evidence.smallest_margin
+    return {**dataclasses.asdict(evidence), "smallest_margin": margin, "certificates": certificates}
 
 
 def _plain(value: Any) -> Any:

@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 from adacd_hil.analysis.logged_run import Section
 from adacd_hil.analysis.score.distribution import LogHistogram
 from adacd_hil.analysis.score.judge import rate_bound_per_h
+from adacd_hil.scheme.identify.certificate import Certificate
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,8 @@ class CertifiedEvidence:
 
     margins: by section. promotions: refined models that took over in the run. is_anchored: whether each certificate
     says what anchors all its offsets; logs from before there were anchors say nothing. revoked: why certificates were
-    taken back, in order. smallest_push: None where nothing was armed.
+    taken back, in order. smallest_push: None where nothing was armed. certificates: those that were not taken back, as
+    the log has them at its end; none in a log that lacks its end, or of an earlier version.
     """
 
     tests: dict[str, int]
@@ -207,6 +209,7 @@ class CertifiedEvidence:
     is_anchored: bool
     revoked: tuple[str, ...]
     smallest_push: SmallestPush | None
+    certificates: tuple[Certificate, ...] = ()
 
     @property
     def smallest_margin(self) -> float | None:

@@ -292,6 +292,8 @@ FRAME_CHECKS = OwnTopic(
     given=tuple(f"{device}_checks" for device in _DEVICES),
 )
 EVENTS = OwnTopic(ChannelId.EVENTS, "/events", LOG)
+CERTIFIED_MODEL = "certified model"
+"""Name of the events at the end of an attempt with a certificate each, as JSON."""
 TRUTH = OwnTopic(
     ChannelId.TRUTH, "/truth", "Truth", head=(_CYCLE_NUMBER,), given=("cycle",), block=lambda _: TRUTH_LAYOUT
 )
