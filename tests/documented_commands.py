@@ -27,6 +27,7 @@ from adacd_hil.cli.main import cli as host_cli
 from adacd_hil.control.tare_file import Tare, read_tare
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.device.profile import ProfileSettings, load_profile
+from adacd_hil.given_path import WrittenPath
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError, find_problems, parse
 from adacd_hil.wire.codec import CodecError, load_codec
@@ -213,7 +214,7 @@ def _value_complaints(param: click.Parameter, values: dict[str, Any]) -> Complai
 
 
 def _is_input(param: click.Parameter) -> bool:
-    return isinstance(param.type, click.Path) and param.name not in ("out", "report")
+    return isinstance(param.type, click.Path) and not isinstance(param.type, WrittenPath)
 
 
 def _require(path: Path) -> None:

@@ -116,6 +116,15 @@ class Drawing:
         return _fragment(out.getvalue(), self.name)
 
 
+def paper_svg(drawing: Drawing) -> str:
+    """Render a drawing as a file of its own, on white, without date."""
+    out = io.StringIO()
+    with style({"svg.hashsalt": drawing.name}):
+        canvas: Any = FigureCanvasSVG(drawing.figure)
+        canvas.print_svg(out, metadata={"Date": None})
+    return out.getvalue()
+
+
 _SUPERSCRIPTS: Final = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -245,29 +254,48 @@ SIGMAS = 2.0
 
 
 class HistoryPanel(NamedTuple):
-    """One panel: values and their deviations (n, m), a curve for each of m names."""
+    """One panel: values and their deviations (n, m), a curve for each of m names; nan: not known.
+
+    marks: rows at which something has changed. level: a line to compare with.
+    """
 
     title: str
     names: tuple[str, ...]
     values: Vector
     std: Vector
+    marks: tuple[int, ...] = ()
+    level: float | None = None
 
 
-def history_figure(dates_utc: Sequence[str], panels: Sequence[HistoryPanel]) -> Drawing:
-    """Draw panels over the dates of n certificates, ISO 8601, with two deviations."""
-    at = np.array([date.removesuffix("Z") for date in dates_utc], dtype="datetime64[s]")
+HISTORY_CAPTION: Final = "Bars: two deviations."
+
+
+def history_figure(
+    dates: Sequence[str],
+    panels: Sequence[HistoryPanel],
+    name: str = "history",
+    title: str = "What the arm's runs have certified",
+    caption: str = HISTORY_CAPTION,
+) -> Drawing:
+    """Draw panels over n dates, ISO 8601, with two deviations."""
+    at = np.array([date.removesuffix("Z") for date in dates], dtype="datetime64[s]")
     with style():
         figure = Figure(figsize=(7.2, 2.0 * len(panels)), layout="constrained")
         rows = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
         for axes, panel in zip(rows, panels, strict=True):
-            for m, name in enumerate(panel.names):
+            for row in panel.marks:
+                axes.axvline(at[row], color=COLOURS["alarm"], linewidth=0.8, linestyle="--")
+            if panel.level is not None:
+                axes.axhline(panel.level, color=COLOURS["muted"], linewidth=0.8, linestyle=":")
+            for m, label in enumerate(panel.names):
                 colour = COLOURS[("joint1", "joint2", "beside")[m % 3]]
                 axes.errorbar(
                     at, panel.values[:, m], SIGMAS * panel.std[:, m], marker="o", ms=3, lw=1, capsize=2, color=colour,
-                    label=name,
+                    label=label,
                 )  # fmt: skip
             axes.set_title(panel.title, loc="left")
             axes.grid(color=COLOURS["grid"])
-            axes.legend(frameon=False, loc="upper left")
+            axes.margins(x=0.02)
+            axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(panel.names))
         rows[-1].tick_params(axis="x", rotation=20)
-    return Drawing("history", "What the arm's runs have certified", "Bars: two deviations.", figure)
+    return Drawing(name, title, caption, figure)

@@ -15,6 +15,7 @@ from adacd_hil.cli.commands.identify_command import identify
 from adacd_hil.cli.commands.log_command import log
 from adacd_hil.cli.commands.play_command import play
 from adacd_hil.cli.commands.replay_command import replay
+from adacd_hil.cli.commands.runs_command import runs, trend
 from adacd_hil.cli.commands.sweep_command import sweep
 from adacd_hil.cli.commands.tune_command import tune
 from adacd_hil.cli.completion import complete_run, complete_scenario, is_completing, prepare_completion
@@ -372,6 +373,8 @@ cli.add_command(identify)
 cli.add_command(play)
 cli.add_command(replay)
 cli.add_command(compare)
+cli.add_command(runs)
+cli.add_command(trend)
 cli.add_command(log)
 cli.add_command(sweep)
 cli.add_command(tune)

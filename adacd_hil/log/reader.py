@@ -28,6 +28,7 @@ from adacd_hil.log.types.message_types import (
     JOINT_STATE_DTYPE,
     LOG,
     MessageType,
+    log_time_ns,
     unpack_log,
 )
 from adacd_hil.log.types.record_arrays import (
@@ -291,8 +292,7 @@ def events_of(payloads: Mapping[str, Iterable[bytes]], topics: Mapping[str, Topi
     if "/events" not in topics or topics["/events"].type_name != LOG.name:
         return events
     for payload in payloads.get("/events", ()):
-        sec, nanosec = np.frombuffer(payload, "<u4", 2, 4).tolist()
-        events.append(LoggedEvent(sec * 1_000_000_000 + nanosec - epoch_ns, unpack_log(payload)))
+        events.append(LoggedEvent(log_time_ns(payload) - epoch_ns, unpack_log(payload)))
     return events
 
 

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,13 @@ from adacd_hil.analysis.drawing import Drawing
 from adacd_hil.analysis.logged_run import MeasuredMotion, Run
 from adacd_hil.analysis.report import page
 from adacd_hil.analysis.report.page import Heading, render, render_page
-from adacd_hil.analysis.report.report_files import IndexEntry, Report, index_page
 from adacd_hil.analysis.report.report_tables import timing_tables
 from adacd_hil.analysis.report.run_figures import draw
 from adacd_hil.analysis.report.run_page import report_page
 from adacd_hil.analysis.report.timing_figures import draw_timing
+from adacd_hil.analysis.runs.run_pages import ListedRun, runs_page, trend_page
+from adacd_hil.analysis.runs.run_summary import BROKEN, CERTIFIED, GOOD, CertificateState, RunSummary
+from adacd_hil.analysis.runs.run_trend import trends
 from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.metrics import ReportSource
 
@@ -77,11 +80,23 @@ def page_of(run: Run) -> str:
     return report_page(metrics, run, ReportSource("run.mcap", "cut"), draw(run, metrics)[:1], timing)
 
 
+def run_summaries() -> list[RunSummary]:
+    """Two runs with another threshold each, and one whose log is broken."""
+    run = RunSummary(
+        "a", Path("runs/a/run.mcap"), GOOD, "all good", datetime(2026, 11, 25), "log", "lab", "lab", "P", "paper",
+        "can", "1", CertificateState(CERTIFIED, 2.0, 2), (0.1, 0.1), 1.5, 8, 8, 0, (0.1, 0.1), (0.01, 0.01),
+        (0.0, 0.0), (0.001, 0.001), 52.0,
+    )  # fmt: skip
+    return [run, replace(run, name="b", threshold_Nm=(0.2, 0.1)), replace(run, name="c", status=BROKEN)]
+
+
 def page_of_a_folder(_: Run) -> str:
-    run = touched_run()
-    where = Path("runs/a/report.html")
-    report = Report(evaluate(run), run.metadata, ReportSource("run.mcap", "cut"), where, where, ())
-    return index_page(Path("runs"), [IndexEntry("a", report), IndexEntry("b", None, "no log")])
+    good, _, broken = run_summaries()
+    return runs_page(Path("runs"), [ListedRun(good, Path("runs/a/report.html")), ListedRun(broken, None, "no log")])
+
+
+def page_of_a_trend(_: Run) -> str:
+    return trend_page(trends(run_summaries()))
 
 
 def page_of_a_communication_test(run: Run) -> str:
@@ -94,6 +109,7 @@ PAGES = {
     "paper": (page_of, touched_run),
     "certified": (page_of, certified_run),
     "folder": (page_of_a_folder, touched_run),
+    "trend": (page_of_a_trend, touched_run),
     "communication test": (page_of_a_communication_test, touched_run),
 }
 

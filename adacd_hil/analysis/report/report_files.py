@@ -13,8 +13,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
-from urllib.parse import quote
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -27,12 +26,10 @@ from adacd_hil.analysis.drawing import COLOURS, Drawing, style
 from adacd_hil.analysis.logged_run import Progress, Run, StretchOfRun, section_at
 from adacd_hil.analysis.report.page import (
     PRINTED_CONTACTS,
-    Heading,
     contact_rows,
     left_out_text,
     paper_cells,
     paper_head,
-    render_page,
     shown_contacts,
 )
 from adacd_hil.analysis.report.report_json import JSON_NAME, report_json
@@ -43,7 +40,6 @@ from adacd_hil.analysis.report.timeline import stays_of
 from adacd_hil.analysis.report.timing_figures import draw_timing
 from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.metrics import Gathered, Metrics, ReportedContact, ReportSource
-from adacd_hil.analysis.score.wording import NONE
 from adacd_hil.file_access import replace_files
 from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
 from adacd_hil.records import PARAMETER_UNITS
@@ -276,61 +272,3 @@ def _title(title: str) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, _ROOM_IN))
     figure.text(0.04, 0.25, title, fontsize=10.5, fontweight="bold", va="bottom", parse_math=False)
     return figure
-
-
-INDEX_NAME: Final = "index.html"
-_ORIGIN: Final = ("config", "profile", "interface")
-"""Metadata with a column each."""
-
-
-class IndexEntry(NamedTuple):
-    """A run of the folder: its name there, and its report, or why it has none."""
-
-    name: str
-    report: Report | None
-    problem: str = ""
-
-    @property
-    def is_clean(self) -> bool:
-        """Whether the run was good and its log is whole."""
-        return self.report is not None and self.report.metrics.is_clean and self.report.is_complete
-
-    @property
-    def verdict(self) -> str:
-        """What is to be said of it in a line."""
-        if self.report is None:
-            return f"The log can't be reported: {self.problem}"
-        missing = f" The log is not whole: {self.report.source.problem}" if self.report.source.problem else ""
-        return self.report.metrics.verdict + missing
-
-
-def count_text(entries: Sequence[IndexEntry]) -> str:
-    """Say how many runs there are and how many of them are not good."""
-    bad = sum(not entry.is_clean for entry in entries)
-    runs = "1 run" if len(entries) == 1 else f"{len(entries)} runs"
-    return f"{runs}, {'all good' if bad == 0 else f'{bad} not good'}"
-
-
-class _IndexRow(NamedTuple):
-    """A run in the table: the place of its report, how long it lasted, and what it was made with."""
-
-    entry: IndexEntry
-    place: str
-    lasts: str
-    origin: Sequence[str]
-
-
-def index_page(folder: Path, entries: Sequence[IndexEntry]) -> str:
-    """Write the page, which lies in `folder`."""
-    count = count_text(entries)
-    heading = Heading("adacd-hil run reports", f"{count}.", (), all(entry.is_clean for entry in entries))
-    rows = [_row(folder, entry) for entry in entries]
-    return render_page("index_page.html.j2", f"{count} – run reports", heading, rows=rows)
-
-
-def _row(folder: Path, entry: IndexEntry) -> _IndexRow:
-    if entry.report is None:
-        return _IndexRow(entry, "", NONE, [NONE] * len(_ORIGIN))
-    place = quote(entry.report.html_path.relative_to(folder).as_posix())
-    origin = [entry.report.metadata.get(key) or NONE for key in _ORIGIN]
-    return _IndexRow(entry, place, f"{entry.report.metrics.cycle.duration_s:.1f}", origin)

@@ -23,7 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from adacd_hil import __version__
-from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
+from adacd_hil.analysis.drawing import COLOURS, Drawing, note, paper_svg, style
 from adacd_hil.analysis.logged_run import Progress
 from adacd_hil.analysis.replay.changed_settings import apply_settings, changed_keys, keep_facts
 from adacd_hil.analysis.replay.replay import replay_many
@@ -49,7 +49,6 @@ from adacd_hil.analysis.sweep.tune_roc import (
     free_hours,
     read_logs,
 )
-from adacd_hil.analysis.thresholds.detector_comparison import paper_svg
 from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import replace_files

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
+from adacd_hil.analysis.drawing import COLOURS, Drawing, note, paper_svg, style
 from adacd_hil.analysis.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
 from adacd_hil.analysis.thresholds.recorded_thresholds import BLOCK_S, Statistics
 from adacd_hil.file_access import replace_files
@@ -261,16 +261,3 @@ def write_comparison(comparison: Comparison, out_dir: Path) -> tuple[Path, ...]:
     }
     with failing_as(f"report in {out_dir} can't be written"):
         return replace_files(out_dir, contents)
-
-
-def paper_svg(drawing: Drawing) -> str:
-    """Render a drawing as a file of its own, on white, without date."""
-    import io
-
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    out = io.StringIO()
-    with style({"svg.hashsalt": drawing.name}):
-        canvas: Any = FigureCanvasSVG(drawing.figure)
-        canvas.print_svg(out, metadata={"Date": None})
-    return out.getvalue()

@@ -53,8 +53,8 @@ def _as_png(found: "History") -> bytes:
     joints = tuple(f"joint {number}" for number in range(1, len(found.last.offset_Nm) + 1))
 
     def panel(title: str, names: tuple[str, ...], values: str, std: str) -> HistoryPanel:
-        columns = [np.array([getattr(certificate, name) for certificate in shown]) for name in (values, std)]
-        return HistoryPanel(title, names, *columns)
+        found, deviations = (np.array([getattr(each, name) for each in shown]) for name in (values, std))
+        return HistoryPanel(title, names, found, deviations)
 
     friction = panel("Friction at 0.6 rad/s, Nm", joints, "friction_Nm", "friction_std_Nm")
     panels = (

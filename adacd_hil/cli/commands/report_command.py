@@ -1,19 +1,25 @@
 """Reports of logs and of folders of runs: the command's work."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.analysis.report.report_files import INDEX_NAME, IndexEntry, Report, count_text, index_page, write_report
+from adacd_hil.analysis.report.report_files import Report, write_report
+from adacd_hil.analysis.runs.run_pages import INDEX_NAME, ListedRun, runs_page
+from adacd_hil.analysis.runs.run_summary import BROKEN, RunSummary, find_runs, reported
+from adacd_hil.analysis.runs.run_table import count_text
 from adacd_hil.cli.output import CommandError, ExitCode, Progress
 from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, TimeWindow, failing_as, log_in
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import one_line
 
-DEEPEST = 4
-"""Levels below a folder in which its runs are looked for."""
+
+class IndexEntry(NamedTuple):
+    """A run of the folder, and its report; None where it can't be reported."""
+
+    listed: ListedRun
+    report: Report | None
 
 
 class Index(NamedTuple):
@@ -24,9 +30,10 @@ class Index(NamedTuple):
 
     def as_text(self) -> str:
         """Give a line for each run."""
-        lines = [f"{count_text(self.entries)}", ""]
-        for entry in self.entries:
-            lines.append(f"{entry.name}: {'good' if entry.is_clean else 'NOT GOOD'}: {one_line(entry.verdict)}")
+        lines = [count_text([entry.listed.run for entry in self.entries]), ""]
+        for listed, _ in self.entries:
+            run = listed.run
+            lines.append(f"{run.name}: {'good' if run.is_clean else 'NOT GOOD'}: {one_line(listed.verdict)}")
         return "\n".join([*lines, "", f"Index: {self.path}"])
 
 
@@ -41,7 +48,7 @@ def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -
     """
     places: dict[Path, tuple[Path, tuple[Path, ...]]] = {}  # by folder of the report
     for given in logs:
-        runs = runs_in(given)
+        runs = _runs_in(given)
         if given.is_dir() and not runs and not (given / LOG_NAME).exists():
             raise LogError(f"{given} has no {LOG_NAME}, nor has any folder in it")
         own = given if runs else log_in(given).parent
@@ -64,36 +71,30 @@ def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -
     return reported, ExitCode.OK if set(codes) <= {ExitCode.OK} else ExitCode.PARTIAL
 
 
-def runs_in(given: Path) -> tuple[Path, ...]:
-    """List the folders with a run below a folder that has none itself, by name; links are left alone."""
-    if not given.is_dir() or (given / LOG_NAME).exists():
-        return ()
-    found = []
-    for folder, names, files in os.walk(given):
-        here = Path(folder)
-        if LOG_NAME in files:
-            found.append(here)
-        if len(here.relative_to(given).parts) >= DEEPEST:
-            names.clear()
-        names.sort()
-    return tuple(found)
+def _runs_in(given: Path) -> tuple[Path, ...]:
+    """List the folders with a run below a folder that has none itself."""
+    return () if not given.is_dir() or (given / LOG_NAME).exists() else tuple(find_runs(given))
 
 
 def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWindow, progress: Progress) -> Index:
     """Report the runs of a folder, and write the page over them."""
-    entries = []
+    entries: list[IndexEntry] = []
     for number, run in enumerate(runs, start=1):
-        name = run.relative_to(given)
+        name = run.relative_to(given).as_posix()
         progress(f"{number} of {len(runs)}: {run}")
         try:
-            entries.append(IndexEntry(name.as_posix(), _report_one(run / LOG_NAME, out / name, stretch, progress)))
+            report = _report_one(run / LOG_NAME, out / name, stretch, progress)
+            listed = ListedRun(reported(run, name, report.as_json()), report.html_path)
+            entries.append(IndexEntry(listed, report))
         except (LogError, ConfigError) as error:
-            progress(one_line(error))
-            entries.append(IndexEntry(name.as_posix(), None, one_line(error)))
+            problem = one_line(error)
+            progress(problem)
+            broken = RunSummary(name, run / LOG_NAME, BROKEN, problem)
+            entries.append(IndexEntry(ListedRun(broken, None, problem), None))
     index = Index(out / INDEX_NAME, tuple(entries))
     with failing_as(f"{index.path} can't be written"):
         out.mkdir(parents=True, exist_ok=True)  # as after no run could be reported
-        replace_file(index.path, index_page(out, entries))
+        replace_file(index.path, runs_page(out, [entry.listed for entry in entries]))
     return index
 
 
@@ -101,9 +102,12 @@ def as_json(reported: Sequence[Reported]) -> list[dict[str, Any]]:
     """Give the content of each report.json; of a run that could not be reported its folder and why."""
     tables = []
     for each in reported:
-        for entry in each.entries if isinstance(each, Index) else (IndexEntry("", each),):
-            table = {"problem": entry.problem} if entry.report is None else entry.report.as_json()
-            tables.append({"folder": entry.name, **table} if isinstance(each, Index) else table)
+        if isinstance(each, Report):
+            tables.append(each.as_json())
+            continue
+        for listed, report in each.entries:
+            table = {"problem": listed.problem} if report is None else report.as_json()
+            tables.append({"folder": listed.run.name, **table})
     return tables
 
 

@@ -43,12 +43,15 @@ from adacd_hil.log.mcap.mcap_records import (
     read_record,
     scan,
 )
-from adacd_hil.log.types.message_types import LOG, payload_dtype, unpack_log
+from adacd_hil.log.reader import LoggedEvent
+from adacd_hil.log.types.message_types import LOG, log_time_ns, payload_dtype, unpack_log
 from adacd_hil.log.types.record_arrays import count_frames
 from adacd_hil.log.types.topics import CONTACT, EVENTS
 from adacd_hil.records import ContactLevel, Event
 
 _READ = (EVENTS.name, CONTACT.name)
+_MILESTONES = ("supervisor", "certificate", "revoked")
+"""Names of the events that are kept."""
 
 
 class TopicInfo(NamedTuple):
@@ -84,6 +87,7 @@ class LogInfo:
     metadata: dict[str, str] = field(default_factory=dict)
     summary: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+    milestones: list[LoggedEvent] = field(default_factory=list)  # changes of state, certificates; t_ns: of the log
 
     @property
     def duration_s(self) -> float:
@@ -91,14 +95,15 @@ class LogInfo:
         return (self.end_ns - self.start_ns) * 1e-9
 
 
-def read_info(path: Path) -> LogInfo:
+def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
     """Look at the log whose first part is `path`, with all its parts.
 
+    is_brief: without events and contacts, and of a damaged file no more than the metadata of the run: some 2 ms.
     Raises LogError when a file can't be read, or has neither MCAP's magic nor anything of a log.
     """
     parts = parts_of(path)
     info = LogInfo(path, files=len(parts))
-    view = _InfoView(info)
+    view = _InfoView(info, is_brief)
     is_mcap = False
     missing = [part for part in range(max(parts)) if part not in parts]
     for part in parts.values():
@@ -118,8 +123,9 @@ def read_info(path: Path) -> LogInfo:
 class _InfoView:
     """What has been seen of a log."""
 
-    def __init__(self, info: LogInfo) -> None:
+    def __init__(self, info: LogInfo, is_brief: bool) -> None:
         self._info = info
+        self._is_brief = is_brief
         self._opening = Opening()
         self._channels: dict[str, tuple[str, int | None]] = {}  # by topic: type and size of payloads
         self._counts: Counter[str] = Counter()
@@ -138,7 +144,10 @@ class _InfoView:
             statistics = parse(Opcode.STATISTICS, records[0].body) if records else None
         if end is None or statistics is None:
             self._info.problems.append(f"{path.name} is cut or damaged: `adacd-hil log check` says how")
-            self._take_damaged(path)
+            if self._is_brief:
+                self._info.metadata = self._info.metadata or run_metadata(path)
+            else:
+                self._take_damaged(path)
         else:
             self._take_whole(file, end, statistics)
 
@@ -172,7 +181,8 @@ class _InfoView:
             self._counts[topic] += count
         if statistics.message_count:
             self._span(statistics.message_start_time, statistics.message_end_time)
-        wanted = {number for number, channel in definitions.channels.items() if channel.topic in _READ}
+        topics = () if self._is_brief else _READ
+        wanted = {number for number, channel in definitions.channels.items() if channel.topic in topics}
         chunks = set()
         for record in end.summary:
             if record.opcode == Opcode.ATTACHMENT_INDEX:
@@ -181,7 +191,7 @@ class _InfoView:
             elif record.opcode == Opcode.METADATA_INDEX:
                 found = read_record(file, parse(record.opcode, record.body).offset)
                 self._take_metadata(parse(Opcode.METADATA, found.body))
-            elif record.opcode == Opcode.CHUNK_INDEX:
+            elif record.opcode == Opcode.CHUNK_INDEX and wanted:
                 chunk = parse(record.opcode, record.body)
                 if wanted & chunk.message_index_offsets.keys() and chunk.chunk_start_offset not in chunks:
                     chunks.add(chunk.chunk_start_offset)
@@ -234,6 +244,8 @@ class _InfoView:
             except (struct.error, IndexError):
                 continue
             self._info.events[event.level] += 1
+            if event.name in _MILESTONES:
+                self._info.milestones.append(LoggedEvent(log_time_ns(payload), event))
             if event.level == "error":
                 self._info.faults.append(f"{event.name}: {event.message}")
 

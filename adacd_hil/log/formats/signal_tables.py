@@ -103,7 +103,7 @@ class Tables:
         self._tables: dict[str, _Table] = {}
         self._files = ExitStack()
         if kind == "parquet":
-            _import_pyarrow()
+            import_pyarrow()
         with failing_as(f"{folder} can't be made a folder"):
             folder.mkdir(parents=True, exist_ok=True)
 
@@ -164,7 +164,7 @@ class _Parquet:
         self._path = path
         self._metadata = metadata
         self._writer: Any = None
-        self._arrow, self._parquet = _import_pyarrow()
+        self._arrow, self._parquet = import_pyarrow()
 
     def write(self, columns: Columns) -> None:
         table = self._arrow.table(dict(columns))
@@ -178,7 +178,7 @@ class _Parquet:
             self._writer.close()
 
 
-def _import_pyarrow() -> tuple[Any, Any]:
+def import_pyarrow() -> tuple[Any, Any]:
     """Return pyarrow and its module for Parquet. Raises LogError with what to install."""
     try:
         import pyarrow

@@ -299,6 +299,12 @@ def is_log(payload: bytes) -> bool:
     return True
 
 
+def log_time_ns(payload: bytes) -> int:
+    """Return when an event was logged, ns of the log. Raises struct.error when the payload is cut."""
+    sec, nanosec = struct.unpack_from("<II", payload, 4)
+    return int(sec) * 1_000_000_000 + int(nanosec)
+
+
 def unpack_log(payload: bytes) -> Event:
     """Unpack an event. Raises struct.error or IndexError when the payload is cut."""
     level = _LEVEL_NAMES.get(payload[12], "error")

@@ -1,0 +1,310 @@
+"""Many runs: their list, without reading logs that a report is of, and the trend of an arm."""
+
+import csv
+import json
+import os
+import shutil
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+from hand_made_run import A, M, make_certified_run, make_run, record
+
+from adacd_hil.analysis.report.report_json import report_json
+from adacd_hil.analysis.report.run_reading import read_run
+from adacd_hil.analysis.runs.run_summary import (
+    BROKEN,
+    CERTIFIED,
+    GOOD,
+    IDENTIFIED,
+    NOT_JUDGED,
+    RUNNING,
+    CertificateState,
+    RunSummary,
+    judged,
+    reported,
+    summarise,
+)
+from adacd_hil.analysis.runs.run_trend import trends
+from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.analysis.score.metrics import ReportSource
+from adacd_hil.cli.main import cli
+from adacd_hil.file_access import create_file
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.toml_files import to_toml
+
+pytestmark = pytest.mark.slow
+
+PARTIAL, USAGE = 3, 2
+DATED = "2026-11-25T14-22-33"
+CERTIFICATE = {
+    "friction_Nm": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], "friction_std_Nm": [0.01] * 6,
+    "offset_Nm": [0.03, 0.04], "offset_std_Nm": [0.001, 0.002],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with its report.json, as the judge gives it."""
+    folder = tmp_path_factory.mktemp("made") / DATED
+    folder.mkdir()
+    run = make_run((A, 60), (M, 60))
+    record(folder / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
+    read = read_run(folder / "run.mcap", None)
+    table = report_json(evaluate(read.run), read.run.metadata, read.source)
+    (folder / "report.json").write_text(json.dumps(table))
+    return folder
+
+
+@pytest.fixture
+def one(made: Path, tmp_path: Path) -> Path:
+    """A copy of that run, in a folder of its own."""
+    return Path(shutil.copytree(made, tmp_path / "runs" / DATED))
+
+
+def alter(folder: Path, **values: Any) -> None:
+    path = folder / "report.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+
+def test_a_report_beside_the_log_has_the_figures(one: Path) -> None:
+    run = summarise(one)
+    assert (run.status, run.verdict) == (GOOD, json.loads((one / "report.json").read_text())["verdict"])
+    assert run.certificate == CertificateState(IDENTIFIED, 0.06, 1)
+    assert run.threshold_Nm == (0.15, 0.15)
+    assert (run.found, run.expected, run.scenario) == (0, None, "paper")
+
+
+def test_a_log_in_lockstep_is_dated_by_its_folder_then_by_its_file(one: Path) -> None:
+    run = summarise(one)
+    assert run.started_by == "folder"
+    assert run.started == datetime(2026, 11, 25, 14, 22, 33).astimezone()
+    os.utime(one.rename(one.parent / "odd") / "run.mcap", (1_000_000, 1_000_000))
+    run = summarise(one.parent / "odd")
+    assert (run.started_by, run.started) == ("file", datetime.fromtimestamp(1_000_000).astimezone())
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ({"stretch": {"from_s": 1.0}}, "report.json is of a stretch of the log"),
+        ({"schema": 2}, "report.json has layout 2, 3 is read"),
+        ({"cycle": {"count": 5}}, "report.json is of another log"),
+        ({"run": {"scenario": "idle"}}, "report.json is of another log"),
+        ({"verdict": 3}, "report.json is damaged: TypeError 3 is no text"),
+        ({"is_clean": "yes"}, "report.json is damaged: TypeError 'yes' is neither true nor false"),
+        ({"sections": []}, "report.json is damaged: AttributeError 'list' object has no attribute 'values'"),
+    ],
+)
+def test_a_report_that_is_not_of_the_whole_log_is_left_alone_and_that_is_told(
+    one: Path, values: dict[str, Any], why: str
+) -> None:
+    alter(one, **values)
+    run = summarise(one)
+    assert (run.status, run.verdict) == (NOT_JUDGED, why)
+
+
+@pytest.mark.parametrize("text", ["", "[" * 100_000, "[]", "\x00"])
+def test_a_damaged_report_is_no_report(one: Path, text: str) -> None:
+    (one / "report.json").write_text(text)
+    assert summarise(one).verdict.startswith("report.json is damaged: ")
+
+
+def test_a_run_without_a_report_is_judged_when_asked(one: Path) -> None:
+    asked = summarise(one)
+    (one / "report.json").unlink()
+    quick = summarise(one)
+    assert (quick.status, quick.threshold_Nm) == (NOT_JUDGED, None)
+    assert judged(quick) == asked
+
+
+def test_a_log_is_broken_though_a_report_of_it_is_there(one: Path) -> None:
+    log = one / "run.mcap"
+    log.write_bytes(log.read_bytes()[:-100])
+    run = summarise(one)
+    assert (run.status, run.verdict) == (BROKEN, "run.mcap is cut or damaged: `adacd-hil log check` says how")
+    assert run.scenario == "paper"
+
+
+def test_a_log_that_is_being_written_is_running(tmp_path: Path) -> None:
+    descriptor = create_file(tmp_path / "run.mcap")
+    try:
+        run = summarise(tmp_path)
+    finally:
+        os.close(descriptor)
+    assert run.status == RUNNING
+
+
+def certified_table() -> dict[str, Any]:
+    run = make_certified_run()
+    return report_json(evaluate(run), run.metadata, ReportSource("run.mcap"))
+
+
+def test_friction_and_offsets_are_those_of_the_first_certificate_without_payload(one: Path) -> None:
+    table = certified_table()
+    payload = {key: [9.0] * len(values) for key, values in CERTIFICATE.items()}
+    table["certified"]["certificates"] = [{**payload, "is_payload": True}, {**CERTIFICATE, "is_payload": False}]
+    run = reported(one, "a", table)
+    assert (run.friction_Nm, run.friction_std_Nm) == ((0.2, 0.5), (0.01, 0.01))
+    assert (run.offset_Nm, run.offset_std_Nm) == ((0.03, 0.04), (0.001, 0.002))
+    assert run.certificate == CertificateState(CERTIFIED, 6.0, 2)
+    assert run.threshold_Nm == (0.1, 0.1)
+
+
+def test_without_certificates_in_numbers_they_are_those_of_the_first_adaptation(one: Path) -> None:
+    run = reported(one, "a", certified_table())
+    assert run.friction_Nm == (0.0, 0.0)
+    assert run.friction_std_Nm == pytest.approx((0.016, 0.016))
+    assert run.offset_Nm == pytest.approx((0.001, 0.001))
+
+
+def series(**columns: list[Any]) -> list[RunSummary]:
+    """Make judged runs, a day each."""
+    count = len(next(iter(columns.values())))
+    return [
+        RunSummary(
+            f"r{day}", Path(f"r{day}/run.mcap"), GOOD, "good", datetime(2026, 1, 1 + day).astimezone(), "log", "lab/P",
+            interface="socketcan", **{name: values[day] for name, values in columns.items()},
+        )
+        for day in range(count)
+    ]  # fmt: skip
+
+
+def test_a_threshold_has_changed_by_a_share_of_it_and_the_settings_that_did_are_named() -> None:
+    one, other = (replace(load_settings("certified"), name=name) for name in ("one", "other"))
+    other = replace(other, certified=replace(other.certified, noise_sigmas=9.0))
+    runs = series(threshold_Nm=[(0.1, 0.2), (0.11, 0.2), (0.13, 0.2), (0.12, 0.2)], settings=[one, one, other, other])
+    (trend,) = trends(reversed(runs))
+    assert trend.sentence == (
+        "Thresholds last changed with run r2 of 2026-01-03 00:00: joint 1 0.100 → 0.130 Nm; settings changed there: "
+        f"certified.noise_sigmas {one.certified.noise_sigmas} → 9.0."
+    )
+    (trend,) = trends(replace(run, settings=one) for run in runs)
+    assert trend.sentence == "Thresholds have not changed since run r0 of 2026-01-01 00:00: 4 runs."
+    (trend,) = trends((replace(run, settings=one) for run in runs), threshold_share=0.2)
+    assert trend.sentence == (
+        "Thresholds last changed with run r2 of 2026-01-03 00:00: joint 1 0.100 → 0.130 Nm; the settings are those of "
+        "the run before."
+    )
+
+
+def test_an_offset_that_creeps_adds_up_and_one_within_its_deviations_does_not() -> None:
+    creeping = [(0.001 * day, 0.0) for day in range(10)]
+    (trend,) = trends(series(offset_Nm=creeping, offset_std_Nm=[(0.001, 0.001)] * 10))
+    assert [(change.run.name, change.joint) for change in trend.offsets.changes] == [("r6", 1)]
+    assert trend.offsets.changes[0].sigmas == pytest.approx(6.0 / 2.0**0.5)
+    assert "last with run r6 of 2026-01-07 00:00: joint 1 0.000 → 0.006 Nm, 4.2 deviations since r0" in trend.further[1]
+    (trend,) = trends(series(offset_Nm=creeping, offset_std_Nm=[(0.01, 0.001)] * 10))
+    assert trend.further[1] == "Torque offsets: no change beyond what the certificates' uncertainty explains."
+
+
+def test_what_has_no_deviation_is_not_said_to_have_changed() -> None:
+    (trend,) = trends(series(friction_Nm=[(0.1, 0.1), (0.9, 0.9)]))
+    assert trend.friction.changes == ()
+    assert trend.further[0].startswith("Of friction nothing is known to compare")
+    assert trend.sentence == "Thresholds can't be compared: 0 of 2 runs have any."
+
+
+def test_an_emulated_arm_is_another_than_that_on_a_bus() -> None:
+    runs = series(margin=[1.0, 2.0])
+    found = trends([runs[0], replace(runs[1], interface="embedded"), replace(runs[1], status=BROKEN)])
+    assert [(trend.arm, len(trend.runs), len(trend.left_out)) for trend in found] == [
+        ("lab/P", 1, 1),
+        ("lab/P, emulated", 1, 0),
+    ]
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def many(one: Path) -> Path:
+    """A folder with a good run, one that is not judged, broken ones, and a link."""
+    folder = one.parent
+    shutil.copytree(one, folder / "b\x1b[2J<i>")
+    (folder / "b\x1b[2J<i>" / "report.json").unlink()
+    (folder / "2026-11-26T08-00-00").mkdir()
+    (folder / "2026-11-26T08-00-00" / "run.mcap").write_bytes(b"nothing of a log")
+    (folder / "only a part").mkdir()
+    (folder / "only a part" / "run_001.mcap").write_bytes(b"")
+    (folder / "latest").symlink_to(one.name)
+    (folder / "notes").mkdir()
+    return folder
+
+
+def test_every_run_is_listed_and_a_broken_one_with_the_reason(many: Path) -> None:
+    found = call("runs", many)
+    assert found.exit_code == PARTIAL
+    assert "4 runs, 2 not good, 1 not judged" in found.stdout
+    assert "2026-11-26T08-00-00: broken: " in found.stdout
+    assert "only a part: broken: " in found.stdout
+    assert "\x1b" not in found.stdout
+
+
+def test_runs_are_chosen_by_verdict_date_and_arm(many: Path) -> None:
+    def names(*options: str) -> list[str]:
+        return [run["run"] for run in json.loads(call("runs", many, "--json", *options).stdout)["runs"]]
+
+    assert names("--verdict", "good") == [DATED]
+    assert names("--verdict", "good", "--until", "2026-11-24") == []
+    assert names("--verdict", "good", "--since", "2026-11-25", "--until", "2026-11-25") == [DATED]
+    assert names("--since", "2026-11-26", "--until", "2026-11-26T09:00") == ["2026-11-26T08-00-00"]
+    assert names("--scenario", "idle") == []
+    assert names("--judge", "--verdict", "not judged") == []
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (("--since", "yesterday"), "'yesterday' is no date such as 2026-11-25"),
+        (("--since", "2026-11-25", "--until", "2026-11-24"), "is after --until"),
+        (("--arm", "lab"), "no run of arm 'lab'"),
+    ],
+)
+def test_a_choice_that_makes_no_sense_is_one_line(many: Path, options: tuple[str, ...], line: str) -> None:
+    found = call("runs", many, *options)
+    assert found.exit_code == USAGE
+    assert line in found.stderr
+
+
+def test_a_folder_without_runs_is_one_line(tmp_path: Path) -> None:
+    assert call("runs", tmp_path).stderr == f"adacd-hil: {tmp_path} has no run.mcap, nor has any folder in it\n"
+    assert call("runs", tmp_path / "none").stderr == f"adacd-hil: {tmp_path / 'none'} does not exist\n"
+
+
+def test_tables_have_a_row_for_each_run_and_fixed_types(many: Path, tmp_path: Path) -> None:
+    call("runs", many, "--csv", tmp_path / "runs.csv", "--parquet", tmp_path / "runs.parquet")
+    with (tmp_path / "runs.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["threshold_1_Nm"] for row in rows if row["status"] == GOOD] == ["0.15"]
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = parquet.read_table(tmp_path / "runs.parquet")
+    assert table.num_rows == len(rows) == 4
+    assert table.column_names == list(rows[0])
+    assert str(table.schema.field("offset_1_Nm").type) == "double"  # though nothing is known of it
+
+
+def test_the_page_leads_to_the_reports_that_there_are(many: Path) -> None:
+    (many / DATED / "report.html").write_text("")
+    call("runs", many, "--html", many / "index.html")
+    page = (many / "index.html").read_text(encoding="utf-8")
+    assert page.count("<a href=") == 1
+    assert f'<a href="{DATED}/report.html">{DATED}</a>' in page
+    assert "&lt;i&gt;" in page
+    assert "<i>" not in page
+
+
+def test_a_trend_is_drawn_and_told(one: Path, tmp_path: Path) -> None:
+    shutil.copytree(one, one.parent / "2026-11-26T08-00-00")
+    for kind, head in (("svg", b"<?xml"), ("png", b"\x89PNG"), ("html", b"<!DOCTYPE")):
+        found = call("trend", one.parent, "--out", tmp_path / f"trend.{kind}")
+        assert found.exit_code == 0, found.stderr
+        assert (tmp_path / f"trend.{kind}").read_bytes().startswith(head)
+    assert "Thresholds have not changed since run 2026-11-25T14-22-33 of 2026-11-25 14:22: 2 runs." in found.stdout
+    (arm,) = json.loads(call("trend", one.parent, "--json").stdout)["arms"]
+    assert arm["threshold_Nm"] == {"values": [[0.15, 0.15]] * 2, "std": [[None, None]] * 2, "changes": []}
+    assert call("trend", one.parent, "--out", tmp_path / "trend.jpg").exit_code == USAGE
