@@ -70,13 +70,13 @@ class Bench:
         self.is_scenario_started = False
         """Whether both drives have been in Operation enabled at once."""
         scenario_seed = scenario.seed if seed is None else seed
-        self._injector = Injector(scenario, scenario_seed, PLANNED_PERIOD_NS, codec, self._outbox, on_event)
-        self._plan = self._injector.plan
+        self.injector = Injector(scenario, scenario_seed, PLANNED_PERIOD_NS, codec, self._outbox, on_event)
+        self._plan = self.injector.plan
         self._body = self._build_body(scenario, scenario_seed)
-        self._rows = TruthFeed(self._fill_truth, on_truth)
-        self._nodes = BenchNodes(scenario, codec, self.contract, self._injector, self._body, self._is_wall)
+        self.rows = TruthFeed(self._fill_truth, on_truth)
+        self._nodes = BenchNodes(scenario, codec, self.contract, self.injector, self._body, self._is_wall)
         self.devices, self.drives, self.sensors = self._nodes.devices, self._nodes.drives, self._nodes.sensors
-        self.time = BenchTime(self._is_wall, self._nodes, self._body, self._injector, self._outbox, self._rows)
+        self.time = BenchTime(self._is_wall, self._nodes, self._body, self.injector, self._outbox, self.rows)
         self._sync_id = codec.message("Sync").can_id
         self._host_id = codec.node_id("HostHeartbeat")
         for device in self.devices:
@@ -87,24 +87,6 @@ class Bench:
             **({} if self._is_wall else {HOST_MARK: self.time.take_mark}),
             **{0x600 + device.node_id: self._sdo_handler(0x600 + device.node_id) for device in self.devices},
         }
-
-    @property
-    def on_truth(self) -> OnTruth | None:
-        """Called once per cycle with what is true."""
-        return self._rows.on_truth
-
-    @on_truth.setter
-    def on_truth(self, on_truth: OnTruth) -> None:
-        self._rows.on_truth = on_truth
-
-    @property
-    def on_event(self) -> OnEvent | None:
-        """Called with t_ns, level, name and text when a fault begins or ends."""
-        return self._injector.on_event
-
-    @on_event.setter
-    def on_event(self, on_event: OnEvent) -> None:
-        self._injector.on_event = on_event
 
     @property
     def is_paced(self) -> bool:
@@ -139,7 +121,7 @@ class Bench:
     def boot(self, t_ns: int = 0) -> None:
         """Power on at `t_ns`: every node announces itself."""
         self.time.begin(t_ns)
-        self._injector.power_on(t_ns)
+        self.injector.power_on(t_ns)
         for device in self.devices:
             device.power_on(t_ns)
         self.time.advance_faults(t_ns)
@@ -166,18 +148,18 @@ class Bench:
         if self._is_wall and t_ns > time.now_ns:
             time.now_ns = t_ns
         if can_id == self._sync_id:
-            if self._injector.has_faults:
+            if self.injector.has_faults:
                 time.advance_faults(t_ns, self._time_to_sync_ns(data))
             if self._plan.is_quiet:
                 self._on_sync(data, t_ns)
-            elif not self._injector.receive_by_all(can_id, data, self._on_sync, t_ns) and not self._is_wall:
+            elif not self.injector.receive_by_all(can_id, data, self._on_sync, t_ns) and not self._is_wall:
                 self._miss_sync(data, t_ns)
         elif can_id in self._nodes.commands:
             for place, take in self._nodes.commands[can_id]:
                 if self._plan.is_quiet:
                     take(data, time.now_ns)
                 else:
-                    self._injector.receive(place, can_id, data, take, time.now_ns)
+                    self.injector.receive(place, can_id, data, take, time.now_ns)
         elif can_id in self._services:
             self._services[can_id](data, time.now_ns)
             time.poll(time.now_ns)
@@ -192,7 +174,7 @@ class Bench:
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
         for place, device in enumerate(self.devices):
-            self._injector.receive(place, 0x000, data, device.on_nmt, t_ns)
+            self.injector.receive(place, 0x000, data, device.on_nmt, t_ns)
         is_reset = len(data) == 2 and data[0] in (RESET_NODE, RESET_COMMUNICATION)
         if is_reset and data[1] in (0, self.devices[0].node_id):
             self._order.restart()
@@ -203,7 +185,7 @@ class Bench:
             for device in self.devices:
                 device.on_heartbeat(self._host_id, t_ns)
 
-        self._injector.receive_by_all(0x700 + self._host_id, data, take, t_ns)
+        self.injector.receive_by_all(0x700 + self._host_id, data, take, t_ns)
 
     def _sdo_handler(self, can_id: int) -> Handler:
         """Let every device with this node id answer."""
@@ -211,7 +193,7 @@ class Bench:
         def answer(data: bytes, t_ns: int) -> None:
             for place, device in enumerate(self.devices):
                 if 0x600 + device.node_id == can_id:
-                    self._injector.receive(place, can_id, data, device.on_sdo, t_ns)
+                    self.injector.receive(place, can_id, data, device.on_sdo, t_ns)
 
         return answer
 
@@ -226,7 +208,7 @@ class Bench:
         elif self.time.has_moved:
             self.time.live_through_lost_syncs(self._lost_syncs)
             self.time.now_ns += self._nodes.period_ns
-        late_ns = self._injector.late_ns(self._nodes.period_ns)
+        late_ns = self.injector.late_ns(self._nodes.period_ns)
         if late_ns and self._is_wall:
             self._outbox.hold(self.time.now_ns + late_ns, lambda: self._answer(data, t_ns, 0))
             self.time.due_ns = min(self.time.due_ns, self._outbox.due_ns)
@@ -246,13 +228,13 @@ class Bench:
         else:
             self.cycle += order.periods
             if not self._is_wall:  # time that passed without SYNC has been counted
-                self.cycle = max(self.cycle, self._rows.cycle + 1)
+                self.cycle = max(self.cycle, self.rows.cycle + 1)
         return True
 
     def _ignore_sync(self, data: bytes, takers: Sequence[int]) -> None:
         """Let the devices take note of a SYNC that none of them answers."""
-        listeners, is_quiet = self._nodes.listeners, self._injector.is_quiet
-        heard = listeners.everybody if is_quiet else self._injector.hear(self._sync_id, data)
+        listeners, is_quiet = self._nodes.listeners, self.injector.is_quiet
+        heard = listeners.everybody if is_quiet else self.injector.hear(self._sync_id, data)
         listeners.ignore(heard, takers, self._order.kind, self.time.now_ns)
         self.time.poll(self.time.now_ns)
 
@@ -292,7 +274,7 @@ class Bench:
 
     def _tell_truth(self, t_ns: int) -> None:
         """Say what is true at this SYNC, which came at `t_ns`."""
-        self._rows.tell_sync(self.cycle, self.time.host_ns if self.is_paced else t_ns, self.time.now_ns)
+        self.rows.tell_sync(self.cycle, self.time.host_ns if self.is_paced else t_ns, self.time.now_ns)
         self.time.has_outlived = False
 
     def _fill_truth(self, block: Vector) -> None:
@@ -322,17 +304,17 @@ class Bench:
             sensor1.on_sync(torque1)
             sensor2.on_sync(torque2)
         else:
-            heard = self._injector.hear(self._sync_id, data)
+            heard = self.injector.hear(self._sync_id, data)
             listeners.tell(heard, takers, order.kind, lost, now_ns)
             heard = [times * is_taken for times, is_taken in zip(heard, takers, strict=True)]
-            self._injector.sync(heard, measured, now_ns)
+            self.injector.sync(heard, measured, now_ns)
             if not self._is_wall:  # by the clock, a drive that hears no SYNC has nothing to count
                 self._nodes.lose_sync(heard, now_ns)
         if now_ns >= self.time.due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
             self.time.poll(now_ns)
         if not self.is_scenario_started and drive1.is_enabled and drive2.is_enabled:
             self.is_scenario_started = True
-            self._injector.start(now_ns)
+            self.injector.start(now_ns)
             self._body.start_scenario()
         for place, send in self._nodes.senders:
             if heard[place]:

@@ -163,8 +163,8 @@ def run(
         bench = Bench(resolved, codec, departure.send, clock_mode=clock_mode, on_answer=departure.go)
         if truth is not None:
             epoch_ns = wall_ns() - clock.now_ns()
-            bench.on_truth = _stamp_truth(truth, bench, epoch_ns)
-            bench.on_event = _stamp_events(truth, bench, epoch_ns)
+            bench.rows.on_truth = _stamp_truth(truth, bench, epoch_ns)
+            bench.injector.on_event = _stamp_events(truth, bench, epoch_ns)
         _serve(Service(bench, bus, departure, clock, clock_mode, stop, is_once))
         return _report(bench, resolved, clock_mode, truth, as_json)
 
