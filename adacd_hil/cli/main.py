@@ -12,6 +12,7 @@ from adacd_hil.cli.commands.compare_command import compare
 from adacd_hil.cli.commands.config_command import config
 from adacd_hil.cli.commands.history_command import history
 from adacd_hil.cli.commands.identify_command import identify
+from adacd_hil.cli.commands.init_command import init
 from adacd_hil.cli.commands.log_command import log
 from adacd_hil.cli.commands.play_command import play
 from adacd_hil.cli.commands.replay_command import replay
@@ -370,6 +371,7 @@ def monitor(
 cli.add_command(config)
 cli.add_command(history)
 cli.add_command(identify)
+cli.add_command(init)
 cli.add_command(play)
 cli.add_command(replay)
 cli.add_command(compare)

@@ -29,6 +29,8 @@ class ConfigurationFindings(NamedTuple):
     errors: list[str]
     warnings: list[str]
     settings: Settings | None
+    is_late: bool = False
+    """Whether the frames don't get through in the period."""
 
 
 def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
@@ -47,13 +49,9 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
         codec = load_contract(settings)
     except (ConfigError, CodecError) as error:
         return ConfigurationFindings([str(error)], [], None)
-    warnings = [
-        *_oddities(settings),
-        *_assumptions(settings),
-        *_layer_warnings(layers),
-        *_budget_warnings(codec, settings),
-    ]
-    return ConfigurationFindings([], warnings, settings)
+    late = list(_budget_warnings(codec, settings))
+    warnings = [*_oddities(settings), *_assumptions(settings), *_layer_warnings(layers), *late]
+    return ConfigurationFindings([], warnings, settings, bool(late))
 
 
 def configuration_checks(settings: Settings) -> list[Check[Settings]]:

@@ -66,12 +66,13 @@ class DeviceError(RuntimeError):
 
 
 class EdsVariable(NamedTuple):
-    """One object of an EDS. bits: its size in a PDO, 0 for what has no fixed size."""
+    """One object of an EDS. bits: its size in a PDO, 0 for what has no fixed size. is_writable: over SDO."""
 
     name: str
     bits: int
     is_signed: bool
     default: int | None
+    is_writable: bool
 
 
 def read_eds(path: Path, node_id: int) -> Any:
@@ -129,7 +130,8 @@ def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
     default = entry.value if entry.value is not None else entry.default
     is_number = entry.data_type in canopen.objectdictionary.NUMBER_TYPES
     is_signed = entry.data_type in canopen.objectdictionary.SIGNED_TYPES
-    return EdsVariable(name, len(entry) if is_number else 0, is_signed, default if isinstance(default, int) else None)
+    bits, number = len(entry) if is_number else 0, default if isinstance(default, int) else None
+    return EdsVariable(name, bits, is_signed, number, "w" in entry.access_type)
 
 
 class _BusNetwork(canopen.Network):

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from adacd_hil.file_access import exists
 from adacd_hil.records import JOINTS, POSITION_TERMS, Vector
 from adacd_hil.scheduling import RealtimeRequest
 from adacd_hil.settings.arm_settings import ArmSettings, BusSettings, DataSettings, DevicesSettings, LockstepSettings
@@ -208,6 +209,22 @@ def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
     return value
 
 
+def _find_beside(table: dict[str, Any], folder: Path) -> None:
+    """Let the files of devices and contract that lie beside the configuration be found from anywhere."""
+
+    def found(name: Any) -> Any:
+        is_beside = isinstance(name, str) and Path(name).suffix and exists(folder / name)
+        return str(folder / name) if is_beside else name
+
+    devices = table.get("devices")
+    if not isinstance(devices, dict):
+        return
+    for key in ("drive", "sensor", "contract"):
+        if key in devices:
+            value = devices[key]
+            devices[key] = [found(name) for name in value] if isinstance(value, list) else found(value)
+
+
 def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[ConfigurationLayer]:
     """Read a configuration and all that it extends; a relative path is taken from the file that names it."""
     if name_or_file in seen:
@@ -217,6 +234,7 @@ def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[Configura
     path = find_toml("configuration", name_or_file, builtin_folder())
     table = read_toml(path)
     table.setdefault("name", path.stem)
+    _find_beside(table, path.parent)
     if "extends" not in table and name_or_file in builtin_names():
         return [ConfigurationLayer(name_or_file, table)]
     extended = table.pop("extends", "paper")

@@ -135,7 +135,7 @@ def _write_section(section: Any, prefix: str, lines: list[str], is_short: bool =
             else:
                 lines.append(f"{field.name} = [{', '.join(rows)}]")
         elif value is not None:
-            lines.append(f"{field.name} = {_toml_value(value)}")
+            lines.append(f"{field.name} = {toml_value(value)}")
     for name, value in nested:
         lines.extend(("", f"[{prefix}{name}]"))
         _write_section(value, f"{prefix}{name}.", lines, is_short)
@@ -147,7 +147,7 @@ def _inline(section: Any, is_short: bool) -> str:
         for field in dataclasses.fields(section)
         if (value := getattr(section, field.name)) is not None and not (is_short and is_default(field, value))
     ]
-    return ", ".join(f"{name} = {_toml_value(value)}" for name, value in values)
+    return ", ".join(f"{name} = {toml_value(value)}" for name, value in values)
 
 
 _TOML_ESCAPES = {code: f"\\u{code:04X}" for code in (*range(0x20), 0x7F)} | {
@@ -156,11 +156,12 @@ _TOML_ESCAPES = {code: f"\\u{code:04X}" for code in (*range(0x20), 0x7F)} | {
 }
 
 
-def _toml_value(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """Write a value as TOML that is read back to the same."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return '"' + value.translate(_TOML_ESCAPES) + '"'
     if isinstance(value, tuple):
-        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+        return "[" + ", ".join(toml_value(item) for item in value) + "]"
     return repr(value)

@@ -1,0 +1,465 @@
+"""The draft of one's own arm as `init` makes it: scans the bus, asks, and lets what is known decide the rest."""
+
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from adacd_hil import __version__
+from adacd_hil.cli.interview import Interview, Proposal
+from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.clock import MonotonicClock, format_date, wall_ns
+from adacd_hil.commission.arm_draft import ArmFacts, Fact, draft_arm, write_draft
+from adacd_hil.commission.arm_geometry import PlanarArm, planar_from_urdf, uniform_rods
+from adacd_hil.commission.configuration_check import ConfigurationFindings, examine_configuration
+from adacd_hil.commission.device_recognition import (
+    DRIVE,
+    SENSOR,
+    DeviceRatings,
+    RecognisedDevice,
+    choose_family,
+    identity_of,
+    recognise,
+)
+from adacd_hil.commission.host_checks import Status, look_for_socketcan
+from adacd_hil.commission.profile_draft import draft_profile, kind_of
+from adacd_hil.device.profile import load_profile, profile_names
+from adacd_hil.device.survey import survey
+from adacd_hil.file_access import read_input, replace_file
+from adacd_hil.log.recording.run_folder import is_there
+from adacd_hil.scheme.model.urdf import UrdfError
+from adacd_hil.settings.arm_settings import ArmSettings
+from adacd_hil.settings.catalogue import known_keys
+from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.terminal import in_line
+from adacd_hil.wire.bus import open_bus
+from adacd_hil.wire.can_interface import can_interfaces, read_link
+
+Pair = tuple[float, float]
+_PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
+_NO_BUS = "none"
+
+
+@dataclass(frozen=True)
+class InitOptions:
+    """What the command line answers; None: not answered."""
+
+    interface: str | None = None
+    channel: str | None = None
+    bitrate: int | None = None
+    is_busless: bool = False
+    urdf: Path | None = None
+    locked: tuple[str, ...] = ()
+    length_m: Pair | None = None
+    mass_kg: Pair | None = None
+    is_upright: bool | None = None
+    rated_torque_nm: Pair | None = None
+    torque_limit_nm: Pair | None = None
+    position_limit_deg: Pair | None = None
+    velocity_limit_deg_s: Pair | None = None
+    drive: tuple[str, str] | None = None
+    sensor: tuple[str, str] | None = None
+    drive_node: tuple[int, int] | None = None
+    sensor_node: tuple[int, int] | None = None
+    eds: tuple[Path, ...] = ()
+
+
+@dataclass
+class DraftFiles:
+    """The files that are to be written: none replaces another unless asked for, and all of them or none."""
+
+    out: Path
+    is_forced: bool
+    contents: dict[Path, bytes] = field(default_factory=dict)
+
+    def check(self, path: Path) -> None:
+        """Raise CommandError where a file is in the way."""
+        if is_there(path) and not self.is_forced:
+            raise CommandError(f"{path} exists; give another name, or --force to replace it", ExitCode.USAGE)
+
+    def add(self, path: Path, content: str | bytes) -> None:
+        """Add a file. Raises CommandError where another is in the way."""
+        data = content.encode() if isinstance(content, str) else content
+        if not (path.is_file() and path.read_bytes() == data):
+            self.check(path)
+        self.contents[path] = data
+
+    def examine(self, text: str) -> ConfigurationFindings:
+        """Check a text for the file as `config check` does, beside the others. Raises CommandError."""
+        with tempfile.TemporaryDirectory() as folder:
+            for path, data in (self.contents | {self.out: text.encode()}).items():
+                (Path(folder) / path.name).write_bytes(data)
+            found = examine_configuration(str(Path(folder) / self.out.name))
+        if found.errors:
+            line = found.errors[0].replace(f"{folder}/", "")
+            raise CommandError(f"{self.out} is not written, as it could not be used: {line}", ExitCode.USAGE)
+        return found
+
+    def finish(self, text: str) -> None:
+        """Write the file and those beside it. Raises CommandError."""
+        self.contents[self.out] = text.encode()
+        try:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            for path, data in self.contents.items():
+                replace_file(path, data)
+        except OSError as error:
+            raise CommandError(f"{self.out} can't be written: {error.strerror}") from error
+
+
+class Drafting:
+    """One draft in the making: what was asked, what was found."""
+
+    def __init__(self, options: InitOptions, interview: Interview, writing: DraftFiles) -> None:
+        self.options, self.interview, self.writing = options, interview, writing
+        self.warnings: list[str] = []
+        self.bus: dict[str, Any] | None = None
+        self.bitrate = options.bitrate
+        self.guessed: set[str] = set()
+        """Drafted profiles in which something is a guess."""
+
+    def draft(self) -> tuple[str, dict[str, Any]]:
+        """Find out, ask, propose; return the text of the file and a summary."""
+        facts = self._gather()
+        title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
+        title += f" from {self.bus['interface']} {self.bus['channel']}." if self.bus else " without hardware."
+        for period_us in _PERIODS_US if facts.period_us in _PERIODS_US else (facts.period_us,):
+            draft = draft_arm(facts._replace(period_us=period_us))
+            text = write_draft(draft, title, self.writing.out.name)
+            if not self.writing.examine(text).is_late:
+                break
+        summary: dict[str, Any] = {
+            "bus": self.bus,
+            "drive": list(facts.drive.value),
+            "drive_node": list(facts.drive_node.value),
+            "sensor": list(facts.sensor.value),
+            "sensor_node": list(facts.sensor_node.value),
+            "assumed": list(draft.assumed),
+            "warnings": [*self.warnings, *draft.warnings],
+        }
+        return text, summary
+
+    def _gather(self) -> ArmFacts:
+
+        options = self.options
+        drives, sensors = self._find_devices()
+        geometry, length_source, mass_source, gravity_source = self._ask_geometry()
+        ratings = [device.ratings for device in drives]
+        rated = self._rated(ratings, geometry)
+        torque = self._limit("torque_limit_Nm", "--torque-limit-nm", _torque_proposals(rated, ratings, geometry))
+        position = self._limit("position_limit_deg", "--position-limit-deg", _position_proposals(ratings, geometry))
+        velocity = self._limit("velocity_limit_deg_s", "--velocity-limit-deg-s", _speed_proposals(ratings, geometry))
+        drive, sensor = self._profiles(drives, sensors)
+        nodes = [
+            Fact(tuple(device.node.node_id for device in found), "found on the bus")
+            if found
+            else Fact(given or default, "given" if given else "")
+            for found, given, default in (
+                (drives, options.drive_node, (1, 2)),
+                (sensors, options.sensor_node, (3, 4)),
+            )
+        ]
+        is_half = all(name.endswith("-500us") for name in (*drive.value, *sensor.value))
+        return ArmFacts(
+            geometry,
+            length_source,
+            mass_source,
+            gravity_source,
+            rated,
+            torque,
+            position,
+            velocity,
+            drive,
+            sensor,
+            nodes[0],
+            nodes[1],
+            500 if is_half else _PERIODS_US[0],
+            8_000_000 if is_half else None,
+            self.bitrate,
+        )
+
+    # -- devices
+
+    def _find_devices(self) -> tuple[list[RecognisedDevice], list[RecognisedDevice]]:
+        """Scan the bus, if there is one; return the drives and sensors of joint 1 and 2, or nothing."""
+        channel = self._ask_channel()
+        if channel is None:
+            return [], []
+        interface = self.options.interface or "socketcan"
+
+        clock = MonotonicClock()
+        bus = open_bus(interface, channel, clock, None, self.options.bitrate, False)
+        try:
+            found = survey(bus, clock, progress=self.interview.say)
+            devices = recognise(bus, clock, found.nodes)
+        finally:
+            bus.close()
+        self.bus = {"interface": interface, "channel": channel, "bitrate": self.options.bitrate}
+        link = read_link(channel) if interface == "socketcan" else None
+        self.bitrate = (None if link is None else link.bitrate) or self.bitrate
+        for device in devices:
+            what = " or ".join(device.profiles) or "no built-in profile"
+            self.interview.say(f"node {device.node.node_id}: {device.kind}, {device.title}: {what}")
+        for node in found.nodes:
+            if all(device.node is not node for device in devices):
+                self.interview.say(f"node {node.node_id}: {node.device_text}, neither drive nor sensor")
+        chosen = [self._two(devices, kind, getattr(self.options, f"{kind}_node"), channel) for kind in (DRIVE, SENSOR)]
+        return chosen[0], chosen[1]
+
+    def _ask_channel(self) -> str | None:
+
+        options = self.options
+        if options.is_busless and (options.channel or options.interface):
+            raise CommandError("--no-bus and --interface or --channel exclude each other", ExitCode.USAGE)
+        if options.is_busless:
+            return None
+        if options.channel is not None:
+            return options.channel
+        if options.interface not in (None, "socketcan"):
+            raise CommandError(f"--interface {options.interface} needs --channel", ExitCode.USAGE)
+        present = can_interfaces()
+        kernel = look_for_socketcan()
+        if kernel.status is not Status.OK:
+            told = f"{kernel.reason} ({kernel.remedy}); an arm without hardware can be rehearsed"
+        else:
+            told = f"CAN interfaces: {', '.join(present) or 'none is there'}"
+        if self.interview.is_asking:
+            self.interview.say(told)
+        proposal = Proposal(present[0] if self.interview.is_asking and present else _NO_BUS)
+        question = f"CAN interface of the arm, `{_NO_BUS}` for an arm without hardware"
+        channel, _ = self.interview.ask("--channel or --no-bus", None, question, str, proposal)
+        return None if channel == _NO_BUS else channel
+
+    def _two(
+        self, devices: Sequence[RecognisedDevice], kind: str, given: tuple[int, int] | None, channel: str
+    ) -> list[RecognisedDevice]:
+        """Choose the two drives, or the two sensors."""
+        known = {device.node.node_id: device for device in devices if device.kind == kind}
+        option, nodes = f"--{kind}-node", " ".join(map(str, known)) or "none"
+        if len(known) < 2:
+            raise CommandError(
+                f"{channel}: {kind}s that answer: {nodes}; an arm has two. Check power, wiring and node ids; --no-bus "
+                "writes a file without them",
+                ExitCode.BUS_MISSING,
+            )
+
+        def read(value: Any) -> list[RecognisedDevice]:
+            chosen = _numbers(value, int, option)
+            for number in chosen:
+                if number not in known:
+                    raise ConfigError(f"node {number} of {option} is no {kind} that answers; there are {nodes}")
+            if chosen[0] == chosen[1]:
+                raise ConfigError(f"{option} {chosen[0]} {chosen[1]}: the node ids must differ")
+            return [known[number] for number in chosen]
+
+        # Of more than two, as of two arms, nobody but the user knows.
+        proposal = Proposal(tuple(known) if len(known) == 2 else None, "in the order of the node ids")
+        answer, source = self.interview.ask(option, given, f"Node ids of the {kind}s of joint 1 and 2", read, proposal)
+        if source != "given":
+            self.warnings.append(f"{kind}s of joint 1 and 2 are nodes {nodes}, {source}: `doctor --move` checks it")
+        return answer
+
+    def _profiles(self, drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]) -> tuple[Fact, Fact]:
+
+        options = self.options
+        drafted = self._draft_profiles([*drives, *sensors])
+        found = choose_family(drives, sensors) if drives else (("",) * 2, ("",) * 2)
+        facts = []
+        for kind, devices, names, default in (
+            ("drive", drives, found[0], "adacd-drive"),
+            ("sensor", sensors, found[1], "adacd-sensor"),
+        ):
+            given = getattr(options, kind)
+            if given is not None:
+                facts.append(Fact(tuple(self.beside(name, kind) for name in given), "given"))
+                continue
+            from_eds = tuple(drafted.get((kind, joint), "") for joint in range(2))
+            chosen = tuple(from_eds[joint] or names[joint] for joint in range(2))
+            if not any(chosen) and not devices:
+                facts.append(Fact((default, default)))
+            elif all(chosen):
+                source = "from the EDS" if all(from_eds) else "recognised by vendor and product"
+                facts.append(Fact(chosen, "" if self.guessed & set(chosen) else source))
+            else:
+                joint = 0 if not chosen[0] else 1
+                title = devices[joint].title if devices else "the device"
+                raise CommandError(
+                    f"{kind} of joint {joint + 1} ({in_line(title)}) has no built-in profile: give --eds FILE, its "
+                    f"maker's, or --{kind} PROFILE PROFILE",
+                    ExitCode.USAGE,
+                )
+        return facts[0], facts[1]
+
+    def beside(self, name: str, kind: str) -> str:
+        """Return a profile's name as the file will have it: a file is named from where the configuration lies."""
+        profile = load_profile(name, kind)
+        if name in profile_names():
+            return name
+        for path in (Path(name), profile.eds):
+            if path.resolve().parent == self.writing.out.resolve().parent:
+                self.writing.contents[path] = path.read_bytes()
+        return os.path.relpath(name, self.writing.out.parent)
+
+    def _draft_profiles(self, devices: Sequence[RecognisedDevice]) -> dict[tuple[str, int], str]:
+        """Draft a profile of each EDS, to lie beside the file; return the names by kind and joint."""
+        names: dict[tuple[str, int], str] = {}
+        for eds in self.options.eds:
+            kind, identity = kind_of(eds), identity_of(eds)
+            same = [device for device in devices if device.kind == kind]
+            fitting = [
+                joint
+                for joint in range(2)
+                if not same or (same[joint].node.vendor, same[joint].node.product) == identity
+            ]
+            if not fitting:
+                vendor, product = ("?" if number is None else f"0x{number:X}" for number in identity)
+                raise CommandError(
+                    f"EDS {eds} is of vendor {vendor}, product {product}, which is no {kind} on the bus: "
+                    f"{'; '.join(in_line(device.title) for device in same)}",
+                    ExitCode.USAGE,
+                )
+            draft = draft_profile(eds, *(device.ratings for device in same[fitting[0] : fitting[0] + 1]))
+            name = f"{self.writing.out.stem}-{eds.stem}.toml"
+            self.warnings += [f"{name}: {line}" for line in draft.guesses]
+            self.guessed |= {name} if draft.guesses else set()
+            folder = self.writing.out.parent
+            self.writing.add(folder / eds.name, eds.read_bytes())
+            self.writing.add(folder / name, draft.text)
+            names |= {(kind, joint): name for joint in fitting}
+        return names
+
+    # -- the arm
+
+    def _ask_geometry(self) -> tuple[PlanarArm, str, str, str]:
+        """Return the geometry, and who says the lengths, the masses, and whether gravity acts."""
+        options, interview = self.options, self.interview
+        urdf = options.urdf
+        if urdf is None and options.length_m is None and interview.is_asking:
+            text, _ = interview.ask("--urdf", None, "URDF of the arm, - for none", str, Proposal("-"))
+            urdf = None if text == "-" else Path(text)
+        if urdf is not None:
+            if options.length_m is not None or options.mass_kg is not None:
+                raise CommandError("--urdf says lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE)
+            arm = _read_urdf(urdf, options.locked)
+            if not arm.is_tip_known:
+                self.warnings.append(f"{urdf} has no frame at the tip: the length of link 2 is a guess")
+            source = f"URDF {urdf.name}"
+            return arm, source if arm.is_tip_known else "", source, source
+        if options.locked:
+            raise CommandError("--lock names a joint of --urdf", ExitCode.USAGE)
+        length_m, length_source = interview.ask(
+            "--length-m L1 L2 or --urdf FILE",
+            options.length_m,
+            "Lengths in m, joint to joint and joint to tip",
+            lambda value: _checked("link_length_m", _numbers(value, float, "--length-m")),
+            Proposal((0.35, 0.30)),
+        )
+        is_upright, gravity_source = interview.ask(
+            "--upright or --flat",
+            None if options.is_upright is None else ("yes" if options.is_upright else "no"),
+            "Does gravity act on the joints (yes or no)",
+            _yes_or_no,
+            Proposal("no"),
+        )
+        mass_kg = options.mass_kg
+        if mass_kg is None and interview.is_asking:
+            question = "Masses of the links in kg, - for unknown"
+            mass_kg, _ = interview.ask("--mass-kg", None, question, _masses, Proposal("-"))
+        if mass_kg is None:
+            return PlanarArm(length_m, (), is_upright), length_source, "", gravity_source
+        arm = uniform_rods(length_m, _masses(mass_kg) or (0.0, 0.0), is_upright)
+        self.warnings.append("inertia is that of uniform rods, without motors and gears")
+        return arm, length_source, "given masses, as uniform rods", gravity_source
+
+    def _rated(self, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Fact:
+
+        told = [rating.rated_torque_Nm for rating in ratings]
+        if self.options.rated_torque_nm is None and len(told) == 2 and None not in told:
+            return Fact(_checked("rated_torque_Nm", (told[0], told[1])), "0x6076 of the drives")
+        proposal = Proposal((12.0, 6.0))
+        if geometry.effort_Nm is not None and min(geometry.effort_Nm) > 0.0:
+            proposal = Proposal(geometry.effort_Nm)  # a URDF's effort is a limit, no rating
+        return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
+
+    def _limit(self, key: str, option: str, proposal: Proposal) -> Fact:
+
+        given = getattr(self.options, option[2:].replace("-", "_"))
+        value, source = self.interview.ask(
+            f"{option} A B",
+            given,
+            f"{known_keys()[f'arm.{key}'].meaning}, {key.partition('_')[0]} of joint 1 and 2 ({key})",
+            lambda value: _checked(key, _numbers(value, float, option)),
+            proposal,
+        )
+        return Fact(value, source)
+
+
+def _numbers(value: Any, kind: type, option: str) -> tuple[Any, Any]:
+    """Read two numbers, given or typed. Raises ConfigError."""
+    words = value.replace(",", " ").split() if isinstance(value, str) else list(value)
+    try:
+        first, second = (kind(word) for word in words)
+    except ValueError:
+        raise ConfigError(f"{option}: {value!r} must be two numbers, of joint 1 and 2") from None
+    return first, second
+
+
+def _checked(key: str, value: tuple[Any, Any]) -> Any:
+    """Check a pair against the bounds of its setting. Raises ConfigError."""
+    return getattr(parse(ArmSettings, {key: list(value)}, "arm."), key)
+
+
+def _yes_or_no(text: str) -> bool:
+    if text.casefold() not in ("yes", "y", "no", "n"):
+        raise ConfigError(f"{text!r} must be yes or no")
+    return text.casefold().startswith("y")
+
+
+def _masses(value: Any) -> Pair | None:
+    if value == "-":
+        return None
+    masses = _numbers(value, float, "--mass-kg")
+    for mass in masses:
+        if not 0.001 <= mass <= 1000.0:
+            raise ConfigError(f"--mass-kg: {mass:g} kg must be within 0.001 kg to 1000 kg")
+    return masses
+
+
+def _read_urdf(path: Path, locked: Sequence[str]) -> PlanarArm:
+
+    try:
+        return planar_from_urdf(read_input(path), locked)
+    except FileNotFoundError:
+        raise CommandError(f"URDF {path} does not exist", ExitCode.USAGE) from None
+    except OSError as error:
+        raise CommandError(f"URDF {path}: {error.strerror}", ExitCode.USAGE) from None
+    except UrdfError as error:
+        raise CommandError(f"URDF {path}: {error}", ExitCode.USAGE) from None
+
+
+def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Proposal:
+    """Propose the least of what drives and URDF allow, and of the rated torque."""
+    shares = [min(rating.torque_share or 1.0, 1.0) for rating in ratings] or [1.0, 1.0]
+    efforts = geometry.effort_Nm or rated.value
+    limit = tuple(min(rated.value[joint] * shares[joint], efforts[joint]) for joint in range(2))
+    source = "the rated torque" if limit == tuple(rated.value) else "the least of 0x6072 and the URDF's effort"
+    return Proposal(limit, source if rated.source else "")
+
+
+def _position_proposals(ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Proposal:
+    told = [rating.position_limit_deg for rating in ratings]
+    if geometry.position_limit_deg is not None:
+        return Proposal(geometry.position_limit_deg, "the URDF's")
+    if told and None not in told:
+        return Proposal(tuple(told), "0x607D of the drives")
+    return Proposal((75.0, 120.0))
+
+
+def _speed_proposals(ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Proposal:
+    told = [rating.velocity_limit_deg_s for rating in ratings]
+    if geometry.velocity_limit_deg_s is not None:
+        return Proposal(geometry.velocity_limit_deg_s, "the URDF's")
+    if told and None not in told:
+        return Proposal(tuple(told), "0x6080 of the drives, by their gears")
+    return Proposal((250.0, 300.0))

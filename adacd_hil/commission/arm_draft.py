@@ -1,0 +1,228 @@
+"""The draft of an arm's configuration: what is known, what follows from it, and what is a guess, with a comment each.
+
+Gains, motion and prior follow from the inertia in proportion to the emulated arm P, on which they were measured. Where
+the masses aren't known, the inertia is taken to be in proportion to the rated torque, as that arm's.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from adacd_hil.commission.arm_geometry import PlanarArm
+from adacd_hil.records import JOINTS
+from adacd_hil.settings.catalogue import known_keys
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.toml_files import toml_value
+from adacd_hil.terminal import one_line
+
+Pair = tuple[float, float]
+
+_MODEL_INERTIA = (0.1786065, 0.0189645)
+"""a1 and a3 of P's CAD model, kg m², for which the gains below are."""
+_KP, _KD = (250.0, 20.0), (12.5, 0.75)
+_MODEL_TORQUE_NM = (12.0, 6.0)
+_RATE_PER_NM = 1000.0 / 6.0
+"""Torque rate limit per rated torque, 1/s."""
+_AMPLITUDE_DEG, _HALF_PERIOD_S, _EXCITATION_S = (30.0, 60.0), (1.125, 4.5), 2.4
+_PEAK_DEG_S = (100.0, 120.0)
+"""Peak speed of the certified scheme's excitation at those amplitudes and that period, and of a withdrawal."""
+_TRAVEL_SHARE, _SPEED_SHARE = 0.8, 0.8
+"""Part of the position and velocity limit that the motion has."""
+_HEAVY = 2.0
+"""Inertia per torque, against P, up to which the motion is as fast: that of arm S, which runs it."""
+_LEAST_TORQUE_SHARE = 0.3
+"""Part of the torque that gravity must leave."""
+
+
+class Fact(NamedTuple):
+    """A pair of values. source: who says so; "" for a guess."""
+
+    value: Any
+    source: str = ""
+
+
+class ArmFacts(NamedTuple):
+    """What is known of an arm. The rest of its configuration follows."""
+
+    geometry: PlanarArm
+    length_source: str
+    mass_source: str
+    gravity_source: str
+    rated_torque_Nm: Fact
+    torque_limit_Nm: Fact
+    position_limit_deg: Fact
+    velocity_limit_deg_s: Fact
+    drive: Fact
+    sensor: Fact
+    drive_node: Fact
+    sensor_node: Fact
+    period_us: int = 1000
+    data_bitrate: int | None = None
+    bitrate: int | None = None
+
+
+class Entry(NamedTuple):
+    """One line of the file. value: None where there is none to give; the key then stands in a comment."""
+
+    key: str
+    value: Any
+    comment: str
+    is_assumed: bool = False
+
+
+class ArmDraft(NamedTuple):
+    """A configuration in the making. warnings: what the arm may not be able to do, a line each."""
+
+    entries: tuple[Entry, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Keys whose values are guesses."""
+        return tuple(entry.key for entry in self.entries if entry.is_assumed)
+
+
+def draft_arm(facts: ArmFacts) -> ArmDraft:
+    """Propose everything that an arm's configuration has to say."""
+    warnings = list(facts.geometry.doubts)
+    entries = [*_arm(facts), *_devices(facts), *_motion(facts, warnings)]
+    return ArmDraft(tuple(entries), tuple(warnings))
+
+
+def _arm(facts: ArmFacts) -> Iterator[Entry]:
+    geometry, rated = facts.geometry, facts.rated_torque_Nm
+    yield _stated("arm.link_length_m", Fact(geometry.link_length_m, facts.length_source), "axis to axis, axis to tip")
+    yield _stated("arm.rated_torque_Nm", rated, "of each drive, 0x6076, at the joint")
+    yield _stated("arm.torque_limit_Nm", facts.torque_limit_Nm, "the most that is ever commanded")
+    rate = tuple(_round(_RATE_PER_NM * torque) for torque in rated.value)
+    yield Entry("arm.torque_rate_limit_Nm_s", rate, "in proportion to the rated torque")
+    yield _stated("arm.position_limit_deg", facts.position_limit_deg, "largest |q|; beyond it the run faults")
+    yield _stated("arm.velocity_limit_deg_s", facts.velocity_limit_deg_s, "largest |dq|; beyond it the run faults")
+    yield Entry("arm.sign", (1, 1), "a guess: +1 where the device counts as the joint; `doctor --move` tells", True)
+    yield Entry(
+        "arm.holding_torque_Nm", None, "not known: what brakes, friction and cogging hold without power; 0: free", True
+    )
+    theta = geometry.cad_theta
+    if theta:
+        names = "a1, a2, a3 in kg m², friction unknown" + (", a4, a5 in Nm" if geometry.is_upright else "")
+        yield _stated("arm.cad_theta", Fact(theta, facts.mass_source), names)
+    else:
+        yield Entry("arm.cad_theta", (), "not known: the masses; the scheme identifies the arm without them")
+    axes = "not vertical: gravity acts on them" if geometry.is_upright else "vertical: gravity doesn't act on them"
+    yield _stated("estimator.gravity", Fact(geometry.is_upright, facts.gravity_source), f"joint axes {axes}")
+
+
+def _devices(facts: ArmFacts) -> Iterator[Entry]:
+    for kind in ("drive", "sensor"):
+        yield _stated(f"devices.{kind}", getattr(facts, kind), "profiles of joint 1 and 2")
+        yield _stated(f"devices.{kind}_node", getattr(facts, f"{kind}_node"), "node ids of joint 1 and 2")
+    yield Entry("devices.contract", "", "composed from the profiles")
+    if facts.bitrate is not None:
+        yield Entry("devices.bitrate", facts.bitrate, "of the bus")
+    if facts.data_bitrate is not None:
+        yield Entry("devices.data_bitrate", facts.data_bitrate, "of CAN FD's data phase")
+    if facts.period_us != 1000:
+        yield Entry("bus.period_us", facts.period_us, "in which the frames fit; `adacd-hil budget` shows how")
+
+
+def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
+    limit, speed = facts.position_limit_deg.value, facts.velocity_limit_deg_s.value
+    amplitude = tuple(_round(min(_AMPLITUDE_DEG[i], _TRAVEL_SHARE * limit[i])) for i in range(JOINTS))
+    yield Entry("trajectory.amplitude_deg", amplitude, f"±, within {_TRAVEL_SHARE:.0%} of the position limit")
+    slower = _slowdown(facts, amplitude, warnings)
+    half_period = tuple(_round(slower * period_s) for period_s in _HALF_PERIOD_S)
+    reason = "as of the emulated arm" if slower == 1.0 else f"{slower:.2f} times slower than the emulated arm"
+    yield Entry("trajectory.half_period_s", half_period, reason)
+    yield Entry("excitation.period_s", _round(slower * _EXCITATION_S), reason)
+    withdrawal = tuple(_round(min(_PEAK_DEG_S[i], _SPEED_SHARE * speed[i])) for i in range(JOINTS))
+    if withdrawal != _PEAK_DEG_S:
+        yield Entry("reaction.velocity_limit_deg_s", withdrawal, f"{_SPEED_SHARE:.0%} of the velocity limit")
+    inertia = _inertia(facts)
+    has_masses = bool(facts.geometry.cad_theta)
+    for name, model in (("Kp", _KP), ("Kd", _KD)):
+        gain = tuple(_round(model[i] * inertia[i] / _MODEL_INERTIA[i]) for i in range(JOINTS))
+        told = "the inertia" if has_masses else "the rated torque, as the masses are not known"
+        yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {told}", not has_masses)
+    prior = load_settings("certified").certified.prior_std
+    wanted = (2.0 * inertia[0], *prior[1:3], *(2.0 * g for g in _gravity(facts)[:1]), *prior[4:])
+    scaled = tuple(_round(max(pair)) for pair in zip(prior, wanted, strict=True))
+    if scaled != prior:
+        yield Entry("certified.prior_std", scaled, "inertia and gravity: twice what the description says")
+
+
+def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) -> float:
+    """Return how much slower than on arm P the motion must be for speed and torque to suffice; 1 or more."""
+    limit_Nm, speed = facts.torque_limit_Nm.value, facts.velocity_limit_deg_s.value
+    inertia, gravity, slower = _inertia(facts), _gravity(facts), 1.0
+    for i in range(JOINTS):
+        share = amplitude[i] / _AMPLITUDE_DEG[i]
+        slower = max(slower, share * _PEAK_DEG_S[i] / (_SPEED_SHARE * speed[i]))
+        left_Nm = limit_Nm[i] - gravity[i]
+        if left_Nm < _LEAST_TORQUE_SHARE * limit_Nm[i]:
+            warnings.append(
+                f"gravity takes {gravity[i]:.1f} Nm of joint {i + 1}'s {limit_Nm[i]:g} Nm: too little is left to move"
+            )
+            left_Nm = _LEAST_TORQUE_SHARE * limit_Nm[i]
+        heavy = inertia[i] / _MODEL_INERTIA[i] * _MODEL_TORQUE_NM[i] / left_Nm * share
+        slower = max(slower, math.sqrt(heavy / _HEAVY))
+    return slower if slower > 1.01 else 1.0
+
+
+def _inertia(facts: ArmFacts) -> Pair:
+    """Return a1 and a3, known or guessed, kg m²."""
+    if theta := facts.geometry.cad_theta:
+        return theta[0], theta[2]
+    rated = facts.rated_torque_Nm.value
+    first, second = (_MODEL_INERTIA[i] * rated[i] / _MODEL_TORQUE_NM[i] for i in range(JOINTS))
+    return first, second
+
+
+def _gravity(facts: ArmFacts) -> Pair:
+    """Return the largest torque of gravity on each joint, Nm; 0 where it is not known or does not act."""
+    theta = facts.geometry.cad_theta
+    return (theta[7] + theta[8], theta[8]) if facts.geometry.is_upright and theta else (0.0, 0.0)
+
+
+def _stated(key: str, fact: Fact, what: str) -> Entry:
+    return Entry(key, fact.value, f"{what}: {fact.source or 'a guess'}", not fact.source)
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+_HEAD = """# {title}
+# `adacd-hil config check {name}` checks this file, `adacd-hil config docs KEY` explains a key; what is not named here
+# is as in `{base}`. `adacd-hil run` needs offsets of the torque sensors: `adacd-hil tare`.
+
+extends = "{base}"
+"""
+
+
+def write_draft(draft: ArmDraft, title: str, name: str, base: str = "certified") -> str:
+    """Write a draft as a commented TOML file."""
+    lines = [_HEAD.format(title=one_line(title), name=one_line(name), base=base).rstrip()]
+    if draft.assumed:
+        lines += [
+            "",
+            "# Guesses. `adacd-hil doctor` asks for each: measure it or look it up, write it, take the key off here.",
+            "assumed = [",
+            *(f'    "{key}",' for key in draft.assumed),
+            "]",
+        ]
+    order = [known.partition(".")[0] for known in known_keys()]
+    top = [entry for entry in draft.entries if "." not in entry.key]
+    lines += [line for entry in top for line in _lines_of(entry)]
+    sections = sorted({entry.key.partition(".")[0] for entry in draft.entries if "." in entry.key}, key=order.index)
+    for section in sections:
+        lines += ["", f"[{section}]"]
+        for entry in draft.entries:
+            if entry.key.startswith(f"{section}."):
+                lines += _lines_of(entry)
+    return "\n".join(lines) + "\n"
+
+
+def _lines_of(entry: Entry) -> list[str]:
+    name = entry.key.rpartition(".")[2]
+    line = f"# {name} = [0.0, 0.0]" if entry.value is None else f"{name} = {toml_value(entry.value)}"
+    return [*([f"# {one_line(entry.comment)}"] if entry.comment else []), line]

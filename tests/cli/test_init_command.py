@@ -1,0 +1,383 @@
+"""`init` writes the configuration of one's own arm: from a bus, a URDF, a log, options, or answers on a terminal."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.bus_lab import complaints
+from click.testing import CliRunner, Result
+from rig import Rig, SessionRig
+
+from adacd_hil.cli.main import cli
+from adacd_hil.commission.arm_geometry import planar_from_urdf, uniform_rods
+from adacd_hil.commission.configuration_check import configuration_checks, examine_configuration
+from adacd_hil.commission.device_recognition import DeviceRatings
+from adacd_hil.commission.host_checks import Status, diagnose
+from adacd_hil.commission.profile_draft import draft_profile
+from adacd_hil.device.contract import load_contract
+from adacd_hil.scheme.model.urdf import UrdfError
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.wire.codec import contract_folder, load_codec
+
+USAGE, BUS_MISSING = 2, 5
+NO_BUS = ("--no-bus", "--yes")
+URDF = """<robot name="lab">
+  <link name="base"/>
+  <link name="upper"><inertial><origin xyz="0.2 0 0"/><mass value="3"/>
+    <inertia ixx="0" ixy="0" ixz="0" iyy="0.04" iyz="0" izz="0.04"/></inertial></link>
+  <link name="lower"><inertial><origin xyz="0.13 0 0"/><mass value="1.5"/>
+    <inertia ixx="0" ixy="0" ixz="0" iyy="0.015" iyz="0" izz="0.015"/></inertial></link>
+  <link name="tip"/>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="{axis}"/>
+    <limit lower="-1.2" upper="1.5" effort="20" velocity="3"/></joint>
+  <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0.35 0 0"/>
+    <axis xyz="{axis}"/><limit lower="-2" upper="2" effort="9" velocity="4"/></joint>
+  <joint name="wrist" type="{wrist}"><parent link="lower"/><child link="tip"/><origin xyz="0.3 0 0"/>
+    <axis xyz="{axis}"/><limit lower="-2" upper="2" effort="2" velocity="4"/></joint>
+</robot>"""
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "lab" / "my-arm.toml"
+
+
+def init(out: Path, *arguments: str, typed: str = "") -> Result:
+    return CliRunner().invoke(cli, ["init", str(out), *arguments], input=typed)
+
+
+def written(out: Path) -> Settings:
+    """The settings of a file that has no error."""
+    found = examine_configuration(str(out))
+    assert found.errors == []
+    assert found.settings is not None
+    return found.settings
+
+
+def urdf(folder: Path, axis: str = "0 0 1", wrist: str = "fixed") -> Path:
+    path = folder / "lab.urdf"
+    path.write_text(URDF.format(axis=axis, wrist=wrist))
+    return path
+
+
+def test_without_hardware_and_terminal_the_missing_option_is_named(out: Path) -> None:
+    result = init(out)
+    assert result.exit_code == USAGE
+    (line,) = result.stderr.splitlines()
+    assert "give --channel or --no-bus" in line
+    result = init(out, "--no-bus")
+    (line,) = result.stderr.splitlines()
+    assert "give --length-m L1 L2 or --urdf FILE" in line
+    assert "--yes for 0.35 0.3" in line
+    assert not out.parent.exists()
+
+
+def test_guesses_are_listed_and_doctor_asks_for_each(out: Path) -> None:
+    assert init(out, *NO_BUS, "--mass-kg", "1", "0.5", "--length-m", "0.4", "0.25").exit_code == 0
+    settings = written(out)
+    assert settings.scheme == "certified"
+    assert settings.arm.link_length_m == (0.4, 0.25)
+    assert "arm.link_length_m" not in settings.assumed
+    assert {"arm.rated_torque_Nm", "arm.sign", "arm.holding_torque_Nm", "devices.drive"} <= set(settings.assumed)
+    findings = {one.name: one for one in diagnose(configuration_checks(settings), settings, lambda _: None)}
+    assert findings["settings"].status is Status.OK
+    for key in settings.assumed:
+        assert findings[f"`{key}`"].status is Status.WARNING
+    assert findings["`arm.holding_torque_Nm`"].reason.startswith("nothing is given: largest torque that brake")
+
+
+def test_what_is_known_is_no_guess(out: Path) -> None:
+    known = ("--rated-torque-nm", "8", "4", "--torque-limit-nm", "7", "3", "--position-limit-deg", "50", "60")
+    devices = ("--drive-node", "11", "12", "--sensor-node", "21", "22", "--drive", "stock-drive", "stock-drive")
+    assert init(out, *NO_BUS, *known, *devices, "--sensor", "int32-sensor", "int32-sensor", "--flat").exit_code == 0
+    settings = written(out)
+    assert settings.arm.torque_limit_Nm == (7.0, 3.0)
+    assert settings.devices.drive_node == (11, 12)
+    assert settings.trajectory.amplitude_deg == (30.0, 48.0)
+    assert set(settings.assumed) == {
+        "arm.link_length_m",
+        "arm.velocity_limit_deg_s",
+        "arm.sign",
+        "arm.holding_torque_Nm",
+        "controller.Kp",
+        "controller.Kd",
+    }
+
+
+def test_a_file_that_is_there_is_left_alone(out: Path) -> None:
+    out.parent.mkdir()
+    out.write_text("mine")
+    result = init(out, *NO_BUS)
+    assert result.exit_code == USAGE
+    assert complaints(result) == [f"adacd-hil: {out} exists; give another name, or --force to replace it"]
+    assert out.read_text() == "mine"
+    assert init(out, *NO_BUS, "--force").exit_code == 0
+    written(out)
+
+
+def test_values_out_of_bounds_write_nothing(out: Path) -> None:
+    result = init(out, *NO_BUS, "--length-m", "350", "300")
+    assert result.exit_code == USAGE
+    assert complaints(result) == ["adacd-hil: `arm.link_length_m[0]` = 350.0 m is above 5 m; 350 mm are 0.35 m"]
+    assert not out.exists()
+
+
+def test_equal_node_ids_write_nothing(out: Path) -> None:
+    result = init(out, *NO_BUS, "--drive-node", "3", "4")
+    assert result.exit_code == USAGE
+    (line,) = complaints(result)
+    assert "node ids 3, 4, 3, 4 of drives and sensors must differ" in line
+    assert not out.exists()
+
+
+def test_heavy_links_move_more_slowly_and_get_larger_gains(out: Path) -> None:
+    assert init(out, *NO_BUS, "--length-m", "0.6", "0.5", "--mass-kg", "8", "5").exit_code == 0
+    heavy, light = written(out), load_settings("certified")
+    assert heavy.excitation.period_s > 2.0 * light.excitation.period_s
+    assert heavy.controller.Kp[0] > 10.0 * light.controller.Kp[0]
+    assert heavy.certified.prior_std[0] == pytest.approx(2.0 * heavy.arm.cad_theta[0], rel=1e-3)
+
+
+@pytest.mark.parametrize(("axis", "is_upright"), [("0 0 1", False), ("0 1 0", True)])
+def test_a_urdf_gives_lengths_masses_limits_and_gravity(tmp_path: Path, out: Path, axis: str, is_upright: bool) -> None:
+    assert init(out, *NO_BUS, "--urdf", str(urdf(tmp_path, axis))).exit_code == 0
+    settings = written(out)
+    assert settings.arm.link_length_m == (0.35, 0.3)
+    assert settings.arm.position_limit_deg == (68.75, 114.59)
+    assert settings.arm.velocity_limit_deg_s == (171.89, 229.18)
+    assert settings.arm.torque_limit_Nm == (20.0, 9.0)
+    assert settings.estimator.gravity == is_upright
+    # Profile S of the emulator is that arm.
+    theta = [0.040 + 3.0 * 0.04 + 1.5 * 0.1225 + 0.015 + 1.5 * 0.0169, 0.35 * 1.5 * 0.13, 0.015 + 1.5 * 0.0169]
+    assert settings.arm.cad_theta[:3] == pytest.approx(theta, rel=1e-5)
+    gravity = (9.80665 * (3.0 * 0.2 + 1.5 * 0.35), 9.80665 * 1.5 * 0.13) if is_upright else ()
+    assert settings.arm.cad_theta[7:] == pytest.approx(gravity, rel=1e-5)
+    assert "arm.link_length_m" not in settings.assumed
+
+
+def test_rods_of_a_urdf_and_of_lengths_and_masses_are_the_same_arm() -> None:
+    text = URDF.format(axis="0 1 0", wrist="fixed").replace("0.2 0 0", "0.175 0 0").replace("0.13 0 0", "0.15 0 0")
+    for inertia, mass, length_m in (("0.04", 3.0, 0.35), ("0.015", 1.5, 0.3)):
+        text = text.replace(f'"{inertia}"', f'"{mass * length_m**2 / 12.0!r}"')
+    arm = planar_from_urdf(text.encode())
+    rods = uniform_rods((0.35, 0.3), (3.0, 1.5), True)
+    np.testing.assert_allclose(arm.cad_theta, rods.cad_theta, rtol=1e-5)
+    assert arm.link_length_m == rods.link_length_m
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (("fixed", "revolute"), "3 joints move (shoulder, elbow, wrist), an arm has 2 here; name those"),
+        (('elbow" type="revolute', 'elbow" type="prismatic'), "a joint slides; both must turn"),
+        (('elbow" type="revolute', 'elbow" type="fixed'), "1 joints move (shoulder), an arm has 2 here"),
+        (('lower="-1.2"', 'lower="0.1"'), 'joint "shoulder": 0 is not within its limits'),
+        (("0.35 0 0", "0 0 0.35"), "the two axes are the same line"),
+    ],
+)
+def test_a_urdf_of_another_arm_is_refused(change: tuple[str, str], line: str) -> None:
+    text = URDF.format(axis="0 0 1", wrist="fixed")
+    with pytest.raises(UrdfError) as caught:
+        planar_from_urdf(text.replace(*change).encode())
+    assert line in str(caught.value)
+
+
+def test_crossed_axes_are_refused_and_a_bent_zero_is_doubted() -> None:
+    text = URDF.format(axis="0 0 1", wrist="fixed")
+    crossed = text.replace('<axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="9"', '<axis xyz="0 1 0"/><limit')
+    with pytest.raises(UrdfError, match="90 deg apart"):
+        planar_from_urdf(crossed.encode())
+    bent = planar_from_urdf(text.replace('<origin xyz="0.13 0 0"/>', '<origin xyz="0 0.13 0"/>').encode())
+    (doubt,) = bent.doubts
+    assert "90 deg off the line of link 1" in doubt
+
+
+def test_three_joints_are_two_when_one_is_locked(tmp_path: Path, out: Path) -> None:
+    path = str(urdf(tmp_path, wrist="revolute"))
+    result = init(out, *NO_BUS, "--urdf", path)
+    assert (result.exit_code, out.exists()) == (USAGE, False)
+    assert "--lock" in complaints(result)[0]
+    assert init(out, *NO_BUS, "--urdf", path, "--lock", "wrist").exit_code == 0
+
+
+def test_profiles_are_drafted_from_eds_files_beside_the_configuration(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    eds = [str(contract_folder() / name) for name in ("stock_drive.eds", "int32_sensor.eds")]
+    result = init(out, *NO_BUS, "--eds", eds[0], "--eds", eds[1])
+    assert result.exit_code == 0
+    assert "torque_Nm = 1e-06: the worth of a count is in the data sheet" in result.stdout
+    names = {path.name for path in out.parent.iterdir()}
+    assert names == {
+        "my-arm.toml",
+        "stock_drive.eds",
+        "int32_sensor.eds",
+        "my-arm-stock_drive.toml",
+        "my-arm-int32_sensor.toml",
+    }
+    settings = written(out)
+    assert "devices.sensor" in settings.assumed
+    assert "devices.drive" not in settings.assumed
+    # The built-in profiles of these devices are the oracle, but for the worth of a count of torque.
+    sensor = out.parent / "my-arm-int32_sensor.toml"
+    sensor.write_text(sensor.read_text().replace("torque_Nm = 1e-06", "torque_Nm = 1e-05"))
+    monkeypatch.chdir(tmp_path)  # the profiles are found from anywhere
+    assert (
+        load_contract(load_settings("lab/my-arm.toml")).layout_digest
+        == load_contract(load_settings("stock")).layout_digest
+    )
+
+
+def test_what_the_device_says_outweighs_the_eds() -> None:
+    draft = draft_profile(contract_folder() / "int32_sensor.eds", DeviceRatings(torque_Nm=1e-4))
+    assert draft.guesses == ()
+    assert "torque_Nm = 0.0001\n" in draft.text
+
+
+def test_an_eds_without_torque_is_refused(tmp_path: Path, out: Path) -> None:
+    eds = tmp_path / "poor.eds"
+    text = (contract_folder() / "stock_drive.eds").read_text()
+    eds.write_text(text.replace("[606C]", "[2606]"))
+    result = init(out, *NO_BUS, "--eds", str(eds))
+    assert result.exit_code == USAGE
+    assert "no 0x606C (velocity), which a drive needs" in complaints(result)[0]
+    assert not out.exists()
+
+
+# -- on a bus
+
+
+@pytest.fixture
+def on_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Rig]:
+    """Let `init` open the bus of a rig, in its time."""
+
+    def attach(**parts: object) -> Rig:
+        rig = Rig(is_wall=True, **parts)  # type: ignore[arg-type]
+        monkeypatch.setattr("adacd_hil.cli.commands.arm_drafting.open_bus", lambda *_: rig.bus)
+        monkeypatch.setattr("adacd_hil.cli.commands.arm_drafting.MonotonicClock", lambda: rig.clock)
+        return rig
+
+    return attach
+
+
+BUS = ("-i", "virtual", "-c", "lab", "--yes")
+
+
+def test_devices_are_recognised_with_their_ratings_and_no_drive_is_enabled(
+    out: Path, on_bus: Callable[..., Rig]
+) -> None:
+    rig = on_bus()
+    result = init(out, *BUS, "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["drive"] == ["adacd-drive", "adacd-drive"]
+    settings = written(out)
+    assert settings.devices.drive_node == (1, 2)
+    assert settings.devices.sensor == ("adacd-sensor", "adacd-sensor")
+    assert settings.arm.rated_torque_Nm == (12.0, 6.0)
+    assert "arm.rated_torque_Nm" not in settings.assumed
+    assert load_contract(settings).layout_digest == load_codec().layout_digest
+    # SDO uploads only: no NMT command, no SYNC, no command, no download.
+    assert {frame.can_id & 0x780 for frame in rig.sent} == {0x600}
+    assert {frame.data[0] & 0xE0 for frame in rig.sent} <= {0x40, 0x60, 0x80}
+
+
+@pytest.mark.parametrize(
+    ("contract", "drive"), [("arm_fd", "adacd-drive-fd"), ("arm_fd_500us", "adacd-drive-fd-500us")]
+)
+def test_the_frames_of_the_devices_tell_profiles_apart(
+    out: Path, on_bus: Callable[..., Rig], contract: str, drive: str
+) -> None:
+    on_bus(codec=load_codec(contract_folder() / f"{contract}.dbc"))
+    assert init(out, *BUS).exit_code == 0
+    settings = written(out)
+    assert settings.devices.drive == (drive, drive)
+    assert settings.bus.period_us == (500 if contract.endswith("500us") else 1000)
+    assert load_contract(settings).layout_digest == load_codec(contract_folder() / f"{contract}.dbc").layout_digest
+
+
+def test_a_device_that_is_missing_is_named(out: Path, on_bus: Callable[..., Rig]) -> None:
+    rig = on_bus()
+    rig.silence(4)
+    result = init(out, *BUS)
+    assert result.exit_code == BUS_MISSING
+    (line,) = complaints(result)
+    assert "lab: sensors that answer: 3; an arm has two" in line
+    assert not out.exists()
+
+
+def test_a_node_that_is_no_drive_is_named(out: Path, on_bus: Callable[..., Rig]) -> None:
+    on_bus()
+    result = init(out, *BUS, "--drive-node", "1", "3")
+    assert result.exit_code == USAGE
+    assert "node 3 of --drive-node is no drive that answers; there are 1 2" in complaints(result)[0]
+
+
+# -- from a log
+
+
+def test_a_log_gives_its_arm_without_its_user(tmp_path: Path, out: Path) -> None:
+    config = tmp_path / "arm.toml"
+    config.write_text(
+        'extends = "certified"\nassumed = ["arm.sign", "arm.holding_torque_Nm"]\n[arm]\nlink_length_m = [0.4, 0.25]\n'
+        "torque_limit_Nm = [9, 4]\ncad_theta = []\n[operator]\nacknowledge_after_s = 0.6\n"
+        'script = [{ at_s = 0.3, request = "finish" }]\n'
+    )
+    SessionRig(tmp_path / "run", load_settings(str(config))).session.run()
+    result = init(out, "--from", str(tmp_path / "run"))
+    assert result.exit_code == 0
+    assert "the scripted user is left out" in result.stdout
+    settings = written(out)
+    assert settings.arm.link_length_m == (0.4, 0.25)
+    assert settings.arm.torque_limit_Nm == (9.0, 4.0)
+    assert settings.arm.cad_theta == ()
+    assert settings.assumed == ("arm.sign", "arm.holding_torque_Nm")
+    assert not settings.operator.acknowledges
+    assert settings.operator.script == ()
+
+
+def test_a_log_leaves_nothing_to_be_given(tmp_path: Path, out: Path) -> None:
+    result = init(out, "--from", str(tmp_path), "--length-m", "1", "1")
+    assert result.exit_code == USAGE
+    assert "leave out --length-m" in complaints(result)[0]
+
+
+# -- on a terminal
+
+
+def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("adacd_hil.cli.interview.is_terminal", lambda: True)
+    monkeypatch.setattr("adacd_hil.wire.can_interface.can_interfaces", list)
+    answers = [
+        "none",
+        "-",
+        "350 300",  # mm
+        "0.4, 0.25",
+        "no",
+        "2 1",
+        "",  # rated torque: as proposed
+        "10 5",
+        "60 a",  # no number
+        "60 100",
+        "",
+        "n",  # no rehearsal
+    ]
+    result = init(out, typed="\n".join(answers) + "\n")
+    assert result.exit_code == 0, result.stderr
+    assert "350 mm are 0.35 m" in result.stderr
+    assert "must be two numbers" in result.stderr
+    settings = written(out)
+    assert settings.arm.link_length_m == (0.4, 0.25)
+    assert settings.arm.torque_limit_Nm == (10.0, 5.0)
+    assert settings.arm.position_limit_deg == (60.0, 100.0)
+    assert settings.arm.cad_theta[0] == pytest.approx(2.0 * 0.16 / 3.0 + 0.16 + 0.0625 / 3.0, rel=1e-5)
+    assert "arm.rated_torque_Nm" in settings.assumed
+    assert "arm.torque_limit_Nm" not in settings.assumed
+
+
+def test_who_ends_the_questions_gets_no_file(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("adacd_hil.cli.interview.is_terminal", lambda: True)
+    result = init(out, typed="none\n")
+    assert result.exit_code != 0
+    assert not out.exists()
