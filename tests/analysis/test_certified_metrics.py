@@ -12,8 +12,8 @@ from adacd_hil.analysis.logged_run import split_sections
 from adacd_hil.analysis.report.report_files import Report
 from adacd_hil.analysis.report.run_page import report_page
 from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.analysis.score.judge import FilterChannel, two_pole_delay_s
 from adacd_hil.analysis.score.metrics import ReportSource
-from adacd_hil.analysis.score.touches import FilterChannel, two_pole_delay_s
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction
 

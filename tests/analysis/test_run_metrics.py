@@ -25,8 +25,7 @@ from hand_made_run import (
 
 from adacd_hil.analysis.logged_run import columns_of_records, section_label, split_sections
 from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.judge import filtered
-from adacd_hil.analysis.score.touches import detection_delay_s
+from adacd_hil.analysis.score.judge import detection_delay_s, filtered
 from adacd_hil.records import FaultReason, SchemeState
 
 SETTLING_ROWS = 1000

@@ -24,8 +24,8 @@ from adacd_hil.analysis.logged_run import (
     host_cycles,
 )
 from adacd_hil.analysis.score.emulator_truth import TruthTable, host_truth
+from adacd_hil.analysis.score.judge import true_contacts
 from adacd_hil.analysis.score.margins import SETTLING_TIME_CONSTANTS
-from adacd_hil.analysis.score.touches import true_contacts
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, contacts_of
 from adacd_hil.records import JOINTS, ContactReport, Request, SchemeState
 from adacd_hil.settings.configuration import Settings

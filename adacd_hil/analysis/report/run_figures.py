@@ -28,9 +28,8 @@ from adacd_hil.analysis.drawing import (
 )
 from adacd_hil.analysis.logged_run import Run, Section
 from adacd_hil.analysis.report.page import ADAPTATIONS, SECTION_TITLES
-from adacd_hil.analysis.score.judge import filtered
+from adacd_hil.analysis.score.judge import filtered, row_at
 from adacd_hil.analysis.score.metrics import Metrics, ReportedContact
-from adacd_hil.analysis.score.touches import row_at
 from adacd_hil.analysis.score.wording import why_not_found
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of

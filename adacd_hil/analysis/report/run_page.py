@@ -36,8 +36,8 @@ from adacd_hil.analysis.report.report_tables import (
     timing_tables,
 )
 from adacd_hil.analysis.report.timeline import SCRIPTS, STYLES, state_key, timeline_of, traces_of
+from adacd_hil.analysis.score.judge import row_at
 from adacd_hil.analysis.score.metrics import CertifiedEvidence, Metrics, ReportedContact, ReportSource
-from adacd_hil.analysis.score.touches import row_at
 from adacd_hil.analysis.score.verdict import LISTED
 from adacd_hil.analysis.score.wording import NONE, number_text, percent_text, scaled, signs_text, uncertain_text
 from adacd_hil.records import Location, Vector

@@ -6,7 +6,18 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.analysis.logged_run import Run, Section, is_realtime, rows_of, section_at, split_sections
-from adacd_hil.analysis.score.judge import JudgedContact, Score
+from adacd_hil.analysis.score.judge import (
+    JudgedContact,
+    LoggedDetection,
+    Score,
+    TruthTouch,
+    channels_at,
+    find_detections,
+    ideal_response,
+    judge_run,
+    row_at,
+    true_contacts,
+)
 from adacd_hil.analysis.score.margins import evaluate_certified, gather_untouched, last_row
 from adacd_hil.analysis.score.metrics import (
     CycleStatistics,
@@ -17,16 +28,6 @@ from adacd_hil.analysis.score.metrics import (
 )
 from adacd_hil.analysis.score.run_faults import find_causes, find_faults, gather_data
 from adacd_hil.analysis.score.timing import collect_evidence, find_reactions
-from adacd_hil.analysis.score.touches import (
-    LoggedDetection,
-    TruthTouch,
-    channels_at,
-    find_detections,
-    ideal_response,
-    judge_run,
-    row_at,
-    true_contacts,
-)
 from adacd_hil.analysis.score.verdict import compare_with_paper, give_verdict, is_margin_below_1, is_revoked
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
 from adacd_hil.scheme.contact.contact_report import KIND_S

@@ -28,7 +28,14 @@ import numpy as np
 
 from adacd_hil.analysis.logged_run import CertifiedStream, Mask, Run, Section, rows_of, split_sections
 from adacd_hil.analysis.score.distribution import Distribution
-from adacd_hil.analysis.score.judge import StreamJudge
+from adacd_hil.analysis.score.judge import (
+    LoggedDetection,
+    StreamJudge,
+    TruthTouch,
+    find_detections,
+    touch_window,
+    true_contacts,
+)
 from adacd_hil.analysis.score.metrics import (
     Beside,
     BesideContact,
@@ -39,7 +46,6 @@ from adacd_hil.analysis.score.metrics import (
     SmallestPush,
     Untouched,
 )
-from adacd_hil.analysis.score.touches import LoggedDetection, TruthTouch, find_detections, touch_window, true_contacts
 from adacd_hil.compiled import compiled
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
 from adacd_hil.records import JOINTS, SchemeState, Vector
