@@ -47,12 +47,14 @@ ENDED_WELL = (0, 3, 130)
 """3: the log lacks what the machine had no time to write; 130: SIGINT, as asked."""
 TITLES = {
     "lateness": "lateness of wake-up",
-    "feedback": "SYNC out to last frame read",
-    "compute": "last frame in to last command out",
-    "command": "SYNC out to last command out",
+    "stamp": "SYNC out to last frame's stamp",
     "answer": "last frame's stamp to last command out",
+    "command": "SYNC out to last command out",
+    "read": "last frame read to last command out",
 }
-"""The times of a cycle. `answer` begins with the kernel's stamp of the last frame; not every log of the host has it."""
+"""The times of a cycle. The stamp is the kernel's, of the reception of the last frame. When that was read, the host
+doesn't say: it reads no clock then.
+"""
 SHARES = (50.0, 99.0, 99.9, 100.0)
 PATIENT = """
 extends = "{base}"
@@ -332,7 +334,10 @@ def run_block(
 def read_samples(path: Path, columns: Sequence[str]) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]]]:
     """Read the samples of the yardstick or the straightforward loop."""
     rows = np.fromfile(path, np.int64).reshape(-1, len(columns))
-    return rows[:, 0], {name: rows[:, place] for place, name in enumerate(columns) if name in TITLES}
+    column = {name: rows[:, place] for place, name in enumerate(columns)}
+    stamp_ns = column["command"] - column["answer"]
+    times_ns = {name: column[name] for name in ("lateness", "answer", "command")}
+    return rows[:, 0], {**times_ns, "stamp": stamp_ns, "read": column["compute"]}
 
 
 def yardstick_run(program: Path, channel: str, folder: Path, period_us: int, contract: str = "arm") -> Run:
@@ -371,6 +376,7 @@ def host_run(channel: str, folder: Path, config: Path, *options: str) -> Run:
     def read(said: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]], dict[str, Any]]:
         described = json.loads(said) if said.strip() else {}
         due_ns, times_ns, rest = read_cycles(read_log(out / LOG_NAME, ("/cycle",)))
+        times_ns["stamp"], times_ns["answer"] = times_ns.pop("feedback"), times_ns.pop("compute")
         kept = ("dropped", "fault", "recoveries", "log_error")
         return due_ns, times_ns, rest | {name: described[name] for name in kept if name in described}
 
@@ -391,8 +397,6 @@ def read_cycles(log: RunLog) -> tuple[NDArray[np.int64], dict[str, NDArray[np.in
         "compute": command_ns - feedback_ns,
         "command": command_ns,
     }
-    if "compute_ns" in cycle:
-        times_ns["answer"] = cycle["compute_ns"]
     scheduler = log.metadata.get("scheduler", "")
     lost = int(np.ptp(cycle["frames_lost"])) if "frames_lost" in cycle else 0
     return t_ns - cycle["lateness_ns"], times_ns, {"frames_lost": lost, "scheduler": scheduler}
@@ -512,8 +516,8 @@ def summarise(blocks: dict[str, list[Block]]) -> dict[str, Any]:
             "command_p50": ratios(
                 blocks[above], blocks[below], lambda block: float(np.median(block.times_ns["command"]))
             ),
-            "compute_p50": ratios(
-                blocks[above], blocks[below], lambda block: float(np.median(block.times_ns["compute"]))
+            "answer_p50": ratios(
+                blocks[above], blocks[below], lambda block: float(np.median(block.times_ns["answer"]))
             ),
         }
         for above, below in pairs
