@@ -1,4 +1,4 @@
-"""The loop: read, step, limit, write, log.
+"""The loop: read, decide, limit, write, then count and log.
 
 One cycle: SYNC k goes out, feedback and torque of k come in, the scheme decides, the controller follows the desired
 motion, the gate limits, the commands go out and act at SYNC k+1. In lockstep the next cycle begins at once; in real
@@ -102,6 +102,15 @@ class Cycle:
         self._checks = SelfChecks(settings, arm, master.parameters, self._q_d)
         self._faults = FaultReport(settings, arm, self._watch, self._pipeline, self._checks, master)
         self._escalation = StopEscalation(arm, master)
+        self._sources = (
+            self._master,
+            arm.strangers,
+            self._data,
+            master.parameters,
+            self._escalation,
+            self._exchange.events,
+            self._pipeline,
+        )
         self._state = SchemeState.INIT
         self._enabled_cycle: int | None = None
         self._faulted_cycle: int | None = None
@@ -144,14 +153,15 @@ class Cycle:
         while not self._is_over(output):
             turn = self._exchange.turn()
             arm = self._watch.judge(turn.arm)
-            self._data.note(arm)
-            self._faults.note(self._state, arm)
             request = self._checks.judge(arm, self._state) or self._request(arm.cycle)
-            output = self._pipeline.step(arm, request)
+            output = self._pipeline.decide(arm, request)
             self._reference.step(arm, output)
             self._follow(arm, output)
             command, flags = self._limit(arm, output, self._exchange.leave())
             record = self._exchange.end(turn, command, recorder.waiting_bytes)
+            self._pipeline.complete()  # the commands are out: from here on, what none of them depends on
+            self._data.note(arm)
+            self._faults.note(self._state, arm)
             self._look_after_devices(arm, output)
             self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
@@ -237,15 +247,7 @@ class Cycle:
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
-        for source in (
-            self._master,
-            self._arm.strangers,
-            self._data,
-            self._master.parameters,
-            self._escalation,
-            self._exchange.events,
-            self._pipeline,
-        ):
+        for source in self._sources:
             for event in source.take_events():
                 recorder.event(t_ns, event)
                 if event.name in CERTIFICATE_EVENTS:

@@ -76,8 +76,9 @@ class SelfChecks:
         return ""
 
     def _judge_motion(self, arm: ArmState) -> str:
-        errors = [abs(float(arm.q[joint] - self._q_d[joint])) for joint in range(JOINTS)]
-        is_near = all(error <= window for error, window in zip(errors, self._window_rad, strict=True))
+        (q1, q2), (desired1, desired2), (window1, window2) = arm.q.tolist(), self._q_d.tolist(), self._window_rad
+        errors = abs(q1 - desired1), abs(q2 - desired2)
+        is_near = errors[0] <= window1 and errors[1] <= window2
         self._away_cycles = 0 if is_near else self._away_cycles + arm.periods
         if self._away_cycles < self._following_cycles:
             return ""

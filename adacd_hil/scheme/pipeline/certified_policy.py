@@ -108,9 +108,11 @@ class CertifiedPolicy(SchemePolicy):
     def step(self, is_complete: int, steps: int) -> int:
         """Take in the sample that is in the block."""
         constants, memory, block, _ = self.numbers
-        observation = certified_kernel.step(constants, memory, block, is_complete, steps, self._mode)
-        self._paper.step(block, is_complete, steps)
-        return observation
+        return certified_kernel.step(constants, memory, block, is_complete, steps, self._mode)
+
+    def step_beside(self, is_complete: int, steps: int) -> None:
+        """Let the paper's scheme take the sample in."""
+        self._paper.step(self.numbers.block, is_complete, steps)
 
     def run(self, samples: Samples, recorded: Recorded, first: int, last: int, calm: Calm) -> int:
         """Run the numbers to the first cycle that isn't calm."""

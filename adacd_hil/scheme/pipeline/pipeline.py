@@ -172,6 +172,7 @@ class Pipeline:
         )
         self._intervals = SampleIntervals(settings)
         self._stretch = CalmStretch()
+        self._open: tuple[ArmState, int, Vector] | None = None  # the calm cycle that is to be completed
         self._theta_hat = layout_of(settings).slices["theta_hat"]
         block = self.numbers.block[0]
         self._q, self._dq, self._tau_J, self._period_s = (block[name] for name in ("q", "dq", "tau_J", "period_s"))
@@ -206,6 +207,13 @@ class Pipeline:
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
+        output = self.decide(arm, request)
+        self.complete()
+        return output
+
+    def decide(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
+        """Take in one cycle; `theta_hat` and `block` of the output hold once `complete` has been called."""
+        self.complete()
         self._q[:] = arm.q
         self._dq[:] = arm.dq
         self._tau_J[:] = arm.tau_J
@@ -213,16 +221,29 @@ class Pipeline:
         policy, stretch = self._policy, self._stretch
         observation = policy.step(int(arm.is_complete), int(arm.steps))
         if request is Request.NONE and stretch.holds(arm, observation) and policy.is_calm:
-            policy.observe_calm(stretch.count)
-            stretch.take(arm, observation)
-            return self._output(arm.cycle, self._supervisor.state, observation, None, self.numbers.values.copy())
+            block = np.empty(self.numbers.values.size)
+            self._open = arm, observation, block
+            return self._output(arm.cycle, self._supervisor.state, observation, None, block)
+        policy.step_beside(int(arm.is_complete), int(arm.steps))
         self._count_calm()
         output = self._conclude(arm, request, observation)
         stretch.begin(self._calm(arm.cycle + 1))
         return output
 
+    def complete(self) -> None:
+        """Do what no decision of this cycle depends on; again, nothing."""
+        if self._open is None:
+            return
+        (arm, observation, block), self._open = self._open, None
+        policy, stretch = self._policy, self._stretch
+        policy.step_beside(int(arm.is_complete), int(arm.steps))
+        block[:] = self.numbers.values
+        policy.observe_calm(stretch.count)
+        stretch.take(arm, observation)
+
     def _count_calm(self) -> None:
         """Let the supervisor and the policy count the calm cycles since the last concluded one."""
+        self.complete()
         stretch = self._stretch
         if stretch.count:
             self._supervisor.pass_by(*stretch.taken)
@@ -245,18 +266,18 @@ class Pipeline:
     ) -> SchemeOutput:
         policy, supervisor = self._policy, self._supervisor
         return SchemeOutput(
-            cycle,
-            supervisor.state,
-            previous,
-            supervisor.fault,
-            observation >> CONTACT_SHIFT,
-            policy.is_model_valid,
-            block[self._theta_hat],
-            policy.theta_ff,
-            policy.tau_ext_hat.copy(),
-            contact,
-            block,
-            policy.contacts.reaction,
+            cycle=cycle,
+            state=supervisor.state,
+            previous_state=previous,
+            fault=supervisor.fault,
+            contact_joints=observation >> CONTACT_SHIFT,
+            is_model_valid=policy.is_model_valid,
+            theta_hat=block[self._theta_hat],
+            theta_ff=policy.theta_ff,
+            tau_ext_hat=policy.tau_ext_hat.copy(),
+            contact=contact,
+            block=block,
+            reaction=policy.contacts.reaction,
         )
 
     def run(self, arms: ArmBatch, requests: NDArray[np.uint8]) -> SchemeBatch:

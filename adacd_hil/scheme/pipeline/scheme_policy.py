@@ -54,6 +54,9 @@ class SchemePolicy(ABC):
         After the supervisor's step, in each cycle.
         """
 
+    def step_beside(self, is_complete: int, steps: int) -> None:
+        """Take the sample in beside what decides; arguments as for `step`, which comes before it."""
+
     def take(self, request: Request, observation: int) -> int:  # noqa: ARG002
         """Take in a request before the supervisor does; return the observation as it stands then."""
         return observation
