@@ -102,14 +102,16 @@ class Exchange:
         for _ in range(MOST_FRAMES):
             if arm.has_all_frames:
                 return last_ns
-            frame = bus.receive(patience_s)
-            if frame is None:
+            frames = bus.receive_some(patience_s, 1 if self._is_following else arm.open_answers)
+            if not frames:
                 break
-            if self._is_following and frame.can_id == arm.sync_id and not frame.is_error:
-                bus.unread(frame)
+            if self._is_following and frames[0].can_id == arm.sync_id and not frames[0].is_error:
+                bus.unread(frames[0])
                 break
-            last_ns = frame.t_ns
-            self._accept(frame, is_late=last_ns < sync_ns)
+            last_ns = frames[-1].t_ns
+            if not arm.accept_answers(frames):
+                for frame in frames:
+                    self._accept(frame, is_late=frame.t_ns < sync_ns)
             elapsed_s = (last_ns - sync_ns) * 1e-9
             if not 0.0 <= elapsed_s <= self._patience_s:  # a late frame, or a stamp of a wall clock that was set
                 elapsed_s = (self._clock.now_ns() - sync_ns) * 1e-9

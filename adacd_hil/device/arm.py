@@ -4,7 +4,7 @@ The only place of sign, zero offset and torque ratio. Every value carries its ag
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -77,10 +77,12 @@ class Arm:
         self._alignment = SampleAlignment(len(self.devices))
         self._sampled_ordinal = self._sampled_cycle = -1  # of the last complete sample
         self.gaps = [0] * len(self.devices)  # bit k: no usable frame k cycles ago
+        self._has_gaps = False
         self._last_data = [b""] * len(self.devices)
         self.repeats = [0] * len(self.devices)
         """How often each device's frame came again, the same or with the same counter."""
         self._frames = CycleFrames(self.devices, period_s)
+        self._read_values: tuple[tuple[float, ...], ...] = ()  # what `_frames` has read last, of each device
         self.strangers = Strangers(settings, codec)
         self._emergency_ids = {EMERGENCY_ID + device.node_id: device for device in self.devices}
         self._tolerated_codes = frozenset(settings.safety.tolerated_emergencies)
@@ -114,7 +116,8 @@ class Arm:
         if self._cycle >= 0:
             if not self.has_all_frames:
                 self._miss()
-            self._remember_gaps()
+            if self._received != _COMPLETE or self._has_gaps:
+                self._remember_gaps()
         self._begin_cycle(cycle, t_ns)
         if periods == 1 and (self._frames.read_cycle == cycle - 1 or self._are_in_step()):
             self._frames.is_open = True
@@ -148,6 +151,7 @@ class Arm:
     def _remember_gaps(self) -> None:
         for place, gaps in enumerate(self.gaps):
             self.gaps[place] = (gaps << 1 | ~self._received >> place & 1) & REMEMBERED_GAPS
+        self._has_gaps = any(self.gaps)
 
     def pass_by(self, cycles: int, cycle: int, t_ns: int) -> None:
         """Take so many cycles, all complete and in time, for read elsewhere; the last one and its SYNC are given."""
@@ -161,6 +165,7 @@ class Arm:
             clock.pass_by(self._ordinal)
         self._sampled_ordinal, self._sampled_cycle = self._ordinal, cycle
         self.gaps = [0] * len(self.devices)
+        self._has_gaps = False
         self._received = self._seen = _COMPLETE
         self.has_all_frames = True
 
@@ -193,6 +198,21 @@ class Arm:
             take(frame.data, self._cycle - self._periods)
         else:
             take(frame.data, self._cycle)
+        return True
+
+    @property
+    def open_answers(self) -> int:
+        """Count the cyclic frames that this cycle lacks, at least 1."""
+        return max(len(self.devices) - self._seen.bit_count() - len(self._frames.held), 1)
+
+    def accept_answers(self, frames: Sequence[Frame]) -> bool:
+        """Take frames that answer this SYNC for all devices, in one call; False, and none is taken, where they don't.
+
+        As `accept` one by one does, which is for those that this refuses.
+        """
+        if not (self._frames.is_open and self._frames.hold_all(frames, self._t_ns)):
+            return False
+        self._take_together()
         return True
 
     def _answer(self, frame: Frame, take: _Take, place: int, newest: int) -> None:
@@ -243,12 +263,14 @@ class Arm:
         if values is None:
             self._release()
             return
+        devices, clocks, last_data = self.devices, self._clocks, self._last_data
         for place, frame in self._frames.close():
-            data = frame.data
-            self.devices[place].follow(data, values[place], cycle)
-            self._clocks[place].follow(ordinal)
-            self._last_data[place] = data
-        self._alignment.put_all(ordinal, [device.values for device in self.devices])
+            data = last_data[place] = frame.data
+            devices[place].follow(data, values[place], cycle)
+            clocks[place].follow(ordinal)
+        drive1, drive2, sensor1, sensor2 = devices
+        self._read_values = drive1.values, drive2.values, sensor1.values, sensor2.values
+        self._alignment.put_all(ordinal, self._read_values)
         self._received = self._seen = _COMPLETE
         self.has_all_frames = True
 
@@ -311,7 +333,7 @@ class Arm:
     @property
     def missing_frames(self) -> int:
         """Count the cyclic frames of this cycle that are not in or failed their checks."""
-        return (_COMPLETE & ~self.received).bit_count()
+        return 0 if self._received == _COMPLETE else (_COMPLETE & ~self.received).bit_count()
 
     @property
     def received(self) -> int:
@@ -328,6 +350,8 @@ class Arm:
     def state(self) -> ArmState:
         """Join what has been received into the state of this cycle: the newest complete sample, else what is newest."""
         cycle = self._cycle
+        if self._frames.read_cycle == cycle:
+            return self._state_of(self._ordinal, self._read_values, (cycle,) * 4)
         if self.received == _COMPLETE:
             return self._state_of(self._ordinal, tuple(device.values for device in self.devices), (cycle,) * 4)
         sample = self._alignment.newest(self._ordinal, self._sampled_ordinal)

@@ -171,6 +171,7 @@ class CycleFrames:
         self._devices, self._period_s = devices, period_s
         self._messages, self._rows = lay_out_frames([device.cyclic_frame for device in devices])
         self._lengths = self._messages["length"].tolist()
+        self._place_of = {device.cyclic_frame.message.can_id: place for place, device in enumerate(devices)}
         self._data = np.zeros((len(devices), _MOST_BYTES), np.uint8)
         self._bytes = self._data.reshape(-1).data
         self._counters = np.zeros(len(devices), np.int64)
@@ -205,6 +206,25 @@ class CycleFrames:
         self._bytes[begin : begin + length] = frame.data
         self.held.append((place, frame))
         self._places |= bit
+        return True
+
+    def hold_all(self, frames: Sequence[Frame], sync_ns: int) -> bool:
+        """Hold frames that are one of each device, of its length and behind SYNC; else False, and nothing is held."""
+        if len(frames) != len(self._devices) or self._places:
+            return False
+        held, places = [], 0
+        for frame in frames:
+            can_id, data, t_ns, is_error = frame
+            place = self._place_of.get(can_id)
+            if place is None or is_error or t_ns < sync_ns or len(data) != self._lengths[place]:
+                return False
+            begin = place * _MOST_BYTES
+            self._bytes[begin : begin + len(data)] = data
+            held.append((place, frame))
+            places |= 1 << place
+        if places != self._all:
+            return False
+        self.held, self._places = held, places
         return True
 
     @property

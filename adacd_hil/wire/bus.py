@@ -102,6 +102,14 @@ class Bus(Protocol):
         Raises BusError, of it BusOffError and InterfaceDownError.
         """
 
+    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:  # noqa: ARG002 (this one has no more at once)
+        """Return the next frame and, up to `most` in all, those that are there with it; [] when none came in time.
+
+        An error frame is returned alone. Raises as `receive`.
+        """
+        frame = self.receive(timeout_s)
+        return [] if frame is None else [frame]
+
     def recover(self) -> None:
         """Drop everything queued both ways, here and in the interface, so that no old frame gets out or in.
 
@@ -142,6 +150,10 @@ class EmbeddedBus(Bus):
         """Return the next frame, or None."""
         return self._received.popleft() if self._received else None
 
+    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:  # noqa: ARG002 (the protocol's signature)
+        """Return up to `most` frames."""
+        return take_first(self._received, most)
+
     def recover(self) -> None:
         """Drop what the host has not read."""
         self._received.clear()
@@ -149,6 +161,16 @@ class EmbeddedBus(Bus):
     def close(self) -> None:
         """Disconnect the device."""
         self._device = None
+
+
+def take_first(received: deque[Frame], most: int) -> list[Frame]:
+    """Take up to `most` frames off a queue, none behind an error frame and that one alone."""
+    frames: list[Frame] = []
+    while received and len(frames) < most:
+        if received[0].is_error:
+            return frames or [received.popleft()]
+        frames.append(received.popleft())
+    return frames
 
 
 def open_bus(
@@ -231,6 +253,19 @@ class Tap(Bus):
         if frame is not None:
             self._passed.append((False, frame))
         return frame
+
+    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
+        """Receive and remember frames that are there together. Raises BusError."""
+        if self._unread is not None or most == 1:
+            frame = self.receive(timeout_s)
+            return [] if frame is None else [frame]
+        try:
+            frames = self._bus.receive_some(timeout_s, most)
+        except BusOffError as error:
+            self._passed.append((False, error.frame))
+            raise
+        self._passed += [(False, frame) for frame in frames]
+        return frames
 
     def unread(self, frame: Frame) -> None:
         """Put a received frame back: it is the next one to be received."""

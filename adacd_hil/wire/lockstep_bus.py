@@ -17,7 +17,7 @@ clock.
 """
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from adacd_hil.clock import VirtualClock
@@ -83,6 +83,7 @@ class LockstepBus(Bus):
         self._offered: list[Offer] = []  # the devices'
         self._received: deque[Frame] = deque()
         """What is through, or surely will be unless the host sends before; see `_withdraw`."""
+        self._ahead: deque[Frame] = deque()  # of the bus behind, taken with others
         self._free_ns = 0
         """When the last frame was through."""
         self.sync_ns = -NEVER_NS
@@ -119,6 +120,18 @@ class LockstepBus(Bus):
         self._count += 1
         self._queue.append((can_id, self._count, now_ns, data))
 
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Queue some frames at the clock's present time. Raises as `send`."""
+        if not self._is_attached or len(self._queue) + len(frames) > self._queue_length:
+            super().send_all(frames)
+            return
+        now_ns = self._clock.now_ns()
+        if self._received:
+            self._withdraw(now_ns)
+        for can_id, data in frames:
+            self._count += 1
+            self._queue.append((can_id, self._count, now_ns, data))
+
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, with the clock at its end; or None with the clock after `timeout_s`.
 
@@ -139,9 +152,32 @@ class LockstepBus(Bus):
         self._clock.sleep_until_ns(limit_ns)
         return None
 
+    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
+        """Return the next frame and the answers to SYNC that follow it without another frame, the clock at their end.
+
+        Raises as `receive`.
+        """
+        limit_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        frame = self.receive(timeout_s)
+        if frame is None:
+            return []
+        frames, received = [frame], self._received
+        while (
+            received
+            and len(frames) < most
+            and received[0].t_ns <= limit_ns
+            and not (received[0].is_error or frame.is_error)
+            and frame.can_id in self._answers
+        ):
+            frame = received.popleft()
+            frames.append(frame)
+        self._clock.sleep_until_ns(frame.t_ns)
+        return frames
+
     def recover(self) -> None:
         """Drop what waits and what was received. Raises BusError when the bus behind it can't yet."""
         self._bus.recover()
+        self._ahead.clear()
         self._queue.clear()
         self._offered.clear()
         self._received.clear()
@@ -159,10 +195,8 @@ class LockstepBus(Bus):
     def _transmit_next(self, limit_ns: int) -> bool:
         """Let the next frame win the bus, if one starts before `limit_ns`."""
         queue = self._queue
-        if len(queue) == 1 and not self._offered:
-            return self._transmit_only(queue[0], limit_ns)
-        if not (self._offered or queue):
-            return False
+        if not self._offered:
+            return bool(queue) and self._transmit_own(limit_ns)
         while True:
             waiting = self._offered
             if queue and self._is_acknowledged:
@@ -172,7 +206,7 @@ class LockstepBus(Bus):
             start_ns = max(min([offer[2] for offer in waiting]), self._free_ns)
             if start_ns >= limit_ns:
                 return False
-            if not self._must_ask(start_ns):
+            if not (self._is_marked and start_ns > self._granted_ns and not self._is_cyclic(start_ns)):
                 break
             self._ask(start_ns)  # the devices may have something that comes first
         winner = min([offer for offer in waiting if offer[2] <= start_ns])
@@ -186,23 +220,24 @@ class LockstepBus(Bus):
             self._forward(can_id, data)
         return True
 
-    def _transmit_only(self, offer: Offer, limit_ns: int) -> bool:
-        """Let the only frame that waits win the bus, if it starts before `limit_ns`."""
-        can_id, _, t_ns, data = offer
+    def _transmit_own(self, limit_ns: int) -> bool:
+        """Let a frame of the host's win the bus, for which nobody else waits, if it starts before `limit_ns`."""
+        queue = self._queue
+        t_ns = queue[0][2]  # the earliest: the queue is in the order in which frames were handed over
         start_ns = t_ns if t_ns > self._free_ns else self._free_ns
         if start_ns >= limit_ns or not self._is_acknowledged:
             return False
-        if self._must_ask(start_ns):
-            self._ask(start_ns)
+        if self._is_marked and start_ns > self._granted_ns and not self._is_cyclic(start_ns):
+            self._ask(start_ns)  # the devices may have something that comes first
             return True  # whatever came: look again
+        winner = queue[0]
+        if len(queue) > 1 and not self._is_fifo:
+            winner = min([offer for offer in queue if offer[2] <= start_ns])
+        can_id, _, _, data = winner
         self._free_ns = start_ns + self._frame_time(can_id, data)
-        self._queue.clear()
+        queue.remove(winner)
         self._forward(can_id, data)
         return True
-
-    def _must_ask(self, start_ns: int) -> bool:
-        """Whether devices that live by grants have not lived until then."""
-        return self._is_marked and start_ns > self._granted_ns and not self._is_cyclic(start_ns)
 
     def _forward(self, can_id: int, data: bytes) -> None:
         """Give a frame of the host's, which is through, to the devices; after SYNC take their answers."""
@@ -213,10 +248,15 @@ class LockstepBus(Bus):
 
     def _take_answers(self) -> None:
         """Take what belongs to this SYNC. Raises SilenceError when nobody says anything."""
-        came: list[Frame] = []
-        missing = len(self._answers)
+        count = missing = len(self._answers)
+        came = self._bus.receive_some(self._patience_s, count) if count and not self._ahead else []
+        if len(came) == count and {frame.can_id for frame in came} == self._answers:
+            missing = 0
+        else:
+            self._ahead.extend(came)
+            came = []
         while missing:
-            frame = self._bus.receive(self._patience_s)
+            frame = self._receive()
             if frame is None:
                 break
             if frame.can_id == DEVICE_MARK:
@@ -227,9 +267,9 @@ class LockstepBus(Bus):
             came.append(frame)
             if frame.can_id in self._answers:
                 missing -= 1
-        if missing == len(self._answers) != 0 and not came:
+        if missing == count != 0 and not came:
             raise SilenceError(f"silence on {self.channel} for {self._patience_s:g} s")
-        if len(came) == len(self._answers) and not (self._queue or self._offered):
+        if len(came) == count and not (self._queue or self._offered):
             self._line_up(came)
         else:
             for frame in came:
@@ -250,7 +290,13 @@ class LockstepBus(Bus):
                     offset_ns = time_ns
                 else:
                     self._note(kind)
-            frame = self._bus.receive(self._patience_s)
+            frame = self._receive()
+
+    def _receive(self, timeout_s: float | None = None) -> Frame | None:
+        """Receive the next frame of the bus behind; None when none came within the time, if not given in patience."""
+        if self._ahead:
+            return self._ahead.popleft()
+        return self._bus.receive(self._patience_s if timeout_s is None else timeout_s)
 
     def _line_up(self, came: list[Frame]) -> None:
         """Let answers that nothing competes with go one after the other, by identifier."""
@@ -311,7 +357,7 @@ class LockstepBus(Bus):
     def _await_grant(self) -> bool:
         """Take what comes until time is granted; tell whether a frame came."""
         came: list[Frame] = []
-        while (frame := self._bus.receive(self._patience_s)) is not None:
+        while (frame := self._receive()) is not None:
             if frame.can_id != DEVICE_MARK:
                 came.append(frame)
                 continue
@@ -330,7 +376,7 @@ class LockstepBus(Bus):
     def _take_while(self, timeout_s: float) -> bool:
         """Take what the bus behind has; tell whether there was something."""
         has_come = False
-        while (frame := self._bus.receive(timeout_s)) is not None:
+        while (frame := self._receive(timeout_s)) is not None:
             timeout_s = 0.0
             if frame.can_id == DEVICE_MARK:
                 mark = unpack_mark(frame.data)

@@ -30,6 +30,7 @@ from adacd_hil.wire.bus import (
     InterfaceDownError,
     QueueBytes,
     TransmitQueueError,
+    take_first,
 )
 from adacd_hil.wire.can_interface import CanInterface
 from adacd_hil.wire.error_frames import ERROR_CLASS_MASK, is_bus_off
@@ -175,6 +176,16 @@ class SocketCanBus(Bus):
                 frame,
             )
         return frame
+
+    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
+        """Return frames that are there together; none: []. Raises BusOffError, InterfaceDownError, BusError."""
+        received = self._received
+        if not received or received[0].is_error:
+            frame = self.receive(timeout_s)
+            if frame is None or frame.is_error:
+                return [] if frame is None else [frame]
+            received.appendleft(frame)
+        return take_first(received, most)
 
     def _take(self, timeout_s: float) -> None:
         """Take what waits, or what comes within `timeout_s`."""

@@ -54,8 +54,13 @@ def _fitting(raw: int, signal: SignalCodec) -> int:
     return raw if signal.raw_low <= raw <= signal.raw_high else raw & min(signal.raw_high, 0x7FFF)
 
 
-def play(name: str, cycles: list[tuple[list[int], list[Fate]]], skipped: int = 1) -> list[Any]:
-    """Run an arm through quiet cycles and those given; return all that it says of each of them."""
+def play(
+    name: str, cycles: list[tuple[list[int], list[Fate]]], skipped: int = 1, is_batched: bool = False
+) -> list[Any]:
+    """Run an arm through quiet cycles and those given; return all that it says of each of them.
+
+    is_batched: what comes is offered as the exchange does, as many frames at once as the cycle lacks.
+    """
     chosen, codec = LOADED[name]
     arm = Arm(chosen, codec, EmbeddedBus(VirtualClock()))
     messages = [codec.message(message) for message in NAMES]
@@ -73,6 +78,7 @@ def play(name: str, cycles: list[tuple[list[int], list[Fate]]], skipped: int = 1
             if due == place:
                 arm.accept(Frame(can_id, data, number * period_ns - 1000), is_late=True)
         arm.synchronise(number, number * period_ns, periods)
+        came: list[Frame] = []
         for index in order:
             message, fate = messages[index], fates[index]
             raw[index] = (raw[index] + fate.step + 2**15) % 2**16 - 2**15
@@ -84,7 +90,13 @@ def play(name: str, cycles: list[tuple[list[int], list[Fate]]], skipped: int = 1
             if fate.what in ("late", "again"):
                 late.append((place + fate.delay, message.can_id, sent))
             for _ in range({"lost": 0, "late": 0, "twice": 2}.get(fate.what, 1)):
-                arm.accept(Frame(message.can_id, sent, number * period_ns + 100_000 + 10_000 * index))
+                came.append(Frame(message.can_id, sent, number * period_ns + 100_000 + 10_000 * index))
+        while came:
+            count = arm.open_answers if is_batched else 1
+            batch, came = came[:count], came[count:]
+            if not (is_batched and arm.accept_answers(batch)):
+                for frame in batch:
+                    arm.accept(frame)
         said.append(_all_of(arm))
     return said
 
@@ -112,6 +124,17 @@ def test_frames_read_together_leave_the_arm_as_one_by_one(name: str, seed: int, 
         changed.setattr(CycleFrames, "begin", lambda *_: False)
         one_by_one = play(name, cycles, skipped)
     assert together == one_by_one
+    assert play(name, cycles, skipped, is_batched=True) == one_by_one
+
+
+@pytest.mark.parametrize("frames", [0, 3, 5])
+def test_what_is_not_one_frame_of_each_device_is_not_taken_at_once(frames: int) -> None:
+    chosen, codec = LOADED["paper"]
+    arm = Arm(chosen, codec, EmbeddedBus(VirtualClock()))
+    arm.synchronise(0, 0, 1)
+    message = codec.message(NAMES[0])
+    assert not arm.accept_answers([Frame(message.can_id, bytes(message.length), 1)] * frames)
+    assert arm.open_answers == 4
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
@@ -119,6 +142,8 @@ def test_quiet_cycles_are_read_together(name: str, monkeypatch: pytest.MonkeyPat
     read: list[Any] = []
     of_one = CycleFrames.read
     monkeypatch.setattr(CycleFrames, "read", lambda frames, cycle: read.append(of_one(frames, cycle)) or read[-1])
-    play(name, draw_cycles(1, 10, share=0.0))
-    assert len(read) >= 10
-    assert None not in read
+    for is_batched in (False, True):
+        read.clear()
+        play(name, draw_cycles(1, 10, share=0.0), is_batched=is_batched)
+        assert len(read) >= 10
+        assert None not in read
