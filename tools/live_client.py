@@ -19,7 +19,7 @@ import numpy as np
 
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.viewer.client import LiveMessage, live_client
-from adacd_hil.log.viewer.live_topics import EVERY_RECORD, rate_of
+from adacd_hil.log.viewer.feed import EVERY_RECORD, rate_of
 
 WALL_NS = 1_000_000_000_000_000_000
 """Log times below this, the year 2001, are those of lockstep: they have no age."""

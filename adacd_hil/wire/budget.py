@@ -39,7 +39,7 @@ from adacd_hil.wire.contract_frames import (
     read_contract,
     share_bus,
 )
-from adacd_hil.wire.frame_bits import FrameBits, unstuffed_frame, worst_case_frame
+from adacd_hil.wire.traffic import FrameBits, unstuffed_frame, worst_case_frame
 
 HORIZON_NS = 1_000_000_000
 """Longest busy period that is followed; what isn't through after it counts as unbounded."""

@@ -60,7 +60,7 @@ NOTHING_QUEUED = QueueBytes(0, 0)
 class Frame(NamedTuple):
     """One CAN frame. t_ns: host time of its reception or transmission.
 
-    An error frame has the error class for its identifier; `adacd_hil.wire.error_frames` reads it.
+    An error frame has the error class for its identifier; `adacd_hil.wire.kernel_frames` reads it.
     """
 
     can_id: int

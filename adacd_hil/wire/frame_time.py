@@ -1,6 +1,6 @@
 """How long a frame takes on the bus, exactly, at the pace of an emulated one.
 
-The same count as `adacd_hil.wire.frame_bits.exact_frame`, from start of frame to the end of the intermission, but
+The same count as `adacd_hil.wire.traffic.exact_frame`, from start of frame to the end of the intermission, but
 compiled, a byte at a time by table: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding.
 """
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
 from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
-from adacd_hil.wire.frame_bits import CRC15, FRAME_LENGTHS, TAIL_BITS, unstuffed_fd_bits, worst_case_frame
+from adacd_hil.wire.traffic import CRC15, FRAME_LENGTHS, TAIL_BITS, unstuffed_fd_bits, worst_case_frame
 
 _HEAD_BITS: Final = 19  # start of frame, identifier, RTR, IDE, r0, DLC
 _EXTENDED_HEAD_BITS: Final = 39  # and SRR, 18 bits more of the identifier, r1

@@ -41,7 +41,7 @@ from adacd_hil.log.recording.ring import Ring, RingReader
 from adacd_hil.log.recording.writer import SHOW_PERIOD_NS, WriterProcess
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.log.viewer.client import LiveClient, live_client
-from adacd_hil.log.viewer.live_topics import Decimator, rate_of
+from adacd_hil.log.viewer.feed import Decimator, rate_of
 from adacd_hil.records import Event
 
 STATED_HZ = {

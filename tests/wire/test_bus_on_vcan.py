@@ -24,7 +24,7 @@ from adacd_hil.wire.bus import (
     open_bus,
 )
 from adacd_hil.wire.can_interface import CanInterface
-from adacd_hil.wire.error_frames import TroubleKind, decode_error
+from adacd_hil.wire.kernel_frames import TroubleKind, decode_error
 from adacd_hil.wire.socketcan import SocketCanBus
 
 pytestmark = pytest.mark.vcan

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adacd_hil.wire.frame_bits import (
+from adacd_hil.wire.traffic import (
     FRAME_LENGTHS,
     FrameBits,
     exact_bits,

@@ -42,8 +42,7 @@ from adacd_hil.log.viewer.admission import (
     Admission,
     ViewerRefusal,
 )
-from adacd_hil.log.viewer.feed import ServerSetup, unpack_batch
-from adacd_hil.log.viewer.live_topics import LiveTopics, Shown
+from adacd_hil.log.viewer.feed import LiveTopics, ServerSetup, Shown, unpack_batch
 
 NICENESS = 5
 BACKLOG = 1024
