@@ -291,6 +291,14 @@ class TorqueSensor(CyclicDevice):
         self.torque_Nm = 0.0
         """As the device gives it: its sign, its own auto-zero, not tared."""
         self.status = SensorStatus(0)
+        """What either of its frames says: a sensor that contradicts itself isn't believed.
+
+        A status frame counts until the next one. One that is taken back before the second torque frame after it doesn't
+        count: so a sensor begins.
+        """
+        self._cyclic_bits = 0
+        self._slow_bits = 0
+        self._heard_bits = 0  # of the last status frame
 
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
         # Two frames of one cycle, late and present, may lie a period apart.
@@ -300,12 +308,16 @@ class TorqueSensor(CyclicDevice):
         torque = self.torque_Nm = values[self._main_at]
         self.sample_cycle = cycle
         if self._status_at is not None:
-            self.status = _STATUSES[int(values[self._status_at]) & STATUS_BITS]
+            self._cyclic_bits = int(values[self._status_at]) & STATUS_BITS
         elif self.status_in_header is not None:
             byte, shift = self.status_in_header
-            self.status = _STATUSES[data[byte] >> shift & STATUS_BITS]
+            self._cyclic_bits = data[byte] >> shift & STATUS_BITS
         elif self.torque_range_Nm:
-            self.status = _judge_range(torque, self.torque_range_Nm)
+            self._cyclic_bits = _judge_range(torque, self.torque_range_Nm)
+        else:
+            return
+        self.status = _STATUSES[self._cyclic_bits | self._slow_bits]
+        self._slow_bits = self._heard_bits
 
     @property
     def values(self) -> tuple[float]:
@@ -313,7 +325,9 @@ class TorqueSensor(CyclicDevice):
         return (self.torque_Nm,)
 
     def _use_status(self, values: Sequence[float], cycle: int) -> None:  # noqa: ARG002 (as of all devices)
-        self.status = _STATUSES[int(values[self._slow_status_at]) & STATUS_BITS]
+        self._heard_bits = int(values[self._slow_status_at]) & STATUS_BITS
+        self._slow_bits &= self._heard_bits
+        self.status = _STATUSES[self._cyclic_bits | self._heard_bits]
 
     @property
     def is_overloaded(self) -> bool:

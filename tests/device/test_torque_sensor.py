@@ -109,3 +109,32 @@ def test_a_frame_of_the_wrong_length_changes_nothing() -> None:
     assert not sensor.accept_cyclic(bytes(3), 0)
     sensor.accept_status(bytes(2), 0)  # this sensor has no status frame
     assert (sensor.sample_cycle, sensor.implausible_frames, sensor.status) == (-1, 1, 0)
+
+
+def test_what_the_status_frame_says_outlives_torque_frames_that_say_otherwise() -> None:
+    rig = Protected()
+    rig.sensor.accept_status(bytes((0x01, 0)), 0)
+    states = []
+    for cycle in range(5):
+        rig.sensor.accept_cyclic(rig.frame(1.5), cycle)
+        states.append(rig.sensor.status)
+    assert states == [0] + [SensorStatus.NOT_VALID] * 4
+
+
+def test_a_status_frame_that_is_taken_back_at_once_does_not_count() -> None:
+    rig = Protected()
+    rig.sensor.accept_status(bytes((0x01, 0)), 0)
+    rig.sensor.accept_cyclic(rig.frame(1.5), 1)
+    rig.sensor.accept_status(bytes((0x00, 0)), 1)
+    states = []
+    for cycle in range(2, 5):
+        rig.sensor.accept_cyclic(rig.frame(1.5), cycle)
+        states.append(rig.sensor.status)
+    assert states == [0, 0, 0]
+
+
+def test_what_the_torque_frame_says_outlives_a_status_frame_that_says_otherwise() -> None:
+    rig = Protected()
+    rig.sensor.accept_cyclic(rig.frame(20.0, status=3), 0)
+    rig.sensor.accept_status(bytes((0x00, 0)), 1)
+    assert rig.sensor.status == OVERLOADED
