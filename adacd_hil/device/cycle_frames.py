@@ -315,7 +315,7 @@ class TorqueSensor(CyclicDevice):
         elif self.torque_range_Nm:
             self._cyclic_bits = _judge_range(torque, self.torque_range_Nm)
         else:
-            return
+            self._slow_bits = self._heard_bits  # nothing else says it
         self.status = _STATUSES[self._cyclic_bits | self._slow_bits]
         self._slow_bits = self._heard_bits
 
@@ -328,6 +328,12 @@ class TorqueSensor(CyclicDevice):
         self._heard_bits = int(values[self._slow_status_at]) & STATUS_BITS
         self._slow_bits &= self._heard_bits
         self.status = _STATUSES[self._cyclic_bits | self._heard_bits]
+
+    @property
+    def is_steady(self) -> bool:
+        """Also, whether no status frame is about to count."""
+        counted = self._cyclic_bits | self._slow_bits
+        return super().is_steady and self._slow_bits == self._heard_bits and self.status == counted
 
     @property
     def is_overloaded(self) -> bool:
