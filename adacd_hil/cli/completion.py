@@ -33,6 +33,16 @@ def complete_scenario(_ctx: Context, _param: Parameter, incomplete: str) -> list
     return [*_starting(names, incomplete), *_toml_files(incomplete)]
 
 
+def complete_truth(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
+    """Give the built-in truths and TOML files."""
+    from importlib import resources
+
+    from adacd_hil.settings.toml_files import toml_names
+
+    names = toml_names(resources.files("firmware_sim") / "truths")
+    return [*_starting(names, incomplete), *_toml_files(incomplete)]
+
+
 def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:
     """Give groups and keys; of an option KEY=VALUE keys with `=`, and the values of a key that has choices."""
     from adacd_hil.settings.catalogue import known_keys, sections

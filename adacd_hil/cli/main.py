@@ -19,7 +19,7 @@ from adacd_hil.cli.commands.replay_command import replay
 from adacd_hil.cli.commands.runs_command import runs, trend
 from adacd_hil.cli.commands.sweep_command import sweep
 from adacd_hil.cli.commands.tune_command import tune
-from adacd_hil.cli.completion import complete_run, complete_scenario, is_completing, prepare_completion
+from adacd_hil.cli.completion import complete_run, complete_scenario, complete_truth, is_completing, prepare_completion
 from adacd_hil.cli.options import (
     clock_option,
     config_option,
@@ -59,6 +59,12 @@ def cli() -> None:
     help="What happens: one that `firmware-sim list` names, or a TOML file.",
     shell_complete=complete_scenario,
 )
+@click.option(
+    "--truth",
+    metavar="NAME|FILE",
+    help="What the real arm is where the configuration says otherwise: a name or a TOML file.",
+    shell_complete=complete_truth,
+)
 @run_folder_option("demo")
 @click.option("--seed", type=click.IntRange(min=0), default=None, help="Noise of the emulated sensors.")
 @clock_option(default="lockstep")
@@ -69,6 +75,7 @@ def cli() -> None:
 def demo(
     config: str,
     scenario: str,
+    truth: str | None,
     out: Path | None,
     seed: int | None,
     clock: str,
@@ -78,12 +85,15 @@ def demo(
 ) -> ExitCode:
     """Play the paper's experiment, or another scenario, with an emulated arm in this process, and report it.
 
+    The arm is that of the configuration: a file with an arm of one's own is rehearsed, and what it lacks is assumed
+    and told.
+
     The configuration's script plays the user of the paper's experiment. In any other scenario the user acknowledges
     stops as the configuration says, and asks to finish at the scenario's `lasts_s`.
     """
     from adacd_hil.cli.commands.demo_command import play
 
-    report, code = play(config, scenario, profile, seed, clock, out, live)
+    report, code = play(config, scenario, profile, seed, clock, out, live, truth)
     print(json.dumps(report.as_json(), indent=2) if as_json else report.as_text())
     return code
 

@@ -129,7 +129,7 @@ class SensorSettings:
         (TORQUE_RANGE_NM, TORQUE_RANGE_NM),
         unit="Nm",
         low=0.1,
-        high=TORQUE_RANGE_NM,
+        high=10_000.0,
         meaning="the converter saturates beyond it",
     )
     torque_bits: tuple[int, int] = setting((16, 16), low=4, high=24, meaning="of the converter, over its whole range")

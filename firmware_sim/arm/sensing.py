@@ -53,9 +53,9 @@ def to_counts(value: float, lsb: float) -> int:
 
 
 @compiled
-def torque_counts(torque_Nm: float) -> int:
+def torque_counts(torque_Nm: float, count_Nm: float = TORQUE_LSB_NM) -> int:
     """Convert as the torque sensor's converter does; saturates at TORQUE_COUNTS."""
-    return min(max(to_counts(torque_Nm, TORQUE_LSB_NM), _LOWEST_COUNT), _HIGHEST_COUNT)
+    return min(max(to_counts(torque_Nm, count_Nm), _LOWEST_COUNT), _HIGHEST_COUNT)
 
 
 @compiled

@@ -292,7 +292,7 @@ class Bench:
         now_ns = self.time.now_ns
         drive1, drive2 = self.drives
         sensor1, sensor2 = self.sensors
-        measured = self._body.sample()
+        measured = self._nodes.sample()
         listeners, order, lost = self._nodes.listeners, self._order, self._lost_syncs
         heard: Sequence[int] = listeners.everybody
         if self._plan.is_quiet and takers == heard:

@@ -4,16 +4,17 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.wire.codec import Codec, contract_folder
+from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
+from firmware_sim.arm.own_arm import STRAIGHT, OwnArmSettings
 from firmware_sim.arm.scripted_contact import TICK_S
-from firmware_sim.arm.sensing import Measurement
+from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
 from firmware_sim.bench.injector import Handler, Injector
-from firmware_sim.body.sensors import converter_ends
+from firmware_sim.body.sensors import converter_ends, count_Nm
 from firmware_sim.canopen.object_dictionary import Abort, EmulatedContract, longest_pdo, refuse
 from firmware_sim.nodes.device import EmulatedDevice, SyncListeners
 from firmware_sim.nodes.drive_node import DriveNode
-from firmware_sim.nodes.drive_profile import Motor
+from firmware_sim.nodes.drive_profile import DriveScale, Motor
 from firmware_sim.nodes.sensor_node import SensorNode
 from firmware_sim.scenario.faults import device_ids, own_messages
 from firmware_sim.scenario.scenario import Scenario
@@ -85,27 +86,43 @@ class BenchNodes:
         """Whether all cyclic frames of the contract, and no others, answer SYNC."""
         self.answers = answers_to_sync(codec)
         self._arm = arm
-        folder = contract_folder()
-        files = [contract.drive_eds if name.startswith("Drive") else contract.sensor_eds for name in _NODES]
+        self.wiring = wiring = scenario.wiring
+        self.is_crossed = wiring != STRAIGHT
+        """Whether some device isn't at its own joint or counts the other way."""
+        described = [contract.describe(place) for place in range(len(_NODES))]
         right_ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
         ids = device_ids(scenario.faults, right_ids)
         longest = longest_pdo(codec)
         self.devices = tuple(
             EmulatedDevice(
                 ids[i],
-                folder / files[i],
+                described[i].eds,
                 injector.sender(i),
                 own_messages(codec.by_id, right_ids[i], ids[i]),
                 longest,
+                described[i].defaults,
+                described[i].fallbacks,
             )
             for i in range(len(_NODES))
         )
         rated_Nm = scenario.arm.rated_torque_Nm
         self.drives = tuple(
-            DriveNode(self.devices[i], codec, i + 1, self._motor(i), rated_Nm[i], is_free_running)
+            DriveNode(
+                self.devices[i],
+                codec,
+                i + 1,
+                self._motor(i),
+                rated_Nm[wiring.drive_joint[i]],
+                is_free_running,
+                _scale_of(scenario.own_arm, i),
+            )
             for i in range(JOINTS)
         )
         self.sensors = tuple(self._make_sensor(i, codec, scenario) for i in range(JOINTS))
+        for device, description in zip(self.devices, described, strict=True):
+            for alias, place in description.aliases.items():
+                if alias != place:
+                    device.serve(*alias, device.reader(*place))
         injector.attach(self.devices, self.drives, self.sensors)
         self.period_ns = self.devices[0].value(0x1006) * 1000
         for device in self.devices:
@@ -133,7 +150,13 @@ class BenchNodes:
         """Let the arm move with what its motors are told."""
         drive1, drive2 = self.drives
         torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
-        self._arm.advance(torque_Nm, (drive1.motor_mode, drive2.motor_mode), tick_count)
+        modes = (drive1.motor_mode, drive2.motor_mode)
+        if self.is_crossed:
+            up1, up2 = self.wiring.drive_sign
+            torque_Nm = (up1 * torque_Nm[0], up2 * torque_Nm[1])
+            if self.wiring.drive_joint == (1, 0):
+                torque_Nm, modes = torque_Nm[::-1], modes[::-1]
+        self._arm.advance(torque_Nm, modes, tick_count)
 
     def lose_sync(self, heard: Sequence[int], t_ns: int) -> None:
         """Let the drives that have not heard a SYNC count its period; `heard`: how often each node has."""
@@ -141,26 +164,43 @@ class BenchNodes:
             if not has_heard:
                 drive.on_lost_sync(t_ns)
 
-    def _motor(self, joint: int) -> Motor:
+    def sample(self) -> Measurement:
+        """Measure the arm, by the places of the devices."""
+        measured = self._arm.sample()
+        return self.wiring.read(measured) if self.is_crossed else measured
+
+    def _motor(self, place: int) -> Motor:
+        joint, sign = self.wiring.drive_joint[place], self.wiring.drive_sign[place]
         return Motor(
-            velocity_rad_s=lambda: self._arm.drive_velocity_rad_s[joint],
-            torque_Nm=lambda: self._arm.motor_torque_Nm[joint],
+            velocity_rad_s=lambda: sign * self._arm.drive_velocity_rad_s[joint],
+            torque_Nm=lambda: sign * self._arm.motor_torque_Nm[joint],
             is_limited=lambda: self._arm.is_torque_limited[joint],
             error_code=lambda: self._arm.motor_error_code[joint],
         )
 
-    def _make_sensor(self, joint: int, codec: Codec, scenario: Scenario) -> SensorNode:
+    def _make_sensor(self, place: int, codec: Codec, scenario: Scenario) -> SensorNode:
+        joint = self.wiring.sensor_joint[place]
+        low, high = converter_ends(scenario.sensors, joint)
+        own = scenario.own_arm
         return SensorNode(
-            self.devices[JOINTS + joint],
+            self.devices[JOINTS + place],
             codec,
-            joint + 1,
-            converter_ends(scenario.sensors, joint),
+            place + 1,
+            (low, high) if self.wiring.sensor_sign[place] > 0 else (-high, -low),
             lambda: self._arm.joint_temperature_C[joint],
+            None if own is None else own.torque_factor[place] * count_Nm(scenario.sensors, joint),
         )
 
     def _set_period(self, period_us: int) -> None:
         if period_us:  # 0 is written to change 0x1019; the period stays
             self.period_ns = period_us * 1000
+
+
+def _scale_of(own: OwnArmSettings | None, place: int) -> DriveScale:
+    if own is None:
+        return DriveScale()
+    increments = own.increments_per_joint_rev[place] or ENCODER_COUNTS
+    return DriveScale(increments / ENCODER_COUNTS, own.velocity_factor[place])
 
 
 def _check_period(period_us: int) -> None:

@@ -35,7 +35,7 @@ from adacd_hil.records import Vector
 from firmware_sim.arm.device_settings import SensorSettings
 from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.scripted_contact import PAIR, TICK_S
-from firmware_sim.arm.sensing import torque_counts
+from firmware_sim.arm.sensing import TORQUE_LSB_NM, TORQUE_RANGE_NM, torque_counts
 
 ENCODER_NUMBERS: Final = float_fields(
     {
@@ -114,6 +114,7 @@ TRANSDUCER_NUMBERS: Final = float_fields(
         "rate_Hz": PAIR,  # Hz of the own clock, error included; 0: at SYNC
         "phase": PAIR,  # sample periods
         "lsb_Nm": PAIR,  # of the converter, Nm
+        "count_Nm": PAIR,  # of the wire, Nm
         "highest": PAIR,  # code of the converter; the lowest is −1 − HIGHEST
         "has_memory": (),  # whether what happens within a tick matters: hysteresis, filter, own clock
     }
@@ -151,10 +152,16 @@ def transducer_numbers(settings: SensorSettings, offset_Nm: tuple[float, float])
     numbers["rate_Hz"][:] = np.array(settings.sample_rate_Hz) * (1.0 + 1e-6 * np.array(settings.clock_error_ppm))
     numbers["phase"][:] = settings.clock_phase
     numbers["lsb_Nm"][:] = 2.0 * np.array(settings.torque_range_Nm) / 2.0 ** np.array(settings.torque_bits)
+    numbers["count_Nm"][:] = [count_Nm(settings, joint) for joint in range(2)]
     numbers["highest"][:] = 2.0 ** (np.array(settings.torque_bits) - 1.0) - 1.0
     memory = (*settings.hysteresis_Nm, *settings.torque_bandwidth_Hz, *settings.sample_rate_Hz)
     numbers["has_memory"] = 1.0 if any(memory) else 0.0
     return numbers
+
+
+def count_Nm(settings: SensorSettings, joint: int) -> float:
+    """Return what a count of the wire is worth: 16 bits over the range, or over ±50 Nm where that is wider."""
+    return TORQUE_LSB_NM * max(1.0, settings.torque_range_Nm[joint] / TORQUE_RANGE_NM)
 
 
 def converter_ends(settings: SensorSettings, joint: int) -> tuple[int, int]:
@@ -169,7 +176,7 @@ def _convert(numbers: np.void, joint: int, torque_Nm: float) -> int:
     lsb_Nm = numbers["lsb_Nm"][joint]
     highest = numbers["highest"][joint]
     code = min(max(math.floor(torque_Nm / lsb_Nm + 0.5), -1.0 - highest), highest)
-    return torque_counts(code * lsb_Nm)
+    return torque_counts(code * lsb_Nm, numbers["count_Nm"][joint])
 
 
 @compiled

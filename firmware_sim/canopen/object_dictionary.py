@@ -6,9 +6,10 @@ there is one, answers a read; the dictionary checks a write before it stores it.
 """
 
 import contextlib
+import copy
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
@@ -19,12 +20,16 @@ from canopen.network import PeriodicMessageTask
 from canopen.objectdictionary import ODVariable, datatypes
 from canopen.sdo.server import SdoServer
 
+from adacd_hil.records import JOINTS
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
 from adacd_hil.wire.contract_frames import move_contract
 
 Send = Callable[[int, bytes], None]
+Values = Mapping[tuple[int, int], int]
+"""Values of objects by index and sub-index."""
+_NO_VALUES: Values = {}
 
 _FIRST_INDEX = 0x1000  # below are data types: dummy mapping entries, no objects
 _FORMATS = {
@@ -201,11 +206,25 @@ def _read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
     return canopen.import_od(str(path), node_id)
 
 
+def _with_defaults(objects: canopen.ObjectDictionary, defaults: Values, fallbacks: Values) -> canopen.ObjectDictionary:
+    """Give a copy of a dictionary other defaults, and one to each number that has none: its fallback, or 0."""
+    objects = copy.deepcopy(objects)
+    for index, entry in objects.items():
+        for subindex, variable in {0: entry}.items() if isinstance(entry, ODVariable) else entry.subindices.items():
+            key = (index, subindex)
+            if key in defaults:
+                variable.default = variable.value = defaults[key]
+            elif variable.default is None and variable.value is None and variable.data_type in datatypes.NUMBER_TYPES:
+                variable.default = fallbacks.get(key, 0)
+    return objects
+
+
 class _DictionaryNode(canopen.LocalNode):
     """canopen's local node with strict sub-indices and without its own heartbeat."""
 
-    def __init__(self, node_id: int, eds_path: Path) -> None:
-        super().__init__(node_id, _read_eds(eds_path, node_id))
+    def __init__(self, node_id: int, eds_path: Path, defaults: Values, fallbacks: Values) -> None:
+        objects = _read_eds(eds_path, node_id)
+        super().__init__(node_id, _with_defaults(objects, defaults, fallbacks) if defaults or fallbacks else objects)
         self._write_callbacks.clear()  # NmtSlave.on_write would start a periodic task
         self.sdo = _Server(self)
         self.sdo._index = self.sdo._subindex = 0  # an abort before the first transfer needs an index to name
@@ -224,8 +243,13 @@ class _DictionaryNode(canopen.LocalNode):
 class ObjectDictionary:
     """The objects of one device: values from the EDS, live values, checked writes, and SDO over the bus."""
 
-    def __init__(self, node_id: int, eds_path: Path, send: Send) -> None:
-        """Read the EDS. Raises OSError when it can't be read."""
+    def __init__(
+        self, node_id: int, eds_path: Path, send: Send, defaults: Values = _NO_VALUES, fallbacks: Values = _NO_VALUES
+    ) -> None:
+        """Read the EDS; `defaults` outweigh its own, `fallbacks` are for numbers without one.
+
+        Raises OSError when it can't be read.
+        """
         self.node_id = node_id
         self._readers: dict[tuple[int, int], Callable[[], int]] = {}
         self._checks: dict[tuple[int, int], list[Callable[[int], None]]] = {}
@@ -233,7 +257,7 @@ class ObjectDictionary:
         self.is_locked: Callable[[int, int], bool] = lambda _index, _subindex: False
         """Whether the state of the device forbids SDO to write an object now."""
         self._is_requested = False  # an SDO request is in progress
-        self._node = _DictionaryNode(node_id, eds_path)
+        self._node = _DictionaryNode(node_id, eds_path, defaults, fallbacks)
         self._node.associate_network(_SilentNetwork(send))
         self._node.add_read_callback(self._read)  # type: ignore[no-untyped-call]
         self._node.add_write_callback(self._write)  # type: ignore[no-untyped-call]
@@ -361,12 +385,33 @@ def _call_all(functions: list[Callable[[int], None]], value: int) -> None:
 
 
 @dataclass(frozen=True)
+class DeviceDescription:
+    """One device: its EDS, and what else its objects hold at power-on.
+
+    defaults: values in place of the EDS's. fallbacks: values where the EDS has none. aliases: objects that hold the
+    live value of another.
+    """
+
+    eds: Path
+    defaults: Values = field(default_factory=dict)
+    fallbacks: Values = field(default_factory=dict)
+    aliases: Mapping[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class EmulatedContract:
-    """File names within `contract_folder`."""
+    """File names within `contract_folder`. `devices`: those of an arm of one's own, by place, in their stead."""
 
     dbc: str
     drive_eds: str
     sensor_eds: str
+    devices: tuple[DeviceDescription, ...] = ()
+
+    def describe(self, place: int) -> DeviceDescription:
+        """Describe the device at a place: drive 1, drive 2, sensor 1, sensor 2."""
+        if self.devices:
+            return self.devices[place]
+        return DeviceDescription(contract_folder() / (self.drive_eds if place < JOINTS else self.sensor_eds))
 
     @property
     def path(self) -> Path:

@@ -29,10 +29,12 @@ from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.bench.injector import Departure, OnEvent
 from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
-from firmware_sim.canopen.object_dictionary import CONTRACTS
+from firmware_sim.canopen.object_dictionary import CONTRACTS, EmulatedContract
 from firmware_sim.canopen.pdo_record import LAST_NODE
+from firmware_sim.cli.own_devices import rehearse
 from firmware_sim.cli.scenario_list import check, describe_all, show, show_as_table
 from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal
+from firmware_sim.scenario.arm_truth import load_truth, truth_names
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 
@@ -116,6 +118,16 @@ def cli() -> None:
 @cli.command(epilog=EPILOG)
 @on_bus
 @click.option(
+    "--config",
+    metavar="NAME|FILE",
+    help="Play the arm of this configuration, the one that the host reads; what it lacks is assumed and told.",
+)
+@click.option(
+    "--truth",
+    metavar="NAME|FILE",
+    help="What the real arm is where --config says otherwise: one that `firmware-sim truths` names, or a TOML file.",
+)
+@click.option(
     "--scenario",
     default="paper",
     show_default=True,
@@ -134,6 +146,8 @@ def run(
     node_offset: int,
     host_node: int,
     clock_mode: ClockMode,
+    config: str | None,
+    truth: str | None,
     scenario: str,
     profile: str | None,
     seed: int | None,
@@ -142,8 +156,17 @@ def run(
     as_json: bool,
 ) -> int:
     """Run the emulated arm; prints "ready" on stderr once its nodes have announced themselves."""
-    resolved = load_scenario(scenario, profile, seed)
-    codec = move_contract(load_codec(CONTRACTS[contract].path), node_offset, host_node)
+    played: EmulatedContract | None = None
+    if config is None:
+        if truth is not None:
+            raise ConfigError("--truth needs --config: the configuration that the host is told")
+        resolved = load_scenario(scenario, profile, seed)
+        codec = move_contract(load_codec(CONTRACTS[contract].path), node_offset, host_node)
+    else:
+        _refuse_beside_config()
+        codec, played, resolved, assumed = rehearse(config, scenario, truth, profile, seed)
+        for line in assumed:
+            _tell(line)
     clock = MonotonicClock()
     with ExitStack() as stack:
         if out is not None:
@@ -152,21 +175,21 @@ def run(
         bus = open_devices_end(interface, channel, clock, codec)
         stack.callback(bus.close)
         stop = stack.enter_context(stop_by_signal())
-        truth = None
+        log: TruthLog | None = None
         if out is not None:
-            metadata = {"scenario": resolved.name, "profile": resolved.profile, "seed": str(resolved.seed)}
+            metadata = {"scenario": resolved.name, "profile": resolved.arm.name, "seed": str(resolved.seed)}
             _make_folder(out)
             # By SYNC, time waits for the log; by wall clock nothing may.
-            truth = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
-            stack.enter_context(truth)
+            log = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
+            stack.enter_context(log)
         departure = Departure(bus)
-        bench = Bench(resolved, codec, departure.send, clock_mode=clock_mode, on_answer=departure.go)
-        if truth is not None:
+        bench = Bench(resolved, codec, departure.send, clock_mode=clock_mode, contract=played, on_answer=departure.go)
+        if log is not None:
             epoch_ns = wall_ns() - clock.now_ns()
-            bench.rows.on_truth = _stamp_truth(truth, bench, epoch_ns)
-            bench.injector.on_event = _stamp_events(truth, bench, epoch_ns)
+            bench.rows.on_truth = _stamp_truth(log, bench, epoch_ns)
+            bench.injector.on_event = _stamp_events(log, bench, epoch_ns)
         _serve(Service(bench, bus, departure, clock, clock_mode, stop, is_once))
-        return _report(bench, resolved, clock_mode, truth, as_json)
+        return _report(bench, resolved, clock_mode, log, as_json)
 
 
 @cli.command(
@@ -231,6 +254,19 @@ def list_scenarios(as_json: bool) -> int:
     else:
         columns = ("name", "group", "about")
         print("\n".join(fit_table([columns, *([row[name] for name in columns] for row in described)])))
+    return EmulatorExit.OK
+
+
+@cli.command("truths", epilog=EPILOG)
+@click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
+def list_truths(as_json: bool) -> int:
+    """List the truths that come with the package: name, and what the host is told wrongly."""
+    rows = [{"name": name, "about": load_truth(name)[0].about} for name in truth_names()]
+    if as_json:
+        print(json.dumps(rows, indent=2, ensure_ascii=False))
+    else:
+        width = max(len(row["name"]) for row in rows)
+        print("\n".join(f"{row['name'].ljust(width)}  {row['about']}" for row in rows))
     return EmulatorExit.OK
 
 
@@ -309,7 +345,7 @@ def _report(
     """Print how it went, having closed the truth log."""
     described: dict[str, Any] = {
         "scenario": scenario.name,
-        "profile": scenario.profile,
+        "profile": scenario.arm.name,
         "seed": scenario.seed,
         "clock": clock_mode,
         "cycles": bench.cycle + 1,
@@ -362,6 +398,18 @@ def _report_played(bench: RecordedBench, cycles: RecordedCycles | None, as_json:
         }
         print(json.dumps(described))
     return EmulatorExit.FAILURE if problem else EmulatorExit.OK
+
+
+def _refuse_beside_config() -> None:
+    """Raise ConfigError for options whose values the configuration gives."""
+    context = click.get_current_context()
+    for name, option in (("contract", "--contract"), ("node_offset", "--node-offset"), ("host_node", "--host-node")):
+        if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
+            raise ConfigError(f"{option} can't stand beside --config, which says it")
+
+
+def _tell(line: str) -> None:
+    print(one_line(line), file=sys.stderr)
 
 
 def _complain(line: str) -> None:

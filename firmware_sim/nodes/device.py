@@ -22,7 +22,7 @@ from firmware_sim.canopen.error_control import (
     Watchdog,
     Watchdogs,
 )
-from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, refuse
+from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, Values, refuse
 from firmware_sim.canopen.pdo import Pdos, PdoUser
 
 _GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
@@ -85,12 +85,14 @@ class EmulatedDevice(ObjectDictionary):
         send: Send,
         messages: Mapping[int, MessageCodec] | None = None,
         longest_pdo: int = CLASSIC_BYTES,
+        defaults: Values | None = None,
+        fallbacks: Values | None = None,
     ) -> None:
         """Read the EDS; nothing is sent before `boot`. Raises OSError when the EDS can't be read.
 
-        `messages`: the contract's, by identifier. `longest_pdo` in bytes.
+        `messages`: the contract's, by identifier. `longest_pdo` in bytes. `defaults`, `fallbacks`: of objects.
         """
-        super().__init__(node_id, eds_path, self._send)
+        super().__init__(node_id, eds_path, self._send, defaults or {}, fallbacks or {})
         self.clock = NodeClock()
         self.is_powered = True
         self.is_on_bus = True

@@ -26,6 +26,7 @@ from firmware_sim.nodes.drive_profile import (
     RAMPS,
     STATE_BITS,
     DriveEvent,
+    DriveScale,
     DriveState,
     Motor,
     Patience,
@@ -62,6 +63,7 @@ class DriveNode(Application):
         motor: Motor,
         rated_torque_Nm: float,
         is_free_running: bool,
+        scale: DriveScale = DriveScale(),  # noqa: B008 (a constant)
     ) -> None:
         """Connect the node to its device.
 
@@ -80,7 +82,8 @@ class DriveNode(Application):
         self.is_free_running = is_free_running
         """Whether time passes without SYNC, so that SYNC is watched."""
         self._rated_mNm = round(rated_torque_Nm * 1000)
-        self._velocity_lsb_rad_s = velocity_lsb(codec, number)
+        self._position_scale = scale.position
+        self._velocity_lsb_rad_s = velocity_lsb(codec, number, scale.velocity)
         self._position = self._velocity = 0
         self._limits = TorqueLimits(device, self._pdos)
         self._demand = self._acted_commands = 0
@@ -177,7 +180,7 @@ class DriveNode(Application):
         """
         t_ns = self._clock.own_ns(t_ns)
         self._patience.sync_ns = t_ns
-        self._position = position
+        self._position = position if self._position_scale == 1.0 else round(position * self._position_scale)
         lsb_rad_s = self._velocity_lsb_rad_s
         if lsb_rad_s is None:
             self._velocity = velocity

@@ -257,6 +257,13 @@ class Motor(NamedTuple):
     error_code: Callable[[], int] = lambda: 0
 
 
+class DriveScale(NamedTuple):
+    """How a drive counts: position in the body's counts, velocity in those that the contract says."""
+
+    position: float = 1.0
+    velocity: float = 1.0
+
+
 class Patience:
     """How long an enabled drive goes without SYNC and without commands: 0x1006, 0x2200, 0x2201."""
 
@@ -297,8 +304,8 @@ class Patience:
         self._tenth_periods = tenth_periods
 
 
-def velocity_lsb(codec: Codec, number: int) -> float | None:
-    """Return the contract's LSB of velocity in rad/s, None when it is the body's own."""
+def velocity_lsb(codec: Codec, number: int, factor: float = 1.0) -> float | None:
+    """Return the LSB of velocity in rad/s, the contract's divided by `factor`; None when it is the body's own."""
     signals = codec.message(f"Drive{number}Feedback").signals
-    scale = next(signal.scale for signal in signals if signal.name == "velocity")
+    scale = next(signal.scale for signal in signals if signal.name == "velocity") / factor
     return None if scale == VELOCITY_LSB_RAD_S else scale

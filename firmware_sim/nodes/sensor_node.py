@@ -40,11 +40,13 @@ class SensorNode(Application):
         number: int,
         converter_ends: tuple[int, int] = TORQUE_COUNTS,
         temperature_C: Callable[[], float] = lambda: ROOM_TEMPERATURE_C,
+        count_Nm: float | None = None,
     ) -> None:
         """Connect the node to its device.
 
         `number`: 1 or 2, as in the DBC's names. `converter_ends`: lowest and highest counts that the converter gives.
-        `temperature_C`: of the joint, 0x2111.
+        `temperature_C`: of the joint, 0x2111. `count_Nm`: what the device makes of a count of the converter; None: its
+        worth, and then no value is beyond the signal.
         """
         self.device = device
         self.has_news = False
@@ -52,8 +54,12 @@ class SensorNode(Application):
         self._pdos = device.pdos
         self._lowest_count, self._highest_count = converter_ends
         signals = codec.message(f"Sensor{number}Torque").signals
-        scale_Nm = next(signal.scale for signal in signals if signal.name == "torque")
-        self._lsbs_per_count = TORQUE_LSB_NM * round(1.0 / scale_Nm)  # exact: contracts have decimal fractions
+        signal = next(signal for signal in signals if signal.name == "torque")
+        if count_Nm is None:
+            self._lsbs_per_count = TORQUE_LSB_NM * round(1.0 / signal.scale)  # exact: contracts have decimal fractions
+        else:
+            self._lsbs_per_count = count_Nm / signal.scale
+        self._ends = signal.raw_low, signal.raw_high
         self._status = STATUS_NOT_VALID  # nothing measured yet
         self._torque = self._counts = 0
         self._zero_counts = 0.0
@@ -84,7 +90,9 @@ class SensorNode(Application):
             self.has_news = True
         if self._autozero_left:
             self._autozero(counts)
-        self._torque = round((counts - self._zero_counts) * self._lsbs_per_count)
+        torque = round((counts - self._zero_counts) * self._lsbs_per_count)
+        lowest, highest = self._ends
+        self._torque = torque if lowest <= torque <= highest else lowest if torque < lowest else highest
         self._counts = counts
         if self._pdos.has_compared and self._pdos.compare():
             self.has_news = True

@@ -32,6 +32,7 @@ from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.device_settings import DriveSettings, SensorSettings
 from firmware_sim.arm.mechanics_settings import MechanicsSettings, PayloadBody
+from firmware_sim.arm.own_arm import STRAIGHT, OwnArmSettings, Wiring
 from firmware_sim.arm.scripted_contact import ContactSettings, ticks
 from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
 from firmware_sim.scenario.faults import FaultSettings, check_rows
@@ -189,6 +190,7 @@ class Scenario:
         0, low=0, high=1000, meaning="how many faults the person acknowledges, each 1 s after it"
     )
     profile: str = setting("P", choices=tuple(ARMS), meaning="which arm")
+    own_arm: OwnArmSettings | None = setting(None, meaning="an arm of one's own in place of the profile")
     seed: int = setting(1, low=0, high=2**63 - 1, meaning="of the sensor noise")
     noise: bool = setting(True, meaning="noise of torque sensors and encoders; quantisation stays")
     start_deg: tuple[float, float] = setting(
@@ -262,8 +264,13 @@ class Scenario:
 
     @property
     def arm(self) -> ArmProfile:
-        """The arm of this profile."""
-        return ARMS[self.profile]
+        """The arm of one's own, or that of the profile."""
+        return ARMS[self.profile] if self.own_arm is None else self.own_arm.profile
+
+    @property
+    def wiring(self) -> Wiring:
+        """How the devices are at the joints."""
+        return STRAIGHT if self.own_arm is None else self.own_arm.wiring
 
     @property
     def payload_bodies(self) -> tuple[PayloadBody, ...]:
@@ -288,7 +295,13 @@ def _builtin_folder() -> Traversable:
 
 def load_scenario(name_or_file: str, profile: str | None = None, seed: int | None = None) -> Scenario:
     """Read a scenario: a built-in name or a TOML file. `profile` and `seed` outweigh the file's. Raises ConfigError."""
-    table = read_table(name_or_file)
+    return resolve_scenario(name_or_file, read_table(name_or_file), profile, seed)
+
+
+def resolve_scenario(
+    name_or_file: str, table: dict[str, Any], profile: str | None = None, seed: int | None = None
+) -> Scenario:
+    """Resolve a scenario's table. Raises ConfigError."""
     if profile is not None:
         table["profile"] = profile
     if seed is not None:

@@ -115,14 +115,10 @@ def test_a_dbc_that_says_otherwise_than_the_device_profiles_is_refused_before_th
     assert not played.log.exists()
 
 
-def test_a_contract_that_no_emulated_device_has_is_refused_before_a_folder_is_made(tmp_path: Path) -> None:
+def test_a_scale_that_the_sensors_own_eds_contradicts_is_refused_before_the_arm_moves(tmp_path: Path) -> None:
     played = adacd_hil(tmp_path, "demo", "--config", str(other_contract(tmp_path)), "--out", "run")
-    (complaint,) = played.error_lines
-    assert played.status == USAGE
-    assert re.search(
-        r"no emulated device has the frames of contract\.dbc, layout digest 0x[0-9A-F]{8}; .* arm,", complaint
-    )
-    assert not (tmp_path / "run").exists()
+    assert played.status == BUS_MISSING
+    assert played.error_lines[-1] == "adacd-hil: Sensor1 (node 3): decimal digits 0x6132:1 = 6, 5 expected"
 
 
 @pytest.mark.long

@@ -192,7 +192,7 @@ def test_the_built_in_scenarios_have_no_errors(name):
         ("sensors", "gain_error = [0.0]", "`sensors.gain_error` has 1 values, 2 expected"),
         ("sensors", "gain_error = 0.1", "`sensors.gain_error` = 0.1 must be a list"),
         ("sensors", "cross_talk = [0.6, 0.0]", "`sensors.cross_talk[0]` = 0.6 is above 0.5"),
-        ("sensors", "torque_range_Nm = [50.0, 60.0]", "`sensors.torque_range_Nm[1]` = 60.0 Nm is above 50 Nm"),
+        ("sensors", "torque_range_Nm = [50.0, 20000.0]", "`sensors.torque_range_Nm[1]` = 20000.0 Nm is above 10000 Nm"),
         ("sensors", "torque_bits = [16, 3]", "`sensors.torque_bits[1]` = 3 is below 4"),
         ("sensors", "torque_bits = [16, 12.5]", "`sensors.torque_bits[1]` = 12.5 must be of type int"),
         ("sensors", "encoder_bits = [25, 20]", "`sensors.encoder_bits[0]` = 25 is above 24"),

@@ -16,13 +16,16 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.file_access import in_words
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.records import FaultReason, SchemeState
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings, configuration_layers, load_settings, resolved_table
 from adacd_hil.settings.run_settings import RequestSettings
+from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.bench_time import TruthLog
-from firmware_sim.canopen.object_dictionary import playable_contract
+from firmware_sim.canopen.object_dictionary import EmulatedContract, playable_contract
+from firmware_sim.cli.own_devices import rehearse_settings
+from firmware_sim.scenario.rehearsal import told_arm
 from firmware_sim.scenario.scenario import Scenario, ScenarioOutcome, load_scenario, named_profile
 
 if TYPE_CHECKING:
@@ -39,17 +42,27 @@ class Cast(NamedTuple):
 
     settings: Settings
     scenario: Scenario
+    contract: EmulatedContract | None = None
+    assumed: tuple[str, ...] = ()
 
 
-def resolve(config: str, scenario_name: str, profile: str | None, seed: int | None) -> Cast:
-    """Read configuration and scenario. Raises ConfigError.
+def resolve(config: str, scenario_name: str, profile: str | None, seed: int | None, truth: str | None = None) -> Cast:
+    """Read configuration, scenario and truth. Raises ConfigError, CodecError.
 
-    The profile is the given one, else that of the scenario's file, else the configuration's. A configuration without a
+    A configuration of an arm of one's own is played as that arm, unless a profile is given. Else the profile is the
+    given one, else that of the scenario's file, else the configuration's. A configuration without a
     script gets the demo's user: who only watches can't acknowledge. One that doesn't say what the motors hold gets it
     from the emulated arm, as from a data sheet.
     """
-    settings = load_settings(config, profile or named_profile(scenario_name))
-    scenario = load_scenario(scenario_name, settings.arm.profile, seed)
+    contract: EmulatedContract | None = None
+    assumed: list[str] = []
+    layers = configuration_layers(config, profile)
+    settings = parse(Settings, resolved_table(layers))
+    if truth is not None or (profile is None and told_arm(settings, layers).is_own):
+        _, contract, scenario, assumed = rehearse_settings(settings, layers, scenario_name, truth, seed)
+    else:
+        settings = load_settings(config, profile or named_profile(scenario_name))
+        scenario = load_scenario(scenario_name, settings.arm.profile, seed)
     operator = settings.operator
     if not operator.script:  # nobody else plays the user of an emulated arm
         operator = load_settings(USER).operator
@@ -62,7 +75,7 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
     arm = settings.arm
     if arm.holding_torque_Nm is None:
         arm = dataclasses.replace(arm, holding_torque_Nm=scenario.mechanics.holding_torque_Nm)
-    return Cast(dataclasses.replace(settings, arm=arm, operator=operator), scenario)
+    return Cast(dataclasses.replace(settings, arm=arm, operator=operator), scenario, contract, tuple(assumed))
 
 
 def run_embedded(
@@ -77,10 +90,10 @@ def run_embedded(
 
     Raises ConfigError, CodecError, LogError, OSError.
     """
-    settings, scenario = cast
+    settings, scenario = cast.settings, cast.scenario
     check_shared("lockstep", settings)  # an arm in this process has no neighbour
     codec = load_contract(settings)
-    contract = playable_contract(codec)
+    contract = cast.contract or playable_contract(codec)
     clock = make_clock(clock_name)
     embedded = EmbeddedBus(clock)
     bus: Bus = model_time(embedded, clock, codec, settings) if isinstance(clock, VirtualClock) else embedded
@@ -123,16 +136,20 @@ def play(
     clock_name: str,
     out: Path | None,
     live: LiveAddress | None = None,
+    truth: str | None = None,
 ) -> tuple["Report", ExitCode]:
     """Play a scenario and report it; `out` None: in a new folder by date.
 
     Raises ConfigError, CodecError, LogError, CommandError, OSError.
     """
-    cast = resolve(config, scenario_name, profile, seed)
-    settings, scenario = cast
+    cast = resolve(config, scenario_name, profile, seed, truth)
+    settings, scenario = cast.settings, cast.scenario
     what = "experiment" if scenario_name == SCENARIO else f"scenario {scenario.name}"
     with run_folder(out, (LOG_NAME, TRUTH_NAME), "demo") as folder, Progress() as progress:
-        progress(f"{what} of configuration {settings.name}, profile {settings.arm.profile}, in {folder.path}")
+        arm = f"profile {settings.arm.profile}" if scenario.own_arm is None else "its own arm"
+        progress(f"{what} of configuration {settings.name}, {arm}, in {folder.path}")
+        for line in cast.assumed:
+            progress(line)
         on_started = functools.partial(folder.link, progress)
         summary, truth_path = run_embedded(cast, clock_name, folder.path, progress, live, on_started)
         if summary.result is not None:

@@ -1,0 +1,132 @@
+"""The devices of a configuration, as the emulator plays them: the contract of their frames, EDS files, counts.
+
+The only place where the emulator reads what the host's package knows of devices: profiles, which are files that
+describe a device, and the contract that follows from them, which is the definition of the messages.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from adacd_hil.device.contract import load_contract
+from adacd_hil.device.profile import PlacedDevice, place_devices
+from adacd_hil.records import JOINTS
+from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
+from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.wire.codec import Codec, contract_folder
+from firmware_sim.canopen.object_dictionary import DeviceDescription, EmulatedContract, contract_of
+from firmware_sim.scenario.arm_truth import ArmTruth, load_truth
+from firmware_sim.scenario.rehearsal import DeviceCounts, compose_scenario, told_arm
+from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, read_table, resolve_scenario
+
+_NOT_VALID = 1 << 31
+_CYCLIC_SYNCHRONOUS_TORQUE = 1 << 9  # of 0x6502
+_NEWTON_METRE = 0x00560100
+_RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
+_OBJECTS = {
+    "position": (0x6064, 0),
+    "velocity": (0x606C, 0),
+    "torque_actual": (0x6077, 0),
+    "torque_demand": (0x6074, 0),
+    "error_code": (0x603F, 0),
+    "torque": (0x9130, 1),
+    "gross_torque": (0x2110, 1),
+    "status": (0x6150, 1),
+    "temperature": (0x2111, 0),
+}
+"""Where the emulated devices have what a profile maps from objects of its own."""
+_SENSOR_OBJECTS = (0x1006, 0x1017)
+_DRIVE_OBJECTS = (*_SENSOR_OBJECTS, 0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x606C, 0x6071, 0x6076)
+
+
+class Rehearsal(NamedTuple):
+    """An arm that can be played: its frames, its devices, its scenario; and what was assumed, a line each."""
+
+    codec: Codec
+    contract: EmulatedContract
+    scenario: Scenario
+    assumed: list[str]
+
+
+def rehearse(
+    config: str, scenario: str, truth: str | None = None, profile: str | None = None, seed: int | None = None
+) -> Rehearsal:
+    """Compose the arm of a configuration. Raises ConfigError, CodecError."""
+    layers = configuration_layers(config, profile)
+    settings = parse(Settings, resolved_table(layers))
+    return rehearse_settings(settings, layers, scenario, truth, seed)
+
+
+def rehearse_settings(
+    settings: Settings,
+    layers: Sequence[ConfigurationLayer],
+    scenario_name: str,
+    truth_name: str | None = None,
+    seed: int | None = None,
+) -> Rehearsal:
+    """Compose the arm of a configuration that was resolved from `layers`. Raises ConfigError, CodecError."""
+    codec = load_contract(settings)
+    devices = place_devices(settings)
+    told = told_arm(settings, layers)
+    table = read_table(scenario_name)
+    is_builtin = scenario_name in builtin_scenarios()
+    if truth_name is None and not told.is_own:
+        return Rehearsal(
+            codec, contract_of(codec), resolve_scenario(scenario_name, table, settings.arm.profile, seed), []
+        )
+    truth, sections = load_truth(truth_name) if truth_name is not None else (ArmTruth(), {})
+    for name, section in sections.items():
+        if not isinstance(section, dict):
+            raise ConfigError(f"truth {truth_name}: `{name}` = {section!r} must be a table")
+        table[name] = {**table.get(name, {}), **section}
+    composed, assumed = compose_scenario(told, truth, _counts(codec, devices), table, is_builtin)
+    scenario = resolve_scenario(scenario_name, composed, settings.arm.profile, seed)
+    return Rehearsal(codec, describe_devices(codec, devices), scenario, assumed)
+
+
+def _counts(codec: Codec, devices: list[PlacedDevice]) -> DeviceCounts:
+    drives, sensors = devices[:JOINTS], devices[JOINTS:]
+    first, second = (float(drive.settings.scale.increments_per_joint_rev) for drive in drives)
+    ranges = []
+    for sensor in sensors:
+        message = codec.message(f"{sensor.name}Torque")
+        signal = message.values[message.place("torque")]
+        ranges.append(sensor.settings.plausibility.torque_range_Nm or signal.raw_high * signal.scale)
+    return DeviceCounts((first, second), (ranges[0], ranges[1]))
+
+
+def describe_devices(codec: Codec, devices: list[PlacedDevice]) -> EmulatedContract:
+    """Describe the four devices by their own EDS. Raises ConfigError when one lacks an object that no drive lacks."""
+    return EmulatedContract(codec.path.name, "", "", tuple(_describe(device) for device in devices))
+
+
+def _describe(device: PlacedDevice) -> DeviceDescription:
+    """Say what a device's objects hold at power-on: what its EDS says, where that is silent what the profile does."""
+    kind, scale = device.settings.kind, device.settings.scale
+    needed = _DRIVE_OBJECTS if kind == "drive" else _SENSOR_OBJECTS
+    if lacking := [f"0x{index:04X}" for index in needed if not device.has(index)]:
+        raise ConfigError(f"{device.name}: {device.profile.eds.name} lacks {', '.join(lacking)}; it can't be played")
+    defaults: dict[tuple[int, int], int] = {}
+    if device.settings.serial:
+        defaults[0x1018, 4] = device.settings.serial[device.joint]
+    aliases = {
+        (signal.name.index, signal.name.sub): _OBJECTS[signal.signal]
+        for pdo in device.settings.pdo
+        if not pdo.is_received
+        for signal in pdo.signals
+        if signal.signal in _OBJECTS
+    }
+    if device.profile.eds.parent == contract_folder():
+        return DeviceDescription(device.profile.eds, defaults, {}, aliases)
+    fallbacks = {(0x1005, 0): 0x80, (0x1006, 0): 1000, (0x1014, 0): 0x80 + device.node_id}
+    fallbacks |= {(index, 1): _NOT_VALID for index in _RECORDS}
+    for pdo in device.settings.pdo:
+        fallbacks[pdo.communication_index, 1] = device.can_id(pdo)
+        fallbacks[pdo.communication_index, 2] = pdo.transmission
+    if kind == "drive":
+        fallbacks |= {(0x608F, 1): scale.increments_per_joint_rev, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
+        fallbacks[0x6502, 0] = _CYCLIC_SYNCHRONOUS_TORQUE
+    else:
+        fallbacks |= {(0x6131, sub): _NEWTON_METRE for sub in range(1, 255)}
+        fallbacks |= {(0x6132, sub): max(round(-math.log10(scale.torque_Nm)), 0) for sub in range(1, 255)}
+    return DeviceDescription(device.profile.eds, defaults, fallbacks, aliases)

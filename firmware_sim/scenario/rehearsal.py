@@ -1,0 +1,405 @@
+"""The arm of a configuration, composed for the emulator to play: mechanics, sensors, and a scenario to its size.
+
+The configuration is the one that the host reads. What it doesn't say is assumed and told, a line each; a truth
+outweighs both. Inertia, in the words of `firmware_sim.arm.arms`, is that of masses in the truth, else of
+`arm.cad_theta`, else of uniform rods as heavy as the drives' rated torque suggests:
+
+    γ = m₂ l₂² / 3 = τ₂ γ_P / τ_P2        α + γ = τ₁ (α + γ)_P / τ_P1, with m₁ ≥ m₂ / 2        index P: profile P
+
+From cad_theta = (a₁, a₂, a₃, …): α = a₁ − a₃, β = a₂, γ = a₃. With c₂ in the middle of link 2, or as near to it as
+β l₁ / α ≤ c₂ ≤ γ l₁ / β allows, m₂ = a₂ / (l₁ c₂), and link 1 is a rod with what is left of α.
+
+A scenario that comes with the package was made for profile P: places grow with the links, forces and payloads so that
+their torques grow with the rated torques.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from adacd_hil.settings.configuration import ConfigurationLayer, Settings, resolved_table
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.toml_files import builtin_names
+from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
+from firmware_sim.scenario.arm_truth import ArmTruth
+
+Pair = tuple[float, float]
+STANDARD_GRAVITY_M_S2: Final = 9.80665
+_MODEL: Final = ARMS["P"]
+_COULOMB_SHARE, _VISCOUS_SHARE_S = 0.003, 0.0025
+"""Friction of profile P over its rated torque, about, at 1 rad/s."""
+_BRAKING_S: Final = 0.015
+"""How long quick stop takes the unloaded arm to a third of its speed, as profile P's."""
+_STOP_MARGIN_DEG: Final = 20.0
+_NOISE_SHARE: Final = TORQUE_NOISE_NM / TORQUE_RANGE_NM
+_RANGE_PER_RATED: Final = 4.0
+_HOLDING_SHARE: Final = 1.5
+
+
+_GEOMETRY: Final = frozenset({"arm.link_length_m", "arm.cad_theta"})
+_OF_THE_ARM: Final = _GEOMETRY | {
+    "arm.rated_torque_Nm",
+    "arm.sign",
+    "devices.drive",
+    "devices.sensor",
+    "devices.drive_node",
+    "devices.sensor_node",
+}
+
+
+class DeviceCounts(NamedTuple):
+    """What a profile says that the emulated devices count in; pairs are by place.
+
+    increments_per_joint_rev: of position. torque_range_Nm: the most that the sensors' signals can carry, or that the
+    profile says.
+    """
+
+    increments_per_joint_rev: Pair
+    torque_range_Nm: Pair
+
+
+@dataclass(frozen=True)
+class _Links:
+    """Mass and place of it, by link."""
+
+    length_m: Pair
+    mass_kg: Pair
+    center_m: Pair
+    inertia_kg_m2: Pair
+
+
+class ToldArm(NamedTuple):
+    """A configuration, and which of its keys are the user's own: neither built in nor of an emulated profile."""
+
+    settings: Settings
+    own_keys: frozenset[str]
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the file says of an arm what no profile has."""
+        return bool(self.own_keys & _OF_THE_ARM)
+
+    @property
+    def has_geometry(self) -> bool:
+        """Whether the file says how long or how heavy the links are; else they are those of the profile."""
+        return bool(self.own_keys & _GEOMETRY)
+
+
+def told_arm(settings: Settings, layers: Sequence[ConfigurationLayer]) -> ToldArm:
+    """Find the user's own keys in the layers of a configuration."""
+    own = [layer for layer in layers if layer.origin not in builtin_names() and "[profiles." not in layer.origin]
+    table = resolved_table(own)
+    keys = {f"{name}.{key}" for name, section in table.items() if isinstance(section, dict) for key in section}
+    return ToldArm(settings, frozenset(keys))
+
+
+def compose_scenario(
+    told: ToldArm, truth: ArmTruth, counts: DeviceCounts, table: dict[str, Any], is_builtin: bool
+) -> tuple[dict[str, Any], list[str]]:
+    """Give a scenario's table the arm of a configuration; return it, and what was assumed, a line each.
+
+    `is_builtin`: it comes with the package, so it is fitted to the size of the arm. Raises ConfigError.
+    """
+    settings, arm = told.settings, told.settings.arm
+    assumed: list[str] = []
+    links = _place_links(told, truth, assumed)
+    rated = truth.arm.rated_torque_Nm or _times(arm.rated_torque_Nm, truth.factor.rated_torque)
+    viscous, coulomb = _friction(told, truth, rated, assumed)
+    inertia = _joint_inertia(links)
+    braking = truth.arm.brake_damping_Nm_s or _times(inertia, (1.0 / _BRAKING_S, 1.0 / _BRAKING_S))
+    stops = truth.arm.stop_deg
+    if stops is None and not told.has_geometry:
+        stops = ARMS[arm.profile].stop_deg
+    if stops is None:
+        first, second = (min(limit + _STOP_MARGIN_DEG, 720.0) for limit in arm.position_limit_deg)
+        stops = first, second
+        assumed.append(
+            f"joint stops at ±{first:g} and ±{second:g} deg, since the file has none: {_STOP_MARGIN_DEG:g} deg beyond "
+            "arm.position_limit_deg"
+        )
+    factor = truth.factor
+    increments = _by_place(truth, "drives", counts.increments_per_joint_rev)
+    own: dict[str, Any] = {
+        "name": settings.name or "own",
+        "link_length_m": links.length_m,
+        "mass_kg": links.mass_kg,
+        "center_m": links.center_m,
+        "inertia_kg_m2": links.inertia_kg_m2,
+        "viscous_Nm_s": viscous,
+        "coulomb_Nm": coulomb,
+        "rated_torque_Nm": rated,
+        "brake_damping_Nm_s": braking,
+        "stop_deg": stops,
+        **_wire(arm.sign, truth),
+        "increments_per_joint_rev": _times(increments, _by_place(truth, "drives", factor.position_counts)),
+        "velocity_factor": _by_place(truth, "drives", factor.velocity_counts),
+        "torque_factor": _by_place(truth, "sensors", factor.torque_counts),
+    }
+    own = {key: list(value) if isinstance(value, tuple) else value for key, value in own.items()}
+    composed = dict(table)
+    if is_builtin:
+        _fit(composed, settings, links.length_m, rated, assumed)
+    composed["own_arm"] = own
+    if truth.arm.torque_offset_Nm is not None:
+        composed["torque_offset_Nm"] = list(truth.arm.torque_offset_Nm)
+    composed["sensors"] = _sensors(rated, counts, composed.get("sensors", {}), assumed)
+    composed["mechanics"] = _mechanics(told, links, composed.get("mechanics", {}), assumed)
+    return composed, [f"assumed: {line}" for line in assumed]
+
+
+def _times(values: Pair, factors: Pair) -> Pair:
+    return values[0] * factors[0], values[1] * factors[1]
+
+
+def _by_place(truth: ArmTruth, what: str, by_joint: Pair) -> Pair:
+    """Order values of joints by the places of the devices that are at them."""
+    return (by_joint[1], by_joint[0]) if truth.wiring.swapped in (what, "joints") else by_joint
+
+
+def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
+    """Find lengths and masses."""
+    arm = told.settings.arm
+    told_m = truth.arm.link_length_m or arm.link_length_m
+    if not told.has_geometry and truth.arm.link_length_m is None and truth.arm.mass_kg is None:
+        model = ARMS[arm.profile]
+        assumed.append(
+            f"links, friction and stops of profile {arm.profile}, since the file has neither arm.link_length_m nor "
+            "arm.cad_theta"
+        )
+        first, second = model.links
+        links = _Links(
+            model.link_length_m,
+            (first.mass_kg, second.mass_kg),
+            (first.center_m, second.center_m),
+            (first.inertia_kg_m2, second.inertia_kg_m2),
+        )
+        return _multiply(links, truth)
+    if truth.arm.link_length_m is None and "arm.link_length_m" not in told.own_keys:
+        assumed.append(f"links of {told_m[0]:g} and {told_m[1]:g} m, since the file has no arm.link_length_m")
+    if truth.arm.mass_kg is not None:
+        links = _weighed(told_m, truth, assumed)
+    elif "arm.cad_theta" in told.own_keys and arm.cad_theta:
+        links = _from_cad(told_m, arm.cad_theta)
+        assumed.append(
+            f"links of {links.mass_kg[0]:.3g} and {links.mass_kg[1]:.3g} kg whose inertia is arm.cad_theta's to the "
+            "digit; --truth with arm.mass_kg plays another"
+        )
+    else:
+        links = _rods(told_m, _heavy_enough(told_m, arm.rated_torque_Nm))
+        for number, mass_kg in enumerate(links.mass_kg, start=1):
+            assumed.append(
+                f"link {number} mass {mass_kg:.3g} kg, a uniform rod, since the file has no arm.cad_theta; its rated "
+                "torque moves it as profile P's"
+            )
+    return _multiply(links, truth)
+
+
+def _multiply(links: _Links, truth: ArmTruth) -> _Links:
+    (f1, f2), (m1, m2) = truth.factor.link_length, truth.factor.mass
+    return _Links(
+        _times(links.length_m, (f1, f2)),
+        _times(links.mass_kg, (m1, m2)),
+        _times(links.center_m, (f1, f2)),
+        _times(links.inertia_kg_m2, (m1 * f1 * f1, m2 * f2 * f2)),
+    )
+
+
+def _weighed(length_m: Pair, truth: ArmTruth, assumed: list[str]) -> _Links:
+    assert truth.arm.mass_kg is not None
+    rods = _rods(length_m, truth.arm.mass_kg)
+    for key, meaning in (
+        ("center_m", "the centre of mass in the middle of each link"),
+        ("inertia_kg_m2", "a rod's inertia"),
+    ):
+        if getattr(truth.arm, key) is None:
+            assumed.append(f"{meaning}, since the truth has no arm.{key}")
+    return _Links(
+        length_m, rods.mass_kg, truth.arm.center_m or rods.center_m, truth.arm.inertia_kg_m2 or rods.inertia_kg_m2
+    )
+
+
+def _rods(length_m: Pair, mass_kg: Pair) -> _Links:
+    (l1, l2), (m1, m2) = length_m, mass_kg
+    return _Links(length_m, mass_kg, (l1 / 2.0, l2 / 2.0), (m1 * l1 * l1 / 12.0, m2 * l2 * l2 / 12.0))
+
+
+def _heavy_enough(length_m: Pair, rated_Nm: Pair) -> Pair:
+    """Return the masses of rods that their rated torque accelerates about as it does profile P's."""
+    (l1, l2), (r1, r2) = length_m, rated_Nm
+    alpha, _, gamma = _MODEL.inertia()
+    m2 = 3.0 * gamma * r2 / _MODEL.rated_torque_Nm[1] / l2**2
+    whole = (alpha + gamma) * r1 / _MODEL.rated_torque_Nm[0]
+    m1 = 3.0 * (whole - m2 * (l1**2 + l2**2 / 3.0)) / l1**2
+    return max(m1, m2 / 2.0), m2
+
+
+def _from_cad(length_m: Pair, theta: Sequence[float]) -> _Links:
+    """Find two links with the inertia of `arm.cad_theta`. Raises ConfigError where no links have it."""
+    a1, a2, a3 = theta[:3]
+    l1, l2 = length_m
+    alpha, beta, gamma = a1 - a3, a2, a3
+    if not (alpha > 0.0 and gamma > 0.0 and beta * beta <= alpha * gamma):
+        raise ConfigError(
+            f"`arm.cad_theta` = [{a1:g}, {a2:g}, {a3:g}, ...] is no arm's: a3 and a1 - a3 must be above 0 kg m², and "
+            f"a2² at most (a1 - a3) a3 = {alpha * gamma:.4g}"
+        )
+    if beta == 0.0:  # link 2 is balanced about its joint
+        m2 = alpha / l1**2 / 2.0
+        c2 = 0.0
+    else:
+        c2 = min(max(l2 / 2.0, 1.02 * beta * l1 / alpha), 0.98 * gamma * l1 / beta)
+        m2 = beta / (l1 * c2)
+    left = max(alpha - m2 * l1**2, 0.0)
+    m1 = max(3.0 * left / l1**2, 1e-4)
+    return _Links(length_m, (m1, m2), (l1 / 2.0, c2), (max(left - m1 * l1**2 / 4.0, 0.0), max(gamma - m2 * c2**2, 0.0)))
+
+
+def _joint_inertia(links: _Links) -> Pair:
+    """Return the inertia about each joint with the arm stretched, kg m²: about joint 1 its least, without β."""
+    (l1, _), (m1, m2), (c1, c2), (i1, i2) = links.length_m, links.mass_kg, links.center_m, links.inertia_kg_m2
+    gamma = i2 + m2 * c2**2
+    return i1 + m1 * c1**2 + m2 * l1**2 + gamma, gamma
+
+
+def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -> tuple[Pair, Pair]:
+    theta = told.settings.arm.cad_theta if "arm.cad_theta" in told.own_keys else ()
+    known = theta[3:7] if any(theta[3:7]) else ()
+    found: list[Pair] = []
+    for key, given, places, share, unit in (
+        ("viscous", truth.arm.viscous_Nm_s, slice(0, 2), _VISCOUS_SHARE_S, "Nm s/rad"),
+        ("Coulomb", truth.arm.coulomb_Nm, slice(2, 4), _COULOMB_SHARE, "Nm"),
+    ):
+        if given is not None:
+            found.append(given)
+        elif known:
+            first, second = known[places]
+            found.append((first, second))
+        elif not told.has_geometry:
+            model = ARMS[told.settings.arm.profile]
+            first, second = model.viscous_Nm_s if key == "viscous" else model.coulomb_Nm
+            found.append((first, second))
+        else:
+            first, second = _times(rated, (share, share))
+            found.append((first, second))
+            assumed.append(
+                f"{key} friction {first:.3g} and {second:.3g} {unit}, since arm.cad_theta has none: {100 * share:g} % "
+                "of rated torque"
+            )
+    viscous, coulomb = found
+    return viscous, coulomb
+
+
+def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
+    """Say where the devices are: as the host is told, but for the truth's wiring."""
+    wiring = truth.wiring
+    drive_joint, sensor_joint = (
+        (2, 1) if wiring.swapped in (what, "joints") else (1, 2) for what in ("drives", "sensors")
+    )
+    turned = [-1 if is_reversed else 1 for is_reversed in wiring.reversed_joint]
+    sensed = [-1 if is_reversed else 1 for is_reversed in wiring.reversed_sensor]
+    return {
+        "drive_joint": list(drive_joint),
+        "sensor_joint": list(sensor_joint),
+        "drive_sign": [sign[place] * turned[joint - 1] for place, joint in enumerate(drive_joint)],
+        "sensor_sign": [sign[place] * turned[j - 1] * sensed[j - 1] for place, j in enumerate(sensor_joint)],
+    }
+
+
+def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
+    """Give the sensors a range that their signals carry, and noise to it, where the scenario doesn't."""
+    sensors = dict(said)
+    if "torque_range_Nm" not in sensors:
+        ranges = [
+            min(max(TORQUE_RANGE_NM, _RANGE_PER_RATED * rated_Nm), most)
+            for rated_Nm, most in zip(rated, counts.torque_range_Nm, strict=True)
+        ]
+        sensors["torque_range_Nm"] = ranges
+        assumed.append(f"torque sensors of ±{ranges[0]:.4g} and ±{ranges[1]:.4g} Nm in 16 bits; no file says")
+    if "torque_noise_Nm" not in sensors:
+        noise = [_NOISE_SHARE * range_Nm for range_Nm in sensors["torque_range_Nm"]]
+        sensors["torque_noise_Nm"] = noise
+        assumed.append(
+            f"their noise {1000 * noise[0]:.3g} and {1000 * noise[1]:.3g} mNm rms, {100 * _NOISE_SHARE:g} % of range"
+        )
+    if "encoder_bits" not in sensors and any(counts.increments_per_joint_rev):
+        bits = [
+            min(max(math.ceil(math.log2(increments)), 8), 20) if increments else 20
+            for increments in counts.increments_per_joint_rev
+        ]
+        sensors["encoder_bits"] = bits
+    return sensors
+
+
+def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
+    """Stand the arm upright where the host estimates gravity, and let its brakes hold it."""
+    mechanics, settings = dict(said), told.settings
+    holding = settings.arm.holding_torque_Nm
+    if settings.estimator.gravity and "tilt_deg" not in mechanics:
+        mechanics["tilt_deg"], mechanics["tilt_direction_deg"] = 90.0, -90.0
+        assumed.append("the arm moves upright, q1 = 0 level, since estimator.gravity = true")
+        if holding is None and "holding_brake_Nm" not in mechanics:
+            (l1, _), (m1, m2), (c1, c2) = links.length_m, links.mass_kg, links.center_m
+            heavy = _HOLDING_SHARE * STANDARD_GRAVITY_M_S2
+            pair = heavy * (m1 * abs(c1) + m2 * (l1 + abs(c2))), heavy * m2 * abs(c2)
+            mechanics["holding_brake_Nm"] = list(pair)
+            assumed.append(
+                f"brakes that hold {pair[0]:.3g} and {pair[1]:.3g} Nm without power, since arm.holding_torque_Nm is "
+                "unset: 1.5 times gravity's"
+            )
+    if holding is not None and any(holding) and "holding_brake_Nm" not in mechanics:
+        mechanics["holding_brake_Nm"] = list(holding)
+    return mechanics
+
+
+_LENGTHS: Final = ("x_m", "y_m", "radius_m", "room_m")
+
+
+def _fit(table: dict[str, Any], settings: Settings, length_m: Pair, rated: Pair, assumed: list[str]) -> None:
+    """Fit a scenario that was made for profile P to the arm, in place."""
+    longer = length_m[0] / _MODEL.link_length_m[0], length_m[1] / _MODEL.link_length_m[1]
+    stronger = rated[0] / _MODEL.rated_torque_Nm[0], rated[1] / _MODEL.rated_torque_Nm[1]
+    reach = sum(length_m) / sum(_MODEL.link_length_m)
+    first, second = settings.trajectory.amplitude_deg
+    if "start_deg" in table:
+        table["start_deg"] = [-first, -second]
+    heavier = stronger[1] / longer[1] ** 2
+    if "payload_kg" in table:
+        table["payload_kg"] *= heavier
+    if "payloads" in table:
+        table["payloads"] = [_heavier(row, heavier, longer[1]) for row in table["payloads"]]
+    for key in ("contacts", "hands"):
+        if key in table:
+            table[key] = [_stronger(row, longer, stronger, reach) for row in table[key]]
+    for key in ("bodies", "walls"):
+        if key in table:
+            table[key] = [
+                {name: value * reach if name in _LENGTHS else value for name, value in row.items()}
+                for row in table[key]
+            ]
+    if (longer, stronger) != ((1.0, 1.0), (1.0, 1.0)):
+        assumed.append(
+            f"places of touches times {longer[0]:.3g} and {longer[1]:.3g}, as the links over profile P's, torques "
+            f"times {stronger[0]:.3g} and {stronger[1]:.3g}, payloads times {heavier:.3g}"
+        )
+
+
+def _heavier(row: dict[str, Any], heavier: float, longer: float) -> dict[str, Any]:
+    fitted = dict(row)
+    fitted["mass_kg"] = row["mass_kg"] * heavier
+    if "center_m" in row:
+        fitted["center_m"] = [value * longer for value in row["center_m"]]
+    if "inertia_kg_m2" in row:
+        fitted["inertia_kg_m2"] = row["inertia_kg_m2"] * heavier * longer**2
+    return fitted
+
+
+def _stronger(row: dict[str, Any], longer: Pair, stronger: Pair, reach: float) -> dict[str, Any]:
+    link = row["link"] - 1
+    fitted = {name: value * reach if name in _LENGTHS else value for name, value in row.items()}
+    fitted["point_m"] = row["point_m"] * longer[link]
+    for key in ("force_N", "force_limit_N"):
+        if key in row:
+            fitted[key] = row[key] * stronger[link] / longer[link]
+    return fitted
