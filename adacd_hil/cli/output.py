@@ -36,13 +36,14 @@ class ExitCode(IntEnum):
     PARTIAL = 3
     SAFETY_STOP = 4
     BUS_MISSING = 5
+    DETECTOR_MISSING = 6
     INTERRUPTED = 130
 
 
 EPILOG = (
     "Exit status: 0 done; 1 failure (a tare: refused); 2 wrong usage or configuration; 3 partial result (the log lost "
     "something, or a disk is full); 4 safety stop (the run faulted or the arm fell silent); 5 bus or devices missing; "
-    "130 interrupted."
+    "6 a live detector can't run here; 130 interrupted."
 )
 
 
@@ -73,12 +74,13 @@ def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
     Imported once something has ended one: numpy and cantools take longer to import than help takes to print.
     """
     from adacd_hil.log.log_files import LogError, LogExistsError
-    from adacd_hil.settings.schema import ConfigError
+    from adacd_hil.settings.schema import ConfigError, DetectorError
     from adacd_hil.wire.bus import BusError, BusMissingError
     from adacd_hil.wire.codec import CodecError
 
     return (
         (CommandError, ExitCode.FAILURE),
+        (DetectorError, ExitCode.DETECTOR_MISSING),
         (ConfigError, ExitCode.USAGE),
         (CodecError, ExitCode.USAGE),
         (BusMissingError, ExitCode.BUS_MISSING),

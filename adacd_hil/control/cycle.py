@@ -12,6 +12,7 @@ import numpy as np
 
 from adacd_hil.clock import Clock
 from adacd_hil.control.controller import Controller, Floating
+from adacd_hil.control.detector_timing import DetectorTiming
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.fault_recovery import FaultReport, SelfChecks, StopEscalation
 from adacd_hil.control.gate import Gate, GateFlag
@@ -91,6 +92,7 @@ class Cycle:
         self._data = DataWatch(settings, arm)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = Pipeline(settings)
+        self._timing = DetectorTiming(self._pipeline.detectors, settings.bus.period_ns, clock)
         self._controller = Controller(settings)
         self._floating = Floating(settings)
         self._gate = Gate(settings.arm, self._period_s)
@@ -109,6 +111,7 @@ class Cycle:
             master.parameters,
             self._escalation,
             self._exchange.events,
+            self._timing,
             self._pipeline,
         )
         self._state = SchemeState.INIT
@@ -134,8 +137,9 @@ class Cycle:
         return self._pipeline.certificates
 
     def compile(self) -> None:
-        """Compile everything the loop calls; to be done before the drives are enabled."""
+        """Compile everything the loop calls; to be done before the drives are enabled. Raises DetectorError."""
         self._pipeline.compile()
+        self._timing.measure(self._progress)
         self._reference.compile()
         self._controller.compile()
 
@@ -163,6 +167,7 @@ class Cycle:
             self._data.note(arm)
             self._faults.note(self._state, arm)
             self._look_after_devices(arm, output)
+            self._timing.step(arm.cycle, arm.t_ns)
             self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
         if self._is_finishing and self._state in POWERED and not self._reference.is_parked(self._arm.cycle):

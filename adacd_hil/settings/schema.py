@@ -17,6 +17,10 @@ class ConfigError(ValueError):
     """A setting that can't be used; the message is one line: key, value, bound, unit."""
 
 
+class DetectorError(ConfigError):
+    """A live detector that can't run here: it isn't registered, doesn't keep the contract, or is too slow."""
+
+
 SUCCESSORS = {
     "certified.collision_Nm": "`detector.collision_Nm`",
     "certified.deviations": "`certified.noise_sigmas` and `certified.model_sigmas`",

@@ -33,6 +33,7 @@ from adacd_hil.analysis.score.wording import unjudged_sentence
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
+from adacd_hil.scheme.detect.live_detectors import describe_code
 from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch, arm_at
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
@@ -342,6 +343,9 @@ def _result(player: _Player, source: ReplaySource, tolerance: float, first_ns: i
     gatherer.end()
     score = gatherer.score()
     score = None if score is None else score.since(first_ns)
+    logged_code = source.metadata.get("detectors", "")
+    if logged_code and (here := describe_code(source.settings)) != logged_code:
+        notes.append(f"live detectors have other code here: {here}; in the log: {logged_code}")
     if unjudged := unjudged_sentence(0 if score is None else len(score.unjudged)):
         notes.append(unjudged)
     if comparison is not None:

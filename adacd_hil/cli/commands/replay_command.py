@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 _EPILOG = (
     "Exit status: 0 identical, or other settings were replayed; 1 something differs, or a log can't be read; 2 wrong "
-    "usage or configuration; 3 what could be compared is identical, but not all of the log could; 130 interrupted."
+    "usage or configuration; 3 what could be compared is identical, but not all of the log could; 6 a live detector of "
+    "the log can't run here; 130 interrupted."
 )
 _MOST_COLUMNS = 6
 """Variants beside the log's own that are set side by side; more are rows."""

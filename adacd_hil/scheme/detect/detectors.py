@@ -24,8 +24,8 @@ observer K         generalised-momentum observer of gain K by the implicit trape
 likelihood N       log-likelihood of a step that began N samples ago: the stream's own covariance whitens it; in sigmas
 cusum              sum of what the smoothed channel of highest cut-off has above a drift; in Nm s
 
-**Further detectors** are added by `register`, one channel each. They run wherever those above do: in thresholds, in the
-comparison of `thresholds --report`, in `tune`.
+**Further detectors** are registered (`detector_registry`), one channel each. They run wherever those above do: in
+thresholds, in the comparison of `thresholds --report`, in `tune`, and live if they keep the contract for that.
 
 A step of tau_ext passes h of a first-order channel after -ln(1 - h / |tau_ext|) / a. Without the drift, the sum is h
 after h / |tau_ext|.
@@ -35,66 +35,39 @@ Sources: De Luca and Mattone, "Sensorless robot collision detection and hybrid f
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
 
 from adacd_hil.compiled import Structured, compiled, packed, zeroed
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.detect import detector_registry
+from adacd_hil.scheme.detect.detector_registry import Maker, Registered
 from adacd_hil.scheme.model import regressor
 from adacd_hil.settings.schema import ConfigError, setting
 
 VELOCITY_LAG_S: Final = 1.25e-3
 """The emulated drives: 1.59 ms of their tracking loop less 0.34 ms, since a commanded torque is a step at the start of
 the interval and not a straight line over it."""
+LIKELIHOOD: Final = "likelihood"
+"""Its channels' names begin with this."""
 
 
-class StreamDetector(Protocol):
-    """One detector on one stream, from its beginning."""
+def register(name: str, make: Maker) -> None:
+    """Add a detector, live too if it keeps the contract for that. make: begins one on a stream of a period, s.
 
-    def take(self, z: Vector, held_Nm: Vector) -> Vector:
-        """Take in N more samples of z and of the friction that may hold (N, n); return the statistic of each (N, n).
-
-        An alarm is a statistic above its threshold. A sample's depends on it and on those before it, not on how the
-        stream is cut into pieces.
-        """
-
-
-_REGISTERED: dict[str, Callable[[float], StreamDetector]] = {}
-_CHECK_SAMPLES, _CHECK_CUT, _CHECK_JOINTS = 400, 137, 2
-
-
-def register(name: str, make: Callable[[float], StreamDetector]) -> None:
-    """Add a detector. make: begins one on a stream of a period, s.
-
-    Raises ValueError for a name that is taken, and for a detector that doesn't do as `StreamDetector` says.
+    Raises ValueError for a name that is taken, and for a detector that breaks the contract of `detector_registry`.
     """
-    settings = DetectorBankSettings()
-    if name in settings.detectors or name in settings.channels:
-        raise ValueError(f"there is a detector or channel {name} already")
-    z = np.random.default_rng(0).standard_normal((_CHECK_SAMPLES, _CHECK_JOINTS))
-    held_Nm = np.where(z > 1.0, 0.1, 0.0)
-    whole, parts = make(1e-3).take(z, held_Nm), make(1e-3)
-    if whole.shape != z.shape:
-        raise ValueError(f"detector {name} gives statistics {whole.shape} for samples {z.shape}")
-    if not np.isfinite(whole).all():
-        sample, joint = np.argwhere(~np.isfinite(whole))[0].tolist()
-        raise ValueError(f"detector {name} gives {whole[sample, joint]} for sample {sample} of joint {joint + 1}")
-    cut = np.concatenate([parts.take(z[rows], held_Nm[rows]) for rows in (slice(_CHECK_CUT), slice(_CHECK_CUT, None))])
-    if not np.array_equal(whole, cut):
-        sample = int(np.argwhere(whole != cut)[0, 0])
-        raise ValueError(
-            f"detector {name} gives sample {sample} another statistic where the stream is cut at {_CHECK_CUT}"
-        )
-    _REGISTERED[name] = make
+    detector_registry.add(name, make, DetectorBankSettings().built_in)
 
 
 def unregister(name: str) -> None:
     """Take a detector out that was registered. Raises KeyError for one that was not."""
-    del _REGISTERED[name]
+    detector_registry.remove(name)
 
 
 @dataclass(frozen=True)
@@ -127,21 +100,41 @@ class DetectorBankSettings:
                 raise ConfigError(f"{name} is empty")
 
     @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of the channels, in the order of the statistics."""
+    def own_channels(self) -> tuple[str, ...]:
+        """Names of the built-in channels, in the order of the statistics."""
         return (
             *(f"first-order {a:g}" for a in self.cutoff_rad_s),
             *(f"smoothed {a:g}" for a in self.cutoff_rad_s),
             "band-pass",
             *(f"observer {gain:g}" for gain in self.observer_rad_s),
-            *(f"likelihood {age}" for age in self.onset_samples),
+            *(f"{LIKELIHOOD} {age}" for age in self.onset_samples),
             "cusum",
-            *_REGISTERED,
         )
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of all channels, those of registered detectors last."""
+        return (*self.own_channels, *self.registered)
+
+    @property
+    def registered(self) -> Mapping[str, Registered]:
+        """The registered detectors by name. Raises DetectorError."""
+        return detector_registry.registered(self.built_in)
+
+    @property
+    def built_in(self) -> frozenset[str]:
+        """Names that no registered detector may have."""
+        return frozenset((*self.own_channels, *self.own_detectors))
 
     @property
     def detectors(self) -> dict[str, tuple[int, ...]]:
         """Name the detectors and the channels of each; a joint is over when one of them is."""
+        first = len(self.own_channels)
+        return self.own_detectors | {name: (first + place,) for place, name in enumerate(self.registered)}
+
+    @property
+    def own_detectors(self) -> dict[str, tuple[int, ...]]:
+        """Name the built-in detectors and the channels of each."""
         count, gains, ages = len(self.cutoff_rad_s), len(self.observer_rad_s), len(self.onset_samples)
         detectors = {
             "paper": (0,),
@@ -152,8 +145,7 @@ class DetectorBankSettings:
         for place, gain in enumerate(self.observer_rad_s):
             detectors[f"observer {gain:g}"] = (2 * count + 1 + place,)
         first = 2 * count + 1 + gains
-        detectors |= {"likelihood ratio": tuple(range(first, first + ages)), "cusum": (first + ages,)}
-        return detectors | {name: (first + ages + 1 + place,) for place, name in enumerate(_REGISTERED)}
+        return detectors | {"likelihood ratio": tuple(range(first, first + ages)), "cusum": (first + ages,)}
 
 
 def likelihood_windows(
@@ -302,7 +294,7 @@ class DetectorBank:
         self._constants = constants_of(settings, weights, period_s)
         self._memory = new_memory(self._constants)
         self._channels = len(settings.channels)
-        self._registered = [make(period_s) for make in _REGISTERED.values()]
+        self._registered = [found.make(period_s) for found in settings.registered.values()]
 
     def take(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
         """Take in N samples (N, n); return the largest statistic of each block, (ceil(N / block_samples), channels, n).
@@ -317,6 +309,41 @@ class DetectorBank:
         starts = np.arange(0, count, block_samples)
         further = [np.maximum.reduceat(detector.take(z, held_Nm), starts) for detector in self._registered]
         return np.concatenate((own, np.stack(further, axis=1)), axis=1)
+
+
+class BankChannel:
+    """One channel of the bank by itself, by the same compiled step: a built-in detector that runs live.
+
+    The likelihood ratio is none: its weights come from recorded motion.
+    """
+
+    def __init__(self, channel: str, period_s: float) -> None:
+        settings = DetectorBankSettings(onset_samples=(1,))
+        self._constants = constants_of(settings, np.zeros((JOINTS, 1, 1)), period_s)
+        self._memory = new_memory(self._constants)
+        self._channels = len(settings.own_channels)
+        self._place = settings.own_channels.index(channel)
+        self.state = {name: self._memory[name] for name in self._memory.dtype.names or ()}
+
+    def take(self, z: Vector, held_Nm: Vector) -> Vector:
+        """Take in samples (N, n); return the channel's statistic of each (N, n)."""
+        statistics = np.empty((len(z), self._channels, JOINTS))
+        record(self._constants, self._memory, z, held_Nm, 1, statistics)
+        return statistics[:, self._place]
+
+
+def live_makers() -> dict[str, Maker]:
+    """Return what begins each detector that can run live, by name: channels, detectors of one channel, registered ones.
+
+    Raises DetectorError.
+    """
+    settings = DetectorBankSettings()
+    channels = {name: name for name in settings.own_channels if not name.startswith(LIKELIHOOD)}
+    for name, places in settings.own_detectors.items():
+        if len(places) == 1:
+            channels[name] = settings.own_channels[places[0]]
+    makers: dict[str, Maker] = {name: partial(BankChannel, channel) for name, channel in channels.items()}
+    return makers | {name: found.make for name, found in settings.registered.items() if found.is_live}
 
 
 @compiled

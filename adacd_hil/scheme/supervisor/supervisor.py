@@ -27,6 +27,7 @@ from adacd_hil.scheme.supervisor.transitions import (
     CERTIFIED,
     COLLISION,
     CONTACT,
+    DETECTOR_FAILED,
     FITTED,
     NEVER,
     NOT_A_NUMBER,
@@ -440,6 +441,8 @@ class Supervisor:
         if fault is not FaultReason.NONE:
             return fault
         is_thrown = self._state is SchemeState.REACT and self._phase_cycles <= self._rebound_cycles
+        if observation & DETECTOR_FAILED:
+            return FaultReason.DETECTOR
         if observation & OVER_LIMIT or (observation & OVER_SPEED and not is_thrown):
             return FaultReason.LIMIT
         if self._state in POWERED and not arm.is_enabled:

@@ -1,0 +1,15 @@
+"""What a lab tests of its detector: that it keeps the contract, and what it finds."""
+
+import numpy as np
+from lab_detectors import MeanOfTwenty
+
+from adacd_hil.scheme.detect.detector_registry import check_contract
+
+
+def test_it_keeps_the_contract_of_a_live_detector():
+    assert check_contract("mean of 20", MeanOfTwenty)
+
+
+def test_a_step_of_1_Nm_is_over_a_half_after_10_samples():
+    statistic = MeanOfTwenty(1e-3).take(np.ones((20, 2)), np.zeros((20, 2)))
+    assert int(np.argmax(statistic[:, 0] > 0.5)) == 10
