@@ -117,6 +117,15 @@ def test_a_detector_of_a_lab_s_package_finds_a_contact_live_and_says_so(lab_run)
 
 
 @pytest.mark.slow
+def test_the_report_s_card_of_a_contact_says_who_found_it(lab_run):
+    result = CliRunner().invoke(cli, ["report", str(lab_run[0])])
+    assert result.exit_code == ExitCode.OK, result.output
+    page = lab_run[0].with_name("report.html").read_text()
+    assert page.count("<dt>found by</dt>") == 1
+    assert "<dd>mean of 20 (joint 1: 0.5" in page
+
+
+@pytest.mark.slow
 def test_a_log_with_a_live_detector_replays_to_the_bit(lab_run):
     _, replayed = lab_run
     assert replayed.is_identical
