@@ -31,6 +31,7 @@ from adacd_hil.scheme.detect.detectors import (
 )
 from adacd_hil.scheme.detect.live_detectors import LiveDetectors, LiveSample, LiveStream
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 from adacd_hil.settings.schema import ConfigError, DetectorError
 from adacd_hil.settings.scheme_settings import DetectorSettings, LiveDetectorSettings
 from firmware_sim.scenario.scenario import load_scenario
@@ -329,6 +330,30 @@ def test_the_stream_is_the_same_sample_by_sample():
         live, held = stream.take(LiveSample(cycle, q[k], dq[k], tau_J[k], theta, 1e-3))
         np.testing.assert_array_equal(live[0], z[k])
         np.testing.assert_array_equal(held[0], held_Nm[k])
+
+
+def test_a_detector_begins_anew_whenever_it_is_armed(registered):
+    registered("plain", Faithful)
+    detectors = LiveDetectors(watched_by(row("plain", 1e-3)))
+    (each,) = detectors.running
+    first = [detectors.step(sample(cycle, torque=0.5), True, True) for cycle in range(3)]
+    assert each.detector.state["count"].tolist() == [3.0]
+    assert detectors.step(sample(3, torque=0.5), True, False) == 0
+    again = [detectors.step(sample(cycle, torque=0.5), True, True) for cycle in range(4, 7)]
+    assert again == first
+    assert first[0] == 0  # nothing is known of what was before
+    assert first[1] >> CONTACT_SHIFT == 0b11
+    assert each.detector.state["count"].tolist() == [3.0]
+
+
+def test_a_cycle_without_a_fresh_sample_leaves_the_alarm_as_it_is(registered):
+    registered("plain", Faithful)
+    detectors = LiveDetectors(watched_by(row("plain", 1e-3)))
+    for cycle in range(2):
+        found = detectors.step(sample(cycle, torque=0.5), True, True)
+    assert found
+    assert detectors.step(sample(2), False, True) == found
+    assert detectors.step(sample(3), True, True) == 0  # after a gap
 
 
 # -- what is refused ---------------------------------------------------------------------------------------------------
