@@ -294,7 +294,23 @@ def cycles_of_a_bus_without_devices() -> dict[str, Any]:
     return {"settings": settings, "arms": arms, "requests": np.zeros(count, np.uint8), "SchemeState": SchemeState}
 
 
+def a_joint_that_is_pushed() -> dict[str, Any]:
+    """Give the arrays of one joint with an inertia and friction, which somebody pushes at 9 s."""
+    urdf = (
+        '<robot name="one"><link name="base"/><link name="arm"/><joint name="j" type="continuous">'
+        '<parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    t = 2e-3 * np.arange(6000)
+    rates = np.array([2.0, 3.3, 5.1])
+    phase = np.outer(t, rates)
+    q, dq = np.sin(phase).sum(axis=1), (rates * np.cos(phase)).sum(axis=1)
+    tau_J = -0.2 * (rates**2 * np.sin(phase)).sum(axis=1) + 0.1 * np.sign(dq) - 0.5 * ((t >= 9.0) & (t < 9.3))
+    tau_J += 0.01 * np.random.default_rng(1).standard_normal(t.size)
+    return {"urdf": urdf, "t": t, "q": q[:, None], "dq": dq[:, None], "tau_J": tau_J[:, None]}
+
+
 EXAMPLES: dict[str, Callable[[], dict[str, Any]]] = {
+    "api.md": a_joint_that_is_pushed,
     "detectors.md": dict,
     "formats.md": dict,
     "scheme-any-arm.md": free_and_pushed_motion,
@@ -312,6 +328,8 @@ def test_a_python_example_runs(page, documents, folder, capsys):
     assert len(blocks) == 1
     if page == "scheme-any-arm.md":  # the contact that it prints
         assert re.fullmatch(r"10\d\d link2 \S.*\n", capsys.readouterr().out)
+    elif page == "api.md":
+        assert capsys.readouterr().out.splitlines()[1:] == ["9.0 s link 1 (1,)"]
     elif page == "detectors.md":
         assert "magnitude" in DetectorBankSettings().detectors
         unregister("magnitude")

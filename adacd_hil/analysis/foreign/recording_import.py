@@ -207,9 +207,9 @@ MOST_ROWS: Final = 4_000_000
 _BLOCK_ROWS = 100_000
 _SPARE_S = 1.0
 """Kept before and after the span that is asked for: what a derived velocity and the grid of samples reach over."""
-_LARGEST = 1e6
+LARGEST = 1e6
 """rad, rad/s or Nm: what is larger is no measurement, and its square would spoil all others."""
-_SHORTEST_SAMPLES = 50
+SHORTEST_SAMPLES = 50
 """A shorter stretch teaches nothing: the filters have not settled."""
 _LEAST_NOISE_NM = 1e-4
 _DEGREE = 3  # of the polynomial whose slope is a derived velocity
@@ -247,7 +247,7 @@ class ForeignRecording:
     def between(self, start_s: float, end_s: float) -> "ForeignRecording":
         """Return what lies in a span of the recording's time, which begins with 0."""
         parts = [_cut(stretch, self.period_s, start_s, end_s) for stretch in self.stretches]
-        kept = tuple(part for part in parts if len(part.record.q) >= _SHORTEST_SAMPLES)
+        kept = tuple(part for part in parts if len(part.record.q) >= SHORTEST_SAMPLES)
         return replace(self, stretches=kept)
 
     @property
@@ -265,7 +265,7 @@ class ForeignRecording:
         parts = [
             _part(stretch, self.period_s, first, last) for first, last in pairwise(bounds) if not is_touched[first]
         ]
-        return [part for part in parts if len(part.record.q) >= _SHORTEST_SAMPLES]
+        return [part for part in parts if len(part.record.q) >= SHORTEST_SAMPLES]
 
 
 def read_recording(
@@ -277,14 +277,29 @@ def read_recording(
     it can't be read or is too long, ConfigError when it lacks a column of the map.
     """
     time_s, begin_s, values, touched = _read_columns(path, described, span)
+    return recording_of(path, described, time_s - begin_s, values, touched, period_s)
+
+
+def recording_of(
+    path: Path,
+    described: RecordingMap,
+    time_s: Vector,
+    values: Vector,
+    touched: NDArray[np.bool_] | None,
+    period_s: float = 0.0,
+) -> ForeignRecording:
+    """Make a recording of columns: time (k,), values (k, 2 n or 3 n), touches (k,); path: its name, for errors.
+
+    values: positions, torques and velocities side by side, in SI units; what is missing is not finite. Raises LogError.
+    """
     period_s = described.sampling.period_s or period_s or float(np.median(np.diff(time_s)))
     is_whole = np.isfinite(values).all(axis=1)
-    time_s, values = time_s[is_whole] - begin_s, values[is_whole]
+    time_s, values = time_s[is_whole], values[is_whole]
     touched = None if touched is None else touched[is_whole]
     n = described.joints
     longest_s = max(described.sampling.longest_gap_s, 1.5 * period_s)
     window = max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
-    shortest = max(_SHORTEST_SAMPLES, window)
+    shortest = max(SHORTEST_SAMPLES, window)
     edges = np.flatnonzero(np.diff(time_s) > longest_s) + 1
     stretches = []
     room = MOST_ROWS
@@ -336,19 +351,19 @@ def _read_columns(
     wanted = (columns.time, *columns.q, *columns.tau_J, *columns.dq, *filter(None, (columns.contact,)))
     places = [_place(name, heads, len(first), path) for name in wanted]
     table, start = _read_table(path, described, places, span)
-    if len(table) < _SHORTEST_SAMPLES:
+    if len(table) < SHORTEST_SAMPLES:
         where = "" if span is None or span.is_whole else f" {span.text}"
-        raise LogError(f"recording {path} has {len(table)} rows{where}, {_SHORTEST_SAMPLES} are the least")
+        raise LogError(f"recording {path} has {len(table)} rows{where}, {SHORTEST_SAMPLES} are the least")
     units = np.array((*described.q_rad, *described.tau_J_Nm, *(described.dq_rad_s if columns.dq else ())))
     time_s, begin_s = table[:, 0] * described.time_s, start * described.time_s
     with np.errstate(over="ignore"):
         values = table[:, 1 : 1 + len(units)] * units
-    too_large = np.argwhere(np.isfinite(table[:, 1 : 1 + len(units)]) & ~(np.abs(values) <= _LARGEST))
+    too_large = np.argwhere(np.isfinite(table[:, 1 : 1 + len(units)]) & ~(np.abs(values) <= LARGEST))
     if len(too_large):
         row, column = too_large[0].tolist()
         raise LogError(
             f"recording {path}: column {wanted[1 + column]!r} is {table[row, 1 + column]:g} at "
-            f"{time_s[row] - begin_s:.9g} s, more than {_LARGEST:g} rad, rad/s or Nm"
+            f"{time_s[row] - begin_s:.9g} s, more than {LARGEST:g} rad, rad/s or Nm"
         )
     return time_s, begin_s, values, table[:, -1] != 0.0 if columns.contact else None
 

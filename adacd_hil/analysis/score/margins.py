@@ -20,13 +20,11 @@ a stream (`judge.StreamJudge`), with a pause of 10 time constants; a false alarm
 While the payload is changed it does not detect.
 """
 
-import contextlib
-import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from adacd_hil.analysis.logged_run import CertifiedStream, Mask, Run, Section, rows_of, split_sections
+from adacd_hil.analysis.logged_run import CertifiedStream, Mask, Run, Section, certificates_in, rows_of, split_sections
 from adacd_hil.analysis.score.distribution import Distribution
 from adacd_hil.analysis.score.judge import (
     LoggedDetection,
@@ -47,10 +45,8 @@ from adacd_hil.analysis.score.metrics import (
     Untouched,
 )
 from adacd_hil.compiled import compiled
-from adacd_hil.log.types.topics import CERTIFIED_MODEL
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.detect import margin as detect_margin
-from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.model.filter_bank import channels_of
 from adacd_hil.settings.configuration import Settings
 
@@ -176,16 +172,8 @@ def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouch
         is_anchored=all(event.level == "info" for _, event in run.events if event.name == "certificate"),
         revoked=tuple(event.message for _, event in run.events if event.name == "revoked"),
         smallest_push=untouched.smallest_push,
-        certificates=tuple(_logged_certificates(run)),
+        certificates=tuple(certificates_in((event.name, event.message) for _, event in run.events)),
     )
-
-
-def _logged_certificates(run: Run) -> Iterator[Certificate]:
-    """Give the certificates that the log has as numbers; what is none is left out."""
-    for _, event in run.events:
-        if event.name == CERTIFIED_MODEL:
-            with contextlib.suppress(ValueError, TypeError, RecursionError):  # of another version, or another program's
-                yield Certificate(**json.loads(event.message))
 
 
 def last_row(run: Run, section: Section) -> int:

@@ -24,12 +24,14 @@ scheme that ran beside it on the same stream: `adacd_hil.analysis.score.margins`
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from adacd_hil.analysis.logged_run import Section
 from adacd_hil.analysis.score.distribution import LogHistogram
 from adacd_hil.analysis.score.judge import rate_bound_per_h
-from adacd_hil.scheme.identify.certificate import Certificate
+
+if TYPE_CHECKING:
+    from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
 
 
 @dataclass(frozen=True)
@@ -209,7 +211,7 @@ class CertifiedEvidence:
     is_anchored: bool
     revoked: tuple[str, ...]
     smallest_push: SmallestPush | None
-    certificates: tuple[Certificate, ...] = ()
+    certificates: "tuple[Certificate, ...]" = ()
 
     @property
     def smallest_margin(self) -> float | None:

@@ -1,0 +1,86 @@
+"""What a script or a package of a lab imports: runs as arrays, arrays through the scheme, what can be extended.
+
+Everything else may move; these names stay. docs/api.md has examples.
+
+| name | is |
+|---|---|
+| `load`, `LoadedRun` | a run's log as named arrays, events, contacts, certificates |
+| `detect`, `fit`, `Arm`, `Detection`, `Model`, `ArrayError` | the scheme over arrays of any serial arm |
+| `Detector`, `register_detector` | a detector of your own |
+| `Bus`, `Frame` | another CAN interface |
+| `SchemeState`, `ContactReport`, `Certificate`, `LogError` | what the results are made of |
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from adacd_hil.analysis.library.array_detection import ArrayContact, ArrayError, detect, fit
+    from adacd_hil.analysis.library.array_detection import ArrayDetection as Detection
+    from adacd_hil.analysis.library.array_detection import FittedModel as Model
+    from adacd_hil.analysis.library.array_detection import OfflineArm as Arm
+    from adacd_hil.analysis.library.loaded_run import LoadedRun, RunContact, RunEvent, load
+    from adacd_hil.log.log_files import LogError
+    from adacd_hil.records import ContactReport, SchemeState
+    from adacd_hil.scheme.detect.detector_registry import StreamDetector as Detector
+    from adacd_hil.scheme.detect.detectors import register as register_detector
+    from adacd_hil.scheme.identify.certificate import Certificate
+    from adacd_hil.wire.bus import Bus, Frame
+
+__all__ = [
+    "Arm",
+    "ArrayContact",
+    "ArrayError",
+    "Bus",
+    "Certificate",
+    "ContactReport",
+    "Detection",
+    "Detector",
+    "Frame",
+    "LoadedRun",
+    "LogError",
+    "Model",
+    "RunContact",
+    "RunEvent",
+    "SchemeState",
+    "detect",
+    "fit",
+    "load",
+    "register_detector",
+]
+
+_LIBRARY = "adacd_hil.analysis.library"
+_PLACES = {
+    "Arm": (f"{_LIBRARY}.array_detection", "OfflineArm"),
+    "ArrayContact": (f"{_LIBRARY}.array_detection", "ArrayContact"),
+    "ArrayError": (f"{_LIBRARY}.array_detection", "ArrayError"),
+    "Bus": ("adacd_hil.wire.bus", "Bus"),
+    "Certificate": ("adacd_hil.scheme.identify.certificate", "Certificate"),
+    "ContactReport": ("adacd_hil.records", "ContactReport"),
+    "Detection": (f"{_LIBRARY}.array_detection", "ArrayDetection"),
+    "Detector": ("adacd_hil.scheme.detect.detector_registry", "StreamDetector"),
+    "Frame": ("adacd_hil.wire.bus", "Frame"),
+    "LoadedRun": (f"{_LIBRARY}.loaded_run", "LoadedRun"),
+    "LogError": ("adacd_hil.log.log_files", "LogError"),
+    "Model": (f"{_LIBRARY}.array_detection", "FittedModel"),
+    "RunContact": (f"{_LIBRARY}.loaded_run", "RunContact"),
+    "RunEvent": (f"{_LIBRARY}.loaded_run", "RunEvent"),
+    "SchemeState": ("adacd_hil.records", "SchemeState"),
+    "detect": (f"{_LIBRARY}.array_detection", "detect"),
+    "fit": (f"{_LIBRARY}.array_detection", "fit"),
+    "load": (f"{_LIBRARY}.loaded_run", "load"),
+    "register_detector": ("adacd_hil.scheme.detect.detectors", "register"),
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import a name when it is asked for: some compile, some draw."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; there are {', '.join(__all__)}")
+    from importlib import import_module
+
+    module, attribute = _PLACES[name]
+    return getattr(import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,219 @@
+"""The surface for scripts and packages: a log as arrays, arrays through the scheme, names that stay."""
+
+import os
+import re
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adacd_hil import api
+from adacd_hil.analysis.library.array_detection import ArrayError, OfflineArm, detect, fit
+from adacd_hil.analysis.library.loaded_run import load
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import read_log
+from adacd_hil.records import SchemeState
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "docs" / "examples"
+PERIOD_S = 2e-3
+PUSH_S, PUSH_NM = (9.0, 9.3), 0.5
+ONE_JOINT = """<robot name="one"><link name="base"/><link name="arm"/>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" velocity="5" effort="5"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def arm() -> OfflineArm:
+    return OfflineArm.from_urdf(ONE_JOINT)
+
+
+@pytest.fixture
+def arrays() -> dict[str, Any]:
+    """An inertia of 0.2 kg m² with friction, which somebody pushes once."""
+    t = 100.0 + PERIOD_S * np.arange(6000)
+    rates = np.array([2.0, 3.3, 5.1])
+    phase = np.outer(t, rates)
+    q, dq, ddq = (factor.sum(axis=1) for factor in (np.sin(phase), rates * np.cos(phase), -(rates**2) * np.sin(phase)))
+    tau = 0.2 * ddq + 0.05 * dq + 0.1 * np.sign(dq) + 0.03 + 0.01 * np.random.default_rng(1).standard_normal(t.size)
+    tau -= PUSH_NM * ((t - 100.0 >= PUSH_S[0]) & (t - 100.0 < PUSH_S[1]))
+    return {"t": t, "q": q[:, None], "dq": dq[:, None], "tau_J": tau[:, None]}
+
+
+def test_a_contact_is_found_in_arrays_and_the_model_is_the_arms(arm: OfflineArm, arrays: dict[str, Any]) -> None:
+    found = detect(arrays, arm)
+    named = dict(zip(found.model.names, found.model.theta, strict=True))
+    assert named["F_c1"] == pytest.approx(0.1, abs=0.01)
+    assert named["offset1"] == pytest.approx(0.03, abs=0.01)
+    assert found.model.margin > 1.0
+    assert [(each.link, each.direction) for each in found.contacts] == [(1, (1,))]
+    assert found.contacts[0].t_s - 100.0 == pytest.approx(PUSH_S[0], abs=0.03)
+    assert found.t_s.shape == (6000,)
+    assert found.tau_ext_hat.shape == found.threshold.shape == (6000, 1)
+    assert (found.t_s[0], found.t_s[-1]) == (pytest.approx(100.0), pytest.approx(arrays["t"][-1]))
+
+
+def test_a_model_of_one_recording_watches_another_and_names_of_others_are_taken(
+    arm: OfflineArm, arrays: dict[str, Any]
+) -> None:
+    model = fit(arrays, arm, fit_s=(100.0, 105.0))
+    renamed = {"time": arrays["t"], "q": arrays["q"], "qd": arrays["dq"], "tau": arrays["tau_J"]}
+    assert detect(renamed, arm, model=model).contacts == detect(arrays, arm, fit_s=(100.0, 105.0)).contacts
+
+
+def test_touches_that_are_known_are_left_out_of_the_fit(arm: OfflineArm, arrays: dict[str, Any]) -> None:
+    touched = (arrays["t"] >= 100.0 + PUSH_S[0]) & (arrays["t"] < 100.0 + PUSH_S[1])
+    blind = fit(arrays, arm, fit_s=(106.0, 112.0))
+    told = fit({**arrays, "touched": touched}, arm, fit_s=(106.0, 112.0))
+    offset = told.names.index("offset1")
+    assert abs(told.theta[offset] - 0.03) < 0.005 < abs(blind.theta[offset] - 0.03)
+
+
+def spoilt(arrays: dict[str, Any], name: str, place: Any, value: float) -> dict[str, Any]:
+    values = arrays[name].copy()
+    values[place] = value
+    return {**arrays, name: values}
+
+
+WRONG = {
+    "array 'tau_J' is missing; there are t, q": lambda a: {"t": a["t"], "q": a["q"]},
+    "unknown array 'tau_K'; did you mean 'tau_J'?": lambda a: {**a, "tau_K": a["q"]},
+    "array 'dq' is given twice, once as 'qd'": lambda a: {**a, "qd": a["dq"]},
+    "q has shape (5, 1), (6000, 1) is expected": lambda a: {**a, "q": a["q"][:5]},
+    "q has shape (6000,), (6000, 1) is expected": lambda a: {**a, "q": a["q"][:, 0]},
+    "t has shape (6000, 1), (k,) with k ≥ 50 is expected": lambda a: {**a, "t": a["t"][:, None]},
+    "t[7] = 100 s is not after t[6] = 100.012 s": lambda a: spoilt(a, "t", 7, 100.0),
+    "t[3] = nan s is not finite": lambda a: spoilt(a, "t", 3, np.nan),
+    "q[5, 0] = nan rad is not at most 1e+06 rad": lambda a: spoilt(a, "q", (5, 0), np.nan),
+    "tau_J[9, 0] = -2e+06 Nm is not at most 1e+06 Nm": lambda a: spoilt(a, "tau_J", (9, 0), -2e6),
+    "q is of complex128, real numbers in rad are expected": lambda a: {**a, "q": a["q"] + 1j},
+    "q is of list, real numbers in rad are expected": lambda a: {**a, "q": [[0.0], [0.0, 1.0]]},
+    "t has a median period of 2 s, 1e-05 to 0.1 s are expected": lambda a: {**a, "t": a["t"] * 1000.0},
+    "touched has shape (6000,) of float64, (6000,) of bool is expected": lambda a: {**a, "touched": a["t"]},
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_arrays_that_can_not_be_used_are_one_line(arm: OfflineArm, arrays: dict[str, Any], line: str) -> None:
+    with pytest.raises(ArrayError, match=f"^{re.escape(line)}$"):
+        detect(WRONG[line](arrays), arm)
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"fit_s": (105.0, 101.0)}, "fit_s = (105, 101) s ends before it begins"),
+        ({"fit_s": (200.0, 300.0)}, "too little free motion to fit from 200 to 300 s: 100 samples "
+         "in a row are the least"),
+        ({"noise_Nm": (0.1, 0.1)}, "noise_Nm has 2 values, the arm 1 joints"),
+        ({"deviations": 0.0}, "`deviations` = 0.0 is below 1"),
+        ({"deviation": 5.0}, "unknown key `deviation`; did you mean `deviations`?"),
+        ({"velocity_lag_s": -1.0}, "velocity_lag_s = -1 s is not within 0 to 0.05 s"),
+    ],
+)  # fmt: skip
+def test_options_that_can_not_be_are_one_line(
+    arm: OfflineArm, arrays: dict[str, Any], options: dict[str, Any], line: str
+) -> None:
+    with pytest.raises(ArrayError, match=f"^{re.escape(line)}$"):
+        detect(arrays, arm, **options)
+
+
+def test_a_log_is_arrays_with_a_row_for_each_cycle(log: Path) -> None:
+    run, raw = load(log.parent), read_log(log)
+    assert len(run) == len(raw.scheme)
+    assert np.array_equal(run["tau_J"], raw.scheme["tau_J"])
+    assert np.array_equal(run["tau_c"], raw.control["tau_c"])
+    assert run["lateness_ns"].shape == run.t_s.shape
+    assert run.t_s[np.flatnonzero(run.state == SchemeState.ADAPT)[0]] == 0.0
+    assert run.problem == ""
+    assert run.settings.bus.period_s == pytest.approx(np.diff(run.t_s).min())
+    assert len(run.contacts) == len({report.cycle for _, report in raw.contacts})
+    assert [event.name for event in run.events].count("supervisor") > 3
+    with pytest.raises(KeyError, match="did you mean 'tau_J'"):
+        run["tau_K"]
+    with pytest.raises(ValueError, match="read-only"):
+        run["q"][0] = 1.0
+
+
+def test_what_is_no_log_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"run\.mcap"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_a_data_frame_has_a_column_for_each_number(log: Path, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = load(log)
+    assert {"t_s", "q_1", "q_2", "state"} <= set(run.columns())
+    assert set(run.columns()["state"]) <= set(SchemeState.__members__)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ImportError, match=rf"^to_{library} needs the extra `{library}`: .*\[{library}\]'$"):
+        getattr(run, f"to_{library}")()
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_a_data_frame_has_a_row_for_each_cycle(log: Path, library: str) -> None:
+    pytest.importorskip(library)
+    run = load(log)
+    frame = getattr(run, f"to_{library}")()
+    assert len(frame) == len(run)
+    assert np.array_equal(np.asarray(frame["tau_J_2"]), run["tau_J"][:, 1])
+
+
+def python(code: str, *places: Path) -> str:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*places, ROOT)))}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, cwd=EXAMPLES
+    )
+    return ran.stdout
+
+
+def test_importing_the_package_costs_nothing() -> None:
+    said = python(
+        "import sys, time; begin = time.process_time(); import adacd_hil, adacd_hil.api;"
+        "print(time.process_time() - begin, 'numpy' in sys.modules)"
+    )
+    seconds, has_numpy = said.split()
+    assert float(seconds) < 0.1
+    assert has_numpy == "False"
+
+
+@pytest.mark.parametrize("name", api.__all__)
+def test_every_name_of_the_surface_is_what_it_says(name: str) -> None:
+    text = Path(str(api.__file__)).read_text()
+    module, attribute = api._PLACES[name]
+    assert getattr(api, name) is getattr(import_module(module), attribute)
+    imported = attribute if attribute == name else f"{attribute} as {name}"
+    assert re.search(rf"from {re.escape(module)} import [^\n]*\b{re.escape(imported)}\b", text)
+
+
+def test_a_name_that_is_not_of_the_surface_is_an_attribute_error() -> None:
+    assert set(api._PLACES) == set(api.__all__) == set(dir(api))
+    with pytest.raises(AttributeError, match="has no attribute 'Pipeline'"):
+        _ = api.Pipeline
+
+
+@pytest.mark.long
+def test_the_example_is_right_for_a_type_checker_from_outside(tmp_path: Path) -> None:
+    """The package is found by its py.typed, as an installed one is."""
+    file = EXAMPLES / "api" / "compare_offline.py"
+    checked = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--cache-dir", str(tmp_path), str(file)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert checked.stdout.strip() == "Success: no issues found in 1 source file"
+
+
+@pytest.mark.long
+def test_the_example_script_runs(log: Path) -> None:
+    said = python(f"import sys; sys.argv = ['', {str(log.parent)!r}]; exec(open('api/compare_offline.py').read())")
+    assert said.startswith("margin ")
