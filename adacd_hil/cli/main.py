@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -35,7 +36,7 @@ from adacd_hil.cli.options import (
 from adacd_hil.cli.output import EPILOG, ExitCode, complain, explained, tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.settings.toml_files import to_toml
-from adacd_hil.terminal import is_interrupted, open_terminals
+from adacd_hil.terminal import is_interrupted, one_line, open_terminals
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -392,16 +393,29 @@ cli.add_command(sweep)
 cli.add_command(tune)
 
 
-def main() -> NoReturn:
-    """Run the command line and exit with a documented status; `adacd_hil.cli.start_host` comes here."""
+def _misused(error: click.ClickException) -> str:
+    """Say in one line what is wrong with a command line, and which help lists what is right."""
+    text = " ".join(error.format_message().split())
+    context = error.ctx if isinstance(error, click.UsageError) else None
+    return text if context is None else f"{text} `{context.command_path} --help` lists what there is"
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line, by default that of this process, and exit with a documented status.
+
+    `adacd_hil.cli.start_host` comes here.
+    """
     if is_completing():  # the shell reads what click writes
         prepare_completion()
-    else:
+    elif arguments is None:
         open_terminals()
     try:
-        code = cli.main(prog_name="adacd-hil", standalone_mode=False)
-    except click.ClickException as error:
+        code = cli.main(arguments, prog_name="adacd-hil", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
+        code = error.exit_code
+    except click.ClickException as error:
+        print(f"adacd-hil: {one_line(_misused(error))}", file=sys.stderr)
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = ExitCode.INTERRUPTED

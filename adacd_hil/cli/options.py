@@ -1,7 +1,9 @@
 """Options that the commands share."""
 
+import errno
 import functools
 import math
+import socket
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -202,4 +204,18 @@ def _address(
         allowed = tuple(map(normal_origin, origins))
     except ValueError as error:
         raise CommandError(f"--live-origin: {error}", ExitCode.USAGE) from None
+    _check_port(host, port)
     return LiveAddress(host, port, allowed, names, most_viewers)
+
+
+def _check_port(host: str, port: int) -> None:
+    """Raise CommandError where another program listens: before minutes are spent on compiling."""
+    try:
+        places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM) if port else ()
+        for family, kind, protocol, _, address in places:
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+    except OSError as error:
+        remedy = "; --live-port 0 takes one that is free" if error.errno == errno.EADDRINUSE else ""
+        raise CommandError(f"can't listen on {host}:{port}: {error.strerror}{remedy}", ExitCode.FAILURE) from None

@@ -4,6 +4,7 @@ A command ends by an exit status, the same in every command, and where it fails 
 """
 
 import contextlib
+import errno
 import functools
 import itertools
 import os
@@ -106,6 +107,15 @@ def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
     return run
 
 
+_REMEDY = "; give another place, or let its owner change the rights"
+
+
+def _is_forbidden(error: BaseException) -> bool:
+    """Whether the system refuses what this user may not do to a file."""
+    causes = (error, error.__cause__)
+    return any(isinstance(one, OSError) and one.errno in (errno.EACCES, errno.EPERM, errno.EROFS) for one in causes)
+
+
 def complain(error: BaseException) -> ExitCode:
     """Say in one line what ended a command; return its exit code. Raises what no command is to be ended by."""
     if isinstance(error, KeyboardInterrupt):
@@ -114,7 +124,8 @@ def complain(error: BaseException) -> ExitCode:
     code = next((code for kind, code in _expected() if isinstance(error, kind)), None)
     if code is None:
         raise error
-    print(f"adacd-hil: {one_line(in_words(error) or type(error).__name__)}", file=sys.stderr)
+    line = f"{in_words(error) or type(error).__name__}{_REMEDY if _is_forbidden(error) else ''}"
+    print(f"adacd-hil: {one_line(line)}", file=sys.stderr)
     if is_disk_full(error):
         return ExitCode.PARTIAL
     return error.code if isinstance(error, CommandError) else code

@@ -58,9 +58,13 @@ _DIGITS, _MOST_DIGITS = 3, 5
 
 
 def log_in(given: str | Path) -> Path:
-    """Name the log that is meant: a folder stands for the run's log in it."""
+    """Name the log that is meant: a folder stands for the run's log in it. Raises LogError for one without."""
     path = Path(given)
-    return path / LOG_NAME if path.is_dir() else path
+    if not path.is_dir():
+        return path
+    if not (path / LOG_NAME).exists():
+        raise LogError(f"folder {path} has no {LOG_NAME}; name a log, or the folder of a run")
+    return path / LOG_NAME
 
 
 def part_path(path: Path, number: int) -> Path:

@@ -29,10 +29,21 @@ def read_toml(path: Path, kind: str = "configuration") -> dict[str, Any]:
     try:
         return parse_toml(read_input(path, _MOST_TOML_BYTES))
     except FileNotFoundError:
-        raise ConfigError(f"{kind} {path} does not exist") from None
+        raise ConfigError(f"{kind} {path} does not exist{_instead(path, kind)}") from None
     except (OSError, ConfigError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(f"{kind} {path}: {reason}") from None
+
+
+def _instead(path: Path, kind: str) -> str:
+    """Name the file beside it that may have been meant, or how one is made."""
+    try:
+        beside = sorted(other.name for other in path.parent.glob("*.toml"))
+    except OSError:
+        beside = []
+    if nearest := nearest_name(path.name, beside):
+        return f"; did you mean {str(path.parent / nearest)!r}?"
+    return "; `adacd-hil init` writes one" if kind == "configuration" else ""
 
 
 def parse_toml(text: bytes | str) -> dict[str, Any]:
@@ -48,7 +59,7 @@ def parse_toml(text: bytes | str) -> dict[str, Any]:
     except RecursionError:
         raise ConfigError(f"more than {_DEEPEST} tables or lists within each other") from None
     except UnicodeDecodeError as error:
-        raise ConfigError(f"byte {error.start} is not UTF-8") from None
+        raise ConfigError(f"byte {error.start} is not UTF-8; save the file as UTF-8") from None
     except ValueError as error:  # of TOML, and of integers that are too long to be read
         raise ConfigError(one_line(error)) from None
     _check_extent(table)

@@ -154,6 +154,7 @@ def _list_groups(as_json: bool) -> None:
 
 def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":
     """Give the settings of these groups and keys, all where there are none. Raises CommandError."""
+    from adacd_hil.remedies import nearest_name
     from adacd_hil.settings.catalogue import explain_unknown, known_keys, sections
 
     known = known_keys()
@@ -166,6 +167,8 @@ def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":
             chosen += [row for name, row in known.items() if name.startswith(f"{key}.")]
         elif key in known:
             chosen.append(known[key])
+        elif group := nearest_name(key, groups):
+            raise CommandError(f"unknown group `{key}`; did you mean `{group}`?", ExitCode.USAGE)
         else:
             raise CommandError(explain_unknown(key), ExitCode.USAGE)
     return list(dict.fromkeys(chosen))

@@ -133,5 +133,7 @@ def live_client(url: str, topics: Collection[str] | None = None) -> Iterator[Liv
         )
         with connection as opened:
             yield LiveClient(opened, topics)
+    except ConnectionRefusedError:
+        raise LogError(f"live view {url}: nobody serves one there; start the run with --live") from None
     except (OSError, WebSocketException, ValueError, LogError) as error:
         raise LogError(f"live view {url}: {' '.join(str(error).split()) or type(error).__name__}") from None

@@ -1,0 +1,206 @@
+"""Typical mistakes of users: each gets one line with the remedy, the documented exit status, and no traceback.
+
+A row: what is typed, the status, and words of the line, the remedy among them. Progress may precede the line.
+"""
+
+import shlex
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from adacd_hil.cli.main import main
+from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.wire.codec import contract_folder
+
+FAILURE, USAGE, PARTIAL, BUS_MISSING = 1, 2, 3, 5
+
+URDF = '<robot name="r"><link name="l0"/>' + "".join(
+    f'<link name="l{n}"/><joint name="j{n}" type="revolute"><parent link="l{n - 1}"/><child link="l{n}"/>'
+    '<origin xyz="0.3 0 0"/><axis xyz="0 0 1"/></joint>'
+    for n in (1, 2, 3)
+)
+FILES = {
+    "my-arm.toml": "",
+    "typo.toml": "[arm\n",
+    "gone.toml": "[certified]\nsigmas = 6.0\n",
+    "near.toml": "[filter]\na_rads = 10.0\n",
+    "mm.toml": "[arm]\nlink_length_m = [350, 300]\n",
+    "rad.toml": "[arm]\nposition_limit_deg = [0.9, 0.8]\n",
+    "deg.toml": "[certified]\nstill_rad_s = 20.0\n",
+    "grams.toml": "[certified]\npayload_std_kg = 3000\n",
+    "same.toml": "[devices]\ndrive_node = [1, 2]\nsensor_node = [2, 3]\n",
+    "node.toml": "[devices]\ndrive_node = [0, 2]\n",
+    "host.toml": "[bus]\nhost_node = 3\n",
+    "one.toml": "[arm]\nlink_length_m = 0.35\n",
+    "three.toml": "[arm]\nlink_length_m = [0.35, 0.3, 0.1]\n",
+    "text.toml": '[filter]\na_rad_s = "ten"\n',
+    "nan.toml": "[filter]\na_rad_s = nan\n",
+    "self.toml": 'extends = "self.toml"\n',
+    "base.toml": 'extends = "certifed"\n',
+    "device.toml": '[devices]\ndrive = ["stok-drive", "stock-drive"]\n',
+    "kind.toml": '[devices]\ndrive = ["int32-sensor", "int32-sensor"]\n',
+    "theta.toml": "[arm]\ncad_theta = [0.2, 0.04]\n",
+    "arm.urdf": f"{URDF}</robot>",
+    "notes.txt": "hello",
+    "log.mcap": "hello",
+    "cut.mcap": "",
+    "bad.dbc": "hello",
+    "other.eds": (contract_folder() / "stock_drive.eds").read_text().replace("0x00020192", "0x00020191"),
+}
+RUN = "run -i virtual -c x"
+INIT = "init new.toml --no-bus --yes"
+
+MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
+    # -- the command line
+    ("reprot runs", USAGE, ("No such command 'reprot'", "Did you mean 'report'?")),
+    ("demo --profil P", USAGE, ("No such option '--profil'", "'--profile'")),
+    ("demo --profile Q", USAGE, ("'Q' is not one of 'P', 'S', 'M'", "demo --help")),
+    ("demo --seed -1", USAGE, ("-1 is not in the range x>=0", "demo --help")),
+    ("run -i socketcan", USAGE, ("Missing option '-c' / '--channel'", "run --help")),
+    ("report", USAGE, ("Missing argument 'LOGS...'", "report --help")),
+    ("report --from 5 --until 3 log.mcap", USAGE, ("--from 5 s is not before --until 3 s",)),
+    ("monitor", USAGE, ("give --interface and --channel, or --url",)),
+    ("log export log.mcap --format exel --out x", USAGE, ("'exel' is not one of 'parquet', 'csv', 'blf'",)),
+    # -- the bus
+    ("run -i sockecan -c can0", BUS_MISSING, ("unknown interface 'sockecan'", "did you mean 'socketcan'?")),
+    ("scan -i socketcan -c cann0", BUS_MISSING, ("CAN interface cann0 does not exist", "did you mean 'can0'?")),
+    ("run -i socketcan -c can0", BUS_MISSING, ("CAN interface can0 is down", "ip link set can0 up")),
+    ("run -i slcan -c tty1 --clock lockstep", USAGE, ("lockstep is for emulated arms", "it needs --clock realtime")),
+    (f"{RUN} -b 1M", USAGE, ("'1M' is not a valid integer", "run --help")),
+    ("init new.toml -i virtual -c x --yes", BUS_MISSING, ("drives that answer: none", "Check power, wiring and node")),
+    ("monitor --url ws://127.0.0.1:1", FAILURE, ("nobody serves one there", "start the run with --live")),
+    ("demo --live --live-port {port}", FAILURE, ("can't listen on 127.0.0.1:{port}", "--live-port 0 takes one")),
+    # -- the configuration
+    ("demo --config papper", USAGE, ("'papper' is neither built in nor a file", "did you mean 'paper'?")),
+    ("demo --config my-arms.toml", USAGE, ("my-arms.toml does not exist", "did you mean 'my-arm.toml'?")),
+    ("demo --config another-name.toml", USAGE, ("does not exist", "`adacd-hil init` writes one")),
+    ("demo --config folder", USAGE, ("configuration folder: it is a folder",)),
+    ("demo --config typo.toml", USAGE, ("typo.toml: Expected ']'", "at line 1, column 5")),
+    ("demo --config utf16.toml", USAGE, ("byte 0 is not UTF-8", "save the file as UTF-8")),
+    ("demo --config gone.toml", USAGE, ("unknown key `certified.sigmas`", "its successor is `certified.noise_sigmas`")),
+    ("demo --config near.toml", USAGE, ("unknown key `filter.a_rads`", "did you mean `filter.a_rad_s`?")),
+    ("demo --config mm.toml", USAGE, ("350.0 m is above 5 m", "350 mm are 0.35 m")),
+    ("demo --config rad.toml", USAGE, ("0.9 deg is below 1 deg", "0.9 rad are 51.5662 deg")),
+    ("demo --config deg.toml", USAGE, ("20.0 rad/s is above 1 rad/s", "20 deg/s are 0.349066 rad/s")),
+    ("demo --config grams.toml", USAGE, ("3000.0 kg is above 1000 kg", "3000 g are 3 kg")),
+    ("demo --config same.toml", USAGE, ("node ids 1, 2, 2, 3 of drives and sensors must differ",)),
+    ("demo --config node.toml", USAGE, ("`devices.drive_node[0]` = 0 is below 1",)),
+    ("demo --config host.toml", USAGE, ("`bus.host_node` = 3 is the node id of a device",)),
+    ("demo --config one.toml", USAGE, ("`arm.link_length_m` = 0.35 must be a list",)),
+    ("demo --config three.toml", USAGE, ("`arm.link_length_m` has 3 values, 2 expected",)),
+    ("demo --config text.toml", USAGE, ("`filter.a_rad_s` = 'ten' must be of type float",)),
+    ("demo --config nan.toml", USAGE, ("`filter.a_rad_s` = nan is not finite",)),
+    ("demo --config theta.toml", USAGE, ("`arm.cad_theta` has 2 values, 7 expected: a1, a2,", "[] without CAD model")),
+    ("demo --config self.toml", USAGE, ("configuration self.toml extends itself",)),
+    ("demo --config base.toml", USAGE, ("'certifed' is neither built in nor a file", "did you mean 'certified'?")),
+    ("demo --config device.toml", USAGE, ("'stok-drive' is neither built in nor a file", "did you mean 'stock-drive'")),
+    ("demo --config kind.toml", USAGE, ("int32-sensor is a sensor, a drive is needed",)),
+    ("config show --set certified.noise_sigma=8", USAGE, ("unknown key", "did you mean `certified.noise_sigmas`?")),
+    ("config show --set certified.noise_sigmas=800", USAGE, ("`certified.noise_sigmas` = 800.0 is above 50",)),
+    ("config show --set certified.noise_sigmas", USAGE, ("must be key=value, such as",)),
+    (
+        "config show --set reaction.start=mesured",
+        USAGE,
+        ("must be one of desired, measured", "mean 'measured'?"),
+    ),
+    ("config docs armm", USAGE, ("unknown group `armm`", "did you mean `arm`?")),
+    # -- other inputs
+    ("demo --scenario papr", USAGE, ("scenario 'papr' is neither built in nor a file", "did you mean 'paper'?")),
+    (f"{RUN} --dbc none.dbc", USAGE, ("DBC none.dbc: No such file",)),
+    (f"{RUN} --dbc bad.dbc", USAGE, ("DBC bad.dbc can't be read", "Invalid syntax at line 1")),
+    ("budget --dbc arm_fdd", USAGE, ("contract 'arm_fdd' is neither in dbc/ nor a file", "did you mean 'arm_fd'?")),
+    (f"{RUN} --tare none.toml", USAGE, ("tare none.toml does not exist", "`adacd-hil tare` makes one")),
+    (f"{INIT} --urdf arm.urdf", USAGE, ("3 joints move (j1, j2, j3), an arm has 2 here", "with --lock")),
+    (f"{INIT} --urdf notes.txt", USAGE, ("URDF notes.txt: not XML",)),
+    (f"{INIT} --eds other.eds", USAGE, ("EDS other.eds is of CiA 401", "a drive is of CiA 402")),
+    (f"{INIT} --length-m 350 300", USAGE, ("350.0 m is above 5 m", "350 mm are 0.35 m")),
+    ("init my-arm.toml --no-bus --yes", USAGE, ("my-arm.toml exists", "--force to replace it")),
+    ("init new.toml", USAGE, ("stdin is no terminal", "give --channel or --no-bus")),
+    # -- logs
+    ("report folder", FAILURE, ("folder has no run.mcap, nor has any folder in it",)),
+    ("report none.mcap", FAILURE, ("log none.mcap can't be read: No such file",)),
+    ("report notes.txt", FAILURE, ("notes.txt is not an MCAP file",)),
+    ("report cut.mcap", FAILURE, ("cut.mcap",)),
+    ("replay folder", FAILURE, ("folder has no run.mcap", "name a log, or the folder of a run")),
+    ("log info folder", FAILURE, ("folder folder has no .mcap file",)),
+    ("history none.toml", USAGE, ("history none.toml does not exist", "`adacd-hil run --history` makes one")),
+    # -- outputs
+    ("demo --out notes.txt", USAGE, ("Directory 'notes.txt' is a file", "demo --help")),
+    ("demo --out full", USAGE, (f"full/{LOG_NAME}",)),
+    ("demo --out /sys/run", FAILURE, ("/sys/run: ", "give another place")),
+    ("init /sys/new.toml --no-bus --yes", FAILURE, ("/sys/new.toml can't be written", "give another place")),
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("mistakes")
+    for name, text in FILES.items():
+        (path / name).write_text(text)
+    (path / "utf16.toml").write_bytes("[arm]\n".encode("utf-16"))
+    (path / "folder").mkdir()
+    (path / "full").mkdir()
+    (path / "full" / LOG_NAME).write_text("a log")
+    return path
+
+
+@pytest.fixture(scope="module")
+def port() -> Iterator[int]:
+    """A port that somebody listens on."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server.getsockname()[1]
+
+
+@pytest.fixture
+def interface(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One CAN interface in this machine, can0, which is down."""
+    can0 = tmp_path / "net" / "can0"
+    (can0 / "device").mkdir(parents=True)
+    for name, text in (("type", "280"), ("flags", "0x0"), ("mtu", "16"), ("tx_queue_len", "10")):
+        (can0 / name).write_text(text)
+    monkeypatch.setattr("adacd_hil.wire.can_interface._INTERFACES", tmp_path / "net")
+    monkeypatch.setattr("adacd_hil.wire.socketcan._require_socketcan", lambda channel: None)
+
+
+def test_there_are_enough_of_them() -> None:
+    assert len({typed for typed, _, _ in MISTAKES}) == len(MISTAKES) >= 40
+
+
+@pytest.mark.parametrize(("typed", "status", "words"), MISTAKES, ids=[typed for typed, _, _ in MISTAKES])
+def test_a_mistake_gets_one_line_with_the_remedy(
+    folder: Path,
+    port: int,
+    interface: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    typed: str,
+    status: int,
+    words: tuple[str, ...],
+) -> None:
+    monkeypatch.chdir(folder)
+    with pytest.raises(SystemExit) as ended:
+        main(shlex.split(typed.format(port=port)))
+    told = capsys.readouterr()
+    assert ended.value.code == status
+    assert told.out == ""
+    *progress, line = told.err.splitlines()
+    assert line.startswith("adacd-hil: ")
+    assert not any(text.startswith(("adacd-hil:", "Traceback", "Usage:")) for text in progress)
+    for part in words:
+        assert part.format(port=port) in line
+    assert not (folder / "new.toml").exists()
+
+
+@pytest.mark.slow
+def test_a_full_disk_behind_the_output_is_a_partial_result() -> None:
+    """The door to the terminals is the program's, so this one runs as one."""
+    script = "from adacd_hil.cli.start_host import start_host; start_host()"
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-c", script, "config", "docs"]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=60)
+    assert done.returncode == PARTIAL
+    assert done.stderr == "adacd-hil: standard output can't be written: No space left on device\n"
