@@ -11,27 +11,21 @@ begins with the first cycle's number less all whole rounds of the counter. The h
 STOPPED belong to the section that they interrupt. The paper's experiment gives A to E.
 """
 
-import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import LoggedEvent, Series
-from adacd_hil.log.types.topics import CERTIFIED_MODEL
 from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings, renewed
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
-
-if TYPE_CHECKING:
-    from adacd_hil.scheme.identify.certificate import Certificate
 
 Cycles = NDArray[np.int64]
 
@@ -461,20 +455,6 @@ def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
         return parse(Settings, renewed(parse_toml(attachments["config.toml"])))
     except ValueError as error:  # what is wrong with the text, the TOML or a setting is a ValueError each
         raise LogError(f"log {path}, attachment config.toml: {error}") from None
-
-
-def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
-    """Give the certificates that events, by name and message, have as numbers; what is none is left out."""
-    from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
-
-    for name, message in told:
-        if name == CERTIFIED_MODEL:
-            with suppress(ValueError, TypeError, RecursionError, AttributeError):  # of another version
-                values: dict[str, Any] = {
-                    key: tuple(value) if isinstance(value, list) else value
-                    for key, value in json.loads(message).items()
-                }
-                yield Certificate(**values)
 
 
 def is_realtime(run: Run) -> bool:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.logged_run import certificates_in, settings_of
+from adacd_hil.analysis.logged_run import settings_of
+from adacd_hil.analysis.score.metrics import certificates_in
 from adacd_hil.log.log_files import LogError, log_in
 from adacd_hil.log.reader import LoggedContact, LoggedEvent, RunLog, read_log
 from adacd_hil.records import ContactReport, SchemeState, Vector

@@ -24,7 +24,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from adacd_hil.analysis.logged_run import CertifiedStream, Mask, Run, Section, certificates_in, rows_of, split_sections
+from adacd_hil.analysis.logged_run import CertifiedStream, Mask, Run, Section, rows_of, split_sections
 from adacd_hil.analysis.score.distribution import Distribution
 from adacd_hil.analysis.score.judge import (
     LoggedDetection,
@@ -43,6 +43,7 @@ from adacd_hil.analysis.score.metrics import (
     Residual,
     SmallestPush,
     Untouched,
+    certificates_in,
 )
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, SchemeState, Vector

@@ -22,13 +22,16 @@ those of the fastest channel of its bank. What else it has: `adacd_hil.analysis.
 scheme that ran beside it on the same stream: `adacd_hil.analysis.score.margins`.
 """
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from adacd_hil.analysis.logged_run import Section
 from adacd_hil.analysis.score.distribution import LogHistogram
 from adacd_hil.analysis.score.judge import rate_bound_per_h
+from adacd_hil.log.types.topics import CERTIFIED_MODEL
 
 if TYPE_CHECKING:
     from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
@@ -218,6 +221,20 @@ class CertifiedEvidence:
         """The smallest of all margins where the certified model was in force or was learnt."""
         values = [min(row.margin) for rows in self.margins.values() for row in rows]
         return min(values, default=None)
+
+
+def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
+    """Give the certificates that events, by name and message, have as numbers; what is none is left out."""
+    from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
+
+    for name, message in told:
+        if name == CERTIFIED_MODEL:
+            with suppress(ValueError, TypeError, RecursionError, AttributeError):  # of another version
+                values: dict[str, Any] = {
+                    key: tuple(value) if isinstance(value, list) else value
+                    for key, value in json.loads(message).items()
+                }
+                yield Certificate(**values)
 
 
 @dataclass(frozen=True)
