@@ -32,6 +32,10 @@ class Movable(Protocol):
         """Torque that the drives know."""
 
     @property
+    def has_ideal_motors(self) -> bool:
+        """Whether no motor ever has less torque than its drive wants, or calls for a fault."""
+
+    @property
     def is_torque_limited(self) -> tuple[bool, bool]:
         """Whether each drive wants more torque than it may have."""
 
@@ -176,6 +180,7 @@ class BenchNodes:
             torque_Nm=lambda: sign * self._arm.motor_torque_Nm[joint],
             is_limited=lambda: self._arm.is_torque_limited[joint],
             error_code=lambda: self._arm.motor_error_code[joint],
+            is_ideal=self._arm.has_ideal_motors,
         )
 
     def _make_sensor(self, place: int, codec: Codec, scenario: Scenario) -> SensorNode:

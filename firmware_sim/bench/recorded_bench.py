@@ -125,6 +125,7 @@ _TORQUES = ("Sensor1Torque", "Sensor2Torque")
 class RecordedBody:
     """The arm as its recorded frames show it, for the nodes' objects and standstill; it knows no truth."""
 
+    has_ideal_motors = True
     is_torque_limited = (False, False)
     motor_error_code = (0, 0)
     joint_temperature_C = (ROOM_TEMPERATURE_C, ROOM_TEMPERATURE_C)

@@ -221,9 +221,10 @@ class Body:
         motor = self._numbers["motor"]
         self._gain, self._offset_Nm = motor["gain"].tolist(), motor["offset_Nm"].tolist()
         self._can_overload = float(motor["can_overload"])
-        self._is_never_limited = not motor["has_limits"] and np.array_equal(
+        self.has_ideal_motors = not motor["has_limits"] and np.array_equal(
             motor["peak_Nm"], scenario.arm.rated_torque_Nm
         )
+        """Whether no motor ever has less torque than its drive wants, or calls for a fault."""
         self.torque_ends = converter_ends(scenario.sensors, 0), converter_ends(scenario.sensors, 1)
         """Lowest and highest counts of each torque sensor; there its value is a bound only."""
         seed = scenario.seed if seed is None else seed
@@ -312,7 +313,7 @@ class Body:
     @property
     def is_torque_limited(self) -> tuple[bool, bool]:
         """Whether each drive wants more torque than current limit, I²t or temperature leave; statusword bit 11."""
-        if self._is_never_limited:
+        if self.has_ideal_motors:
             return False, False
         first, second = self._is_limited.tolist()
         return first != 0.0, second != 0.0
@@ -320,7 +321,7 @@ class Body:
     @property
     def motor_error_code(self) -> tuple[int, int]:
         """Error code that each motor's I²t or temperature calls for now, 0 for none; 0x603F."""
-        if self._is_never_limited:
+        if self.has_ideal_motors:
             return 0, 0
         heat1, heat2 = self._is_overheated.tolist()
         spent1, spent2 = self._is_spent.tolist()

@@ -414,10 +414,10 @@ class DriveNode(Application):
 
     def _watch_motor(self, t_ns: int) -> None:
         """Fault when the motor's state calls for it; note when limits come and go."""
-        code = self._motor.error_code()
-        if code:
+        motor = self._motor
+        if not motor.is_ideal and (code := motor.error_code()):
             self._latch(code, None, t_ns)
-        is_limited = self._motor.is_limited()
+        is_limited = not motor.is_ideal and motor.is_limited()
         is_limiting = self._limits.is_limiting and self._follows_target
         if is_limited != self._is_motor_limited or is_limiting != self._is_limiting:
             self._is_motor_limited, self._is_limiting = is_limited, is_limiting

@@ -248,13 +248,14 @@ class Motor(NamedTuple):
     """The drive's knowledge of its motor without the bus: velocity in rad/s, torque in Nm.
 
     is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
-    fault that the motor's state calls for now, 0 for none.
+    fault that the motor's state calls for now, 0 for none. is_ideal: neither ever is, so that nobody has to ask.
     """
 
     velocity_rad_s: Callable[[], float]
     torque_Nm: Callable[[], float]
     is_limited: Callable[[], bool] = lambda: False
     error_code: Callable[[], int] = lambda: 0
+    is_ideal: bool = False
 
 
 class DriveScale(NamedTuple):

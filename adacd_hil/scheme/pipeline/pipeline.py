@@ -72,7 +72,7 @@ class SchemeBatch(NamedTuple):
 
 _LONGEST_CALM = 1024
 """Cycles that are counted together at most."""
-_NOTHING_CALM = Calm(0, 0, 0)
+_NOTHING_CALM, _NOTHING_JUDGED = Calm(0, 0, 0), ((0.0, 0.0), 0.0)
 
 
 def layout_of(settings: Settings) -> Layout:
@@ -137,24 +137,27 @@ class CalmStretch:
 
     def __init__(self) -> None:
         self.count = 0
-        self._bounds = _NOTHING_CALM
+        self._bounds, self._judged = _NOTHING_CALM, _NOTHING_JUDGED
         self._periods = 0
         self._observations = np.zeros(_LONGEST_CALM, dtype=np.int64)
         self._passed = np.zeros(_LONGEST_CALM, dtype=np.int64)
 
-    def begin(self, bounds: Calm) -> None:
-        """Draw the bounds for the cycles that follow."""
+    def begin(self, bounds: Calm, judged: tuple[tuple[float, float], float]) -> None:
+        """Draw the bounds for the cycles that follow. judged: of the contact, a way and the least torque along it."""
         self.count = self._periods = 0
-        self._bounds = bounds
+        self._bounds, self._judged = bounds, judged
 
-    def holds(self, arm: ArmState, observation: int) -> bool:
+    def holds(self, arm: ArmState, observation: int, tau_ext_hat: Vector) -> bool:
         """Tell whether a cycle is within the bounds; `take` it then."""
         watched, expected, cycles, periods, due = self._bounds
+        (way_1, way_2), least_Nm = self._judged
+        torque_1, torque_2 = tau_ext_hat.tolist()
         return (
             self.count < min(cycles, _LONGEST_CALM)
             and (observation | finding_of(arm)) & watched == expected
             and self._periods + arm.periods < periods
             and arm.cycle < due
+            and torque_1 * way_1 + torque_2 * way_2 >= least_Nm
         )
 
     def take(self, arm: ArmState, observation: int) -> None:
@@ -240,14 +243,14 @@ class Pipeline:
         self._period_s[0] = self._intervals.since_last(arm)
         policy, stretch = self._policy, self._stretch
         observation = policy.step(int(arm.is_complete), int(arm.steps))
-        if request is Request.NONE and stretch.holds(arm, observation) and policy.is_calm:
+        if request is Request.NONE and stretch.holds(arm, observation, policy.tau_ext_hat) and policy.is_calm:
             block = np.empty(self.numbers.values.size)
             self._open = arm, observation, block
             return self._output(arm.cycle, self._supervisor.state, observation, None, block)
         policy.step_beside(int(arm.is_complete), int(arm.steps))
         self._count_calm()
         output = self._conclude(arm, request, observation)
-        stretch.begin(self._calm(arm.cycle + 1))
+        stretch.begin(self._calm(arm.cycle + 1), policy.contacts.judged)
         return output
 
     def complete(self) -> None:
@@ -268,7 +271,7 @@ class Pipeline:
         if stretch.count:
             self._supervisor.pass_by(*stretch.taken)
             self._policy.pass_by(stretch.count)
-        stretch.begin(_NOTHING_CALM)
+        stretch.begin(_NOTHING_CALM, _NOTHING_JUDGED)
 
     def _conclude(self, arm: ArmState, request: Request, observation: int) -> SchemeOutput:
         """Do what comes after the numbers in a cycle in which something could happen."""
