@@ -152,6 +152,8 @@ def test_two_logs_that_are_the_same_compare_with_status_0_and_others_with_1(log:
     assert run("compare", log, log.parent).exit_code == OK
     content = log.read_bytes()
     (tmp_path / "run.mcap").write_bytes(content[: len(content) * 3 // 4])
+    many = run("compare", log, log.parent, tmp_path, "--json")
+    assert (many.exit_code, [each["is_same"] for each in json.loads(many.stdout)]) == (FAILURE, [True, False])
     done = run("compare", log, tmp_path, "--json")
     found = json.loads(done.stdout)
     assert done.exit_code == FAILURE

@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     from adacd_hil.log.log_files import TimeWindow
 
 _EPILOG = (
-    "Exit status: 0 both decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "
-    "same as far as both logs are whole."
+    "Exit status: 0 all decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "
+    "same as far as the logs are whole."
 )
 
 
 @click.command(epilog=_EPILOG)
 @click.argument("first", type=GivenPath())
-@click.argument("second", type=GivenPath())
+@click.argument("others", type=GivenPath(), nargs=-1, required=True)
 @json_option
 @explained
 @stretch_options
-def compare(first: Path, second: Path, as_json: bool, stretch: "TimeWindow") -> ExitCode:
-    """Compare two runs: settings, every field of /scheme, states, contacts, parameters, timing.
+def compare(first: Path, others: tuple[Path, ...], as_json: bool, stretch: "TimeWindow") -> ExitCode:
+    """Compare the first run with each other: settings, fields of /scheme, states, contacts, parameters, timing.
 
     Times count from motion start, the first cycle in ADAPT. A folder stands for the run log in it.
 
@@ -39,11 +39,15 @@ def compare(first: Path, second: Path, as_json: bool, stretch: "TimeWindow") -> 
     from adacd_hil.analysis.replay.log_comparison import compare_logs
 
     with Progress() as progress:
-        found = compare_logs(log_in(first), log_in(second), progress, stretch)
-    print(json.dumps(found.as_json(), indent=2) if as_json else _as_text(found))
-    if not found.is_same:
+        found = [compare_logs(log_in(first), log_in(other), progress, stretch) for other in others]
+    if as_json:
+        tables = [each.as_json() for each in found]
+        print(json.dumps(tables[0] if len(tables) == 1 else tables, indent=2))
+    else:
+        print("\n\n".join(map(_as_text, found)))
+    if not all(each.is_same for each in found):
         return ExitCode.FAILURE
-    return ExitCode.PARTIAL if found.notes else ExitCode.OK
+    return ExitCode.PARTIAL if any(each.notes for each in found) else ExitCode.OK
 
 
 def _as_text(found: "LogComparison") -> str:
