@@ -3,24 +3,32 @@
 The on-disk cache is keyed by the text of every module with compiled functions and of all that these import. numba alone
 looks only at the file of the function itself, and would go on using the old code of an edited callee and the old value
 of an edited constant.
+
+Processes share the work: none compiles what another one is just compiling (`_SharedCache`).
 """
 
 import contextlib
 import fcntl
+import gc
 import hashlib
 import os
 import re
 import stat
 import tempfile
+import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core import event
 from numba.core.caching import FunctionCache
 from numpy.typing import ArrayLike
+
+from adacd_hil.compile_progress import CompileCount, full_name, functions_below
 
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("adacd_hil", "firmware_sim")
@@ -121,6 +129,53 @@ _FOLDER = cache_folder(source_digest())
 numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
 
+_POLL_S = 0.02
+_MOST_POLLS = 6000
+"""For another process that compiles a function, 120 s: one that was stopped in the midst of it holds up nobody longer.
+"""
+
+
+class _Claims:
+    """Which process compiles which function at present: locks of single bytes of one file, freed when a process ends.
+
+    Calls have no circle, so neither has waiting; the kernel would refuse one.
+    """
+
+    def __init__(self) -> None:
+        self._descriptor: int | None = None
+        with contextlib.suppress(OSError):
+            self._descriptor = os.open(_FOLDER / "claims", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+
+    def take(self, what: str) -> bool:
+        """Claim a function; return whether another process had it until now. Without locks there is no claim."""
+        for polls in range(_MOST_POLLS):
+            if self._lock(what, fcntl.LOCK_EX | fcntl.LOCK_NB):
+                return polls > 0
+            threading.Event().wait(_POLL_S)
+            _compilation.tell()
+        return True
+
+    def give_back(self, what: str) -> None:
+        """Let others have it."""
+        self._lock(what, fcntl.LOCK_UN)
+
+    def _lock(self, what: str, operation: int) -> bool:
+        """Tell whether the operation is done, or can't be done at all; not where another process has the byte."""
+        if self._descriptor is None:
+            return True
+        byte = int.from_bytes(hashlib.sha256(what.encode()).digest()[:7], "big")
+        try:
+            fcntl.lockf(self._descriptor, operation, 1, byte)
+        except (BlockingIOError, PermissionError):
+            return False
+        except OSError:  # a file system without locks
+            return True
+        return True
+
+
+_claims = _Claims()
+
+
 class _SharedCache(FunctionCache):
     """numba's cache on disk, for processes that compile at the same time.
 
@@ -128,11 +183,33 @@ class _SharedCache(FunctionCache):
     different types both take the same name, and the index then gives the code of one for the types of the other.
     """
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load what was compiled for these types; None where this process is to compile it, and then to save it."""
+        found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        if found is None and _claims.take(self._claim(sig)):
+            found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            if found is not None:
+                _claims.give_back(self._claim(sig))
+        return found
+
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save what was compiled, one process after the other. A disk that takes nothing costs compiling anew."""
-        with contextlib.suppress(OSError), (_FOLDER / "lock").open("wb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        try:
+            with contextlib.suppress(OSError), (_FOLDER / "lock").open("wb") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        finally:
+            _claims.give_back(self._claim(sig))
+
+    def version(self) -> int | None:
+        """Return what differs once something more was saved, by whichever process; None: nothing was."""
+        try:
+            return Path(self._cache_file._index_path).stat().st_mtime_ns
+        except OSError:
+            return None
+
+    def _claim(self, sig: Any) -> str:
+        return f"{full_name(self._py_func)} {sig}"
 
 
 def compiled(function: Function) -> Function:
@@ -152,6 +229,70 @@ def _compiled(function: Function, **options: bool) -> Function:
     if dispatcher is not function:  # as it is where NUMBA_DISABLE_JIT is set
         dispatcher._cache = _SharedCache(function)  # type: ignore[no-untyped-call]
     return cast(Function, dispatcher)
+
+
+class _Compilation(event.Listener):
+    """What is compiled at present, and who is told. No garbage is collected meanwhile: a tenth of the time."""
+
+    def __init__(self) -> None:
+        self._depth = 0
+        self._was_collecting = False
+        self._count = self.new_count(())
+        self._on_first: Callable[[], None] | None = None
+
+    def new_count(self, functions: Sequence[Any]) -> CompileCount:
+        """Count from now on, towards these functions and all that they call."""
+        self._count = CompileCount(functions_below(functions), lambda function: function._cache.version())
+        return self._count
+
+    def on_start(self, event: Any) -> None:  # noqa: ARG002
+        """Begin to compile a function."""
+        if self._depth == 0:
+            self._was_collecting = gc.isenabled()
+            gc.disable()
+        self._depth += 1
+        begin, self._on_first = self._on_first, None
+        if begin is not None:
+            begin()
+        self._count.tell()
+
+    def on_end(self, event: Any) -> None:
+        """Count it."""
+        self._depth -= 1
+        if self._depth == 0 and self._was_collecting:
+            gc.enable()
+        if isinstance(event.data["dispatcher"]._cache, _SharedCache):  # not one of numba's own
+            self._count.add(event.data["dispatcher"])
+
+    def tell(self) -> None:
+        """Tell the listeners how far it is."""
+        self._count.tell()
+
+    @contextmanager
+    def of(self, functions: Sequence[Any], on_first: Callable[[], None]) -> Iterator[None]:
+        """Count towards these functions in the block, unless a block around this one does."""
+        if self._on_first is not None or self._count.is_expecting:
+            yield
+            return
+        self.new_count(functions)
+        self._on_first = on_first
+        try:
+            yield
+        finally:
+            self._on_first = None
+            self.new_count(())
+
+
+_compilation = _Compilation()
+event.register("numba:compile", _compilation)  # type: ignore[no-untyped-call]
+
+
+def compiling(functions: Sequence[Any], on_first: Callable[[], None] = lambda: None) -> Any:
+    """Return a block that compiles these functions and all that they call: who listens is told how many there are.
+
+    on_first: called before the first is compiled, and not at all where all are in the cache.
+    """
+    return _compilation.of(functions, on_first)
 
 
 Structured = np.ndarray[Any, np.dtype[np.void]]

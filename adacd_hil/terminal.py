@@ -20,6 +20,7 @@ import textwrap
 import threading
 from collections.abc import Iterable, Sequence
 from types import FrameType
+from typing import TextIO
 
 _CONTROL = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # C0 but for tab and newline, DEL, C1
@@ -88,6 +89,27 @@ def fit_table(lines: Sequence[Sequence[str]], right: Sequence[int] = (), width: 
         cells = lines if len(part) > 2 or widths[part[-1]] <= room else _parted(lines, part, room)
         told += _aligned(cells, part, widths, right)
     return told
+
+
+def fold(text: str, width: int | None) -> str:
+    """Part lines that are longer than `width` between words; what follows is indented two letters more.
+
+    A word that is longer, as a path, is left whole, so that it can be copied. None: nothing is parted.
+    """
+    if width is None:
+        return text
+    folded: list[str] = []
+    for line in text.split("\n"):
+        indent = " " * min(len(line) - len(line.lstrip()) + 2, max(0, width - _LEAST_ROOM))
+        is_long = len(line) > width
+        folded += _parts(line, width, indent) if is_long else [line]
+    return "\n".join(folded)
+
+
+def _parts(line: str, width: int, indent: str) -> list[str]:
+    return textwrap.wrap(
+        line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False, replace_whitespace=False
+    )
 
 
 _GAP = "  "
@@ -225,6 +247,35 @@ def write_screen(text: str) -> None:
     else:
         sys.stdout.write(text)
         sys.stdout.flush()
+
+
+def moves_cursor(stream: TextIO) -> bool:
+    """Tell whether a stream is a terminal that can overwrite a line; TERM=dumb can't."""
+    try:
+        return stream.isatty() and os.environ.get("TERM", "dumb") != "dumb"
+    except ValueError:  # it is closed
+        return False
+
+
+def has_colour(stream: TextIO) -> bool:
+    """Tell whether colours may be written: to a terminal that isn't dumb, unless NO_COLOR is set, to anything."""
+    return moves_cursor(stream) and not os.environ.get("NO_COLOR")
+
+
+def write_line(stream: TextIO, text: str, is_over: bool, has_end: bool) -> None:
+    """Write a line, over the one that the cursor is in where `is_over`; without `has_end` the cursor stays in it."""
+    if not has_end:
+        text = text[: shutil.get_terminal_size().columns - 1]
+    whole = f"{_ERASE_LINE if is_over else ''}{plain(text)}{_LINE_END if has_end else ''}"
+    if isinstance(stream, Terminal):
+        stream.write_raw(whole)
+    else:
+        stream.write(whole)
+        stream.flush()
+
+
+_ERASE_LINE = "\r\x1b[2K"
+_LINE_END = "\n"
 
 
 def open_terminals() -> None:

@@ -33,7 +33,7 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, complain, explained, tell, tried
+from adacd_hil.cli.output import EPILOG, ExitCode, complain, explained, show, tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.terminal import is_interrupted, one_line, open_terminals
@@ -92,10 +92,13 @@ def demo(
     The configuration's script plays the user of the paper's experiment. In any other scenario the user acknowledges
     stops as the configuration says, and asks to finish at the scenario's `lasts_s`.
     """
-    from adacd_hil.cli.commands.demo_command import play
+    from adacd_hil.cli.commands.demo_command import next_of_report, play
 
     report, code = play(config, scenario, profile, seed, clock, out, live, truth)
-    print(json.dumps(report.as_json(), indent=2) if as_json else report.as_text())
+    if as_json:
+        print(json.dumps(report.as_json(), indent=2))
+    else:
+        show(report.as_text(), *next_of_report(report.html_path))
     return code
 
 
@@ -127,10 +130,13 @@ def run(
     and `finish` to end. Ctrl-C parks the arm and ends; a second Ctrl-C
     stops at once.
     """
-    from adacd_hil.cli.commands.run_command import as_text, run_on_bus
+    from adacd_hil.cli.commands.run_command import as_text, next_of_run, run_on_bus
 
     result, code = run_on_bus(connection, clock, out, tare, live, history)
-    print(json.dumps(result, indent=2) if as_json else as_text(result))
+    if as_json:
+        print(json.dumps(result, indent=2))
+    else:
+        show(as_text(result), *next_of_run(result))
     return code
 
 
@@ -184,7 +190,7 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Ti
     if as_json:
         print(json.dumps(in_json(reports), indent=2))
     else:
-        print("\n\n".join(entry.as_text() for entry in reports))
+        show("\n\n".join(entry.as_text() for entry in reports))
     return code
 
 

@@ -9,20 +9,22 @@ import functools
 import itertools
 import os
 import queue
+import shlex
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from adacd_hil.clock import wall_ns
+from adacd_hil.clock import MonotonicClock, wall_ns
+from adacd_hil.compile_progress import telling
 from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
-from adacd_hil.terminal import fit_table, in_line, one_line, terminal_columns
+from adacd_hil.terminal import fit_table, fold, in_line, moves_cursor, one_line, terminal_columns, write_line
 
 if TYPE_CHECKING:
     from adacd_hil.control.session import SessionSummary  # it compiles: seconds that a command without a run can spare
@@ -137,32 +139,71 @@ def format_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequ
     return "\n".join(fit_table(lines, right, terminal_columns()))
 
 
+def show(text: str, *next_commands: str) -> None:
+    """Print a result for people, folded to their terminal; on standard error, what they may type next."""
+    print(fold(text, terminal_columns()))
+    suggest(*next_commands)
+
+
+def suggest(*next_commands: str) -> None:
+    """Name on standard error what may be typed next."""
+    for place, command in enumerate(next_commands):
+        print(f"{'next:' if place == 0 else '     '} {in_line(command)}", file=sys.stderr)
+
+
+def quoted(path: Path) -> str:
+    """Quote a path for a shell."""
+    return shlex.quote(str(path))
+
+
 class Progress:
     """Lines on stderr about work in progress; their end waits for the last one, but not for ever.
 
-    A thread of their own prints them: a stuck terminal must not stop the arm.
+    A thread of their own prints them: a stuck terminal must not stop the arm. How far compiling is takes one line of a
+    terminal, which the next line overwrites; elsewhere it is said every few seconds.
     """
 
     CLOSE_TIMEOUT_S = 2.0
+    COUNT_EVERY_NS = 1_000_000_000
+    TOLD_EVERY_NS = 4_000_000_000
+    """Between two counts in one line of a terminal, and between two lines elsewhere."""
 
     def __init__(self) -> None:
-        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._lines: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
+        self._has_cursor = moves_cursor(sys.stderr)
+        self._pause_ns = self.COUNT_EVERY_NS if self._has_cursor else self.TOLD_EVERY_NS
+        self._clock = MonotonicClock()
+        self._counted_ns = self._clock.now_ns() - self._pause_ns
         self._thread = threading.Thread(target=self._print, name="progress", daemon=True)
         self._thread.start()
+        self._told = ExitStack()
+        self._told.enter_context(telling(self.count))
 
     def __call__(self, line: str) -> None:
         """Queue a line."""
-        self._lines.put(line)
+        self._lines.put((line, False))
+
+    def count(self, line: Callable[[], str]) -> None:
+        """Queue a line that the next one may overwrite, if it is time for one."""
+        if self._clock.now_ns() - self._counted_ns >= self._pause_ns:
+            self._counted_ns = self._clock.now_ns()
+            self._lines.put((line(), self._has_cursor))
 
     def _print(self) -> None:
-        while (line := self._lines.get()) is not None:
-            print(in_line(line), file=sys.stderr, flush=True)
+        is_overwritten = False
+        while (said := self._lines.get()) is not None:
+            line, is_count = said
+            write_line(sys.stderr, in_line(line), is_overwritten, has_end=not is_count)
+            is_overwritten = is_count
+        if is_overwritten:
+            write_line(sys.stderr, "", is_overwritten, has_end=False)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         """Print what is queued and end."""
+        self._told.close()
         self._lines.put(None)
         self._thread.join(self.CLOSE_TIMEOUT_S)
 
@@ -199,7 +240,7 @@ def tell(said: str, out: Path | None, content: str, has_all: bool) -> None:
             replace_file(out, content)
         except OSError as error:
             failure = error
-    print(said)
+    print(said if has_all else fold(said, terminal_columns()))
     if failure is None:
         return
     if not has_all:

@@ -19,6 +19,7 @@ from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.pacing import Pacer
 from adacd_hil.control.reference import Reference
+from adacd_hil.control.run_narration import RunNarration
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import DataShares, DataWatch
 from adacd_hil.device.arm_watch import ArmWatch, Recurrence
@@ -80,11 +81,13 @@ class Cycle:
         operator: Operator,
         progress: Callable[[str], None],
         clock: Clock,
+        touched_ns: Callable[[], int | None] = lambda: None,
     ) -> None:
-        """Prepare. `clock`: what durations within a cycle are measured by."""
+        """Prepare. `clock`: what durations within a cycle are measured by; `touched_ns`: as of `RunNarration`."""
         self._period_s = settings.bus.period_s
         self._frame_checks = Recurrence(FRAME_CHECKS_S, self._period_s)
         self._progress = progress
+        self._narration = RunNarration(progress, touched_ns)
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
         self._exchange = Exchange(settings, bus, arm, master, pacer, clock)
@@ -256,12 +259,12 @@ class Cycle:
             for event in source.take_events():
                 recorder.event(t_ns, event)
                 if event.name in CERTIFICATE_EVENTS:
-                    self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
+                    self._narration.event(t_ns, event.message)
         if output.state is not self._state:
             event = self._transition(output, arm)
             recorder.event(t_ns, event)
             self._follow_state(output.state, arm.cycle)
-            self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
+            self._narration.transition(t_ns, output, event.message)
 
     def _transition(self, output: SchemeOutput, arm: ArmState) -> Event:
         text = f"{output.previous_state.name} -> {output.state.name}"

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.control.cycle import Cycle, RunResult
+from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.fault_recovery import Recovery
 from adacd_hil.control.history_file import HISTORY_NAME, UsedHistory
 from adacd_hil.control.operator import Operator, ScriptedOperator
@@ -93,7 +94,8 @@ class Ending(NamedTuple):
 class Session:
     """One run on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time.
 
-    `on_started` is called when the devices are put into operation for the first time.
+    `on_started` is called when the devices are put into operation for the first time. `touched_ns`: as of
+    `RunNarration`.
     """
 
     settings: Settings
@@ -109,6 +111,7 @@ class Session:
     history: UsedHistory | None = None
     live: LiveAddress | None = None
     on_started: Callable[[], None] = lambda: None
+    touched_ns: Callable[[], int | None] = lambda: None
     _cycle: Cycle | None = None
     _identities: tuple[Identity, ...] = ()
     _is_interrupted: bool = False
@@ -135,8 +138,8 @@ class Session:
             self.settings = replace(self.settings, realtime=realtime)
         tap = Tap(self.bus, self.clock)
         pacer = make_pacer(self.settings, self.clock, tap, self.codec.message("Sync").can_id)
-        self.progress("compiling")
-        attempt = self._prepare(tap, pacer)
+        with compiling_cycle(self.settings):
+            attempt = self._prepare(tap, pacer)
         # After compiling: a second of work at real-time priority would be paid back by 50 ms of throttling later.
         grant = self._request_realtime()
         for line in grant.missing:
@@ -188,7 +191,7 @@ class Session:
         """Build and compile everything that must know nothing of an attempt before."""
         arm = Arm(self.settings, self.codec, tap)
         master = Master(self.settings, self.codec, tap, watch_host=not self.is_lockstep)
-        cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.clock)
+        cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.clock, self.touched_ns)
         cycle.compile()
         self._cycle = cycle
         if self._is_interrupted:

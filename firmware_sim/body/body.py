@@ -275,6 +275,9 @@ class Body:
             self._payloads, self._encoder_noise.table, self._substeps, self._work,
         )  # fmt: skip
 
+    compiled_functions = (advance_body, sample_body, fill_truth)
+    """The largest that are compiled with the first body."""
+
     def _compile(self) -> None:
         """Run every compiled function once, on a copy of the state."""
         state = self._state_vector.copy()

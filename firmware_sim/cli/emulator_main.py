@@ -12,6 +12,7 @@ from typing import Any, NoReturn, get_args
 import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
+from adacd_hil.compiled import compiling
 from adacd_hil.file_access import in_words, tidied
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.editing.log_info import run_metadata
@@ -29,6 +30,7 @@ from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.bench.injector import Departure, OnEvent
 from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
+from firmware_sim.body.body import Body
 from firmware_sim.canopen.object_dictionary import CONTRACTS, EmulatedContract
 from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.own_devices import rehearse
@@ -183,7 +185,10 @@ def run(
             log = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
             stack.enter_context(log)
         departure = Departure(bus)
-        bench = Bench(resolved, codec, departure.send, clock_mode=clock_mode, contract=played, on_answer=departure.go)
+        with compiling(Body.compiled_functions):
+            bench = Bench(
+                resolved, codec, departure.send, clock_mode=clock_mode, contract=played, on_answer=departure.go
+            )
         if log is not None:
             epoch_ns = wall_ns() - clock.now_ns()
             bench.rows.on_truth = _stamp_truth(log, bench, epoch_ns)

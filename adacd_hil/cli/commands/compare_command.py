@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import ExitCode, Progress, explained, format_table
+from adacd_hil.cli.output import ExitCode, Progress, explained, format_table, show
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
@@ -44,7 +44,7 @@ def compare(first: Path, others: tuple[Path, ...], as_json: bool, stretch: "Time
         tables = [each.as_json() for each in found]
         print(json.dumps(tables[0] if len(tables) == 1 else tables, indent=2))
     else:
-        print("\n\n".join(map(_as_text, found)))
+        show("\n\n".join(map(_as_text, found)))
     if not all(each.is_same for each in found):
         return ExitCode.FAILURE
     return ExitCode.PARTIAL if any(each.notes for each in found) else ExitCode.OK

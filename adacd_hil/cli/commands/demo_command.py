@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from adacd_hil.analysis.score.emulator_truth import config_digest
 from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, exit_code, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, exit_code, quoted, run_folder
 from adacd_hil.clock import VirtualClock
+from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.file_access import in_words
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, LOG_NAME, TRUTH_NAME, LogError
-from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.records import TRUTH_LAYOUT, FaultReason, SchemeState, Vector
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import Settings, configuration_layers, load_settings, resolved_table
 from adacd_hil.settings.run_settings import RequestSettings
 from adacd_hil.settings.schema import parse
@@ -23,6 +25,7 @@ from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.bench_time import TruthLog
+from firmware_sim.body.body import Body
 from firmware_sim.canopen.object_dictionary import EmulatedContract, playable_contract
 from firmware_sim.cli.own_devices import rehearse_settings
 from firmware_sim.scenario.rehearsal import told_arm
@@ -35,6 +38,9 @@ SCENARIO = "paper"
 """Whose requests to the host are in a script; the user of another one only asks to finish."""
 USER = "demo"
 """The configuration with that script, for those that have none."""
+
+
+_TOUCHED_LINK = TRUTH_LAYOUT.slices["contact_link"].start
 
 
 class Cast(NamedTuple):
@@ -78,6 +84,22 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
     return Cast(dataclasses.replace(settings, arm=arm, operator=operator), scenario, contract, tuple(assumed))
 
 
+class _TrueTouch:
+    """Since when the emulator's person touches the arm: for what is told of the run, not for the host."""
+
+    def __init__(self, truth: TruthLog) -> None:
+        self.since_ns: int | None = None
+        self._truth = truth
+
+    def write(self, cycle: int, t_ns: int, block: Vector) -> None:
+        """Log the truth of one cycle."""
+        if block[_TOUCHED_LINK] == 0.0:
+            self.since_ns = None
+        elif self.since_ns is None:
+            self.since_ns = t_ns
+        self._truth.write(cycle, t_ns, block)
+
+
 def run_embedded(
     cast: Cast,
     clock_name: str,
@@ -101,9 +123,12 @@ def run_embedded(
     host = {CONFIG_DIGEST_KEY: config_digest(to_toml(settings))}
     with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", metadata=host, scenario=scenario) as truth:
         try:
-            bench = Bench(
-                scenario, codec, embedded.deliver, contract=contract, on_truth=truth.write, on_event=truth.event
-            )
+            touch = _TrueTouch(truth)
+            with compiling_cycle(settings, Body.compiled_functions):
+                bench = Bench(
+                    scenario, codec, embedded.deliver, contract=contract, on_truth=touch.write, on_event=truth.event
+                )
+                Pipeline(settings).compile()
             embedded.attach(bench.on_frame)
             bench.boot()
             session = Session(
@@ -118,6 +143,7 @@ def run_embedded(
                 progress=progress,
                 live=live,
                 on_started=on_started,
+                touched_ns=lambda: touch.since_ns,
             )
             with on_interrupt(session.interrupt):
                 summary = session.run()
@@ -171,6 +197,15 @@ def play(
     if summary.error:
         raise CommandError(summary.error, exit_code(summary))
     return report, exit_code(summary)
+
+
+def next_of_report(html_path: Path) -> tuple[str, ...]:
+    """Name what may be typed after a demo."""
+    log_path = html_path.with_name(LOG_NAME)
+    return (
+        f"xdg-open {quoted(html_path)}",
+        f"adacd-hil replay {quoted(log_path)}   # the same decisions, bit for bit?",
+    )
 
 
 def _ending(summary: SessionSummary) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table, quoted, show
 from adacd_hil.file_access import replace_file
 from adacd_hil.given_path import GIVEN_FILE, WrittenPath
 from adacd_hil.terminal import in_line
@@ -67,8 +67,18 @@ def identify(
         if out is not None:
             _write(found, out)
             progress(f"pictures in {out}")
-    print(json.dumps(found.as_json(), indent=2) if as_json else _as_text(found))
+    if as_json:
+        print(json.dumps(found.as_json(), indent=2))
+    else:
+        show(_as_text(found), *_next(map_path, recordings[0], has_watched=bool(watch)))
     return ExitCode.OK if found.is_explained else ExitCode.PARTIAL
+
+
+def _next(map_path: Path, recording: Path, has_watched: bool) -> tuple[str, ...]:
+    if has_watched:
+        return ()
+    again = f"adacd-hil identify {quoted(recording)} --map {quoted(map_path)}"
+    return (f"{again} --watch TOUCHED.csv   # contacts in a recording of a touched arm",)
 
 
 def _write(found: "Identified", out: Path) -> None:

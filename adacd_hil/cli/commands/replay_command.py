@@ -8,7 +8,7 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table, quoted, show
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
@@ -87,9 +87,16 @@ def replay(
     if as_json:
         print(json.dumps([_as_json(*result, shown, stretch) for result in results], indent=2, allow_nan=False))
     else:
-        print("\n\n".join(_as_text(*result, shown, stretch) for result in results))
+        text = "\n\n".join(_as_text(*result, shown, stretch) for result in results)
+        show(text, *_next(logs[0], has_changes=bool(changes or vary or config)))
     codes = [_code(replays) for _, replays, _ in results]
     return max(codes, key=[ExitCode.OK, ExitCode.PARTIAL, ExitCode.FAILURE].index)
+
+
+def _next(given: Path, has_changes: bool) -> tuple[str, ...]:
+    if has_changes:
+        return (f"adacd-hil sweep {quoted(given)} --vary KEY=A,B,C   # many values at once",)
+    return (f"adacd-hil replay {quoted(given)} --set certified.noise_sigmas=8   # and with another setting?",)
 
 
 _Result = tuple[Path, "list[Replay]", list[str]]

@@ -20,7 +20,7 @@ from adacd_hil.cli.connection import (
     never_stopped,
     on_interrupt,
 )
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, exit_code, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, exit_code, quoted, run_folder
 from adacd_hil.clock import format_date, wall_ns
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
@@ -28,6 +28,7 @@ from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.control.tare_file import use_tare
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.records import FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line
@@ -170,10 +171,30 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
     }
 
 
+def next_of_run(result: dict[str, Any]) -> tuple[str, ...]:
+    """Name what may be typed after a run."""
+    if "cycles" not in result:
+        return ("adacd-hil doctor, with the same options: what is wrong, and what to do about it",)
+    return (
+        f"adacd-hil report {quoted(Path(result['log']))}",
+        f"adacd-hil replay {quoted(Path(result['log']))}   # the same decisions, bit for bit?",
+    )
+
+
+def _verdict(result: dict[str, Any]) -> str:
+    """Say in one line how a run ended."""
+    if "cycles" not in result:
+        return "The run did not start."
+    if result["fault"] != FaultReason.NONE.name:
+        return f"The run ended by a fault: {result['fault']}. The drives are disabled."
+    lost = "" if not result["dropped"] and not result["log_error"] else "; the log is not whole"
+    return f"The run ended without a fault, in {result['state']}, after {result['cycles']} cycles{lost}."
+
+
 def as_text(result: dict[str, Any]) -> str:
     """Lay out what `summarise` says for people, a line each."""
     data = result.get("data")
-    lines = [f"{key}: {value}" for key, value in result.items() if key != "data"]
+    lines = [_verdict(result), *(f"{key}: {value}" for key, value in result.items() if key != "data")]
     if data is not None:
         lines.append(f"incomplete cycles: {data['incomplete']:.2%}; samples used late: {data['late']:.2%}")
         for what, shares in (("no frame in time", data["no_new_data"]), ("repeated frames", data["repeated"])):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, show
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.terminal import in_line
@@ -106,9 +107,20 @@ def sweep(
         "elapsed_s": round(outcome.elapsed_s, 3),
         "rows_per_s": round(outcome.computed / outcome.elapsed_s, 2) if outcome.elapsed_s else None,
     }
-    lines = (in_line(f"{key}: {value}") for key, value in result.items())
-    print(json.dumps(result, indent=2) if as_json else "\n".join(lines))
+    verdict = f"{plan.size - outcome.failed} of {plan.size} rows are there"
+    lines = [verdict, *(in_line(f"{key}: {value}") for key, value in result.items())]
+    if as_json:
+        print(json.dumps(result, indent=2))
+    else:
+        show("\n".join(lines), *_next(table, outcome.failed))
     return ExitCode.PARTIAL if outcome.failed else ExitCode.OK
+
+
+def _next(table: Path, failed: int) -> tuple[str, ...]:
+    if failed:
+        return ("the same command again: it computes what failed",)
+    read = f"import pandas; print(pandas.read_parquet({str(table)!r}))"
+    return (f"python -c {shlex.quote(read)}   # or any other reader of Parquet",)
 
 
 def _plan(

@@ -8,7 +8,18 @@ import click
 
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table, tell, tried
+from adacd_hil.cli.output import (
+    CommandError,
+    ExitCode,
+    Progress,
+    explained,
+    format_table,
+    quoted,
+    show,
+    suggest,
+    tell,
+    tried,
+)
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
@@ -65,14 +76,25 @@ def tune(
             found = find(paths, rate_per_h, config, progress, stretch)
         said = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
         if base is None or found.best is None:
-            print(said)
+            print(said) if as_json else show(said, *_next(paths[0], found, None))
         else:
             tell(said, out, suggested_toml(found, found.best, *base), as_json)
+            if not as_json:
+                suggest(*_next(paths[0], found, out))
     if report is not None:
         from adacd_hil.analysis.sweep.tune import write_tuning
 
         write_tuning(found, report)
     return ExitCode.OK if found.is_shown else ExitCode.PARTIAL
+
+
+def _next(log_path: Path, found: "Tuning", out: Path | None) -> tuple[str, ...]:
+    """Name what may be typed after it: to write the configuration, then to try it on the log."""
+    if found.best is None:
+        return ()
+    if out is None:
+        return (f"adacd-hil tune {quoted(log_path)} --out tuned.toml   # writes the suggestion as a configuration",)
+    return (f"adacd-hil replay {quoted(log_path)} --config {quoted(out)}   # what it would have changed",)
 
 
 def _as_text(found: "Tuning") -> str:

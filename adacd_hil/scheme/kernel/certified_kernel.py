@@ -180,7 +180,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     if mode & WEIGH and not observation & UNSEEN:
         doubt.weigh(k, m)
     if is_fresh and mode & (LEARN | TEST | REFINE):
-        observation |= _improve(k, m, out, observation & CONTACT != 0, mode)
+        observation |= improve(k, m, out, observation & CONTACT != 0, mode)
     _fill_model(k, m, out)
     return observation
 
@@ -207,7 +207,8 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
     if not is_seen and np.max(np.abs(out["dq"])) > regressor.SLOW_RAD_S:
         m["recovering_cycles"] = max(m["recovering_cycles"], k["settle_cycles"])
     m["is_steady"] = 1.0 if is_seen and steps == 1 else 0.0
-    _take_sample(k, m, out["q"], out["dq"], out["tau_J"], each_s, is_seen, out["tau_ext_wide_hat"])
+    q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays as those above: it is compiled once
+    _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
     m["has_gap"] = 0.0
     keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
     out["tau_f"][:] = m["tau_f"][filter_bank.SLOW]
@@ -297,7 +298,7 @@ def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
 
 
 @compiled
-def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
+def improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     """Learn, test or refine by this sample; return what that has come to."""
     is_free_before = m["recovering_cycles"] == 0.0
     if is_touched:

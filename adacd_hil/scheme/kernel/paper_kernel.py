@@ -190,6 +190,7 @@ def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
     a, b = c["a_rad_s"], c["b_rad_s"]
     nominal_s: float = c["period_s"]
     period_s: float = out["period_s"][0]
+    q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays as those of `between`: all is compiled once
     is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
     if is_seen:
         step_s = period_s / steps
@@ -200,15 +201,15 @@ def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
             put_between(m["last"], out["q"], out["dq"], out["tau_J"], k / steps, m["between"])
             _advance(c, m, m["between"][0], m["between"][1], m["between"][2], hold, out["tau_f"])
             _compare(c, m, m["between"][1], hold.decay, out)
-        _advance(c, m, out["q"], out["dq"], out["tau_J"], hold, out["tau_f"])
-        _compare(c, m, out["dq"], hold.decay, out)
+        _advance(c, m, q, dq, tau_J, hold, out["tau_f"])
+        _compare(c, m, dq, hold.decay, out)
     else:
         period_s = nominal_s
-        regressor.fill_momentum(out["q"], out["dq"], m["Y_p"])
-        regressor.fill_remainder(out["q"], out["dq"], m["Y_h"])
-        filter_bank.resume(a, b, m["Y_p"], m["Y_h"], out["tau_J"], m["input_old"], m["tau_old"], m["S"], m["W_f"])
+        regressor.fill_momentum(q, dq, m["Y_p"])
+        regressor.fill_remainder(q, dq, m["Y_h"])
+        filter_bank.resume(a, b, m["Y_p"], m["Y_h"], tau_J, m["input_old"], m["tau_old"], m["S"], m["W_f"])
         m["has_gap"] = 0.0
-        _compare(c, m, out["dq"], c["decay"], out)
+        _compare(c, m, dq, c["decay"], out)
     keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
     return is_seen, period_s
 

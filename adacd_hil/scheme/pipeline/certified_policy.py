@@ -15,7 +15,7 @@ from adacd_hil.scheme.identify import earlier, termination
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import WEAK, Doubt
 from adacd_hil.scheme.identify.doubt import begin as begin_doubt
-from adacd_hil.scheme.kernel import certified_kernel, certified_memory
+from adacd_hil.scheme.kernel import certified_kernel, certified_memory, paper_kernel
 from adacd_hil.scheme.kernel.kernel_samples import Recorded, Samples
 from adacd_hil.scheme.kernel.paper_kernel import PaperShadow
 from adacd_hil.scheme.model import filter_bank
@@ -69,6 +69,15 @@ class CertifiedPolicy(SchemePolicy):
         self._watch = CertificateWatch(self.numbers.constants, self.numbers.memory, settings.history.date_utc)
         self._doubt = Doubt(settings, self.numbers.constants, self.numbers.memory)
 
+    compiled_functions = (
+        certified_kernel.begin_adaptation,
+        certified_kernel.step,
+        certified_kernel.begin_test,
+        certified_kernel.begin_refinement,
+        paper_kernel.begin_adaptation,
+        paper_kernel.step_shadow,
+    )
+
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies."""
         constants, memory, block, _ = self.numbers
@@ -81,6 +90,12 @@ class CertifiedPolicy(SchemePolicy):
         begin_doubt(constants[0], memory[0])
         self._doubt.compile()
         self._paper.compile(self.numbers.block)
+
+    def compile_longest(self) -> None:
+        """Compile how a sample is learnt from, half of what a step takes, and the paper's scheme."""
+        constants, memory, block, _ = self.numbers
+        certified_kernel.improve(constants[0], memory.copy()[0], block.copy()[0], False, certified_kernel.LEARN)
+        self._paper.compile(block)
 
     def describe_missing(self) -> list[str]:
         """Say what an adaptation that takes too long is waiting for, a line each."""

@@ -206,6 +206,15 @@ class Pipeline:
         if self.detectors is not None:
             self.detectors.compile()
 
+    @property
+    def compiled_functions(self) -> tuple[object, ...]:
+        """The largest that `compile` runs."""
+        return self._policy.compiled_functions
+
+    def compile_longest(self) -> None:
+        """Compile about half of it, what `compile` comes to last: for another process, at the same time."""
+        self._policy.compile_longest()
+
     def describe_missing(self) -> list[str]:
         """Say what an adaptation that takes too long is waiting for, a line each; none of the paper's, eq. (15)."""
         return self._policy.describe_missing()

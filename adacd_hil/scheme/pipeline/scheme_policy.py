@@ -36,9 +36,15 @@ class SchemePolicy(ABC):
     is_model_valid: bool
     armed_in: frozenset[SchemeState] = frozenset((SchemeState.MONITOR,))
 
+    compiled_functions: tuple[object, ...]
+    """The largest that `compile` runs."""
+
     @abstractmethod
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
+
+    def compile_longest(self) -> None:
+        """Compile about half of it, what `compile` comes to last; nothing where all of it takes a moment."""
 
     @abstractmethod
     def step(self, is_complete: int, steps: int) -> int:
@@ -129,6 +135,8 @@ class PaperPolicy(SchemePolicy):
         self.theta_ff = np.zeros(self._theta_hat.size)
         self.is_model_valid = False
         self.supervisor = supervisor
+
+    compiled_functions = (paper_kernel.begin_adaptation, paper_kernel.step)
 
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies."""

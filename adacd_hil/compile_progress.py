@@ -1,0 +1,94 @@
+"""How far compiling is: who is told, and which functions are still to be compiled.
+
+Compiling takes the better part of a minute, once per version of the program. It is told to whoever listens
+(`telling`): a command's progress, which knows nothing of numba and would wait for its import.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+Listener = Callable[[Callable[[], str]], None]
+"""Is offered a line, often; it calls for one when it wants to show it."""
+
+_listeners: list[Listener] = []
+
+
+@contextmanager
+def telling(listener: Listener) -> Iterator[None]:
+    """Tell `listener` in the block how far compiling is, in the thread that compiles, several times a second."""
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
+
+
+def functions_below(functions: Sequence[Any], is_all: bool = False) -> dict[str, Any]:
+    """Return these compiled functions and all that they call, by full name.
+
+    Calls are found by the names in the code: of functions, and of functions in modules. Left out is what this process
+    has compiled or loaded, unless is_all, and what numba doesn't compile, as all of it where NUMBA_DISABLE_JIT is set.
+    """
+    found: dict[str, Any] = {}
+    waiting = list(functions)
+    while waiting:
+        function = waiting.pop()
+        text = getattr(function, "py_func", None)
+        if text is None or full_name(text) in found or (function.overloads and not is_all):
+            continue
+        found[full_name(text)] = function
+        names = text.__code__.co_names
+        for value in (text.__globals__[name] for name in names if name in text.__globals__):
+            waiting += (
+                [vars(value)[name] for name in names if name in vars(value)]
+                if isinstance(value, ModuleType)
+                else [value]
+            )
+    return found
+
+
+def full_name(function: Any) -> str:
+    """Name a function by its module."""
+    return f"{function.__module__}.{function.__qualname__}"
+
+
+class CompileCount:
+    """Counts functions that are compiled, and tells the listeners.
+
+    expected: by full name, of all that will be needed; without them the count has no total. version_of: of what the
+    cache on the disk has of a function, which another process may have changed; None: nothing.
+    """
+
+    def __init__(self, expected: dict[str, Any], version_of: Callable[[Any], object]) -> None:
+        self._expected, self._version_of = expected, version_of
+        self._before = self._versions()
+        self._done: set[str] = set()
+
+    @property
+    def is_expecting(self) -> bool:
+        """Whether there is a total."""
+        return bool(self._expected)
+
+    def add(self, function: Any) -> None:
+        """Count a function that has been compiled, and all that it calls."""
+        self._done |= {
+            name for name in functions_below([function], is_all=True) if not self._expected or name in self._expected
+        }
+        self.tell()
+
+    def tell(self) -> None:
+        """Offer the listeners a line."""
+        for listener in _listeners:
+            listener(self._line)
+
+    def _line(self) -> str:
+        kept = self._versions().items()
+        self._done |= {name for name, version in kept if version is not None and version != self._before[name]}
+        done, total = len(self._done), len(self._expected)
+        said = f"compiling {done} of {total} functions" if total else f"compiling, {done} functions so far"
+        return f"{said}, once per version"
+
+    def _versions(self) -> dict[str, object]:
+        return {name: self._version_of(function) for name, function in self._expected.items()}

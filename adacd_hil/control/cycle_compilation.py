@@ -1,0 +1,44 @@
+"""Compilation of what a cycle calls, on two processors: a second process compiles the longest part of it beside.
+
+Both keep what they have compiled in the same cache, and neither compiles what the other one is compiling.
+"""
+
+import contextlib
+import os
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from adacd_hil.compiled import compiling
+from adacd_hil.log.recording.processes import read_setup, start_module
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.settings.configuration import Settings
+
+_MODULE = "adacd_hil.control.cycle_compilation"
+
+
+@contextmanager
+def compiling_cycle(settings: Settings, further: Sequence[Any] = ()) -> Iterator[None]:
+    """Compile the cycle in the block, and `further` compiled functions: who listens is told how far it is.
+
+    Where there is a second processor, and something to compile, another process helps; it ends with the block.
+    """
+    helpers: list[subprocess.Popen[bytes]] = []
+
+    def start() -> None:
+        if len(os.sched_getaffinity(0)) > 1:
+            with contextlib.suppress(OSError):
+                helpers.append(start_module(_MODULE, (), settings, subprocess.DEVNULL))
+
+    try:
+        with compiling([*Pipeline(settings).compiled_functions, *further], start):
+            yield
+    finally:
+        for helper in helpers:
+            helper.kill()
+            helper.wait()
+
+
+if __name__ == "__main__":
+    Pipeline(read_setup()).compile_longest()

@@ -1,0 +1,105 @@
+"""Who compiles says how far it is; processes share the work."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adacd_hil.compile_progress import functions_below, telling
+from adacd_hil.compiled import compiled, compiling
+from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.model import regressor
+
+
+@compiled
+def halve(x):
+    return 0.5 * x
+
+
+@compiled
+def quarter(x):
+    return halve(halve(x))
+
+
+@pytest.mark.skipif(not hasattr(halve, "py_func"), reason="NUMBA_DISABLE_JIT is set")
+def test_the_total_is_a_function_and_all_that_it_calls() -> None:
+    assert list(functions_below([quarter], is_all=True)) == [f"{__name__}.quarter", f"{__name__}.halve"]
+    below = functions_below([paper_kernel.step], is_all=True).values()
+    assert {paper_kernel.step, regressor.fill_momentum} < set(below)
+    assert paper_kernel.run_paper not in set(below)
+
+
+@pytest.mark.skipif(not hasattr(halve, "py_func"), reason="NUMBA_DISABLE_JIT is set")
+def test_whoever_listens_is_told_how_far_compiling_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    for function in (halve, quarter):
+        monkeypatch.setattr(function._cache, "load_overload", lambda *_: None)  # an empty cache
+    said: list[str] = []
+    begun: list[int] = []
+    with telling(lambda line: said.append(line())), compiling([quarter], lambda: begun.append(len(said))):
+        assert quarter(4.0) == 1.0
+    assert said[0] == "compiling 0 of 2 functions, once per version"
+    assert said[-1] == "compiling 2 of 2 functions, once per version"
+    assert begun == [0]
+    with telling(lambda line: said.append(line())), compiling([quarter], lambda: begun.append(len(said))):
+        assert quarter(np.float64(8.0)) == 2.0
+    assert begun == [0]  # it was compiled
+
+
+WAITING = """
+import sys
+from adacd_hil.compiled import _SharedCache, compiled
+
+@compiled
+def double(x):
+    return 2.0 * x
+
+save = _SharedCache.save_overload
+
+def held(self, *arguments):
+    print("compiled", flush=True)
+    sys.stdin.readline()
+    save(self, *arguments)
+
+_SharedCache.save_overload = held
+double(1.5)
+print(sum(double.stats.cache_hits.values()), flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_what_another_process_compiles_is_awaited_and_taken_over(tmp_path: Path) -> None:
+    program = tmp_path / "double.py"
+    program.write_text(WAITING)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def start() -> "subprocess.Popen[str]":
+        words = [sys.executable, str(program)]
+        return subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+
+    with start() as first:
+        assert first.stdout is not None
+        assert first.stdout.readline() == "compiled\n"
+        with start() as second:
+            with pytest.raises(subprocess.TimeoutExpired):
+                second.communicate(timeout=0.5)
+            assert first.communicate("\n") == ("0\n", None)
+            assert second.communicate() == ("1\n", None)
+
+
+@pytest.mark.slow
+def test_who_compiles_and_dies_holds_up_nobody(tmp_path: Path) -> None:
+    program = tmp_path / "double.py"
+    program.write_text(WAITING)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    words = [sys.executable, str(program)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as first:
+        assert first.stdout is not None
+        assert first.stdout.readline() == "compiled\n"
+        first.kill()
+    assert (
+        subprocess.run(words, check=False, input="\n", capture_output=True, text=True, env=environment).stdout
+        == "compiled\n0\n"
+    )
