@@ -238,14 +238,16 @@ class RecalledContact(ContactEvidence):
         self._since = 0
 
     def compile(self) -> None:
-        """Run every compiled function once."""
+        """Run every compiled function, for one row and for several: numpy calls the columns of one row contiguous."""
         zeros, ones = np.zeros(JOINTS), np.ones(JOINTS)
         history = ContactHistory(4)
-        history.put(zeros, ones, ones, ones)
-        rows = history.last(1)
-        localisation.on_link2(rows[:, TAU], rows[:, Q2], ones, self._length_m)
-        classify(rows[:, TAU], ones, self._period_s)
-        _peak(rows[:, 1], 1.0)
+        for count in (1, 2):
+            history.put(zeros, ones, ones, ones)
+            rows = history.last(count)
+            tau, sigma = rows[:, TAU], rows[-1, SIGMA]
+            localisation.on_link2(tau, rows[:, Q2], sigma, self._length_m)
+            classify(tau, sigma, self._period_s)
+            _peak(tau[:, 0], sigma[0])
 
     def observe(self) -> None:
         """Take in one cycle, whatever the state is."""

@@ -11,7 +11,7 @@ from adacd_hil.scheme.contact.contact_report import RecalledContact
 from adacd_hil.scheme.contact.reaction import ContactCourse, ReactionChoice
 from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.detect.margin import MarginWatch
-from adacd_hil.scheme.identify import earlier, termination
+from adacd_hil.scheme.identify import anchor, earlier, termination
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import WEAK, Doubt
 from adacd_hil.scheme.identify.doubt import begin as begin_doubt
@@ -88,6 +88,7 @@ class CertifiedPolicy(SchemePolicy):
         certified_kernel.begin_refinement(constants, memory)
         earlier.forget(memory[0])
         begin_doubt(constants[0], memory[0])
+        anchor.tightest(constants[0], memory[0], 0)
         self._doubt.compile()
         self._paper.compile(self.numbers.block)
 
