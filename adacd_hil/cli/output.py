@@ -10,6 +10,7 @@ import itertools
 import os
 import queue
 import shlex
+import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -25,6 +26,8 @@ from adacd_hil.compile_progress import telling
 from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.terminal import fit_table, fold, in_line, moves_cursor, one_line, terminal_columns, write_line
+
+PROGRAM = "adacd-hil"
 
 if TYPE_CHECKING:
     from adacd_hil.control.session import SessionSummary  # it compiles: seconds that a command without a run can spare
@@ -146,9 +149,11 @@ def show(text: str, *next_commands: str) -> None:
 
 
 def suggest(*next_commands: str) -> None:
-    """Name on standard error what may be typed next."""
+    """Name on standard error what may be typed next, with this program as its user called it."""
+    called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     for place, command in enumerate(next_commands):
-        print(f"{'next:' if place == 0 else '     '} {in_line(command)}", file=sys.stderr)
+        typed = f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
+        print(f"{'next:' if place == 0 else '     '} {in_line(typed)}", file=sys.stderr)
 
 
 def quoted(path: Path) -> str:

@@ -254,6 +254,7 @@ class Cycle:
             messages.append((ChannelId.FRAME_CHECKS, pack_frame_checks(self._arm.frame_checks())))
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
+            self._narration.contact(t_ns, output.contact)
         recorder.cycle(t_ns, messages, self._bus.take())
         for source in self._sources:
             for event in source.take_events():

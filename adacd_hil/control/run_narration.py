@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from adacd_hil.records import ContactLevel, Reaction, SchemeOutput, SchemeState
+from adacd_hil.records import ContactLevel, ContactReport, Reaction, SchemeOutput, SchemeState
 
 _STATES = {
     SchemeState.COMMISSION: "checks the arm at rest",
@@ -66,4 +66,11 @@ class RunNarration:
         touched_ns = self._touched_ns()
         late_ms = None if touched_ns is None else (t_ns - touched_ns) * 1e-6
         found = f", found after {late_ms:.0f} ms" if late_ms is not None and 0.0 <= late_ms <= _LATEST_MS else ""
-        return f"{what} on link {contact.link}{found}: {_REACTIONS[contact.reaction]}"
+        return f"{what}{found}: {_REACTIONS[contact.reaction]}"
+
+    def contact(self, t_ns: int, contact: ContactReport) -> None:
+        """Tell on which link a contact was, once that is final: the first alarm may be of the other joint."""
+        if contact.is_final:
+            first, second = contact.tau_ext_peak
+            peak = f"{first:+.1f} / {second:+.1f} Nm at the joints"
+            self.event(t_ns, f"that was on link {contact.link}, up to {peak}")

@@ -172,9 +172,9 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
 
 
 def next_of_run(result: dict[str, Any]) -> tuple[str, ...]:
-    """Name what may be typed after a run."""
+    """Name what may be typed after a run; after one that didn't begin the error has said it."""
     if "cycles" not in result:
-        return ("adacd-hil doctor, with the same options: what is wrong, and what to do about it",)
+        return ()
     return (
         f"adacd-hil report {quoted(Path(result['log']))}",
         f"adacd-hil replay {quoted(Path(result['log']))}   # the same decisions, bit for bit?",
