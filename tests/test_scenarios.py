@@ -105,13 +105,13 @@ def test_an_expectation_of_a_certified_host_is_there_because_it_is_another(name:
 
 
 def test_the_user_of_a_scenario_only_acknowledges_and_finishes() -> None:
-    settings, scenario = resolve("paper", "power-loss-and-return", None, None)
+    settings, scenario, *_ = resolve("paper", "power-loss-and-return", None, None)
     assert [(entry.at_s, entry.request) for entry in settings.operator.script] == [(scenario.lasts_s, "finish")]
     assert (settings.operator.acknowledge_after_s, settings.operator.acknowledge_faults) == (0.6, 1)
 
 
 def test_the_papers_experiment_keeps_the_script_of_the_configuration() -> None:
-    settings, _ = resolve("paper", "paper", None, None)
+    settings, *_ = resolve("paper", "paper", None, None)
     assert [entry.request for entry in settings.operator.script] == ["payload", "payload_changed", "finish"]
 
 

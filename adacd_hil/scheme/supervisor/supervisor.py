@@ -109,7 +109,8 @@ _RAISED_BY = MappingProxyType(
     }
 )
 """Findings without which an event doesn't come. Those that are not here come by counting, or by a request."""
-_NOT_WELL = int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | NOT_A_NUMBER | OVER_LIMIT | OVER_SPEED | UNSEEN
+_UNRELIABLE = NOT_A_NUMBER | DETECTOR_FAILED
+_NOT_WELL = int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | _UNRELIABLE | OVER_LIMIT | OVER_SPEED | UNSEEN
 """Findings without which `_check` finds nothing in an arm that is enabled."""
 
 
