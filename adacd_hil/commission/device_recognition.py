@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, find_variable, read_eds, read_object
 from adacd_hil.device.contract import compose
-from adacd_hil.device.device_setup import NEWTON_METRE
+from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT
 from adacd_hil.device.profile import load_profile, place_devices, profile_names
 from adacd_hil.device.survey import Node
 from adacd_hil.records import JOINTS
@@ -24,8 +24,7 @@ from adacd_hil.wire.bus import Bus, Tap
 from adacd_hil.wire.codec import CodecError
 
 DRIVE, SENSOR = "drive", "sensor"
-_KINDS = {402: DRIVE, 404: SENSOR}
-_PREFIX_SHIFT = 24  # of 0x6131: power of ten, signed
+KINDS = {402: DRIVE, 404: SENSOR}
 _DEG_S_PER_RPM = 6.0
 
 
@@ -68,7 +67,7 @@ def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node]) -> list[RecognisedD
     canopen = CanopenBus(Tap(bus, clock))
     found = []
     for node in nodes:
-        kind = _KINDS.get((node.device_type or 0) & 0xFFFF)
+        kind = KINDS.get((node.device_type or 0) & 0xFFFF)
         if kind is not None and node.answers:
             remote = canopen.add_node(node.node_id, None)
             profiles = fitting_profiles(node, kind)
@@ -112,7 +111,7 @@ def _read_ratings(remote: Any, kind: str) -> DeviceRatings:
         unit, digits = number(0x6131, 1), number(0x6132, 1)
         if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
             return DeviceRatings()
-        prefix = unit >> _PREFIX_SHIFT
+        prefix = unit >> PREFIX_SHIFT
         exponent = (prefix - 256 if prefix > 127 else prefix) - digits
         return DeviceRatings(torque_Nm=10.0**exponent if abs(exponent) < 12 else None)
     rated_mNm, permille = number(0x6076), number(0x6072)

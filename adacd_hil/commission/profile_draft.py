@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.commission.device_recognition import DRIVE, SENSOR, DeviceRatings
+from adacd_hil.commission.device_recognition import DRIVE, KINDS, SENSOR, DeviceRatings
 from adacd_hil.device.canopen_bus import find_variable, read_eds
 from adacd_hil.device.pdo_mapping import SIGNAL_OBJECTS
 from adacd_hil.device.profile import ObjectName, ProfileSettings
@@ -16,7 +16,6 @@ from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.bus import CLASSIC_BYTES
 
-_KINDS = {402: DRIVE, 404: SENSOR}
 _TORQUE_OBJECTS = ((0x9130, 1), (0x7130, 1))
 """CiA 404: process value of an input as int32, as int16."""
 _FEATURES = {
@@ -43,10 +42,10 @@ def kind_of(eds: Path) -> str:
     """Tell whether an EDS is that of a drive or a sensor, by 0x1000. Raises ConfigError."""
     variable = find_variable(read_eds(eds, 1), 0x1000, 0)
     number = None if variable is None or variable.default is None else variable.default & 0xFFFF
-    if number not in _KINDS:
+    if number not in KINDS:
         told = "tells no device profile" if number is None else f"is of CiA {number}"
         raise ConfigError(f"EDS {eds} {told} in 0x1000; a drive is of CiA 402, a sensor of CiA 404")
-    return _KINDS[number]
+    return KINDS[number]
 
 
 def draft_profile(eds: Path, ratings: DeviceRatings = DeviceRatings()) -> ProfileDraft:  # noqa: B008 (immutable)

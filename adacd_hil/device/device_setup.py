@@ -151,7 +151,7 @@ def _enter_mode(slave: Slave) -> None:
 
 NEWTON_METRE = 0x00560100
 """0x6131 without its prefix: numerator Nm, denominator 1."""
-_PREFIX_SHIFT = 24  # of 0x6131: power of ten, signed
+PREFIX_SHIFT = 24  # of 0x6131: power of ten, signed
 
 
 def set_up_sensor(slave: Slave, codec: Codec) -> str:
@@ -167,7 +167,7 @@ def set_up_sensor(slave: Slave, codec: Codec) -> str:
         unit = slave.read(0x6131, channel)
         if unit & 0x00FFFFFF != NEWTON_METRE:
             slave.fail(f"unit 0x6131:{channel} = 0x{unit:08X}, 0x{NEWTON_METRE:08X} (Nm) expected")
-        prefix = unit >> _PREFIX_SHIFT
+        prefix = unit >> PREFIX_SHIFT
         prefix -= 256 if prefix > 127 else 0
     if slave.has(0x6132, channel):
         digits = prefix - math.log10(scale)

@@ -14,12 +14,12 @@ from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import Codec, contract_folder
+from adacd_hil.wire.contract_frames import NOT_VALID
 from firmware_sim.canopen.object_dictionary import DeviceDescription, EmulatedContract, contract_of
 from firmware_sim.scenario.arm_truth import ArmTruth, load_truth
 from firmware_sim.scenario.rehearsal import DeviceCounts, compose_scenario, told_arm
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, read_table, resolve_scenario
 
-_NOT_VALID = 1 << 31
 _CYCLIC_SYNCHRONOUS_TORQUE = 1 << 9  # of 0x6502
 _NEWTON_METRE = 0x00560100
 _RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
@@ -119,7 +119,7 @@ def _describe(device: PlacedDevice) -> DeviceDescription:
     if device.profile.eds.parent == contract_folder():
         return DeviceDescription(device.profile.eds, defaults, {}, aliases)
     fallbacks = {(0x1005, 0): 0x80, (0x1006, 0): 1000, (0x1014, 0): 0x80 + device.node_id}
-    fallbacks |= {(index, 1): _NOT_VALID for index in _RECORDS}
+    fallbacks |= {(index, 1): NOT_VALID for index in _RECORDS}
     for pdo in device.settings.pdo:
         fallbacks[pdo.communication_index, 1] = device.can_id(pdo)
         fallbacks[pdo.communication_index, 2] = pdo.transmission

@@ -22,11 +22,11 @@ from adacd_hil.settings.configuration import ConfigurationLayer, Settings, resol
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names
 from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.mechanics_settings import STANDARD_GRAVITY_M_S2
 from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
 from firmware_sim.scenario.arm_truth import ArmTruth
 
 Pair = tuple[float, float]
-STANDARD_GRAVITY_M_S2: Final = 9.80665
 _MODEL: Final = ARMS["P"]
 _COULOMB_SHARE, _VISCOUS_SHARE_S = 0.003, 0.0025
 """Friction of profile P over its rated torque, about, at 1 rad/s."""
