@@ -98,10 +98,10 @@ def _read_head(path: Path) -> _Extras:
     return extras
 
 
-def _read_items(path: Path) -> Iterator[Item]:
-    """Read a file from front to end. Raises LogError as `_read_head` does."""
+def _read_items(path: Path, is_ahead: bool = True) -> Iterator[Item]:
+    """Read a file from front to end; is_ahead: as for `read_blocks`. Raises LogError as `_read_head` does."""
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
-        yield from read_blocks(file, str(path))
+        yield from read_blocks(file, str(path), is_ahead=is_ahead)
 
 
 class _Definitions:
@@ -185,11 +185,13 @@ class LogWalk:
         names = [part_path(self._path, number).name for number in sorted({start, stop - 1})] if start < stop else []
         return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
 
-    def pieces(self, cycles: int, epoch_ns: int, has_frame_records: bool = False) -> Iterator[RawPiece]:
+    def pieces(
+        self, cycles: int, epoch_ns: int, has_frame_records: bool = False, is_ahead: bool = True
+    ) -> Iterator[RawPiece]:
         """Read the messages of all parts, at most so many cycles at a time; what is known of the log grows meanwhile.
 
         epoch_ns: what the times of frames are less than those of the file; has_frame_records: of frames the records
-        are gathered, too.
+        are gathered, too; is_ahead: a thread opens chunks before they are asked for.
         """
         builder = PieceBuilder(cycles, epoch_ns, has_frame_records)
         self._problems, self.summary, self.parts = [], {}, 0
@@ -199,7 +201,7 @@ class LogWalk:
                 self._problems.append(step)
                 continue
             walk = _PartWalk(step.path, builder, self._layout, self._wanted)
-            for piece in walk.pieces():
+            for piece in walk.pieces(is_ahead):
                 self.topics = {topic.name: topic for topic in builder.topics}
                 yield piece
             self.topics = {topic.name: topic for topic in builder.topics}
@@ -247,9 +249,9 @@ class _PartWalk:
     def _note(self, problem: str) -> None:
         self.problem = self.problem or problem
 
-    def pieces(self) -> Iterator[RawPiece]:
+    def pieces(self, is_ahead: bool) -> Iterator[RawPiece]:
         """Read the file; yield whenever enough is gathered."""
-        for item in _read_items(self._path):
+        for item in _read_items(self._path, is_ahead):
             if isinstance(item, Block):
                 yield from self._take_block(item)
             elif isinstance(item, RawRecord):

@@ -343,14 +343,22 @@ class LogStream:
     What is damaged or missing is left out; `problem` says so.
     """
 
-    def __init__(self, path: str | Path, topics: Collection[str] | None = None, cycles_per_piece: int = 5_000) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        topics: Collection[str] | None = None,
+        cycles_per_piece: int = 5_000,
+        is_ahead: bool = True,
+    ) -> None:
         """Begin to read the log whose first part is `path`, of the messages only those of `topics` when given.
 
-        A folder stands for the run's log in it. Raises LogError when nothing of it can be read.
+        A folder stands for the run's log in it. is_ahead: a thread opens chunks ahead, for a caller that has none of
+        its own for the reading. Raises LogError when nothing of it can be read.
         """
         self._walk, self.epoch_ns = open_log(path, topics)
         self._topics = topics
         self._cycles_per_piece = cycles_per_piece
+        self._is_ahead = is_ahead
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -401,7 +409,7 @@ class LogStream:
 
     def __iter__(self) -> Iterator[Piece]:
         own = self._own_topics()
-        for piece in self._walk.pieces(self._cycles_per_piece, self.epoch_ns):
+        for piece in self._walk.pieces(self._cycles_per_piece, self.epoch_ns, is_ahead=self._is_ahead):
             topics = {name: topic for name, topic in self._walk.topics.items() if not is_of_frames(topic)}
             yield Piece(series_of(piece.records, topics, own, self.epoch_ns), piece.frames, piece.payloads)
 

@@ -235,7 +235,7 @@ class LogSource:
 
     def __init__(self, path: Path, cycles_per_piece: int = CYCLES_PER_PIECE) -> None:
         """Open the log. Raises LogError, ConfigError, CodecError."""
-        self._stream = LogStream(path, TOPICS, cycles_per_piece)
+        self._stream = LogStream(path, TOPICS, cycles_per_piece, is_ahead=False)  # replay reads in a thread
         self._path = path
         self.metadata: Mapping[str, str] = self._stream.metadata
         self.settings = settings_of(path, self._stream.attachments)

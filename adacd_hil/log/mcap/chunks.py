@@ -321,11 +321,15 @@ class _Packed(NamedTuple):
     entries: list[bytes]  # of the message indexes behind it
 
 
-def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES) -> Iterator[Item]:
+def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES, is_ahead: bool = True) -> Iterator[Item]:
     """Read a file from front to end: blocks, attachments and metadata, and what is missing.
 
-    block_bytes: of the chunks that make a block; 1: each chunk is one. Raises LogError when it isn't MCAP.
+    block_bytes: of the chunks that make a block; 1: each chunk is one. is_ahead: a thread opens chunks before they are
+    asked for. Raises LogError when it isn't MCAP.
     """
+    if not is_ahead:
+        yield from _open_each(_pack(file, name, block_bytes))
+        return
     waiting: deque[Future[Block] | RawRecord | Problem] = deque()
     free: list[bytearray] = []
     # A second thread would wait for Python's lock more than it opens: 1.3 times the processor time, no sooner done.
@@ -342,6 +346,18 @@ def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES) -> I
                 yield from _finished(waiting.popleft(), free)
         finally:
             thread.shutdown(cancel_futures=True)
+
+
+def _open_each(items: Iterator[list[_Packed] | RawRecord | Problem]) -> Iterator[Item]:
+    """Open chunks when they are asked for."""
+    memory = bytearray()
+    for item in items:
+        if isinstance(item, list):
+            block = _open(item, memory)
+            memory = block.memory
+            yield block
+        else:
+            yield item
 
 
 def _finished(item: Future[Block] | RawRecord | Problem, free: list[bytearray]) -> Iterator[Item]:
