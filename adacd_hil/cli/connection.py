@@ -12,7 +12,7 @@ from typing import NoReturn
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.device.contract import load_contract
-from adacd_hil.device.survey import host_frames
+from adacd_hil.device.strangers import host_frames
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, open_bus

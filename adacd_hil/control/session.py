@@ -21,7 +21,7 @@ from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
-from adacd_hil.device.survey import refuse_company
+from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import place_file
 from adacd_hil.log.log_files import LOG_NAME, MOST_VIEWERS, arithmetic
 from adacd_hil.log.recording.processes import LiveSetup

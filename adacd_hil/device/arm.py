@@ -14,7 +14,7 @@ from adacd_hil.device.arm_watch import PATIENCE_PERIODS
 from adacd_hil.device.cycle_frames import NO_CYCLE, USABLE, CycleFrames, TorqueSensor
 from adacd_hil.device.drive import Drive, option_codes, torque_limit_permille
 from adacd_hil.device.profile import PlacedDevice, place_devices
-from adacd_hil.device.survey import Strangers
+from adacd_hil.device.strangers import Strangers
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameChecks
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame

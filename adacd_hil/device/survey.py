@@ -1,37 +1,19 @@
-"""Who is on the bus: nodes and identifiers, by asking and by listening, and who should not be on it.
+"""Who is on the bus: CANopen nodes found by asking and by listening, and every identifier that is heard.
 
-**Survey**: CANopen nodes found by asking and by listening, and every identifier that is heard. It
-sends SDO uploads only and changes no node's state, so it works beside a running master. Source: CiA 301 (4.2), clauses
-7.2.4 (SDO), 7.2.8 (NMT, boot-up, heartbeat), 7.3.3 (predefined connection set), objects 0x1000, 0x1001, 0x1008, 0x1018.
-Of nodes whose profile says that they have it, 0x2000 is read as well: wire version and layout digest.
-
-**Somebody else on the bus**: who sends what only this host sends, or what only one device of the arm sends.
-
-A CAN frame doesn't say who sent it. What only one sender may send gives another one away:
-
-- commands, SYNC, NMT, the host's heartbeat and SDO requests to the arm's devices come from this host alone. One that is
-  received has another sender. Who only reads objects, as a survey of the bus does, is named, and stops nothing.
-- a device answers each SYNC with one cyclic frame. A second one that is right by length and CRC but not the same frame
-  again has another sender: a second device with that node id, or an attack.
-
-CRC and alive counter are no secret: they find errors, not intent. See `docs/threat-model.md`.
+A survey sends SDO uploads only and changes no node's state, so it works beside a running master. Source: CiA 301 (4.2),
+clauses 7.2.4 (SDO), 7.2.8 (NMT, boot-up, heartbeat), 7.3.3 (predefined connection set), objects 0x1000, 0x1001, 0x1008,
+0x1018. Of nodes whose profile says that they have it, 0x2000 is read as well: wire version and layout digest.
 """
 
 import struct
-from collections import deque
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from adacd_hil.clock import Clock
-from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.device_setup import Slave
-from adacd_hil.device.profile import place_devices
-from adacd_hil.records import Event
-from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Frame, Tap
+from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Tap
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, NMT_ID, SDO_REQUEST_ID
 from adacd_hil.wire.traffic import Talk, Traffic, listen
 
 LISTEN_S = 1.5
@@ -286,118 +268,3 @@ def message_name(codec: Codec, can_id: int) -> str:
         return message.name
     function = function_name(can_id)
     return f"({function})" if function else "unknown"
-
-
-HOSTS_LISTEN_S = 0.3
-"""How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats."""
-HOLD_S = 1.0
-"""How long after such a frame the arm counts as somebody else's, too: ten heartbeats of a host."""
-CONTRADICTIONS = 2
-"""Second frames of a device that are no accident."""
-CONTRADICTION_WINDOW_S = 0.1
-"""In which they are counted."""
-_NMT_WORDS = {1: "start", 2: "stop", 128: "pre-operational", 129: "reset node", 130: "reset communication"}
-_READING = (2, 3, 5)
-"""SDO client commands that change nothing: upload initiate, segment, block. Source: CiA 301 (4.2), clause 7.2.4.3."""
-
-
-def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
-    """Say by identifier what somebody does who sends what only this host sends."""
-    doing = {
-        codec.message(HOST_HEARTBEAT).can_id: "sends this host's heartbeat",
-        NMT_ID: "sends NMT commands",
-    }
-    if not settings.bus.follows:
-        doing[codec.message("Sync").can_id] = "sends SYNC"
-    for device in place_devices(settings):
-        name = _plain(device.name)
-        doing[SDO_REQUEST_ID + device.node_id] = f"writes objects of {name}"
-        if device.settings.kind == "drive":
-            doing[codec.message(f"{device.name}Command").can_id] = f"commands {name}"
-    return doing
-
-
-def listen_for_hosts(bus: Bus, clock: Clock, settings: Settings, codec: Codec, duration_s: float) -> list[str]:
-    """Listen to the bus and say what somebody does who runs the arm already, one line each. Raises BusError.
-
-    Who only reads objects, and commands to nodes of other arms, are not among it.
-    """
-    strangers = Strangers(settings, codec)
-    end_ns = clock.now_ns() + round(duration_s * 1e9)
-    while (remaining_ns := end_ns - clock.now_ns()) > 0:
-        frame = bus.receive(remaining_ns * 1e-9)
-        if frame is not None and not frame.is_error:
-            strangers.accept(frame, 0)
-    return strangers.describe(0)
-
-
-def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
-    """Raise DeviceError when somebody else runs the arm: a reset would take it out of their hands. Raises BusError.
-
-    Only where time passes by itself: in lockstep it does by this host's own frames.
-    """
-    heard = listen_for_hosts(bus, clock, settings, codec, HOSTS_LISTEN_S)
-    if heard:
-        raise DeviceError(f"{'; '.join(heard)} on {bus.channel}: end the other program; an arm has one host")
-
-
-def _plain(name: str) -> str:
-    """Turn a device's name in the contract into words: Drive1 into drive 1."""
-    return f"{name[:-1].lower()} {name[-1]}"
-
-
-class Strangers(RateLimitedEvents):
-    """Hears them. `can_ids`: what only this host sends."""
-
-    def __init__(self, settings: Settings, codec: Codec) -> None:
-        super().__init__()
-        self._doing = host_frames(settings, codec)
-        self._nodes = {0, *(device.node_id for device in place_devices(settings))}
-        self.can_ids = frozenset(self._doing)
-        self._hold_cycles = round(HOLD_S / settings.bus.period_s)
-        self._window_cycles = max(1, round(CONTRADICTION_WINDOW_S / settings.bus.period_s))
-        self._until_cycle = -2  # before any, the first of which is -1: none begun
-        self._complaints: dict[str, int] = {}
-        self._contradictions: dict[str, deque[int]] = {}
-
-    def accept(self, frame: Frame, cycle: int) -> bool:
-        """Take a frame that was received in a cycle; False when it may be somebody else's."""
-        doing = self._doing.get(frame.can_id)
-        if doing is None:
-            return False
-        if frame.can_id == NMT_ID:
-            command, node_id = (*frame.data[:2], 0, 0)[:2]
-            if node_id not in self._nodes:
-                return True  # to a node of another arm
-            word = _NMT_WORDS.get(command, f"command {command}")
-            doing = f"sends NMT {word} to {f'node {node_id}' if node_id else 'all nodes'}"
-        elif frame.can_id & 0x780 == SDO_REQUEST_ID and frame.data and frame.data[0] >> 5 in _READING:
-            text = f"somebody else {doing.replace('writes', 'reads')} (0x{frame.can_id:03X})"
-            self.say(frame.t_ns, (frame.can_id, "reads"), Event("warning", "bus", text))
-            return True
-        self._complain(frame, doing, cycle)
-        return True
-
-    def hear_device(self, frame: Frame, name: str, cycle: int) -> None:
-        """Take a frame with a device's identifier that is right, new, and answers no SYNC."""
-        seen = self._contradictions.setdefault(name, deque(maxlen=CONTRADICTIONS))
-        seen.append(cycle)
-        if len(seen) == CONTRADICTIONS and cycle - seen[0] <= self._window_cycles:
-            self._complain(frame, f"sends as {_plain(name)}", cycle)
-            return
-        text = f"a second frame of {_plain(name)} (0x{frame.can_id:03X}) on one SYNC, with other content"
-        self.say(frame.t_ns, (frame.can_id, "once"), Event("warning", "bus", text))
-
-    def _complain(self, frame: Frame, doing: str, cycle: int) -> None:
-        text = f"somebody else {doing} (0x{frame.can_id:03X})"
-        self._until_cycle = cycle + self._hold_cycles
-        self._complaints[text] = cycle
-        self.say(frame.t_ns, text, Event("error", "bus", text))
-
-    def are_heard(self, cycle: int) -> bool:
-        """Tell whether somebody else has acted on the arm of late."""
-        return cycle <= self._until_cycle
-
-    def describe(self, cycle: int) -> list[str]:
-        """Say who has acted on the arm of late, one line each."""
-        return [text for text, heard in self._complaints.items() if cycle <= heard + self._hold_cycles]

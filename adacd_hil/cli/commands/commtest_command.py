@@ -24,7 +24,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
-from adacd_hil.device.survey import refuse_company
+from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import replace_files
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.log.recording.recorder import Recorder

@@ -15,7 +15,7 @@ from adacd_hil.commission.tare_session import TareSession
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
-from adacd_hil.device.survey import refuse_company
+from adacd_hil.device.strangers import refuse_company
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.terminal import in_line
 
