@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partialmethod
 from types import SimpleNamespace
 
 import numpy as np
@@ -49,7 +50,8 @@ def few_kept(monkeypatch):
         ("_NOISE_CYCLES", 4),
     ):
         monkeypatch.setattr(run_reading, name, value)
-    monkeypatch.setattr(reader.LogStream.__init__, "__defaults__", (None, PIECE))
+    in_short_pieces = partialmethod(reader.LogStream.__init__, cycles_per_piece=PIECE)
+    monkeypatch.setattr(reader.LogStream, "__init__", in_short_pieces)
 
 
 def record_certified(path, run):
