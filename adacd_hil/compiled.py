@@ -19,6 +19,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -312,5 +313,14 @@ def zeroed(shapes: Mapping[str, tuple[int, ...]]) -> Structured:
 
 
 def float_fields(shapes: Mapping[str, tuple[int, ...]]) -> np.dtype[np.void]:
-    """Describe an element with float64 fields of these shapes."""
-    return np.dtype([(name, np.float64, shape) for name, shape in shapes.items()])
+    """Describe an element with float64 fields of these shapes; equal descriptions are one and the same object.
+
+    At each call of compiled code numba looks up the types of the arguments: in 0.2 us if the description is the object
+    that it knows, in 5 to 10 us if it is another one that is equal, field by field.
+    """
+    return _float_fields(tuple(shapes.items()))
+
+
+@cache
+def _float_fields(shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> np.dtype[np.void]:
+    return np.dtype([(name, np.float64, shape) for name, shape in shapes])

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured, compiled
+from adacd_hil.compiled import Structured, compiled, float_fields
 from adacd_hil.records import ArmBatch, Layout, Vector
 from adacd_hil.scheme.supervisor.transitions import AT_REST, NOT_A_NUMBER, OVER_LIMIT, UNLOADED, UNSEEN
 from adacd_hil.settings.configuration import Settings
@@ -81,7 +81,7 @@ def take_out(recorded: Recorded, k: int, observation: int, values: Vector) -> No
 
 def block_dtype(layout: Layout) -> np.dtype[np.void]:
     """Describe a block as a structure; its bytes are those of the float64 block."""
-    return np.dtype([(field.name, np.float64, (field.size,)) for field in layout.fields])
+    return float_fields({field.name: (field.size,) for field in layout.fields})
 
 
 def limits_of(settings: Settings) -> dict[str, Any]:
