@@ -25,8 +25,8 @@ from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.settings.arm_settings import ArmSettings
 from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import external_torque
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, ticks
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
+from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, ticks
 from firmware_sim.body.body import Body
 from firmware_sim.body.body_ticks import BODY_NUMBERS, BODY_STATE, advance_body, find_contact, sample_body
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario

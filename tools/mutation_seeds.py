@@ -11,7 +11,7 @@ from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.control.history_file import HISTORY_FORMAT, CertificateRecord, History, devices_digest
 from adacd_hil.control.tare_file import DeviceRecord
 from adacd_hil.log.editing.cut_and_merge import TimeWindow, cut
-from adacd_hil.log.formats.can_messages import to_messages
+from adacd_hil.log.formats.can_io import to_messages
 from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.configuration import load_settings

@@ -45,7 +45,7 @@ def complete_truth(_ctx: Context, _param: Parameter, incomplete: str) -> list[Co
 
 def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:
     """Give groups and keys; of an option KEY=VALUE keys with `=`, and the values of a key that has choices."""
-    from adacd_hil.settings.catalogue import known_keys, sections
+    from adacd_hil.settings.configuration import known_keys, sections
 
     known = {key: row for key, row in known_keys().items() if not row.is_in_row}
     if param.param_type_name == "argument":

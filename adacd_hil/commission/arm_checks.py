@@ -24,8 +24,8 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.cycle_frames import SensorStatus
+from adacd_hil.device.device_setup import contract_differences, read_pdos
 from adacd_hil.device.network import Master
-from adacd_hil.device.pdo_mapping import contract_differences, read_pdos
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, survey
 from adacd_hil.records import JOINTS, Vector

@@ -8,8 +8,17 @@ from adacd_hil.commission.host_checks import Check, CheckOutcome, ok, warning
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
 from adacd_hil.records import JOINTS
-from adacd_hil.settings.catalogue import KnownKey, explain_unknown, in_words, known_keys, value_of
-from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
+from adacd_hil.settings.configuration import (
+    ConfigurationLayer,
+    KnownKey,
+    Settings,
+    configuration_layers,
+    explain_unknown,
+    in_words,
+    known_keys,
+    resolved_table,
+    value_of,
+)
 from adacd_hil.settings.schema import ConfigError, find_problems, parse
 from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.wire.budget import check_budget

@@ -9,8 +9,14 @@ from typing import Any, NamedTuple
 
 from adacd_hil.device.arm_watch import OPERATIONAL, PATIENCE_PERIODS, follow_devices
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, describe_emergency
-from adacd_hil.device.device_setup import ParameterWatch, Slave, command_deadline_ms, set_up_drive, set_up_sensor
-from adacd_hil.device.pdo_mapping import set_up_pdos
+from adacd_hil.device.device_setup import (
+    ParameterWatch,
+    Slave,
+    command_deadline_ms,
+    set_up_drive,
+    set_up_pdos,
+    set_up_sensor,
+)
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, place_devices
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings

@@ -35,8 +35,8 @@ import numpy as np
 from adacd_hil.compiled import Structured, compiled, float_fields
 from adacd_hil.records import Vector
 from firmware_sim.arm.plant import accelerate, decide_slips, external_torque
-from firmware_sim.arm.scripted_contact import PAIR
 from firmware_sim.arm.touch_forces import touch
+from firmware_sim.arm.touch_settings import PAIR
 
 REFERENCE_C: Final = 25.0
 """Temperature for which the profiles' friction holds."""

@@ -15,7 +15,7 @@ from adacd_hil.settings.schema import ConfigError, setting
 from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, ArmProfile
 from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS, REFERENCE_C
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.touch_settings import TICK_S
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665
 """Standard gravity, CGPM 1901."""

@@ -29,7 +29,7 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.compiled import Structured, compiled, float_fields
-from firmware_sim.arm.scripted_contact import PAIR, contact_force, contact_torque
+from firmware_sim.arm.touch_settings import PAIR, contact_force, contact_torque
 
 CURRENT_LOOP_RAD_S: Final = 2.0 * math.pi * 1000.0
 """Bandwidth of the drive's torque loop; 1 kHz is usual for servo drives."""

@@ -26,7 +26,7 @@ import numpy as np
 
 from adacd_hil.compiled import Structured, compiled, float_fields
 from adacd_hil.records import Vector
-from firmware_sim.arm.scripted_contact import TICK_S, contact_force, contact_torque
+from firmware_sim.arm.touch_settings import TICK_S, contact_force, contact_torque
 
 BODY: Final = 0
 HAND: Final = 1

@@ -7,8 +7,8 @@ from adacd_hil.records import JOINTS, Vector
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
 from firmware_sim.arm.own_arm import STRAIGHT, OwnArmSettings
-from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
+from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.bench.injector import Handler, Injector
 from firmware_sim.body.sensors import converter_ends, count_Nm
 from firmware_sim.canopen.object_dictionary import Abort, EmulatedContract, longest_pdo, refuse

@@ -19,10 +19,9 @@ from firmware_sim.arm.arms import ArmProfile
 from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.mechanics import work_space
 from firmware_sim.arm.plant import fit_payload, mirror_stiff_joints
-from firmware_sim.arm.scripted_contact import TICK_S, contact_table, ticks
 from firmware_sim.arm.sensing import Measurement, TorqueNoise
 from firmware_sim.arm.touch_forces import BODY, HAND, THING, THING_PLACES, TOUCH_HEADER, TOUCH_TRUTH, WALL
-from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
+from firmware_sim.arm.touch_settings import TICK_S, BodySettings, HandSettings, WallSettings, contact_table, ticks
 from firmware_sim.body.body_ticks import (
     BODY_NUMBERS,
     BODY_STATE,

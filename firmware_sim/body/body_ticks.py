@@ -26,9 +26,9 @@ from firmware_sim.arm.plant import (
     integrate,
     mirror_stiff_joints,
 )
-from firmware_sim.arm.scripted_contact import PAIR, TICK_S
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, VELOCITY_LSB_RAD_S, DriveMode, to_counts, track
 from firmware_sim.arm.touch_forces import TOUCH_TRUTH, add_prescribed_work, change_touch, describe_touch
+from firmware_sim.arm.touch_settings import PAIR, TICK_S
 from firmware_sim.body.motor import MOTOR_NUMBERS, MOTOR_STATE, command_torque, heat_motor
 from firmware_sim.body.sensors import (
     ENCODER_NUMBERS,

@@ -27,7 +27,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled, float_fields
 from firmware_sim.arm.device_settings import CURRENT_LOOP_HZ, DriveSettings
-from firmware_sim.arm.scripted_contact import PAIR, TICK_S
+from firmware_sim.arm.touch_settings import PAIR, TICK_S
 
 CONTINUOUS_OVER_CURRENT: Final = 0x2310
 EXCESS_TEMPERATURE: Final = 0x4310

@@ -33,8 +33,7 @@ from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.device_settings import DriveSettings, SensorSettings
 from firmware_sim.arm.mechanics_settings import MechanicsSettings, PayloadBody
 from firmware_sim.arm.own_arm import STRAIGHT, OwnArmSettings, Wiring
-from firmware_sim.arm.scripted_contact import ContactSettings, ticks
-from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
+from firmware_sim.arm.touch_settings import BodySettings, ContactSettings, HandSettings, WallSettings, ticks
 from firmware_sim.scenario.faults import FaultSettings, check_rows
 
 ENDS: Final = ("finished", "fault", "refused", "lost")

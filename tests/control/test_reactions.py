@@ -13,8 +13,7 @@ from adacd_hil.control.controller import Floating
 from adacd_hil.control.reference import Admittance, Reference, corner_to_corner
 from adacd_hil.records import ArmState, ContactKind, FaultReason, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
-from firmware_sim.arm.scripted_contact import ContactSettings
-from firmware_sim.arm.touch_settings import BodySettings
+from firmware_sim.arm.touch_settings import BodySettings, ContactSettings
 from firmware_sim.scenario.scenario import Scenario
 
 PERIOD_S = 1e-3

@@ -11,8 +11,8 @@ from firmware_sim.arm.joint_forces import gravity_torque
 from firmware_sim.arm.mechanics import integrate_mechanics, observe, work_space
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S, contact_table
 from firmware_sim.arm.touch_forces import THING
+from firmware_sim.arm.touch_settings import TICK_S, contact_table
 
 NOBODY = contact_table(())
 NO_TOUCH = np.zeros(0, THING)

@@ -11,7 +11,7 @@ from long_cases import long_but
 from adacd_hil.control.reference import corner_to_corner
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.plant import CURRENT_LOOP_RAD_S, mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table
+from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_table
 
 POINT_PAYLOAD = (1.0, (0.0, 0.0), 0.0)
 BODY_PAYLOAD = (1.5, (0.05, 0.08), 0.01)

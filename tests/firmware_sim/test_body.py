@@ -13,8 +13,8 @@ import pytest
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.scripted_contact import ContactSettings
 from firmware_sim.arm.sensing import TORQUE_LSB_NM, DriveMode
+from firmware_sim.arm.touch_settings import ContactSettings
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario, load_scenario
 

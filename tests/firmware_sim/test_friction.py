@@ -8,7 +8,7 @@ from general_arm import GeneralArm, one_joint
 
 from firmware_sim.arm.joint_forces import advance_bristle, bristle_rate
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
-from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.touch_settings import TICK_S
 
 COULOMB_NM, STATIC_NM, STRIBECK_RAD_S = 0.5, 0.8, 0.1
 STRIBECK = {"static_Nm": (STATIC_NM, 0.0), "stribeck_velocity_rad_s": (STRIBECK_RAD_S, 0.1)}

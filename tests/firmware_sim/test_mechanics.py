@@ -18,8 +18,8 @@ from adacd_hil.settings.schema import ConfigError, parse
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.mechanics_settings import LARGEST_SUBSTEPS, MechanicsSettings
 from firmware_sim.arm.plant import MECHANICAL_STATE, accelerate, fit_payload, integrate
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
 from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.arm.touch_settings import TICK_S, ContactSettings
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 
@@ -396,7 +396,7 @@ SPRING_MASS = """
 import math, sys
 import numpy as np
 import firmware_sim.arm.touch_forces
-from firmware_sim.arm.scripted_contact import contact_table
+from firmware_sim.arm.touch_settings import contact_table
 from adacd_hil.compiled import compiled
 
 @compiled

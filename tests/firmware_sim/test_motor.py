@@ -11,8 +11,8 @@ from bench_host import ENABLE, FAULT_RESET, BenchHost, quiet_scenario
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.device_settings import DriveSettings
-from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.bench.bench import Bench
 from firmware_sim.body.body import Body
 from firmware_sim.body.motor import (

@@ -19,7 +19,7 @@ from firmware_sim.arm.plant import (
     integrate,
     mass_matrix,
 )
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table
+from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_table
 
 NOBODY = contact_table(())
 INERTIA = ("alpha", "beta", "gamma")

@@ -7,7 +7,7 @@ import pytest
 
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.scripted_contact import contact_force, contact_table, contact_torque
+from firmware_sim.arm.touch_settings import contact_force, contact_table, contact_torque
 from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
 
 CONTACT = "{ at_s = 1.0, link = 2, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"

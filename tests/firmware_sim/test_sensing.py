@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     TORQUE_LSB_NM,
@@ -17,6 +16,7 @@ from firmware_sim.arm.sensing import (
     torque_counts,
     track,
 )
+from firmware_sim.arm.touch_settings import TICK_S
 
 
 def tracked(positions_rad: np.ndarray) -> np.ndarray:

@@ -12,7 +12,6 @@ from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.arm.device_settings import DriveSettings, SensorSettings
-from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     VELOCITY_LSB_RAD_S,
@@ -22,6 +21,7 @@ from firmware_sim.arm.sensing import (
     torque_counts,
     track,
 )
+from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 

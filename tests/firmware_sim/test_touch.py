@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.settings.schema import ConfigError, parse
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_force, contact_table, contact_torque
+from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_force, contact_table, contact_torque
 
 L1_M, L2_M = 0.35, 0.30
 

@@ -8,9 +8,17 @@ from touched_arm import TouchedArm
 
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table, contact_torque
 from firmware_sim.arm.touch_forces import ENERGY, touch
-from firmware_sim.arm.touch_settings import BODY_REGIONS, BodySettings, HandSettings, WallSettings
+from firmware_sim.arm.touch_settings import (
+    BODY_REGIONS,
+    TICK_S,
+    BodySettings,
+    ContactSettings,
+    HandSettings,
+    WallSettings,
+    contact_table,
+    contact_torque,
+)
 from firmware_sim.body.body import initial_touch_state, largest_rate_rad_s, touch_table
 
 POSE = (0.3, 0.7)

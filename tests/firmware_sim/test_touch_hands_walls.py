@@ -10,7 +10,6 @@ from touched_arm import TouchedArm
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, integrate, mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table, contact_torque
 from firmware_sim.arm.touch_forces import (
     ENERGY,
     THING_STATE,
@@ -21,7 +20,15 @@ from firmware_sim.arm.touch_forces import (
     describe_touch,
     touch,
 )
-from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
+from firmware_sim.arm.touch_settings import (
+    TICK_S,
+    BodySettings,
+    ContactSettings,
+    HandSettings,
+    WallSettings,
+    contact_table,
+    contact_torque,
+)
 from firmware_sim.body.body import largest_rate_rad_s
 from firmware_sim.scenario.scenario import load_scenario
 

@@ -11,8 +11,8 @@ from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.joint_forces import spring_torque
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.plant import mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, DriveMode
+from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_table
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
 

@@ -7,8 +7,8 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import MECHANICAL_STATE, accelerate, fit_payload, mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S, contact_table
 from firmware_sim.arm.touch_forces import THING_STATE, TOUCH_HEADER, TOUCH_TRUTH, change_touch, describe_touch, touch
+from firmware_sim.arm.touch_settings import TICK_S, contact_table
 from firmware_sim.body.body import initial_touch_state, touch_table
 from firmware_sim.scenario.scenario import Scenario
 

@@ -10,7 +10,7 @@ from made_log import make_log
 
 from adacd_hil.log.check.log_check import check_log
 from adacd_hil.log.editing.log_info import read_info
-from adacd_hil.log.formats.can_messages import to_messages
+from adacd_hil.log.formats.can_io import to_messages
 from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.log.formats.signal_tables import Tables, export_tables
 from adacd_hil.log.log_files import LogError, find_parts

@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import settings_page
 
-from adacd_hil.settings.catalogue import known_keys
+from adacd_hil.settings.configuration import known_keys
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "settings.md"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from adacd_hil.control.controller import fill_torque
-from firmware_sim.arm.scripted_contact import ContactSettings
 from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.arm.touch_settings import ContactSettings
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
 

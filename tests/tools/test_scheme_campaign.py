@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_sim.arm.scripted_contact import ContactSettings
+from firmware_sim.arm.touch_settings import ContactSettings
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from campaign_bound import Bound, fit, threshold_sigma, whiten

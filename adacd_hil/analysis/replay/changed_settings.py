@@ -11,8 +11,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from adacd_hil.settings.catalogue import explain_unknown, known_keys
-from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration import Settings, explain_unknown, known_keys
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 

@@ -11,8 +11,15 @@ from adacd_hil import __version__
 from adacd_hil.cli.interview import Interview, Proposal
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, format_date, wall_ns
-from adacd_hil.commission.arm_draft import ArmFacts, Fact, draft_arm, write_draft
-from adacd_hil.commission.arm_geometry import PlanarArm, planar_from_urdf, uniform_rods
+from adacd_hil.commission.arm_draft import (
+    ArmFacts,
+    Fact,
+    PlanarArm,
+    draft_arm,
+    planar_from_urdf,
+    uniform_rods,
+    write_draft,
+)
 from adacd_hil.commission.configuration_check import ConfigurationFindings, examine_configuration
 from adacd_hil.commission.device_recognition import (
     DRIVE,
@@ -20,18 +27,19 @@ from adacd_hil.commission.device_recognition import (
     DeviceRatings,
     RecognisedDevice,
     choose_family,
+    draft_profile,
     identity_of,
+    kind_of,
     recognise,
 )
 from adacd_hil.commission.host_checks import Status, look_for_socketcan
-from adacd_hil.commission.profile_draft import draft_profile, kind_of
 from adacd_hil.device.profile import load_profile, profile_names
 from adacd_hil.device.survey import survey
 from adacd_hil.file_access import read_input, replace_file
 from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.scheme.model.urdf import UrdfError
 from adacd_hil.settings.arm_settings import ArmSettings
-from adacd_hil.settings.catalogue import known_keys
+from adacd_hil.settings.configuration import known_keys
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import open_bus

@@ -11,7 +11,7 @@ from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.settings.catalogue import KnownKey
+    from adacd_hil.settings.configuration import KnownKey
 
 EPILOG = "Exit status: 0 done, warnings included; 2 wrong usage, or a configuration that can't be used."
 
@@ -65,8 +65,7 @@ def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tupl
     """Give the settings in force with value and default as TOML, and origin. Raises ConfigError, CommandError."""
     from adacd_hil.analysis.replay.changed_settings import apply_settings, parse_changes
     from adacd_hil.commission.configuration_check import origins_of
-    from adacd_hil.settings.catalogue import in_words, value_of
-    from adacd_hil.settings.configuration import Settings, configuration_layers, resolved_table
+    from adacd_hil.settings.configuration import Settings, configuration_layers, in_words, resolved_table, value_of
     from adacd_hil.settings.schema import parse
 
     layers = configuration_layers(name, profile)
@@ -139,7 +138,7 @@ def docs(keys: tuple[str, ...], as_json: bool) -> ExitCode:
 
 
 def _list_groups(as_json: bool) -> None:
-    from adacd_hil.settings.catalogue import keys_of, sections
+    from adacd_hil.settings.configuration import keys_of, sections
 
     groups: list[dict[str, Any]] = [
         {"group": name or "(top)", "keys": sum(1 for _ in keys_of(section, "")), "meaning": meaning}
@@ -155,7 +154,7 @@ def _list_groups(as_json: bool) -> None:
 def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":
     """Give the settings of these groups and keys, all where there are none. Raises CommandError."""
     from adacd_hil.remedies import nearest_name
-    from adacd_hil.settings.catalogue import explain_unknown, known_keys, sections
+    from adacd_hil.settings.configuration import explain_unknown, known_keys, sections
 
     known = known_keys()
     if not keys:

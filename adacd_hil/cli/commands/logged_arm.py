@@ -14,8 +14,7 @@ from adacd_hil.device.contract import find_contract
 from adacd_hil.file_access import exists
 from adacd_hil.log.editing.log_info import attachment
 from adacd_hil.log.log_files import log_in
-from adacd_hil.settings.catalogue import known_keys, value_of
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings, known_keys, load_settings, value_of
 from adacd_hil.settings.schema import ConfigError
 
 _NOT_TAKEN = {

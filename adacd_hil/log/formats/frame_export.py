@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import placing
-from adacd_hil.log.formats.can_messages import to_messages
+from adacd_hil.log.formats.can_io import to_messages
 from adacd_hil.log.formats.frame_log import FrameSource, candump_channel, candump_line
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.wire.codec import Codec

@@ -67,7 +67,7 @@ def open_frames(path: Path) -> FrameSource:
             f"{f', did you mean {near}' if near else ''}; known: {' '.join(SUFFIXES)}"
         )
     # python-can costs 0.1 s, and with asammdf beside it 0.3 s.
-    from adacd_hil.log.formats.can_messages import PythonCanFrames
+    from adacd_hil.log.formats.can_io import PythonCanFrames
 
     if suffix == ".mf4":
         _need_asammdf(path)

@@ -11,9 +11,10 @@ From CERTIFY that is ADAPT: the fit is forgotten, and an arm that still stands w
 
 A request is kept until it can be served, but only in the states of `KEPT_IN`; elsewhere it is dropped. No word that was
 given before a stop releases it: an acknowledgement is dropped, and a change of payload waits until the stop has been
-acknowledged, but for one that is announced in STOPPED itself.
+acknowledged, but for one that is announced in STOPPED itself. `KeptRequest` outlives a fault that is acknowledged.
 """
 
+from collections.abc import Iterable
 from types import MappingProxyType
 
 import numpy as np
@@ -457,3 +458,30 @@ class Supervisor:
         if max(*arm.age_q, *arm.age_tau_J) > self._max_age_cycles or self._stale_cycles > self._blind_limit:
             return FaultReason.DATA_AGE
         return FaultReason.BLIND if self._blind_cycles >= self._blind_limit else FaultReason.NONE
+
+
+class KeptRequest:
+    """The end of the run, or a stop to change the payload, until it is served. One object per attempt.
+
+    carried: what the attempt before has left; it is asked once the drives are enabled again.
+    """
+
+    def __init__(self, carried: Request = Request.NONE) -> None:
+        self.request = carried
+        self._carried = carried
+
+    def take(self) -> Request:
+        """Return what the attempt before has left, once; then NONE."""
+        carried, self._carried = self._carried, Request.NONE
+        return carried
+
+    def ask(self, request: Request, state: SchemeState) -> None:
+        """Take note of a request; state: that of the cycle before."""
+        is_kept = request is Request.FINISH or (request is Request.PAYLOAD and state in KEPT_IN[request])
+        if is_kept and self.request is not Request.FINISH:
+            self.request = request
+
+    def serve(self, states: Iterable[int]) -> None:
+        """Take note of the states that cycles have led to."""
+        if self.request is Request.PAYLOAD and SchemeState.PAYLOAD in states:
+            self.request = Request.NONE
