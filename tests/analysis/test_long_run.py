@@ -396,4 +396,4 @@ def test_of_many_stays_those_that_are_narrower_than_a_mark_are_drawn_together():
     marks = [mark.title for mark in timeline.states]
     assert 100 < len(marks) < 650  # 612 fit beside each other
     assert sum(int(mark.split()[0]) for mark in marks if "states" in mark) == 1600
-    assert any(mark.startswith("MONITOR, 3.20 to") for mark in marks)
+    assert any(mark.startswith("watching, 3.20 to") for mark in marks)

@@ -36,7 +36,7 @@ def titles_of(html):
 def test_the_timeline_names_states_contacts_and_false_alarms():
     run = touched_run()
     titles = titles_of(drawn(run))
-    assert titles[0] == "ENABLE, −0.05 to 0.00 s"
+    assert titles[0] == "enabling, −0.05 to 0.00 s"
     assert "contact 1 at 1.95 s, on link 1, found on link 1, after 5 ms" in titles
     assert "contact 3 at 6.95 s, on link 1, missed" in titles
     assert titles[-1] == "false alarm, at 8.95 s"
@@ -57,7 +57,7 @@ def test_marks_lie_where_their_time_is():
 
 def test_the_key_names_the_states_that_the_run_has_been_in():
     key = state_key(make_run((A, 100), (M, 200), (SchemeState.STOPPED, 5)))
-    assert key == [("adaptation", "ADAPT"), ("stopped", "STOPPED")]
+    assert key == [("adaptation", "learning"), ("stopped", "stopped")]
 
 
 def test_a_fault_and_a_warning_are_notices_in_the_order_of_time():
@@ -68,7 +68,7 @@ def test_a_fault_and_a_warning_are_notices_in_the_order_of_time():
     run = replace(run, events=events)
     notices = notices_of(run, evaluate(run))
     assert [(notice.at_s, notice.is_bad, notice.text) for notice in notices] == [
-        (0.1, True, "FAULT"),
+        (0.1, True, "fault"),
         (pytest.approx(0.11), True, "bus: off"),
         (pytest.approx(0.12), False, "bus: slow"),
     ]
@@ -78,7 +78,7 @@ def test_many_warnings_do_not_crowd_out_a_fault():
     run = make_run((A, 500), (SchemeState.FAULT, 1))
     run = replace(run, events=tuple(LoggedEvent(int(t), Event("warning", "bus", "slow")) for t in run.t_ns[:400]))
     notices = notices_of(run, evaluate(run))
-    assert (len(notices), notices[-1].text) == (300, "FAULT")
+    assert (len(notices), notices[-1].text) == (300, "fault")
 
 
 def test_a_run_without_cycles_has_no_timeline():
@@ -182,7 +182,7 @@ def test_a_contact_that_detection_was_not_armed_for_is_not_wrong():
     run = make_run()
     touch(run, 400, 100, (5.0, 0.0))
     html = carded(run)
-    assert ("not armed in ADAPT" in html, 'class="wrong"' in html) == (True, False)
+    assert ("detection was off: learning" in html, 'class="wrong"' in html) == (True, False)
 
 
 def test_cards_stop_where_the_table_goes_on():

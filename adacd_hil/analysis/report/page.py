@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from adacd_hil.analysis.logged_run import StretchOfRun
-from adacd_hil.analysis.score.metrics import Metrics, ReportedContact
+from adacd_hil.analysis.score.metrics import Beside, Metrics, ReportedContact
 from adacd_hil.analysis.score.wording import NONE, number_text, pair_text, signs_text, why_not_found, yes_text
 
 TRACED_CONTACTS: Final = 60
@@ -178,7 +178,7 @@ def contact_rows(
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Give head and rows of a list of contacts, where it is known with the delay of the paper's scheme beside."""
     rows = [_contact_words(contact) for contact in contacts]
-    beside = None if metrics.evidence is None else metrics.evidence.paper_beside
+    beside = shown_beside(metrics)
     if beside is None or not beside.contacts:
         return _CONTACT_HEAD, rows
     delays = {c.number: number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts}
@@ -192,19 +192,29 @@ def has_paper(metrics: Metrics) -> bool:
     return any(row.paper is not None for row in metrics.paper)
 
 
+def shown_beside(metrics: Metrics) -> Beside | None:
+    """Give the result of the paper's scheme on the same stream, which is shown where the paper's experiment was played.
+
+    report.json has it of every run.
+    """
+    return metrics.evidence.paper_beside if metrics.evidence is not None and has_paper(metrics) else None
+
+
 def paper_head(metrics: Metrics) -> tuple[str, ...]:
     """Name the columns of paper against measured; the paper's own is there where its experiment was played."""
     if metrics.evidence is None:
         return ("", "paper", "measured") if has_paper(metrics) else ("", "measured")
-    paper = ("paper (printed)",) if has_paper(metrics) else ()
-    return ("", *paper, "paper's scheme, same stream", "certified")
+    paper = ("paper (printed)", "paper's scheme, same stream") if has_paper(metrics) else ()
+    return ("", *paper, "certified")
 
 
 def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
     """Write a row per quantity."""
     rows = []
     for row in metrics.paper:
-        beside = () if metrics.evidence is None else (row.beside or NONE,)
+        if row.paper is None and row.measured == NONE:
+            continue
+        beside = () if metrics.evidence is None or row.paper is None else (row.beside or NONE,)
         rows.append((row.quantity, *(() if row.paper is None else (row.paper,)), *beside, row.measured))
     return rows
 

@@ -27,6 +27,7 @@ from adacd_hil.analysis.logged_run import Progress, Run, StretchOfRun, section_a
 from adacd_hil.analysis.report.page import (
     PRINTED_CONTACTS,
     contact_rows,
+    has_paper,
     left_out_text,
     paper_cells,
     paper_head,
@@ -112,7 +113,8 @@ def write_run_report(
     gathered: what all of its cycles come to, where it does not have all of them.
     """
     metrics = evaluate(run, gathered)
-    drawings = draw(run, metrics)
+    shown_run = run if has_paper(metrics) else dataclasses.replace(run, beside=None)
+    drawings = draw(shown_run, metrics)
     timing = draw_timing(run.timing, metrics.timing, run.zero_ns, "motion start")
     pngs = {drawing.name: drawing.png() for drawing in drawings if drawing.name in _PNG_FIGURES}
     report = Report(
@@ -129,7 +131,7 @@ def write_run_report(
         **report_tables(run, metrics),
         **{f"{name}.png": png for name, png in pngs.items()},
         report.json_path.name: table + "\n",
-        report.html_path.name: report_page(metrics, run, source, drawings, timing),
+        report.html_path.name: report_page(metrics, shown_run, source, drawings, timing),
     }
     if is_printed:
         shown, verdict = [*drawings, *timing], (metrics.verdict, metrics.is_clean)

@@ -27,7 +27,7 @@ from adacd_hil.analysis.drawing import (
     style,
 )
 from adacd_hil.analysis.logged_run import Run, Section
-from adacd_hil.analysis.report.page import ADAPTATIONS, SECTION_TITLES
+from adacd_hil.analysis.report.page import ADAPTATIONS, SECTION_TITLES, has_paper, shown_beside
 from adacd_hil.analysis.score.judge import filtered, row_at
 from adacd_hil.analysis.score.metrics import Metrics, ReportedContact
 from adacd_hil.analysis.score.wording import why_not_found
@@ -112,9 +112,10 @@ def residuals(run: Run, metrics: Metrics) -> Drawing:
             "around the threshold, where the model's own error shows. Numbers mark contacts"
         )
     else:
+        beside = ", and of the paper's scheme on the same stream" if run.beside is not None else ""
         caption = (
-            "Estimated external torque of the certified scheme, slowest filter, with the CAD model, and of the paper's "
-            "scheme on the same stream; below each, near zero and with the thresholds in force. Numbers mark contacts"
+            f"Measured minus predicted torque: of the certified scheme, slowest filter, with the CAD model{beside}; "
+            "below each, near zero and with the thresholds in force. Numbers mark contacts"
         )
     if len(metrics.contacts) > _NUMBERED:
         caption = caption.replace("Numbers", "Strokes")
@@ -122,7 +123,8 @@ def residuals(run: Run, metrics: Metrics) -> Drawing:
     caption += ", a hollow mark one that was not detected" if has_missed else ""
     caption += f"; of {len(metrics.sections)} sections the wide ones are lettered" if _is_narrow(metrics) else ""
     caption += ", a cross a false alarm." if metrics.false_alarms else "."
-    return Drawing("fig5", "Figure 5 — error in (a) joint 1 and (b) joint 2", caption, figure)
+    figure_5 = "Figure 5 — error" if has_paper(metrics) else "Torque that the model does not explain,"
+    return Drawing("fig5", f"{figure_5} in (a) joint 1 and (b) joint 2", caption, figure)
 
 
 def _panels(figure: Figure, lanes: int) -> tuple[list[Axes], list[list[Axes]]]:
@@ -355,7 +357,7 @@ def close_ups(run: Run, metrics: Metrics) -> Drawing:
     )
     time_s = run.time_s()
     view = _view(run)
-    beside = None if metrics.evidence is None else metrics.evidence.paper_beside
+    beside = shown_beside(metrics)
     theirs = {} if beside is None else {contact.number: contact.detected_s for contact in beside.contacts}
     for contact, axes in zip(contacts, grid.flat, strict=False):
         _close_up(axes, run, contact, time_s, view, theirs.get(contact.number))

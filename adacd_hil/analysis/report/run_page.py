@@ -1,6 +1,7 @@
 """The page of a report, put together, and its cards of contacts."""
 
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -20,8 +21,10 @@ from adacd_hil.analysis.report.page import (
     left_out_text,
     make_table,
     render_page,
+    shown_beside,
     shown_contacts,
     stretch_text,
+    went_wrong,
 )
 from adacd_hil.analysis.report.report_tables import (
     counted_sentence,
@@ -37,9 +40,17 @@ from adacd_hil.analysis.report.report_tables import (
 )
 from adacd_hil.analysis.report.timeline import SCRIPTS, STYLES, state_key, timeline_of, traces_of
 from adacd_hil.analysis.score.judge import row_at
-from adacd_hil.analysis.score.metrics import CertifiedEvidence, Metrics, ReportedContact, ReportSource
+from adacd_hil.analysis.score.metrics import Beside, Metrics, ReportedContact, ReportSource
 from adacd_hil.analysis.score.verdict import LISTED
-from adacd_hil.analysis.score.wording import NONE, number_text, percent_text, scaled, signs_text, uncertain_text
+from adacd_hil.analysis.score.wording import (
+    NONE,
+    number_text,
+    percent_text,
+    scaled,
+    signs_text,
+    state_words,
+    uncertain_text,
+)
 from adacd_hil.records import DETECTOR_EVENT, Location, Vector
 
 _Point = tuple[float, float]
@@ -205,7 +216,7 @@ def _kind(contact: ReportedContact) -> str:
 
 
 def _why_not(contact: ReportedContact) -> str:
-    return "missed" if contact.is_armed else f"not armed in {contact.state}"
+    return "missed" if contact.is_armed else f"detection was off: {state_words(contact.state)}"
 
 
 def _found(contact: ReportedContact) -> list[tuple[str, str]]:
@@ -305,6 +316,7 @@ def report_page(
         SCRIPTS if traces else (),
         run=run,
         metrics=metrics,
+        next_steps=next_steps(metrics, source),
         tiles=_tiles(metrics),
         timeline=timeline_of(run, metrics),
         state_key=state_key(run),
@@ -338,6 +350,45 @@ def _name(run: Run, source: ReportSource) -> str:
     return " ".join(filter(None, words)) or source.log_name
 
 
+class NextStep(NamedTuple):
+    """What a reader may do next, and the command for it; empty where there is none."""
+
+    text: str
+    command: str = ""
+
+
+def next_steps(metrics: Metrics, source: ReportSource) -> list[NextStep]:
+    """Say what to do next, the gravest first."""
+    log = shlex.quote(source.log_name)
+    steps = []
+    if not source.is_complete:
+        steps.append(NextStep("The log is not whole. See what it lacks.", f"adacd-hil log check {log}"))
+    if metrics.fault or (not metrics.contacts and not metrics.adaptation_s):
+        steps.append(
+            NextStep("The run ended early. The notices of the timeline say why; doctor checks host, bus and arm.",
+                     "adacd-hil doctor")
+        )  # fmt: skip
+    if metrics.false_alarms:
+        steps.append(
+            NextStep("There were false alarms. Find thresholds from recorded motion that nobody touched.",
+                     f"adacd-hil thresholds {log}")
+        )  # fmt: skip
+    if any(went_wrong(contact) for contact in metrics.contacts):
+        steps.append(
+            NextStep("Some contacts were missed, or their link or direction is wrong: they are marked below. Try other "
+                     "thresholds and filters on this log.", f"adacd-hil tune {log}")
+        )  # fmt: skip
+    if not steps:
+        steps.append(NextStep("Nothing went wrong. Choose a contact below to see the torques of that moment."))
+    steps.append(NextStep("Check that the log gives the same decisions again.", f"adacd-hil replay {log}"))
+    steps.append(
+        NextStep("Try another setting on this log.", f"adacd-hil replay {log} --set certified.noise_sigmas=8")
+        if metrics.evidence is not None
+        else NextStep("Try another setting on this log.", f"adacd-hil replay {log} --set filter.a_rad_s=20")
+    )
+    return steps
+
+
 def _heading(metrics: Metrics, run: Run, source: ReportSource) -> Heading:
     meta = [
         ("configuration", "config"), ("profile", "profile"), ("clock", "clock"), ("interface", "interface"),
@@ -366,13 +417,13 @@ def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
     has_truth, evidence = metrics.missed is not None, metrics.evidence
     tiles = [
         ("identified in" if evidence is None else "certified in", " · ".join(times_s) or NONE, "s"),
-        ("the paper's, same stream", _beside_times(evidence), "s"),
+        ("the paper's scheme, same stream", _beside_times(shown_beside(metrics)), "s"),
         ("contacts detected", f"{len(seen)} of {len(armed)}", "") if has_truth else ("detections", str(len(seen)), ""),
         ("false alarms", NONE if metrics.false_alarms is None else str(metrics.false_alarms), ""),
         ("link right", f"{right} of {len(links)}" if links else NONE, ""),
         ("median delay", number_text(float(np.median(delays_ms)), 1) if delays_ms else NONE, "ms"),
-        ("of which by law", number_text(float(np.median(laws_ms)), 1) if laws_ms else NONE, "ms"),
-        ("largest frozen residual", number_text(max(frozen), 3) if frozen else NONE, "Nm"),
+        ("of which the filter's", number_text(float(np.median(laws_ms)), 1) if laws_ms else NONE, "ms"),
+        ("largest unexplained torque", number_text(max(frozen), 3) if frozen else NONE, "Nm"),
         ("incomplete cycles", _share_number(metrics.data.incomplete), "%"),
         ("smallest margin", NONE if evidence is None else number_text(evidence.smallest_margin, 2), "×"),
     ]
@@ -383,10 +434,10 @@ def _share_number(share: float | None) -> str:
     return NONE if share is None else percent_text(share).removesuffix(" %")
 
 
-def _beside_times(evidence: CertifiedEvidence | None) -> str:
-    if evidence is None or evidence.paper_beside is None:
+def _beside_times(beside: Beside | None) -> str:
+    if beside is None:
         return NONE
-    times_s = [number_text(time_s, 2) for time_s in evidence.paper_beside.adaptation_s.values()]
+    times_s = [number_text(time_s, 2) for time_s in beside.adaptation_s.values()]
     return " · ".join(_listed(times_s)) or NONE
 
 

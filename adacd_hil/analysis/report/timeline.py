@@ -15,7 +15,7 @@ from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.report.page import MARKS
 from adacd_hil.analysis.report.traces import Packed, TracePanel, pack, panels_of, step_of
 from adacd_hil.analysis.score.metrics import Metrics, ReportedContact
-from adacd_hil.analysis.score.wording import number_text
+from adacd_hil.analysis.score.wording import STATE_WORDS, number_text
 from adacd_hil.records import SchemeState
 
 STATE_COLOURS: Final = {
@@ -102,7 +102,11 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
         for t_ns, event in run.events
         if event.level in ("warning", "error")
     ]
-    notices += [Notice(stay.start_s, True, "FAULT") for stay in stays_of(run) if stay.state is SchemeState.FAULT]
+    notices += [
+        Notice(stay.start_s, True, STATE_WORDS[SchemeState.FAULT])
+        for stay in stays_of(run)
+        if stay.state is SchemeState.FAULT
+    ]
     notices += [Notice(at_s, True, "false alarm") for at_s in metrics.false_alarms_s or ()]
     notices.sort(key=lambda notice: not notice.is_bad)
     return sorted(notices[:_MOST_NOTICES])
@@ -111,7 +115,7 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
 def state_key(run: Run) -> list[tuple[str, str]]:
     """Give colour and name of the states that the run has been in."""
     there = {stay.state for stay in stays_of(run)}
-    return [(colour, state.name) for state, colour in STATE_COLOURS.items() if state in there]
+    return [(colour, STATE_WORDS[state]) for state, colour in STATE_COLOURS.items() if state in there]
 
 
 def timeline_of(run: Run, metrics: Metrics) -> Timeline | None:
@@ -173,7 +177,7 @@ def _state_marks(stays: list[Stay], scale: _Scale) -> Iterator[Mark]:
     for drawn in _drawn_stays(stays, scale):
         stay = drawn.gravest if isinstance(drawn, _Narrow) else drawn
         left, right = scale.x(stay.start_s), scale.x(stay.end_s)
-        name, width = stay.state.name, max(right - left, _NARROWEST)
+        name, width = STATE_WORDS[stay.state], max(right - left, _NARROWEST)
         label = name if width > _LETTER * len(name) + 8 else ""
         margin_s = 0.05 * (stay.end_s - stay.start_s) + 0.005
         if isinstance(drawn, _Narrow):

@@ -50,7 +50,7 @@ def give_verdict(
     text = f"{found}; {identified}"
     if evidence is not None and not evidence.is_anchored:
         text += ", with torque offsets that nothing anchors"
-    if evidence is not None and evidence.paper_beside is not None:
+    if evidence is not None and evidence.paper_beside is not None and is_papers_experiment(run):
         text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
     if is_margin_below_1(evidence):
         text = f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}; {text}"

@@ -7,8 +7,29 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.analysis.score.judge import Score
+from adacd_hil.records import SchemeState
 
 NONE: Final = "–"
+
+
+STATE_WORDS: Final = {
+    SchemeState.INIT: "starting",
+    SchemeState.COMMISSION: "checking at rest",
+    SchemeState.ENABLE: "enabling",
+    SchemeState.ADAPT: "learning",
+    SchemeState.CERTIFY: "testing",
+    SchemeState.MONITOR: "watching",
+    SchemeState.REACT: "reacting",
+    SchemeState.STOPPED: "stopped",
+    SchemeState.PAYLOAD: "payload change",
+    SchemeState.FAULT: "fault",
+}
+"""States as a report names them."""
+
+
+def state_words(name: str | None) -> str:
+    """Write a state that a log names."""
+    return NONE if name is None else STATE_WORDS[SchemeState[name]]
 
 
 def number_text(value: float | None, digits: int, unit: str = "") -> str:
