@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from adacd_hil import remedies
-from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.remedies import install_command, nearest_name
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings, apply_settings, load_settings
 from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse
 
 KEYS = ("a_rad_s", "b_rad_s", "threshold_Nm", "torque_limit_Nm", "torque_rate_limit_Nm_s", "Kp", "Kd", "condition")

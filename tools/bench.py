@@ -41,7 +41,7 @@ from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
-from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.bench.bench import Bench
 from firmware_sim.body.body import Body

@@ -34,8 +34,7 @@ from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 from adacd_hil.settings.configuration import Settings, load_settings
 from firmware_sim.arm.arms import ArmProfile
-from firmware_sim.arm.device_settings import SensorSettings
-from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.hardware_settings import MechanicsSettings, SensorSettings
 
 Array = NDArray[np.float64]
 

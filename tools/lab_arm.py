@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.settings.configuration import load_settings
 from firmware_sim.arm.arms import ARMS, ArmProfile, RigidLink
-from firmware_sim.arm.device_settings import DriveSettings, SensorSettings
-from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.hardware_settings import DriveSettings, MechanicsSettings, SensorSettings
 
 Pair = tuple[float, float]
 

@@ -8,8 +8,7 @@ import can
 import numpy as np
 
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
-from adacd_hil.control.history_file import HISTORY_FORMAT, CertificateRecord, History, devices_digest
-from adacd_hil.control.tare_file import DeviceRecord
+from adacd_hil.control.arm_records import HISTORY_FORMAT, CertificateRecord, DeviceRecord, History, devices_digest
 from adacd_hil.log.editing.cut_and_merge import TimeWindow, cut
 from adacd_hil.log.formats.can_io import to_messages
 from adacd_hil.log.formats.frame_log import read_frames

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import CycleColumns, columns_of_records
-from adacd_hil.analysis.score.timing import OLDEST_CYCLES
+from adacd_hil.analysis.score.evaluation import OLDEST_CYCLES
 from adacd_hil.clock import Clock
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.pacing import make_pacer

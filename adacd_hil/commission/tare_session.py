@@ -23,8 +23,8 @@ from adacd_hil.commission.tare import (
     measure_pose,
     solve_tare,
 )
+from adacd_hil.control.arm_records import TARE_FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
 from adacd_hil.control.session import git_commit
-from adacd_hil.control.tare_file import TARE_FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, explained
 from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Master

@@ -12,12 +12,11 @@ import numpy as np
 
 from adacd_hil.clock import Clock
 from adacd_hil.control.controller import Controller, Floating
-from adacd_hil.control.detector_timing import DetectorTiming
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.fault_recovery import FaultReport, SelfChecks, StopEscalation
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.pacing import Pacer
+from adacd_hil.control.pacing import DetectorTiming, Pacer
 from adacd_hil.control.reference import Reference
 from adacd_hil.control.run_narration import RunNarration
 from adacd_hil.device.arm import Arm

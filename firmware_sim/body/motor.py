@@ -26,7 +26,7 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.compiled import compiled, float_fields
-from firmware_sim.arm.device_settings import CURRENT_LOOP_HZ, DriveSettings
+from firmware_sim.arm.hardware_settings import CURRENT_LOOP_HZ, DriveSettings
 from firmware_sim.arm.touch_settings import PAIR, TICK_S
 
 CONTINUOUS_OVER_CURRENT: Final = 0x2310

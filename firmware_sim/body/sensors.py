@@ -32,7 +32,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled, float_fields
 from adacd_hil.records import Vector
-from firmware_sim.arm.device_settings import SensorSettings
+from firmware_sim.arm.hardware_settings import SensorSettings
 from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.sensing import TORQUE_LSB_NM, TORQUE_RANGE_NM, torque_counts
 from firmware_sim.arm.touch_settings import PAIR, TICK_S

@@ -22,7 +22,7 @@ from adacd_hil.settings.configuration import ConfigurationLayer, Settings, resol
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.mechanics_settings import STANDARD_GRAVITY_M_S2
+from firmware_sim.arm.hardware_settings import STANDARD_GRAVITY_M_S2
 from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
 from firmware_sim.scenario.arm_truth import ArmTruth
 

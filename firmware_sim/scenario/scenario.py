@@ -30,8 +30,7 @@ from adacd_hil.records import FaultReason, Vector
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 from firmware_sim.arm.arms import ARMS, ArmProfile
-from firmware_sim.arm.device_settings import DriveSettings, SensorSettings
-from firmware_sim.arm.mechanics_settings import MechanicsSettings, PayloadBody
+from firmware_sim.arm.hardware_settings import DriveSettings, MechanicsSettings, PayloadBody, SensorSettings
 from firmware_sim.arm.own_arm import STRAIGHT, OwnArmSettings, Wiring
 from firmware_sim.arm.touch_settings import BodySettings, ContactSettings, HandSettings, WallSettings, ticks
 from firmware_sim.scenario.faults import FaultSettings, check_rows

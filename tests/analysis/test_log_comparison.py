@@ -7,12 +7,11 @@ import pytest
 from log.recorded_run import make_run, record
 
 from adacd_hil.analysis import logged_run
-from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.log_comparison import MATCH_S, ComparedContact, compare_logs, match_contacts
 from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.cli.commands.compare_command import _contact as in_words
 from adacd_hil.log.log_files import LogError
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration import apply_settings, load_settings
 from adacd_hil.settings.toml_files import to_toml
 
 SETTINGS = load_settings("paper")

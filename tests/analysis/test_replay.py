@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records, without_cycles, writable
 
-from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.log_source import LogSource
 from adacd_hil.analysis.replay.replay import replay, replay_many, replay_source
 from adacd_hil.analysis.replay.replayed_outcome import Replay, side_by_side
@@ -19,6 +18,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import begin_of_log, read_log
 from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.settings.configuration import apply_settings
 from firmware_sim.bench.bench_time import TruthLog
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.log_source import LogSource
 from adacd_hil.analysis.score.emulator_truth import contacts_beside
 from adacd_hil.analysis.score.judge import least_rate_per_h, rate_bound_per_h, share_bounds
@@ -40,7 +39,7 @@ from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import begin_of_log, read_log
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.pipeline.pipeline import layout_of
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration import apply_settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import to_toml

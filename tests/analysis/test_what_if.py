@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import pytest
 
-from adacd_hil.analysis.replay.changed_settings import (
+from adacd_hil.settings.configuration import (
     apply_settings,
     changed_keys,
     keep_facts,
+    load_settings,
     parse_changes,
     parse_variations,
     split_list,
 )
-from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError
 
 PAPER = load_settings("paper")

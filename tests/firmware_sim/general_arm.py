@@ -7,9 +7,9 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from firmware_sim.arm.arms import ARMS, ArmProfile
+from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.joint_forces import gravity_torque
 from firmware_sim.arm.mechanics import integrate_mechanics, observe, work_space
-from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
 from firmware_sim.arm.touch_forces import THING
 from firmware_sim.arm.touch_settings import TICK_S, contact_table

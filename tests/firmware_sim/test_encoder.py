@@ -7,7 +7,7 @@ import pytest
 
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
-from firmware_sim.arm.device_settings import SensorSettings
+from firmware_sim.arm.hardware_settings import SensorSettings
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, DriveMode, to_counts
 from firmware_sim.body.body import Body
 from firmware_sim.body.sensors import NOISE_TICKS, encoder_numbers, read_angle

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from general_arm import GeneralArm, one_joint
 
+from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.joint_forces import advance_bristle, bristle_rate
-from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.touch_settings import TICK_S
 
 COULOMB_NM, STATIC_NM, STRIBECK_RAD_S = 0.5, 0.8, 0.1

@@ -16,7 +16,7 @@ from long_cases import long_but
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import ConfigError, parse
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.mechanics_settings import LARGEST_SUBSTEPS, MechanicsSettings
+from firmware_sim.arm.hardware_settings import LARGEST_SUBSTEPS, MechanicsSettings
 from firmware_sim.arm.plant import MECHANICAL_STATE, accelerate, fit_payload, integrate
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import TICK_S, ContactSettings

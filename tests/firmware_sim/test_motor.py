@@ -10,7 +10,7 @@ from bench_host import ENABLE, FAULT_RESET, BenchHost, quiet_scenario
 
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
-from firmware_sim.arm.device_settings import DriveSettings
+from firmware_sim.arm.hardware_settings import DriveSettings
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.bench.bench import Bench

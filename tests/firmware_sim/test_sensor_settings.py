@@ -11,7 +11,7 @@ import pytest
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_toml
-from firmware_sim.arm.device_settings import DriveSettings, SensorSettings
+from firmware_sim.arm.hardware_settings import DriveSettings, SensorSettings
 from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     VELOCITY_LSB_RAD_S,

@@ -10,7 +10,7 @@ from scipy import signal
 
 import firmware_sim.bench.bench_nodes
 from adacd_hil.settings.schema import parse
-from firmware_sim.arm.device_settings import SensorSettings
+from firmware_sim.arm.hardware_settings import SensorSettings
 from firmware_sim.arm.sensing import TORQUE_LSB_NM, DriveMode, TorqueNoise, torque_counts
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body

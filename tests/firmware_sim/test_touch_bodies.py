@@ -7,7 +7,7 @@ import pytest
 from touched_arm import TouchedArm
 
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.touch_forces import ENERGY, touch
 from firmware_sim.arm.touch_settings import (
     BODY_REGIONS,

@@ -8,8 +8,8 @@ import pytest
 from general_arm import GeneralArm, one_joint, without_friction
 
 from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.joint_forces import spring_torque
-from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.plant import mass_matrix
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, DriveMode
 from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_table

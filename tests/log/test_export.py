@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from recorded_run import CODEC, make_run, record
 from test_can_io import all_kinds, content, write
 
-from adacd_hil.cli.commands.log_export import export
+from adacd_hil.cli.commands.log_command import export
 from adacd_hil.log.formats.can_io import TimedMessage, to_messages
 from adacd_hil.log.formats.frame_export import FrameChoice, export_frames, sides
 from adacd_hil.log.formats.frame_log import open_frames, read_frames

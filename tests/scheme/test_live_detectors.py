@@ -17,7 +17,7 @@ from adacd_hil.cli.commands.demo_command import Cast, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import ExitCode
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.control.detector_timing import DetectorTiming
+from adacd_hil.control.pacing import DetectorTiming
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.scheme.detect import detector_registry

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.device_settings import SensorSettings
-from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.hardware_settings import MechanicsSettings, SensorSettings
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import error_campaign

@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import Milestones, Progress, settings_of
-from adacd_hil.analysis.replay.changed_settings import changed_keys
 from adacd_hil.analysis.score.distribution import Distribution
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
 from adacd_hil.records import SchemeState
-from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration import Settings, changed_keys
 
 _TOPICS: Final = ("/scheme", "/cycle", "/contact")
 _TIMES: Final = ("lateness_ns", "feedback_ns", "command_ns", "compute_ns", "slack_ns")

@@ -18,6 +18,7 @@ from adacd_hil.analysis.report.page import (
     stretch_text,
 )
 from adacd_hil.analysis.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
+from adacd_hil.analysis.score.evaluation import OLDEST_CYCLES
 from adacd_hil.analysis.score.metrics import (
     CertifiedEvidence,
     ChannelMargin,
@@ -27,7 +28,6 @@ from adacd_hil.analysis.score.metrics import (
     Residual,
     TimingEvidence,
 )
-from adacd_hil.analysis.score.timing import OLDEST_CYCLES
 from adacd_hil.analysis.score.wording import NONE, number_text, pair_text, percent_text, rate_sentence, signed_text
 from adacd_hil.records import PARAMETER_UNITS
 

@@ -51,11 +51,11 @@ from adacd_hil.analysis.score.emulator_truth import (
     host_truth,
     read_truth,
 )
+from adacd_hil.analysis.score.evaluation import QUEUES, TimingGatherer, find_reactions
 from adacd_hil.analysis.score.judge import find_detections, true_contacts
 from adacd_hil.analysis.score.margins import UntouchedGatherer
 from adacd_hil.analysis.score.metrics import Gathered, ReportSource
 from adacd_hil.analysis.score.run_faults import CyclicDataGatherer
-from adacd_hil.analysis.score.timing import QUEUES, TimingGatherer, find_reactions
 from adacd_hil.analysis.score.wording import unjudged_sentence
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, WHOLE, LogError, TimeWindow
 from adacd_hil.log.reader import LogStream, Piece, Series, check_states, start_of_log

@@ -20,8 +20,8 @@ from adacd_hil.analysis.drawing import (
 )
 from adacd_hil.analysis.logged_run import COMPUTE, LATENESS, SLACK, SYNC_TO_COMMAND, CycleColumns, Quantity
 from adacd_hil.analysis.score.distribution import BINS_PER_DECADE
+from adacd_hil.analysis.score.evaluation import QUEUES
 from adacd_hil.analysis.score.metrics import TimeStatistics, TimingEvidence
-from adacd_hil.analysis.score.timing import QUEUES
 from adacd_hil.records import Vector
 
 _SHOWN: Final = (LATENESS, COMPUTE, SYNC_TO_COMMAND, SLACK)

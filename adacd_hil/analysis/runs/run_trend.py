@@ -19,11 +19,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.replay.changed_settings import changed_keys
 from adacd_hil.analysis.runs.run_summary import FRICTION_AT_RAD_S, RunSummary
 from adacd_hil.analysis.runs.run_table import in_order
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify.certificate import LAST_SIGMAS
+from adacd_hil.settings.configuration import changed_keys
 
 THRESHOLD_SHARE: Final = 0.4
 """Eight demos that differed in their seeds only had thresholds up to 27 % apart, 2026-11-25."""

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from adacd_hil.analysis.logged_run import Progress
-from adacd_hil.analysis.replay.changed_settings import apply_settings, keep_facts
 from adacd_hil.analysis.replay.log_source import LogSource
 from adacd_hil.analysis.replay.replay import replay_many
 from adacd_hil.analysis.replay.replayed_outcome import Replay
@@ -31,7 +30,7 @@ from adacd_hil.file_access import replace_file, replacing
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import SchemeState
 from adacd_hil.remedies import install_command
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings, apply_settings, keep_facts, load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import CodecError
 

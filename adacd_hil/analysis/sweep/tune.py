@@ -25,7 +25,6 @@ from matplotlib.figure import Figure
 from adacd_hil import __version__
 from adacd_hil.analysis.drawing import COLOURS, Drawing, note, paper_svg, style
 from adacd_hil.analysis.logged_run import Progress
-from adacd_hil.analysis.replay.changed_settings import apply_settings, changed_keys, keep_facts
 from adacd_hil.analysis.replay.replay import replay_many
 from adacd_hil.analysis.replay.replayed_outcome import Replay
 from adacd_hil.analysis.score.judge import least_rate_per_h
@@ -53,7 +52,7 @@ from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import replace_files
 from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings, apply_settings, changed_keys, keep_facts, load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names, to_toml
 

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import Progress
-from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.replay import Watch, replay_many
 from adacd_hil.analysis.sweep.tune_roc import Changes, Observed, Touched, TunedLog, Window, rising
 from adacd_hil.analysis.thresholds.detector_comparison import WARM_UP_S
@@ -27,7 +26,7 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
-from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration import Settings, apply_settings
 from adacd_hil.settings.schema import ConfigError
 
 _FILTER_FACTORS: Final = (1.0, 0.5, 2.0, 4.0)

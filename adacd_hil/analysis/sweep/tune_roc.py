@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import AttemptBegins, Progress, host_span
-from adacd_hil.analysis.replay.changed_settings import changed_keys, keep_facts
 from adacd_hil.analysis.replay.log_source import LogSource
 from adacd_hil.analysis.score.emulator_truth import HostCycles, TrueContact, contacts_beside, windows_of
 from adacd_hil.analysis.score.judge import Times, TouchWindow, explained_until, rate_bound_per_h, share_bounds
@@ -39,7 +38,7 @@ from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
 from adacd_hil.log.reader import Series
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings, changed_keys, keep_facts, load_settings
 
 Changes = dict[str, str]
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from adacd_hil.analysis.logged_run import QUANTITIES
 from adacd_hil.analysis.score.distribution import bar_chart, doubling_bins
+from adacd_hil.analysis.score.evaluation import collect_evidence
 from adacd_hil.analysis.score.metrics import TimingEvidence
-from adacd_hil.analysis.score.timing import collect_evidence
 from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, wall_ns

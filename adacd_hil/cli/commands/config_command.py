@@ -63,9 +63,16 @@ def show(
 
 def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
     """Give the settings in force with value and default as TOML, and origin. Raises ConfigError, CommandError."""
-    from adacd_hil.analysis.replay.changed_settings import apply_settings, parse_changes
     from adacd_hil.commission.configuration_check import origins_of
-    from adacd_hil.settings.configuration import Settings, configuration_layers, in_words, resolved_table, value_of
+    from adacd_hil.settings.configuration import (
+        Settings,
+        apply_settings,
+        configuration_layers,
+        in_words,
+        parse_changes,
+        resolved_table,
+        value_of,
+    )
     from adacd_hil.settings.schema import parse
 
     layers = configuration_layers(name, profile)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.commands.log_export import contract_of, dbc_option, id_option, only_option
+from adacd_hil.cli.commands.log_command import contract_of, dbc_option, id_option, only_option
 from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained

@@ -114,17 +114,17 @@ def _replay_one(
     stretch: "TimeWindow",
     progress: Any,
 ) -> _Result:
-    from adacd_hil.analysis.replay.changed_settings import (
+    from adacd_hil.analysis.replay.replay import replay_source
+    from adacd_hil.analysis.score.emulator_truth import contacts_beside
+    from adacd_hil.control.operator import ScriptedOperator
+    from adacd_hil.settings.configuration import (
         apply_settings,
         keep_facts,
+        load_settings,
         parse_changes,
         parse_variations,
         refuse_facts,
     )
-    from adacd_hil.analysis.replay.replay import replay_source
-    from adacd_hil.analysis.score.emulator_truth import contacts_beside
-    from adacd_hil.control.operator import ScriptedOperator
-    from adacd_hil.settings.configuration import load_settings
 
     source, is_alone = _open(given, configured, against)
     own = source.settings
@@ -220,8 +220,8 @@ def _counts(own: "Replay") -> str:
 def _as_json(
     path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow"
 ) -> dict[str, Any]:
-    from adacd_hil.analysis.replay.changed_settings import changed_keys
     from adacd_hil.analysis.replay.replayed_outcome import as_json
+    from adacd_hil.settings.configuration import changed_keys
 
     own = replays[0]
     return {

@@ -127,10 +127,9 @@ def _plan(
     logs: Sequence[Path], scenarios: Sequence[str], seeds: str, vary: Sequence[str], config: str, profile: str
 ) -> "Plan":
     from adacd_hil import __version__
-    from adacd_hil.analysis.replay.changed_settings import apply_settings, parse_variations
     from adacd_hil.analysis.sweep.sweep import plan_logs, plan_scenarios
     from adacd_hil.compiled import program_digest
-    from adacd_hil.settings.configuration import load_settings
+    from adacd_hil.settings.configuration import apply_settings, load_settings, parse_variations
 
     variants = parse_variations(vary)
     base = load_settings(config or "certified", profile or None)
@@ -175,10 +174,10 @@ def simulate_task(task: "Task") -> "list[Values]":
 
 
 def _simulate(task: "Task", row: "SweepRow") -> "Values":
-    from adacd_hil.analysis.replay.changed_settings import apply_settings
     from adacd_hil.analysis.replay.replay import replay
     from adacd_hil.analysis.sweep.sweep import REFUSALS, failed, finished
     from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+    from adacd_hil.settings.configuration import apply_settings
 
     subject = task.subject
     try:

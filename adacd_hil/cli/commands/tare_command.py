@@ -12,7 +12,7 @@ from adacd_hil.cli.output import CommandError, ExitCode, Progress
 from adacd_hil.clock import VirtualClock
 from adacd_hil.commission.tare import TareRefusedError
 from adacd_hil.commission.tare_session import TareSession
-from adacd_hil.control.tare_file import Tare, read_tare, write_tare
+from adacd_hil.control.arm_records import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import refuse_company
