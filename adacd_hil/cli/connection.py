@@ -14,7 +14,7 @@ from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.settings.configuration import Settings, load_settings
-from adacd_hil.terminal import hurry
+from adacd_hil.terminal import hurry, in_line
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, open_bus
 from adacd_hil.wire.can_interface import can_interfaces, is_virtual
 from adacd_hil.wire.codec import Codec
@@ -33,12 +33,26 @@ def check_clock(name: str, interface: str, channel: str) -> None:
 
     An interface that is not there is nothing yet; opening it says so.
     """
-    is_there = interface != "socketcan" or channel in can_interfaces()
-    if name == "lockstep" and is_there and not is_virtual(interface, channel):
+    if name == "lockstep" and _may_be_hardware(interface, channel):
         raise CommandError(
             f"--clock lockstep is for emulated arms; {interface} {channel} may be hardware: it needs --clock realtime",
             ExitCode.USAGE,
         )
+
+
+def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
+    """Raise CommandError for a scripted user on what may be hardware: there a person acknowledges."""
+    if _may_be_hardware(interface, channel):
+        raise CommandError(
+            f"--scenario {in_line(scenario)} plays the user of an emulated arm; {interface} {channel} may be hardware: "
+            "leave it out",
+            ExitCode.USAGE,
+        )
+
+
+def _may_be_hardware(interface: str, channel: str) -> bool:
+    is_there = interface != "socketcan" or channel in can_interfaces()
+    return is_there and not is_virtual(interface, channel)
 
 
 def check_autonomy(settings: Settings, interface: str, channel: str) -> None:
@@ -103,7 +117,10 @@ class Connection:
 
     def settings(self) -> Settings:
         """Read the configuration, of which the option --dbc outweighs the contract. Raises ConfigError."""
-        settings = load_settings(self.config, self.profile)
+        return self.with_contract(load_settings(self.config, self.profile))
+
+    def with_contract(self, settings: Settings) -> Settings:
+        """Give settings the contract of --dbc, where it is given."""
         if self.dbc is None:
             return settings
         return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, contract=str(self.dbc)))

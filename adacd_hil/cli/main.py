@@ -110,6 +110,12 @@ def demo(
     type=WrittenPath(dir_okay=False),
     help="What the arm's runs have certified; the last is compared with, and this run's are added.",
 )
+@click.option(
+    "--scenario",
+    metavar="NAME|FILE",
+    help="Rehearse: requests are those of this scenario's user, as in `demo`. On a virtual interface only.",
+    shell_complete=complete_scenario,
+)
 @run_folder_option("run")
 @clock_option(default="realtime")
 @json_option
@@ -118,6 +124,7 @@ def run(
     connection: "Connection",
     tare: Path | None,
     history: Path | None,
+    scenario: str | None,
     out: Path | None,
     clock: str,
     as_json: bool,
@@ -132,7 +139,7 @@ def run(
     """
     from adacd_hil.cli.commands.run_command import as_text, next_of_run, run_on_bus
 
-    result, code = run_on_bus(connection, clock, out, tare, live, history)
+    result, code = run_on_bus(connection, clock, out, tare, live, history, scenario)
     if as_json:
         print(json.dumps(result, indent=2))
     else:

@@ -15,6 +15,7 @@ from adacd_hil.cli.connection import (
     Connection,
     check_autonomy,
     check_clock,
+    check_rehearsal,
     check_shared,
     make_clock,
     never_stopped,
@@ -49,6 +50,14 @@ def check_budget_of(codec: Codec, settings: Settings) -> None:
         raise ConfigError(f"contract {codec.path.stem}: {budget.line}")
 
 
+def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
+    """Resolve a configuration as `demo` does, with a scenario's user. Raises ConfigError, CodecError, CommandError."""
+    from adacd_hil.cli.commands.demo_command import resolve
+
+    check_rehearsal(scenario, connection.interface, connection.channel)
+    return connection.with_contract(resolve(connection.config, scenario, connection.profile, None).settings)
+
+
 def drop_old_frames(bus: Bus, interface: str) -> None:
     """Empty the transmit queue if a process before this one has left frames in it. Raises BusError.
 
@@ -65,16 +74,17 @@ def run_on_bus(
     tare_path: Path | None = None,
     live: LiveAddress | None = None,
     history_path: Path | None = None,
+    scenario: str | None = None,
 ) -> tuple[dict[str, Any], ExitCode]:
     """Run the scheme on a bus, with the offsets of a tare and the arm's history when they are given.
 
-    `out` None: a new folder by date.
+    `out` None: a new folder by date. scenario: whose user acts, for an emulated arm.
 
     Raises ConfigError, CodecError, BusMissingError, LogError, CommandError, OSError.
     """
     interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)
-    settings = connection.settings()
+    settings = connection.settings() if scenario is None else rehearsed_settings(connection, scenario)
     check_shared(clock_name, settings)
     check_autonomy(settings, interface, channel)
     tare = None
