@@ -8,9 +8,10 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-realtime check compiled-certified compiled-paper vcan docs bench clean
+.PHONY: help install demo test test-all test-realtime check compiled-certified compiled-paper vcan docs bench clean
 
 help:
+	@echo "make install   the locked packages and this one, in .venv"
 	@echo "make demo   the paper's experiment with an emulated arm, certified scheme and paper's side by side; report in runs/demo/report.html (the last demo's)"
 	@echo "make test   all checks, and all tests but the longest, SocketCAN included"
 	@echo "make test-all   all checks and all tests"
@@ -28,13 +29,16 @@ $(BIN)/python:
 
 # The package is installed as the source tree itself, with the locked build back end and nothing fetched besides.
 $(VENV)/.run: requirements.lock pyproject.toml | $(BIN)/python
-	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@echo "installing `grep -c '==' requirements.lock` packages, some 0.6 GB, into $(VENV)"
+	$(BIN)/pip install --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
 $(VENV)/.dev: requirements-dev.lock $(VENV)/.run
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.lock
 	@touch $@
+
+install: $(VENV)/.run
 
 demo: $(VENV)/.run
 	$(BIN)/adacd-hil demo

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from documents import PAGES, ROOT, Document, Piece, read_document
 
+from adacd_hil.api import load
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import FRAME_DTYPE
@@ -59,9 +60,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory, documents: dict[str, Docume
     shutil.copy(ROOT / "dbc/arm.dbc", folder)
     for name, source in (("map.toml", "map.toml"), ("planar-arm.urdf",) * 2, ("arm.urdf", "planar-arm.urdf")):
         shutil.copy(ROOT / "docs/examples/foreign" / source, folder / name)
+    shutil.copy(ROOT / "tests/scheme/seven_joint_arm.urdf", folder / "panda.urdf")
     for name, block in named_toml(documents).items():
         (folder / name).write_text(block.text)
-    for name in ("recording.csv", "cyclic.log", "host.toml", "tare.toml", "ca.pem", "me.pem", "me-key.pem"):
+    for name in ("recording.csv", "mine.csv", "cyclic.log", "host.toml", "tare.toml", "ca.pem", "me.pem", "me-key.pem"):
         (folder / name).touch()
     with contextlib.chdir(folder):
         export = ["log", "export", "run.mcap", "--format"]
@@ -325,11 +327,16 @@ def test_a_python_example_runs(page, documents, folder, capsys):
     blocks = [block for block in documents[f"docs/{page}"].blocks if block.language == "python"]
     for block in blocks:
         exec(compile(block.text, block.place, "exec"), names)
-    assert len(blocks) == 1
+    assert len(blocks) == (2 if page == "api.md" else 1)
     if page == "scheme-any-arm.md":  # the contact that it prints
         assert re.fullmatch(r"10\d\d link2 \S.*\n", capsys.readouterr().out)
     elif page == "api.md":
         assert capsys.readouterr().out.splitlines()[1:] == ["9.0 s link 1 (1,)"]
+        run = load("run.mcap")
+        assert {name: values.shape for name, values in names["arrays"].items()} == {
+            name: run[name].shape if name != "t" else run.t_s.shape for name in ("t", "q", "dq", "tau_J")
+        }
+        assert np.array_equal(names["arrays"]["tau_J"], run["tau_J"])
     elif page == "detectors.md":
         assert "magnitude" in DetectorBankSettings().detectors
         unregister("magnitude")
