@@ -41,7 +41,12 @@ class Document:
 
 def read_document(path: Path) -> Document:
     """Take a page apart."""
-    tokens = MarkdownIt("commonmark").enable("table").parse(path.read_text(encoding="utf-8"))
+    return parse_document(path, path.read_text(encoding="utf-8"))
+
+
+def parse_document(path: Path, text: str) -> Document:
+    """Take the text of a page, or a part of it, apart."""
+    tokens = MarkdownIt("commonmark").enable("table").parse(text)
     blocks, spans, links, anchors = [], [], [], set()
     for number, token in enumerate(tokens):
         line = (token.map or [0])[0] + 1

@@ -1,0 +1,114 @@
+"""The README's three ways to begin, played from its text as `tools/first_hour.py` plays them, in short.
+
+Nothing is installed and nothing is on a bus: `.venv` leads to this process's own programs, demos last some seconds, and
+commands that need `can0`, or a guest for one, are looked at only: what they read must be there by then.
+"""
+
+import os
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from documents import ROOT
+
+sys.path.insert(0, str(ROOT / "tools"))
+import first_hour
+from first_hour import Step, Way, concepts, logical_lines, play, read_way
+
+pytestmark = pytest.mark.slow
+
+SHORT = """
+lasts_s = {lasts_s}
+contacts = [{{ at_s = {touched_s}, link = 2, point_m = 0.2, force_N = 20.0, duration_s = 0.1 }}]
+"""
+LASTS_S = {"see": 1.0, "recordings": 11.5, "arm": 1.0}
+"""How long demos last: for `identify` the README takes the first 9 s, in which nobody touches the arm."""
+PROGRAMS = {
+    "adacd-hil": "from adacd_hil.cli.start_host import start_host as start",
+    "firmware-sim": "from firmware_sim.cli.start_emulator import start_emulator as start",
+}
+NOT_HERE = {
+    r"-c can0|tools/with-vcan ": "needs a bus",
+    r"make test": "it is what runs this test",
+    r"--rehearse": "plays the whole experiment",
+    r"--scenario blow-chest|--truth": "played by the tests of scenarios and truths",
+}
+MADE_ON_A_BUS = {r"adacd-hil tare ": ("tare.toml", "short.toml"), r"--out runs/today": ("runs/today", "demo")}
+"""What commands that are not typed leave for later ones, and what stands for it."""
+
+
+def newcomer_folder(folder: Path, lasts_s: float) -> dict[str, str]:
+    """Make a folder that looks like a clone after `make install`; return the environment of its programs."""
+    for path in ROOT.iterdir():
+        if path.name not in (".git", ".venv", "runs"):
+            (folder / path.name).symlink_to(path)
+    programs = folder / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    for name, line in PROGRAMS.items():
+        (programs / name).write_text(f"#!{sys.executable}\n{line}\nif __name__ == '__main__':\n    start()\n")
+    (programs / "python").write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    for path in programs.iterdir():
+        path.chmod(0o755)
+    (folder / ".venv" / ".run").touch()
+    (folder / "short.toml").write_text(SHORT.format(lasts_s=lasts_s, touched_s=0.9 * lasts_s))
+    return {**os.environ, "PYTHONPATH": str(ROOT), "ADACD_HIL_DEMO_SCENARIO": str(folder / "short.toml")}
+
+
+def not_typed_here(text: str, folder: Path) -> str:
+    """Say why a command is not typed, and leave what it would have made."""
+    why = next((why for pattern, why in NOT_HERE.items() if re.search(pattern, text)), first_hour.not_typed(text))
+    for made in [made for pattern, made in MADE_ON_A_BUS.items() if why and re.search(pattern, text)]:
+        (folder / made[0]).symlink_to(made[1])
+    return why
+
+
+@pytest.mark.parametrize("name", first_hour.WAYS)
+def test_a_newcomer_gets_there_by_the_text_alone(name: str, tmp_path: Path) -> None:
+    way = read_way(name)
+    play(way, tmp_path, newcomer_folder(tmp_path, LASTS_S[name]), lambda text: not_typed_here(text, tmp_path))
+    assert way.complaints == []
+    assert sum(step.status is not None for step in way.played) >= 4
+
+
+def played(text: str, folder: Path) -> Way:
+    way = Way("x", [Step("x.md", text)], 0, [])
+    play(way, folder, dict(os.environ), lambda _: "")
+    return way
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (".venv/bin/adacd-hil replay no-such-run.mcap", "no-such-run.mcap"),
+        ("grep x no-such-file", "No such file"),
+        (".venv/bin/adacd-hil demo", "not found"),
+    ],
+)
+def test_what_a_newcomer_can_not_type_is_a_complaint(text: str, said: str, tmp_path: Path) -> None:
+    (complaint,) = played(text, tmp_path).complaints
+    assert said in complaint
+
+
+def test_a_question_is_answered_by_enter(tmp_path: Path) -> None:
+    way = played("""python3 -c 'assert input("name [x]: ") == input("sure? ") == ""'""", tmp_path)
+    assert way.complaints == []
+    assert way.played[0].questions == 2
+
+
+def test_a_way_that_holds_too_much_is_a_complaint() -> None:
+    way = Way("x", [], 16_000, [str(number) for number in range(12)])
+    assert way.complaints == ["x: 12 concepts, 11 at most", "x: 80 min, 60 at most"]
+
+
+def test_a_block_is_typed_line_by_line_and_a_quote_keeps_lines_together() -> None:
+    block = "# first\nfoo a \\\n  b   # else's\nsh -c '\n  foo # x\n  bar'\n\nbaz '#'\n"
+    assert logical_lines(block) == ["foo a \\\n  b", "sh -c '\n  foo # x\n  bar'", "baz '#'"]
+
+
+def test_terms_are_found_in_prose_in_any_form_and_names_as_they_are_written() -> None:
+    assert concepts("Residuals of [x](certificate.md); you can sync. `tares` | PDOs") == [
+        "residual",
+        "tare",
+        "SDO, PDO",
+    ]
