@@ -48,6 +48,7 @@ class Bench:
         contract: EmulatedContract | None = None,
         on_event: OnEvent | None = None,
         on_answer: Callable[[], None] = lambda: None,
+        arm: "Movable | None" = None,
     ) -> None:
         """Build and compile everything; nothing is sent before `boot`.
 
@@ -55,7 +56,7 @@ class Bench:
         outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
         TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS files the devices have; default:
         those that go with the codec's DBC. on_event: called with t_ns, level, name and text when a fault begins or
-        ends.
+        ends. arm: None: a body of the scenario's.
         Raises ConfigError when a fault is about a frame that the contract hasn't, CodecError when the DBC lacks a
         message, OSError when an EDS can't be read.
         """
@@ -72,7 +73,7 @@ class Bench:
         scenario_seed = scenario.seed if seed is None else seed
         self.injector = Injector(scenario, scenario_seed, PLANNED_PERIOD_NS, codec, self._outbox, on_event)
         self._plan = self.injector.plan
-        self._body = self._build_body(scenario, scenario_seed)
+        self._body = arm or Body(scenario, seed=scenario_seed)
         self.rows = TruthFeed(self._fill_truth, on_truth)
         self._nodes = BenchNodes(scenario, codec, self.contract, self.injector, self._body, self._is_wall)
         self.devices, self.drives, self.sensors = self._nodes.devices, self._nodes.drives, self._nodes.sensors
@@ -323,6 +324,3 @@ class Bench:
     def _listen(self) -> None:
         """Take over which PDOs the devices exchange."""
         self._nodes.listen()
-
-    def _build_body(self, scenario: Scenario, seed: int) -> Movable:
-        return Body(scenario, seed=seed)

@@ -1,9 +1,9 @@
 """The nodes of a bench, two drives and two torque sensors around one arm, and what they exchange on the bus."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
 from firmware_sim.arm.own_arm import STRAIGHT, OwnArmSettings
@@ -19,51 +19,15 @@ from firmware_sim.nodes.sensor_node import SensorNode
 from firmware_sim.scenario.faults import device_ids, own_messages
 from firmware_sim.scenario.scenario import Scenario
 
+if TYPE_CHECKING:
+    from firmware_sim.bench.recorded_bench import RecordedBody
+    from firmware_sim.body.body import Body
+
+Movable: TypeAlias = "Body | RecordedBody"
+"""The arm as its devices use it."""
 TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
-
-
-class Movable(Protocol):
-    """The part of the arm that its devices use; `Body` documents each member."""
-
-    @property
-    def motor_torque_Nm(self) -> tuple[float, float]:
-        """Torque that the drives know."""
-
-    @property
-    def has_ideal_motors(self) -> bool:
-        """Whether no motor ever has less torque than its drive wants, or calls for a fault."""
-
-    @property
-    def is_torque_limited(self) -> tuple[bool, bool]:
-        """Whether each drive wants more torque than it may have."""
-
-    @property
-    def motor_error_code(self) -> tuple[int, int]:
-        """Fault that each motor calls for, 0 for none."""
-
-    @property
-    def joint_temperature_C(self) -> tuple[float, float]:
-        """Temperature of each joint."""
-
-    @property
-    def drive_velocity_rad_s(self) -> tuple[float, float]:
-        """Velocity that the drives know."""
-
-    def start_scenario(self) -> None:
-        """Take note that the drives are enabled."""
-
-    def advance(
-        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int | None = None
-    ) -> None:
-        """Move by some ticks."""
-
-    def sample(self) -> Measurement:
-        """Measure."""
-
-    def truth(self, out: Vector) -> None:
-        """Fill in what is true."""
 
 
 class BenchNodes:

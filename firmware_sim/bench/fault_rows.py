@@ -106,21 +106,9 @@ def distort_value(row: FaultRow, node: int, counts: int, lsb: float) -> int:
     return min(max(counts, -bound), bound)
 
 
-def _lose(_row: FaultRow, _message: MessageCodec | None, _frames: Sent) -> Sent:
-    return []
-
-
-def _duplicate(_row: FaultRow, _message: MessageCodec | None, frames: Sent) -> Sent:
-    return [frame for frame in frames for _ in range(2)]
-
-
 def _delay(row: FaultRow, _message: MessageCodec | None, frames: Sent) -> Sent:
     late_ns = row.late_ns()
     return [(delay_ns + late_ns, data) for delay_ns, data in frames]
-
-
-def _corrupt(row: FaultRow, _message: MessageCodec | None, frames: Sent) -> Sent:
-    return [(delay_ns, _flip(row, data)) for delay_ns, data in frames]
 
 
 def _flip(row: FaultRow, data: bytes) -> bytes:
@@ -158,10 +146,10 @@ def _freeze(row: FaultRow, message: MessageCodec, data: bytes) -> bytes:
 
 
 FRAME_CHANGES: dict[str, Callable[[FaultRow, MessageCodec | None, Sent], Sent]] = {
-    "lose": _lose,
-    "duplicate": _duplicate,
+    "lose": lambda _row, _message, _frames: [],
+    "duplicate": lambda _row, _message, frames: [frame for frame in frames for _ in range(2)],
     "delay": _delay,
-    "corrupt": _corrupt,
+    "corrupt": lambda row, _message, frames: [(delay_ns, _flip(row, data)) for delay_ns, data in frames],
     "freeze_counter": _freeze_counter,
 }
 

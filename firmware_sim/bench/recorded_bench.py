@@ -20,7 +20,6 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S, DriveMode, Measurement
 from firmware_sim.bench.bench import Bench, ClockMode
-from firmware_sim.bench.bench_nodes import Movable
 from firmware_sim.canopen.object_dictionary import EmulatedContract
 from firmware_sim.nodes.sensor_node import ROOM_TEMPERATURE_C
 from firmware_sim.scenario.scenario import Scenario
@@ -164,7 +163,7 @@ class RecordedBody:
         self,
         torque_setpoint_Nm: Sequence[float],
         drive_mode: Sequence[int],
-        tick_count: int | None = None,  # noqa: ARG002 (the protocol's signature)
+        tick_count: int | None = None,  # noqa: ARG002 (the body's signature)
     ) -> None:
         """Take note of the torque; SYNC brings the next cycle."""
         first_Nm, second_Nm = torque_setpoint_Nm
@@ -203,13 +202,12 @@ class RecordedBench(Bench):
         self._body_now = RecordedBody(codec)
         self._is_reset = True
         self._first_cycle = 0
-        super().__init__(scenario, codec, send, clock_mode=clock_mode, contract=contract, on_answer=on_answer)
+        super().__init__(
+            scenario, codec, send, clock_mode=clock_mode, contract=contract, on_answer=on_answer, arm=self._body_now
+        )
 
     def outlive_host(self) -> None:
         """Do nothing: the recording moves the arm, with or without host."""
-
-    def _build_body(self, scenario: Scenario, seed: int) -> Movable:  # noqa: ARG002 (the recording is the arm)
-        return self._body_now
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
         super()._on_nmt(data, t_ns)

@@ -172,8 +172,6 @@ def _header_bytes(message: MessageCodec) -> int:
     return sum(sizes.values())
 
 
-FD_BYTES = FD_LENGTHS[-1]
-
 _HEADERS = {
     2: ((0x2100, 1), (0x2100, 2)),  # AUTOSAR Profile 2: CRC; counter and status
     4: ((0x2101, 1), (0x2101, 2), (0x2101, 3)),  # Profile 5: CRC, counter, status

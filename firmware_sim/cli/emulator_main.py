@@ -3,6 +3,7 @@
 import json
 import logging
 import sys
+import tomllib
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from enum import IntEnum
@@ -18,7 +19,6 @@ from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.editing.log_info import run_metadata
 from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError
 from adacd_hil.log.recording.run_folder import check_free
-from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import fit_table, in_line, one_line, open_terminals
@@ -28,13 +28,13 @@ from adacd_hil.wire.contract_frames import HOST_NODE, move_contract
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import TruthLog
-from firmware_sim.bench.injector import Departure, OnEvent
+from firmware_sim.bench.injector import Departure
 from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
 from firmware_sim.body.body import Body
 from firmware_sim.canopen.object_dictionary import CONTRACTS, EmulatedContract
 from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.own_devices import rehearse
-from firmware_sim.cli.scenario_list import check, describe_all, show, show_as_table
+from firmware_sim.cli.scenario_list import check, describe_all, show
 from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal
 from firmware_sim.scenario.arm_truth import load_truth, truth_names
 from firmware_sim.scenario.scenario import Scenario, load_scenario
@@ -168,7 +168,7 @@ def run(
         _refuse_beside_config()
         codec, played, resolved, assumed = rehearse(config, scenario, truth, profile, seed)
         for line in assumed:
-            _tell(line)
+            print(one_line(line), file=sys.stderr)
     clock = MonotonicClock()
     with ExitStack() as stack:
         if out is not None:
@@ -190,9 +190,7 @@ def run(
                 resolved, codec, departure.send, clock_mode=clock_mode, contract=played, on_answer=departure.go
             )
         if log is not None:
-            epoch_ns = wall_ns() - clock.now_ns()
-            bench.rows.on_truth = _stamp_truth(log, bench, epoch_ns)
-            bench.injector.on_event = _stamp_events(log, bench, epoch_ns)
+            _log_truth(log, bench, wall_ns() - clock.now_ns())
         _serve(Service(bench, bus, departure, clock, clock_mode, stop, is_once))
         return _report(bench, resolved, clock_mode, log, as_json)
 
@@ -285,7 +283,7 @@ def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int 
     """Print a scenario, resolved, as TOML that loads to the same: what differs from the defaults."""
     resolved = load_scenario(scenario, profile, seed)
     if as_json:
-        print(json.dumps(show_as_table(resolved, is_whole), indent=2, ensure_ascii=False))
+        print(json.dumps(tomllib.loads(show(resolved, is_whole)), indent=2, ensure_ascii=False))
     else:
         print(show(resolved, is_whole), end="")
     return EmulatorExit.OK
@@ -308,22 +306,14 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
     return EmulatorExit.USAGE if any(finding.problems for finding in findings) else EmulatorExit.OK
 
 
-def _stamp_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> Callable[[int, int, Vector], None]:
-    """Stamp the truth by the host's clock in lockstep, else by the wall clock."""
+def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
+    """Log truth and faults of a bench, stamped by the host's clock in lockstep, else by the wall clock."""
 
-    def write(cycle: int, t_ns: int, block: Vector) -> None:
-        truth.write(cycle, t_ns if bench.is_paced else t_ns + epoch_ns, block)
+    def stamp(t_ns: int) -> int:
+        return t_ns if bench.is_paced else t_ns + epoch_ns
 
-    return write
-
-
-def _stamp_events(truth: TruthLog, bench: Bench, epoch_ns: int) -> OnEvent:
-    """Stamp the beginnings and ends of faults as the truth."""
-
-    def write(t_ns: int, level: str, name: str, text: str) -> None:
-        truth.event(t_ns if bench.is_paced else t_ns + epoch_ns, level, name, text)
-
-    return write
+    bench.rows.on_truth = lambda cycle, t_ns, block: truth.write(cycle, stamp(t_ns), block)
+    bench.injector.on_event = lambda t_ns, *event: truth.event(stamp(t_ns), *event)
 
 
 def _serve(service: Service) -> None:
@@ -411,10 +401,6 @@ def _refuse_beside_config() -> None:
     for name, option in (("contract", "--contract"), ("node_offset", "--node-offset"), ("host_node", "--host-node")):
         if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
             raise ConfigError(f"{option} can't stand beside --config, which says it")
-
-
-def _tell(line: str) -> None:
-    print(one_line(line), file=sys.stderr)
 
 
 def _complain(line: str) -> None:

@@ -1,6 +1,5 @@
 """The command line's output about scenarios: their list, the content of one, and the errors of a file."""
 
-import tomllib
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,17 +44,12 @@ def show(scenario: Scenario, is_whole: bool) -> str:
     return to_toml(scenario) if is_whole else to_short_toml(scenario)
 
 
-def show_as_table(scenario: Scenario, is_whole: bool) -> dict[str, Any]:
-    """Give the same as a table."""
-    return tomllib.loads(show(scenario, is_whole))
-
-
 def check(file: str, codec: Codec) -> ScenarioFinding:
     """Look for everything that keeps a scenario from being played under a contract."""
     try:
         table = read_table(file)
     except ConfigError as error:
-        return ScenarioFinding(file, (_in_file(str(error), file),))
+        return ScenarioFinding(file, (str(error).removeprefix(f"scenario {file}").removeprefix(":").strip(),))
     problems = find_problems(Scenario, table)
     if problems:
         return ScenarioFinding(file, tuple(problems))
@@ -65,11 +59,6 @@ def check(file: str, codec: Codec) -> ScenarioFinding:
     except ConfigError as error:
         return ScenarioFinding(file, (str(error),))
     return ScenarioFinding(file, (), _checked(scenario, codec))
-
-
-def _in_file(problem: str, file: str) -> str:
-    """Take the file's name off a problem that begins with it."""
-    return problem.removeprefix(f"scenario {file}").removeprefix(":").strip()
 
 
 def _checked(scenario: Scenario, codec: Codec) -> str:

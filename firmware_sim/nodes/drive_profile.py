@@ -12,6 +12,7 @@ Source: CiA 402-2 (IEC 61800-7-201): power drive system finite state automaton, 
 objects 0x605A to 0x605E, cyclic synchronous torque mode.
 """
 
+import functools
 from collections.abc import Callable
 from enum import Enum
 from typing import NamedTuple
@@ -182,6 +183,7 @@ class Standstill:
 _NO_COMMAND_YET = 256  # SYNCs without a command: more than the longest patience, 0x2200
 _NO_PATIENCE = 1 << 30  # a drive without 0x2200 doesn't count SYNCs
 _TENTH_PERIODS = 15  # a drive without 0x2201: SYNC is missing after 1.5 periods
+_LIMITS = (0x6072, 0x60E0, 0x60E1)  # of torque: both ways, positive, negative
 _UNLIMITED = 0xFFFF  # where the EDS lacks a limit
 
 
@@ -189,24 +191,19 @@ class TorqueLimits:
     """Target, offset and limits, as written by SDO or PDO."""
 
     def __init__(self, dictionary: ObjectDictionary, pdos: Pdos) -> None:
-        self.target = 0
-        self._offset = self._max = self._positive = self._negative = 0
-        self._low = self._high = 0
+        self.target = self._offset = 0
+        self._limits = {index: dictionary.default_or(_UNLIMITED, index) for index in _LIMITS}
         dictionary.serve(0x6071, 0, lambda: self.target)
         dictionary.serve(0x60B2, 0, lambda: self._offset)
-        dictionary.serve(0x6072, 0, lambda: self._max)
-        dictionary.serve(0x60E0, 0, lambda: self._positive)
-        dictionary.serve(0x60E1, 0, lambda: self._negative)
-        for index, take, default in (
-            (0x6071, self._set_target, 0),
-            (0x60B2, self._set_offset, 0),
-            (0x6072, self._set_max, _UNLIMITED),
-            (0x60E0, self._set_positive, _UNLIMITED),
-            (0x60E1, self._set_negative, _UNLIMITED),
-        ):
+        for index in _LIMITS:
+            dictionary.serve(index, 0, functools.partial(self._limits.__getitem__, index))
+        takers: dict[int, Callable[[int], None]] = {0x6071: self._set_target, 0x60B2: self._set_offset}
+        takers |= {index: functools.partial(self._limit, index) for index in _LIMITS}
+        for index, take in takers.items():
             pdos.accept(index, 0, take)
             dictionary.watch(index, 0, take)
-            take(dictionary.default_or(default, index))
+        self.target, self._offset = dictionary.default_or(0, 0x6071), dictionary.default_or(0, 0x60B2)
+        self._combine()
 
     def demand(self) -> int:
         """Return 0x6074 of an enabled drive."""
@@ -226,22 +223,14 @@ class TorqueLimits:
     def _set_offset(self, permille: int) -> None:
         self._offset = permille
 
-    def _set_max(self, permille: int) -> None:
-        self._max = permille
-        self._combine()
-
-    def _set_positive(self, permille: int) -> None:
-        self._positive = permille
-        self._combine()
-
-    def _set_negative(self, permille: int) -> None:
-        self._negative = permille
+    def _limit(self, index: int, permille: int) -> None:
+        self._limits[index] = permille
         self._combine()
 
     def _combine(self) -> None:
         """Of several limits the smallest counts."""
-        self._high = min(self._max, self._positive)
-        self._low = -min(self._max, self._negative)
+        most, positive, negative = self._limits.values()
+        self._low, self._high = -min(most, negative), min(most, positive)
 
 
 class Motor(NamedTuple):
