@@ -7,7 +7,6 @@ from typing import NamedTuple
 from adacd_hil.commission.host_checks import Check, CheckOutcome, ok, warning
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
-from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import (
     ConfigurationLayer,
     KnownKey,
@@ -59,7 +58,8 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
     except (ConfigError, CodecError) as error:
         return ConfigurationFindings([str(error)], [], None)
     late = list(_budget_warnings(codec, settings))
-    warnings = [*_oddities(settings), *_assumptions(settings), *_layer_warnings(layers), *late]
+    assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in settings.assumed)}"] if settings.assumed else []
+    warnings = [*_oddities(settings), *assumed, *_layer_warnings(layers), *late]
     return ConfigurationFindings([], warnings, settings, bool(late))
 
 
@@ -91,12 +91,6 @@ def _oddities(settings: Settings) -> list[str]:
     return [line for look in _LOOKS for line in look(settings)]
 
 
-def _assumptions(settings: Settings) -> list[str]:
-    if not settings.assumed:
-        return []
-    return [f"assumed, not known: {', '.join(f'`{key}`' for key in settings.assumed)}"]
-
-
 def _device_problems(settings: Settings) -> list[str]:
     devices = settings.devices
     problems: dict[str, None] = {}
@@ -109,21 +103,21 @@ def _device_problems(settings: Settings) -> list[str]:
     return list(problems)
 
 
-def _torque_limits(settings: Settings) -> Iterator[str]:
-    arm = settings.arm
-    yield from _over("arm.torque_limit_Nm", arm.torque_limit_Nm, "arm.rated_torque_Nm", arm.rated_torque_Nm, "Nm")
+_BOUNDS = (
+    ("arm.torque_limit_Nm", "arm.rated_torque_Nm", "Nm", ""),
+    ("trajectory.amplitude_deg", "arm.position_limit_deg", "deg", "; the motion would end in a fault"),
+    ("reaction.velocity_limit_deg_s", "arm.velocity_limit_deg_s", "deg/s", "; a withdrawal would end in a fault"),
+)
+"""Keys of pairs that must not be larger than those of other keys, and what comes of it."""
 
 
-def _travel(settings: Settings) -> Iterator[str]:
-    amplitude, limit = settings.trajectory.amplitude_deg, settings.arm.position_limit_deg
-    for line in _over("trajectory.amplitude_deg", amplitude, "arm.position_limit_deg", limit, "deg"):
-        yield f"{line}; the motion would end in a fault"
-
-
-def _speed(settings: Settings) -> Iterator[str]:
-    speed, limit = settings.reaction.velocity_limit_deg_s, settings.arm.velocity_limit_deg_s
-    for line in _over("reaction.velocity_limit_deg_s", speed, "arm.velocity_limit_deg_s", limit, "deg/s"):
-        yield f"{line}; a withdrawal would end in a fault"
+def _over(settings: Settings) -> Iterator[str]:
+    for key, bound_key, unit, outcome in _BOUNDS:
+        pairs = zip(value_of(settings, key), value_of(settings, bound_key), strict=True)
+        for joint, (value, bound) in enumerate(pairs):
+            if value > bound:
+                told = f"`{bound_key}[{joint}]` = {bound:g} {unit}"
+                yield f"`{key}[{joint}]` = {value:g} {unit} exceeds {told}{outcome}"
 
 
 def _radians(settings: Settings) -> Iterator[str]:
@@ -142,20 +136,7 @@ def _unknown_assumptions(settings: Settings) -> Iterator[str]:
             yield f"`assumed` names no setting: {explain_unknown(key)}"
 
 
-_LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (
-    _torque_limits,
-    _travel,
-    _speed,
-    _radians,
-    _unknown_assumptions,
-)
-
-
-def _over(key: str, values: Pair, bound_key: str, bounds: Pair, unit: str) -> Iterator[str]:
-    for joint in range(JOINTS):
-        if values[joint] > bounds[joint]:
-            bound = f"`{bound_key}[{joint}]` = {bounds[joint]:g} {unit}"
-            yield f"`{key}[{joint}]` = {values[joint]:g} {unit} exceeds {bound}"
+_LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (_over, _radians, _unknown_assumptions)
 
 
 def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:

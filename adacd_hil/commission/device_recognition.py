@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,12 +59,9 @@ class RecognisedDevice(NamedTuple):
     def title(self) -> str:
         """Name, vendor, product and serial number."""
         node = self.node
-        numbers = (f"{what} {'?' if value is None else f'0x{value:X}'}" for what, value in self._numbers())
+        identity = (("vendor", node.vendor), ("product", node.product))
+        numbers = (f"{what} {'?' if value is None else f'0x{value:X}'}" for what, value in identity)
         return f"{node.name or 'a device without a name'}, {', '.join(numbers)}, serial {node.serial or '?'}"
-
-    def _numbers(self) -> Iterator[tuple[str, int | None]]:
-        yield "vendor", self.node.vendor
-        yield "product", self.node.product
 
 
 def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node]) -> list[RecognisedDevice]:
