@@ -105,17 +105,6 @@ TRANSITIONS: dict[tuple[Cia402State, Controlword], Cia402Transition] = {
 IEC 61800-7-201, figure of the power drive system finite state automaton and its table of transitions.
 """
 
-TOWARD_ENABLED: dict[Cia402State, Cia402Transition] = {
-    state: TRANSITIONS[state, command]
-    for state, command in (
-        (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN),
-        (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON),
-        (_S.SWITCHED_ON, _C.ENABLE_OPERATION),
-        (_S.FAULT, _C.FAULT_RESET),
-    )
-}
-"""The way up. States that are not listed are left by the drive itself."""
-
 _WAYS: dict[Goal, dict[Cia402State, Controlword]] = {
     Goal.OPERATION_ENABLED: {
         _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,

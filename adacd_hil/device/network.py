@@ -4,7 +4,7 @@ Boot: reset of communication, wait for every boot-up, identity, SYNC, heartbeats
 Source: CiA 301 (4.2), clauses 7.2.8 (NMT) and 7.5.2 (communication objects); CiA 302-2 (boot-up of slaves).
 """
 
-from collections.abc import Callable
+import functools
 from typing import Any, NamedTuple
 
 from adacd_hil.device.arm_watch import OPERATIONAL, PATIENCE_PERIODS, follow_devices
@@ -62,15 +62,13 @@ class Master:
         self.nodes: dict[str, Any] = {}
         devices = place_devices(settings)
         for device in devices:
-            node = self._canopen.add_node(device.node_id, device.objects, self._emergency_listener(device.name))
+            listener = functools.partial(self._on_emergency, device.name)
+            node = self._canopen.add_node(device.node_id, device.objects, listener)
             self.nodes[device.name] = node
             self.slaves.append(Slave(device, node))
         self._heartbeats = follow_devices(devices, settings.bus.heartbeat_ms, self._events.append)
         self.parameters = ParameterWatch(settings, bus)
         self._canopen.bystander = self._heartbeats.accept
-
-    def _emergency_listener(self, name: str) -> Callable[[Any], None]:
-        return lambda error: self._on_emergency(name, error)
 
     def _on_emergency(self, name: str, error: Any) -> None:
         slave = next(slave for slave in self.slaves if slave.name == name)

@@ -211,7 +211,6 @@ class InterfaceState:
     state: str | None = None
     rx_errors: int | None = None
     tx_errors: int | None = None
-    bus_offs: int | None = None
 
     @property
     def is_virtual(self) -> bool:
@@ -253,7 +252,6 @@ def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
         state=data.get("state"),
         rx_errors=counters.get("rx"),
         tx_errors=counters.get("tx"),
-        bus_offs=info.get("info_xstats", {}).get("bus_off"),
     )
 
 

@@ -282,16 +282,6 @@ class Load:
             return 0.0
         return 100.0 * self.bits.duration_s(self.bitrate, self.data_bitrate) / (self.interval_ns * 1e-9)
 
-    @property
-    def frames_s(self) -> float:
-        """Frames per second."""
-        return self.frames / (self.interval_ns * 1e-9) if self.interval_ns > 0 else 0.0
-
-    @property
-    def bits_s(self) -> float:
-        """Bits per second, of both rates."""
-        return self.bits.total / (self.interval_ns * 1e-9) if self.interval_ns > 0 else 0.0
-
 
 class LoadMeter:
     """Counts frames; `take` returns the load since the last call. About 10 µs per frame: for `monitor`, not the cycle.

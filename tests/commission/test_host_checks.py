@@ -25,7 +25,6 @@ CAN0 = InterfaceState(
     state="ERROR-ACTIVE",
     rx_errors=0,
     tx_errors=0,
-    bus_offs=0,
 )
 THROTTLED_AT = {
     runtime_us: {

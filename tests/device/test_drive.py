@@ -8,7 +8,6 @@ import adacd_hil
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.drive import (
     IMPLAUSIBLE_JUMP_RAD,
-    TOWARD_ENABLED,
     TRANSITIONS,
     Cia402State,
     Controlword,
@@ -65,7 +64,9 @@ def test_a_statusword_reads_as_the_standards_state(statusword: int, state: Cia40
 
 
 def test_the_way_up_has_the_standards_numbers() -> None:
-    assert {t.number: (s.name, t.target.name) for s, t in TOWARD_ENABLED.items()} == {
+    up = {Controlword.SHUTDOWN, Controlword.SWITCH_ON, Controlword.ENABLE_OPERATION, Controlword.FAULT_RESET}
+    steps = {t.number: (s.name, t.target.name) for (s, command), t in TRANSITIONS.items() if command in up}
+    assert {number: steps[number] for number in (2, 3, 4, 15)} == {
         2: ("SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"),
         3: ("READY_TO_SWITCH_ON", "SWITCHED_ON"),
         4: ("SWITCHED_ON", "OPERATION_ENABLED"),

@@ -6,7 +6,7 @@ import pytest
 
 from adacd_hil.device.drive import (
     IMPLAUSIBLE_JUMP_RAD,
-    TOWARD_ENABLED,
+    TRANSITIONS,
     Cia402State,
     Controlword,
     Drive,
@@ -78,13 +78,15 @@ def test_states_and_controlwords_have_the_numbers_that_logs_and_wire_hold() -> N
 
 
 def test_the_way_up_commands_what_the_standard_says() -> None:
-    way = {state.name: (step.number, int(step.command), step.target.name) for state, step in TOWARD_ENABLED.items()}
-    assert way == {
+    way = {
         "SWITCH_ON_DISABLED": (2, 0x06, "READY_TO_SWITCH_ON"),
         "READY_TO_SWITCH_ON": (3, 0x07, "SWITCHED_ON"),
         "SWITCHED_ON": (4, 0x0F, "OPERATION_ENABLED"),
         "FAULT": (15, 0x80, "SWITCH_ON_DISABLED"),
     }
+    for state, expected in way.items():
+        step = TRANSITIONS[Cia402State[state], Controlword(expected[1])]
+        assert (step.number, int(step.command), step.target.name) == expected
 
 
 @pytest.mark.parametrize("joint", [1, 2])

@@ -31,7 +31,6 @@ def test_load_is_the_time_of_the_frames_over_the_interval() -> None:
     load = meter.take(2_000_000)
     assert (load.frames, load.bits.total, load.payload_bits) == (10, 530, 0)
     assert load.percent == pytest.approx(100 * 530 * 2e-6 / 2e-3)
-    assert (load.frames_s, load.bits_s) == (5000.0, 265_000.0)
 
 
 def test_an_interval_begins_where_the_last_one_ended() -> None:
@@ -51,8 +50,7 @@ def test_without_a_start_the_first_frame_is_it() -> None:
 
 
 def test_nothing_in_no_time_is_no_load() -> None:
-    load = LoadMeter(BITRATE).take(SECOND_NS)
-    assert (load.percent, load.frames_s, load.bits_s) == (0.0, 0.0, 0.0)
+    assert LoadMeter(BITRATE).take(SECOND_NS).percent == 0.0
 
 
 def test_can_fd_counts_at_both_rates() -> None:

@@ -227,20 +227,6 @@ class Prediction:
         """Alarms per hour."""
         return self.counted / self.hours
 
-    @property
-    def factor(self) -> float:
-        """Measured over predicted."""
-        return self.measured_per_h / self.predicted_per_h
-
-
-def compare_with(peaks: Vector, held_out: Vector, block_s: float, rates_per_h: Sequence[float]) -> list[Prediction]:
-    """Find thresholds from one recording and count the alarms of another; block maxima (B,) each."""
-    hours = counted_hours(held_out, block_s)
-    return [
-        Prediction(rate, clusters(held_out, calibrate(peaks, block_s, rate).threshold, block_s).size, hours)
-        for rate in rates_per_h
-    ]
-
 
 @dataclass(frozen=True)
 class ThresholdSource:
