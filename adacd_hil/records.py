@@ -201,6 +201,7 @@ class Request(IntEnum):
     FAULT_TAMPERED = 7
     ACCEPT = 8  # nobody touches the arm: what was refused, a torque sensor's zero or more friction, is the arm's
     RELEARN = 9  # nobody touches the stopped arm, what is known of it is wrong: learn it anew
+    FAULT_MISCONFIGURED = 10  # asked for by the host's own checks, as the FAULTs above
 
 
 class Reaction(IntEnum):
@@ -234,6 +235,7 @@ class FaultReason(IntEnum):
     FOLLOWING = 14  # the arm doesn't follow the desired motion
     TAMPERED = 15  # a parameter of a device is no longer what the host has written
     DETECTOR = 16  # a live detector has raised, or given no finite statistic per joint
+    MISCONFIGURED = 17  # the first motion contradicts an order, a sign or a scale of the configuration
 
 
 class ArmState(NamedTuple):

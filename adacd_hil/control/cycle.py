@@ -14,6 +14,7 @@ from adacd_hil.clock import Clock
 from adacd_hil.control.controller import Controller, Floating
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.fault_recovery import FaultReport, SelfChecks, StopEscalation
+from adacd_hil.control.first_motion import FirstMotion
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.pacing import DetectorTiming, Pacer
@@ -102,7 +103,8 @@ class Cycle:
         self._q_d, self._dq_d, self._ddq_d = fields["q_d"], fields["dq_d"], fields["ddq_d"]
         self._tau_d, self._tau_c = fields["tau_d"], fields["tau_c"]
         self._reference = Reference(settings, self._q_d, self._dq_d, self._ddq_d)
-        self._checks = SelfChecks(settings, arm, master.parameters, self._q_d)
+        self._first_motion = FirstMotion(settings, arm)
+        self._checks = SelfChecks(settings, arm, master.parameters, self._q_d, self._first_motion)
         self._faults = FaultReport(settings, arm, self._watch, self._pipeline, self._checks, master)
         self._escalation = StopEscalation(arm, master)
         self._sources = (
@@ -113,6 +115,7 @@ class Cycle:
             self._escalation,
             self._exchange.events,
             self._timing,
+            self._first_motion,
             self._pipeline,
         )
         self._state = SchemeState.INIT
@@ -167,6 +170,7 @@ class Cycle:
             self._pipeline.complete()  # the commands are out: from here on, what none of them depends on
             self._data.note(arm)
             self._faults.note(self._state, arm)
+            self._first_motion.note(arm, self._state, self._tau_c)
             self._look_after_devices(arm, output)
             self._timing.step(arm.cycle, arm.t_ns)
             self._log(recorder, record, arm, request, output, command, flags)

@@ -1,6 +1,7 @@
 """A fault: what the host finds itself, what the log's line of it says, and the way out of it.
 
-`SelfChecks` compare what the host wanted with what came of it: torque, motion, and the devices' parameters. The scheme
+`SelfChecks` compare what the host wanted with what came of it: torque, motion, the devices' parameters, and what the
+first motion says of the configuration. The scheme
 knows none of it: what fails goes to it as a request for FAULT, so that a log replays to the same decision.
 `FaultReport` gives the causes, by the fault's reason, and what is wrong with the devices.
 
@@ -16,6 +17,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from adacd_hil.clock import Clock
+from adacd_hil.control.first_motion import FirstMotion
 from adacd_hil.control.operator import FaultAnswer, Operator
 from adacd_hil.control.pacing import MOST_FRAMES
 from adacd_hil.device.arm import Arm
@@ -41,8 +43,11 @@ _JUDGED = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR, SchemeSt
 class SelfChecks:
     """Judges every cycle of an enabled arm. `reason`, `line`: what failed first; NONE and empty before."""
 
-    def __init__(self, settings: Settings, arm: Arm, parameters: ParameterWatch, q_d: Vector) -> None:
+    def __init__(
+        self, settings: Settings, arm: Arm, parameters: ParameterWatch, q_d: Vector, first_motion: FirstMotion
+    ) -> None:
         """`q_d` (2,): the desired position, rad, as it was when the present cycle began."""
+        self._first_motion = first_motion
         period_s = settings.bus.period_s
         self._arm, self._parameters, self._q_d = arm, parameters, q_d
         self._window_rad = [math.radians(deg) for deg in settings.controller.following_window_deg]
@@ -63,6 +68,8 @@ class SelfChecks:
         line = self._judge_torque(arm.cycle)
         if line:
             return self._fail(FaultReason.TORQUE, Request.FAULT_TORQUE, line)
+        if self._first_motion.line:
+            return self._fail(FaultReason.MISCONFIGURED, Request.FAULT_MISCONFIGURED, self._first_motion.line)
         line = self._judge_motion(arm) if state in _JUDGED else self._follow()
         return self._fail(FaultReason.FOLLOWING, Request.FAULT_FOLLOWING, line) if line else Request.NONE
 

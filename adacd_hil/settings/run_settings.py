@@ -220,6 +220,13 @@ class SafetySettings:
     )
     rest_velocity_rad_s: float = setting(0.05, unit="rad/s", low=1e-4, high=1.0, meaning="|dq| that counts as at rest")
     rest_torque_Nm: float = setting(1.0, unit="Nm", low=0.01, high=100.0, meaning="largest |tau_J| before enabling")
+    first_motion_error: float = setting(
+        0.3,
+        low=0.0,
+        high=0.9,
+        meaning="first motion: share by which sensed and commanded torque, or position and velocity, may differ before "
+        "the run faults; 0: not compared",
+    )
     phase_timeout_s: float = setting(5.0, unit="s", low=0.1, high=600.0, meaning="longest COMMISSION and ENABLE")
     tolerated_emergencies: tuple[int, ...] = setting(
         (0x8200, 0x8210, 0x8240),

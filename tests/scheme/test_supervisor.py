@@ -303,6 +303,7 @@ def test_a_model_without_a_fresh_sample_is_a_fault_in_the_fifth_cycle_and_so_is_
         (Request.FAULT_TORQUE, FaultReason.TORQUE),
         (Request.FAULT_FOLLOWING, FaultReason.FOLLOWING),
         (Request.FAULT_TAMPERED, FaultReason.TAMPERED),
+        (Request.FAULT_MISCONFIGURED, FaultReason.MISCONFIGURED),
     ],
 )
 def test_the_host_s_own_checks_ask_for_a_fault_of_an_arm_that_may_have_torque(request_, reason):

@@ -215,7 +215,12 @@ class Script(Protocol):
         """Return what it asks in a cycle. `elapsed_s`: since the drives were enabled, None before."""
 
 
-_OWN_CHECKS = (Request.FAULT_TORQUE, Request.FAULT_FOLLOWING, Request.FAULT_TAMPERED)
+_OWN_CHECKS = (
+    Request.FAULT_TORQUE,
+    Request.FAULT_FOLLOWING,
+    Request.FAULT_TAMPERED,
+    Request.FAULT_MISCONFIGURED,
+)
 """What the host asked for in place of the user; no script has them."""
 
 ScriptOf = Callable[[OperatorSettings], Script]

@@ -83,6 +83,7 @@ KEPT_IN = MappingProxyType(
         Request.FAULT_TORQUE: frozenset[SchemeState](),
         Request.FAULT_FOLLOWING: frozenset[SchemeState](),
         Request.FAULT_TAMPERED: frozenset[SchemeState](),
+        Request.FAULT_MISCONFIGURED: frozenset[SchemeState](),
     }
 )
 """Where a request waits to be served. FINISH is the control layer's; ACCEPT and a fault are served at once, or
@@ -92,6 +93,7 @@ _FAULT_ASKED = MappingProxyType(
         Request.FAULT_TORQUE: FaultReason.TORQUE,
         Request.FAULT_FOLLOWING: FaultReason.FOLLOWING,
         Request.FAULT_TAMPERED: FaultReason.TAMPERED,
+        Request.FAULT_MISCONFIGURED: FaultReason.MISCONFIGURED,
     }
 )
 

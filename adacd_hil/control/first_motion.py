@@ -1,0 +1,222 @@
+"""The first motion compared with what the host was told of the arm: signs, order and scales of its devices.
+
+At rest a horizontal arm shows none of them. In motion, means over blocks of 20 ms show, joint by joint,
+
+    tau_J = k tau_c + x tau_c of the other joint − l dtau_c/dt − R ddq − v dq − c sgn(dq) + offset    by least squares
+
+The sensor sits between motor and link, so k = 1 and x = 0 whoever touches the arm, whatever it carries. k = −1 is a
+sensor that counts the other way than its drive, k = 2 a count of torque or a torque constant that is worth half or
+twice what was told, and k = 0 with x = 1 at both joints are drives or sensors that are exchanged. Before the sensor lie
+l, by which drive and bus are later than usual, the rotor R, and friction v, c.
+
+    position    Δq = s ∫ dq dt,  s = 1 where increments and counts of velocity are worth what was told
+
+Each joint is judged until it is known well enough to be right or wrong. What is wrong stops the arm: `line`. What is
+off by less is worth a warning, for a torque constant has a tolerance.
+"""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.device.arm import Arm
+from adacd_hil.records import JOINTS, ArmState, Event, SchemeState, Vector
+from adacd_hil.scheme.supervisor.supervisor import POWERED
+from adacd_hil.settings.configuration import Settings
+
+BLOCK_S: Final = 0.02
+_FEWEST_BLOCKS: Final = 20
+"""In motion, of a joint: twice and a half as many as the regression has unknowns."""
+_JUDGED_EVERY: Final = 5
+_MOST_BLOCKS: Final = 3000
+"""A minute: who has not been known by then moves too little."""
+_MOVING_RAD_S: Final = 0.05
+"""Slower, friction before the sensor may hold anything."""
+_CORRELATED: Final = 4.0
+"""Blocks that count as one: what the regression lacks lasts longer than a block."""
+_DEVIATIONS: Final = 5.0
+_SURE: Final = 0.06
+"""Largest standard deviation of k by which a joint is wrong."""
+_KNOWN: Final = 0.02
+"""Largest one by which it is right, and judged no more."""
+_WARNED: Final = 0.15
+"""A k that is off by more is worth a warning: torque constants are within ±10 %."""
+_LEAST_WAY_RAD: Final = 0.2
+_OWN, _OTHER = 0, 1
+_COLUMNS: Final = 7
+
+
+class FirstMotion:
+    """Judges an arm that moves for the first time. `line`: what contradicts the configuration, empty while nothing."""
+
+    def __init__(self, settings: Settings, arm: Arm) -> None:
+        """Begin; `safety.first_motion_error` = 0 judges nothing."""
+        self._arm = arm
+        self._settings = settings
+        self._error = settings.safety.first_motion_error
+        self._period_s = settings.bus.period_s
+        self._cycles = max(2, round(BLOCK_S / self._period_s))
+        # A command of cycle k acts from the next SYNC on, and the sample after that shows it; pipelined one later.
+        self._commands = np.zeros((4 if settings.bus.is_pipelined else 3, JOINTS))
+        self._sums = np.zeros((3, JOINTS))  # of dq, tau_J, tau_c
+        self._ends = np.zeros((3, JOINTS))  # q, dq, tau_c as the block began
+        self._seen = 0
+        self._blocks = 0
+        self._normal = np.zeros((JOINTS, _COLUMNS + 1, _COLUMNS + 1))
+        self._moving = [0] * JOINTS
+        self._path = np.zeros((2, JOINTS))  # Σ Δq ∫ dq dt, Σ (∫ dq dt)²
+        self._way_rad = np.zeros(JOINTS)
+        self._open = set(range(JOINTS)) if self._error > 0.0 else set[int]()
+        self._events: list[Event] = []
+        self.line = ""
+
+    @property
+    def is_on(self) -> bool:
+        """Whether a joint is still to be judged."""
+        return bool(self._open) and not self.line
+
+    def take_events(self) -> list[Event]:
+        """Return what is worth a line since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def note(self, arm: ArmState, state: SchemeState, tau_c: Vector) -> None:
+        """Take in a cycle; `tau_c` (2,): what was commanded in it, Nm. `state`: of the scheme before it."""
+        if not self.is_on:
+            return
+        commands = self._commands
+        commands[1:] = commands[:-1]
+        commands[0] = tau_c
+        is_usable = arm.is_complete and arm.periods == 1 and arm.steps == 1 and state in POWERED
+        if not is_usable or any(drive.is_limited for drive in self._arm.drives):
+            self._seen = 0
+            return
+        acting = commands[-1]
+        if self._seen == 0:
+            self._sums[:] = 0.0
+            self._ends[:] = arm.q, arm.dq, acting
+        self._seen += 1
+        self._sums += (arm.dq, arm.tau_J, acting)
+        if self._seen > self._cycles:
+            self._take_block(arm, acting)
+            self._seen = 0
+
+    def _take_block(self, arm: ArmState, acting: Vector) -> None:
+        span_s = self._cycles * self._period_s
+        q, dq, tau_c = self._ends
+        means = self._sums / self._seen
+        way = (self._sums[0] - 0.5 * (dq + arm.dq)) * self._period_s  # by the trapezoidal rule
+        self._path += (arm.q - q) * way, way * way
+        self._way_rad += np.abs(way)
+        ddq, lag = (arm.dq - dq) / span_s, (acting - tau_c) / span_s
+        for joint in range(JOINTS):
+            speed, other = means[0, joint], 1 - joint
+            if min(dq[joint] * speed, arm.dq[joint] * speed) > 0.0 and abs(speed) >= _MOVING_RAD_S:
+                sign = math.copysign(1.0, speed)
+                tau_J, own, cross = means[1, joint], means[2, joint], means[2, other]
+                row = np.array((own, cross, lag[joint], ddq[joint], speed, sign, 1.0, tau_J))
+                self._normal[joint] += row[:, np.newaxis] * row
+                self._moving[joint] += 1
+        self._blocks += 1
+        if self._blocks % _JUDGED_EVERY == 0:
+            self._judge()
+        if self._blocks >= _MOST_BLOCKS:
+            self._open.clear()
+
+    def _judge(self) -> None:
+        self.line = self._judge_position() or self._judge_torque()
+
+    def _judge_position(self) -> str:
+        for joint in range(JOINTS):
+            if self._way_rad[joint] < _LEAST_WAY_RAD:
+                continue
+            ratio = float(self._path[0, joint] / self._path[1, joint])
+            if not 1.0 - self._error <= ratio <= 1.0 / (1.0 - self._error):
+                return (
+                    f"joint {joint + 1}: its position moves {ratio:+.2f} times as far as its velocity says, "
+                    "+1 expected; correct scale.increments_per_joint_rev or scale.velocity_rad_s of "
+                    f"devices.drive[{joint}]"
+                )
+        return ""
+
+    def _judge_torque(self) -> str:
+        found = [
+            ratio_of(self._normal[joint], self._moving[joint]) if self._moving[joint] >= _FEWEST_BLOCKS else None
+            for joint in range(JOINTS)
+        ]
+        first, second = found
+        if first is not None and second is not None and first.is_of_other and second.is_of_other:
+            return (
+                "joints 1 and 2: each torque sensor measures what the drive of the other joint is commanded; exchange "
+                "devices.sensor_node if the sensors are at the wrong joints, devices.drive_node if the drives are"
+            )
+        for joint, ratio in enumerate(found):
+            if ratio is None or joint not in self._open or ratio.own_std > _SURE:
+                continue
+            slack = _DEVIATIONS * ratio.own_std
+            if ratio.own + slack < 1.0 - self._error or ratio.own - slack > 1.0 / (1.0 - self._error):
+                if abs(ratio.other) > 0.5:  # perhaps exchanged: the other joint tells
+                    continue
+                return self._describe(joint, ratio)
+            is_right = 1.0 - self._error <= ratio.own - slack and ratio.own + slack <= 1.0 / (1.0 - self._error)
+            if is_right and ratio.own_std <= _KNOWN:
+                self._close(joint, ratio)
+        return ""
+
+    def _close(self, joint: int, ratio: "TorqueRatio") -> None:
+        """Judge a joint no more; it is as it was told, or almost."""
+        self._open.remove(joint)
+        is_off = abs(ratio.own - 1.0) > _WARNED
+        text = (
+            f"joint {joint + 1}: its torque sensor measures {ratio.own:.2f} ± {ratio.own_std:.2f} times the commanded "
+            f"torque"
+        )
+        if is_off:
+            text += f"; check {self._scales(joint)}"
+        self._events.append(Event("warning" if is_off else "info", "first motion", text))
+
+    def _scales(self, joint: int) -> str:
+        rated_Nm = self._settings.arm.rated_torque_Nm[joint]
+        return (
+            f"scale.torque_Nm of devices.sensor[{joint}], arm.rated_torque_Nm[{joint}] = {rated_Nm:g} Nm and the "
+            "motor's torque constant"
+        )
+
+    def _describe(self, joint: int, ratio: "TorqueRatio") -> str:
+        head = f"joint {joint + 1}: its torque sensor measures {ratio.own:+.2f} times the commanded torque"
+        if ratio.own < 0.0:
+            return (
+                f"{head}, +1 expected: one of the two counts the other way than arm.sign[{joint}] says; reverse the "
+                f"sensor of devices.sensor_node[{joint}] by its maker's tool"
+            )
+        low, high = 1.0 - self._error, 1.0 / (1.0 - self._error)
+        return f"{head}, {low:.2f} to {high:.2f} allowed by safety.first_motion_error; correct {self._scales(joint)}"
+
+
+class TorqueRatio(NamedTuple):
+    """What a sensor measures of the torque that its own joint's drive is commanded, and of the other's."""
+
+    own: float
+    other: float
+    own_std: float
+    other_std: float
+
+    @property
+    def is_of_other(self) -> bool:
+        """Whether the sensor measures the other joint's torque and not its own."""
+        is_known = max(self.own_std, self.other_std) < 2.0 * _SURE
+        return is_known and abs(self.own) < 0.4 and abs(self.other) > 0.6
+
+
+def ratio_of(normal: NDArray[np.float64], blocks: int) -> TorqueRatio:
+    """Solve the normal equations (8, 8) of a joint that has moved in so many blocks."""
+    A, b, square = normal[:-1, :-1], normal[:-1, -1], float(normal[-1, -1])
+    size = np.sqrt(np.maximum(np.diag(A), 1e-12))
+    inverse = np.linalg.inv(A / np.outer(size, size) + 1e-9 * np.eye(_COLUMNS))
+    x = inverse @ (b / size)
+    left = max(square - float(x @ (b / size)), 0.0) / max(blocks - _COLUMNS, 1) * _CORRELATED
+    std = np.sqrt(left * np.diag(inverse)) / size
+    own, other = x[:2] / size[:2]
+    return TorqueRatio(float(own), float(other), float(std[_OWN]), float(std[_OTHER]))

@@ -1,0 +1,187 @@
+"""The first motion says what the host was told wrongly of its arm: each mistake is noticed, named, with its place."""
+
+import dataclasses
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from adacd_hil.analysis.replay.replay import replay
+from adacd_hil.api import LoadedRun, load
+from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.control.first_motion import FirstMotion
+from adacd_hil.control.session import SessionSummary
+from adacd_hil.records import ArmState, FaultReason, SchemeState
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.run_settings import RequestSettings
+
+pytestmark = pytest.mark.slow
+
+ARM = """
+extends = "certified"
+
+[arm]
+link_length_m = [0.4, 0.25]
+rated_torque_Nm = [12.0, 12.0]
+torque_limit_Nm = [12.0, 6.0]
+cad_theta = [0.2875, 0.05, 0.0208333, 0.0, 0.0, 0.0, 0.0]
+
+[devices]
+drive_node = [11, 12]
+sensor_node = [21, 22]
+contract = ""
+
+[controller]
+Kp = [402.4, 21.97]
+Kd = [20.12, 0.8239]
+"""
+BOTH_JUDGED_S = 4.0
+"""By then both joints of the right arms below are known."""
+
+
+def rehearse(folder: Path, truth: str = "", arm: str = ARM, lasts_s: float = BOTH_JUDGED_S) -> SessionSummary:
+    """Play the arm with what is true otherwise, TOML or the name of one of the package, to its end or a fault."""
+    config = folder / "my-arm.toml"
+    config.write_text(arm)
+    name = truth or None
+    if "=" in truth:
+        name = str(folder / "truth.toml")
+        Path(name).write_text(truth)
+    cast = resolve(str(config), "paper", None, None, name)
+    finish = (RequestSettings(at_s=lasts_s, request="finish"),)
+    operator = dataclasses.replace(cast.settings.operator, script=finish, acknowledge_faults=0)
+    settings = dataclasses.replace(cast.settings, operator=operator)
+    return run_embedded(cast._replace(settings=settings), "lockstep", folder / "run")[0]
+
+
+class Feed:
+    """The recorded motion of a right arm, to be changed as a wrong statement would have it, and judged again."""
+
+    def __init__(self, run: LoadedRun) -> None:
+        self.state = run.state
+        self.q, self.dq, self.tau_J, self.tau_c = (np.array(run[name]) for name in ("q", "dq", "tau_J", "tau_c"))
+
+    def judged(self) -> FirstMotion:
+        """Return who has judged it."""
+        judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=()))  # type: ignore[arg-type]
+        before = SchemeState.INIT
+        for row, state in enumerate(self.state.tolist()):
+            values = {"q": self.q[row], "dq": self.dq[row], "tau_J": self.tau_J[row]}
+            judge.note(BLANK._replace(**values), before, self.tau_c[row])
+            before = SchemeState(state)
+            if judge.line:
+                break
+        return judge
+
+
+BLANK = ArmState(0, 0, 1, np.zeros(2), np.zeros(2), np.zeros(2), (0, 0), (0, 0), True, True, FaultReason.NONE, steps=1)
+
+
+@pytest.fixture(scope="module")
+def right_run(tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
+    folder = tmp_path_factory.mktemp("right")
+    summary = rehearse(folder)
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.NONE
+    return load(folder / "run")
+
+
+@pytest.fixture
+def feed(right_run: LoadedRun) -> Feed:
+    return Feed(right_run)
+
+
+def lines_of(run: LoadedRun, level: str) -> list[str]:
+    return [event.message for event in run.events if event.name == "first motion" and event.level == level]
+
+
+def test_a_right_arm_is_left_alone_and_what_its_sensors_measure_is_logged(right_run: LoadedRun, feed: Feed) -> None:
+    assert [line[:7] for line in lines_of(right_run, "info")] == ["joint 1", "joint 2"]
+    assert lines_of(right_run, "warning") == []
+    assert feed.judged().line == ""
+
+
+TORQUE = r"joint (\d): its torque sensor measures ([+-][\d.]+) times the commanded torque"
+POSITION = r"joint (\d): its position moves ([+-][\d.]+) times as far as its velocity says"
+
+
+def check(line: str, pattern: str, joint: int, value: float) -> None:
+    found = re.search(pattern, line)
+    assert found is not None, line
+    assert int(found[1]) == joint
+    assert float(found[2]) == pytest.approx(value, rel=0.1)
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+@pytest.mark.parametrize("factor", [-1.0, 2.0, 0.5])
+def test_a_wrong_sign_or_scale_of_a_torque_sensor_is_named(feed: Feed, joint: int, factor: float) -> None:
+    feed.tau_J[:, joint - 1] *= factor
+    line = feed.judged().line
+    check(line, TORQUE, joint, factor)
+    assert f"devices.sensor{'_node' if factor < 0.0 else ''}[{joint - 1}]" in line
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+@pytest.mark.parametrize("factor", [1.5, 0.6, -1.0])
+def test_a_position_that_is_not_its_velocity_s_is_named(feed: Feed, joint: int, factor: float) -> None:
+    feed.q[:, joint - 1] *= factor
+    line = feed.judged().line
+    check(line, POSITION, joint, factor)
+    assert f"devices.drive[{joint - 1}]" in line
+
+
+def test_sensors_at_each_other_s_joint_are_named(feed: Feed) -> None:
+    feed.tau_J[:] = feed.tau_J[:, ::-1]
+    line = feed.judged().line
+    assert "joints 1 and 2: each torque sensor measures what the drive of the other joint is commanded" in line
+    assert "devices.sensor_node" in line
+
+
+def test_a_torque_constant_that_is_off_by_a_fifth_is_a_warning(feed: Feed) -> None:
+    feed.tau_c[:, 1] *= 1.2
+    judge = feed.judged()
+    assert judge.line == ""
+    [warning] = [event.message for event in judge.take_events() if event.level == "warning"]
+    assert warning.startswith("joint 2: its torque sensor measures 0.8")
+
+
+def test_noise_of_an_arm_that_is_touched_is_no_mistake(feed: Feed) -> None:
+    """The sensor is between motor and link: what pushes the link, the motor has to give, too."""
+    push_Nm = np.sin(np.arange(len(feed.state))[:, np.newaxis] / 150.0) * (5.0, 3.0)
+    feed.tau_J[2:] += push_Nm[:-2]
+    feed.tau_c += push_Nm
+    assert feed.judged().line == ""
+
+
+def test_a_mistake_that_would_be_certified_stops_the_arm_first_and_replays_to_the_same(tmp_path: Path) -> None:
+    summary = rehearse(tmp_path, "wrong-torque-constant")
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.MISCONFIGURED
+    run = load(tmp_path / "run")
+    assert run.certificates == ()
+    [line] = [event.message for event in run.events if "-> FAULT" in event.message]
+    check(line, TORQUE, 2, 0.5)
+    assert "arm.rated_torque_Nm[1] = 12 Nm and the motor's torque constant" in line
+    replayed = replay(summary.log.path)
+    assert replayed.compared > 0
+    assert replayed.mismatch_count == 0
+    assert replayed.states[-1].fault is FaultReason.MISCONFIGURED
+
+
+def test_rotors_friction_before_the_sensors_and_slow_drives_are_no_mistake(tmp_path: Path) -> None:
+    truth = """
+drives = { torque_constant_error = [0.1, -0.1], current_loop_Hz = [100.0, 100.0] }
+mechanics = { rotor_inertia_kg_m2 = [0.3, 0.02], motor_coulomb_Nm = [0.4, 0.2], motor_viscous_Nm_s = [0.2, 0.1] }
+"""
+    summary = rehearse(tmp_path, truth)
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.NONE
+    assert lines_of(load(tmp_path / "run"), "warning") == []
+
+
+def test_nothing_is_compared_where_the_user_says_so(tmp_path: Path) -> None:
+    summary = rehearse(tmp_path, "wrong-torque-constant", ARM + "\n[safety]\nfirst_motion_error = 0.0\n", lasts_s=1.0)
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.NONE
