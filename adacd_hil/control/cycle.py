@@ -16,10 +16,9 @@ from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.fault_recovery import FaultReport, SelfChecks, StopEscalation
 from adacd_hil.control.first_motion import FirstMotion
 from adacd_hil.control.gate import Gate, GateFlag
-from adacd_hil.control.operator import Operator
+from adacd_hil.control.operator import Operator, RunNarration
 from adacd_hil.control.pacing import DetectorTiming, Pacer
 from adacd_hil.control.reference import Reference
-from adacd_hil.control.run_narration import RunNarration
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import DataShares, DataWatch
 from adacd_hil.device.arm_watch import ArmWatch, Recurrence

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
-from firmware_sim.arm.own_arm import STRAIGHT, OwnArmSettings
+from firmware_sim.arm.arms import STRAIGHT, OwnArmSettings
 from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.bench.injector import Handler, Injector

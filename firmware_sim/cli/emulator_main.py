@@ -36,8 +36,7 @@ from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.own_devices import rehearse
 from firmware_sim.cli.scenario_list import check, describe_all, show
 from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal
-from firmware_sim.scenario.arm_truth import load_truth, truth_names
-from firmware_sim.scenario.scenario import Scenario, load_scenario
+from firmware_sim.scenario.scenario import Scenario, load_scenario, load_truth, truth_names
 
 
 class EmulatorExit(IntEnum):

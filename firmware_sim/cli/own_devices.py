@@ -16,9 +16,15 @@ from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.contract_frames import NOT_VALID
 from firmware_sim.canopen.object_dictionary import DeviceDescription, EmulatedContract, contract_of
-from firmware_sim.scenario.arm_truth import ArmTruth, load_truth
 from firmware_sim.scenario.rehearsal import DeviceCounts, compose_scenario, told_arm
-from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, read_table, resolve_scenario
+from firmware_sim.scenario.scenario import (
+    ArmTruth,
+    Scenario,
+    builtin_scenarios,
+    load_truth,
+    read_table,
+    resolve_scenario,
+)
 
 _CYCLIC_SYNCHRONOUS_TORQUE = 1 << 9  # of 0x6502
 _NEWTON_METRE = 0x00560100

@@ -24,7 +24,7 @@ from adacd_hil.settings.toml_files import builtin_names
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import STANDARD_GRAVITY_M_S2
 from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
-from firmware_sim.scenario.arm_truth import ArmTruth
+from firmware_sim.scenario.scenario import ArmTruth
 
 Pair = tuple[float, float]
 _MODEL: Final = ARMS["P"]

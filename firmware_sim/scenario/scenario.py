@@ -1,4 +1,4 @@
-"""A scenario: the arm, its contacts, its payload, its faults, and the expected outcome with a host.
+"""A scenario: the arm, its contacts, its payload, its faults, and the expected outcome with a host; truths beside it.
 
 Times count from the moment both drives are in Operation enabled. Scenarios are TOML files; those that come with the
 package are in the folder `scenarios`. `about`, `group`, `lasts_s`, `acknowledge_faults`, `expect` and
@@ -15,13 +15,17 @@ Ends of a run:
     fault      the host went to FAULT and nobody acknowledged it
     refused    the host did not put the devices into operation
     lost       the bus failed in operation, or nobody answered any more
+
+A truth says what the real arm is where the host is told otherwise, or nothing. The host never reads it. `[arm]` has
+values of their own; `[factor]` multiplies what the host is told; `[wiring]` exchanges and reverses devices;
+`[sensors]`, `[drives]` and `[mechanics]` are the sections of a scenario and are laid over them. A truth that comes with
+the package states one thing that a user gets wrong, of any arm.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from importlib import resources
-from importlib.resources.abc import Traversable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -29,9 +33,8 @@ import numpy as np
 from adacd_hil.records import FaultReason, Vector
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
-from firmware_sim.arm.arms import ARMS, ArmProfile
+from firmware_sim.arm.arms import ARMS, STRAIGHT, ArmProfile, OwnArmSettings, Wiring
 from firmware_sim.arm.hardware_settings import DriveSettings, MechanicsSettings, PayloadBody, SensorSettings
-from firmware_sim.arm.own_arm import STRAIGHT, OwnArmSettings, Wiring
 from firmware_sim.arm.touch_settings import BodySettings, ContactSettings, HandSettings, WallSettings, ticks
 from firmware_sim.scenario.faults import FaultSettings, check_rows
 
@@ -39,6 +42,8 @@ ENDS: Final = ("finished", "fault", "refused", "lost")
 REASONS: Final = tuple(reason.name for reason in FaultReason if reason is not FaultReason.NONE)
 
 Pair = tuple[float, float]
+_FOLDER: Final = resources.files("firmware_sim")
+"""Its folders `scenarios` and `truths` hold those that come with the package."""
 
 
 @dataclass(frozen=True)
@@ -284,11 +289,7 @@ class Scenario:
 
 def builtin_scenarios() -> list[str]:
     """Name the scenarios that come with the package."""
-    return toml_names(_builtin_folder())
-
-
-def _builtin_folder() -> Traversable:
-    return resources.files("firmware_sim") / "scenarios"
+    return toml_names(_FOLDER / "scenarios")
 
 
 def load_scenario(name_or_file: str, profile: str | None = None, seed: int | None = None) -> Scenario:
@@ -312,8 +313,12 @@ def resolve_scenario(
 
 def read_table(name_or_file: str) -> dict[str, Any]:
     """Read a scenario's TOML, unchecked but for its syntax. Raises ConfigError."""
-    path = find_toml("scenario", name_or_file, _builtin_folder())
-    table = read_toml(path, "scenario")
+    return _read("scenario", name_or_file)
+
+
+def _read(kind: str, name_or_file: str) -> dict[str, Any]:
+    path = find_toml(kind, name_or_file, _FOLDER / f"{kind}s")
+    table = read_toml(path, kind)
     table.setdefault("name", path.stem)
     return table
 
@@ -322,3 +327,91 @@ def named_profile(name_or_file: str) -> str | None:
     """Give the profile that a scenario's file names, unchecked; None where it leaves that open. Raises ConfigError."""
     profile = read_table(name_or_file).get("profile")
     return None if profile is None else str(profile)
+
+
+SCENARIO_SECTIONS = ("sensors", "drives", "mechanics")
+
+
+@dataclass(frozen=True)
+class TruthArmSettings:
+    """The arm itself; what is absent is as the host is told, or assumed. Pairs are by joint."""
+
+    link_length_m: Pair | None = setting(None, unit="m", low=0.01, high=5.0, meaning="joint to joint, joint 2 to tip")
+    mass_kg: Pair | None = setting(None, unit="kg", low=1e-4, high=1000.0, meaning="mass of each link")
+    center_m: Pair | None = setting(
+        None, unit="m", low=-5.0, high=5.0, meaning="centre of mass from the link's joint; absent: the middle"
+    )
+    inertia_kg_m2: Pair | None = setting(
+        None, unit="kg m²", low=0.0, high=1000.0, meaning="about the centre of mass; absent: a rod's"
+    )
+    viscous_Nm_s: Pair | None = setting(None, unit="Nm s/rad", low=0.0, high=1e4, meaning="viscous friction")
+    coulomb_Nm: Pair | None = setting(None, unit="Nm", low=0.0, high=1e3, meaning="Coulomb friction")
+    rated_torque_Nm: Pair | None = setting(
+        None, unit="Nm", low=0.1, high=1000.0, meaning="rated torque of each joint's drive, 0x6076"
+    )
+    brake_damping_Nm_s: Pair | None = setting(
+        None, unit="Nm s/rad", low=0.0, high=1e4, meaning="quick stop and fault: braking torque per rad/s"
+    )
+    stop_deg: Pair | None = setting(None, unit="deg", low=1.0, high=720.0, meaning="joint stops at ±")
+    torque_offset_Nm: Pair | None = setting(
+        None, unit="Nm", low=-50.0, high=50.0, meaning="zero error of the torque sensors"
+    )
+
+    def __post_init__(self) -> None:
+        for key in ("center_m", "inertia_kg_m2"):
+            if getattr(self, key) is not None and self.mass_kg is None:
+                raise ConfigError(f"`arm.{key}` needs `arm.mass_kg` beside it")
+
+
+@dataclass(frozen=True)
+class FactorSettings:
+    """What is multiplied, by joint; 1 leaves it."""
+
+    link_length: Pair = setting((1.0, 1.0), low=0.1, high=10.0, meaning="of the lengths; masses keep their shares")
+    mass: Pair = setting((1.0, 1.0), low=0.01, high=100.0, meaning="of the masses, and with them the inertia")
+    rated_torque: Pair = setting((1.0, 1.0), low=0.01, high=100.0, meaning="of the rated torque of each joint's drive")
+    torque_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the torque sensors' counts")
+    position_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the drives' counts of position")
+    velocity_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the drives' counts of velocity")
+
+
+SWAPS = ("nothing", "drives", "sensors", "joints")
+
+
+@dataclass(frozen=True)
+class WiringSettings:
+    """Which devices are elsewhere than the host is told."""
+
+    swapped: str = setting(
+        "nothing", choices=SWAPS, meaning="what is exchanged between the joints; `joints`: drives and sensors"
+    )
+    reversed_joint: tuple[bool, bool] = setting(
+        (False, False), meaning="joints whose drive and sensor both count the other way"
+    )
+    reversed_sensor: tuple[bool, bool] = setting((False, False), meaning="torque sensors that count the other way")
+
+
+@dataclass(frozen=True)
+class ArmTruth:
+    """What the host isn't told, resolved; `sections`: those of a scenario, as they were read."""
+
+    name: str = setting("", meaning="name of the truth")
+    about: str = setting("", meaning="what the host is told wrongly, in one line")
+    arm: TruthArmSettings = setting(TruthArmSettings, meaning="the arm")
+    factor: FactorSettings = setting(FactorSettings, meaning="factors on what the host is told")
+    wiring: WiringSettings = setting(WiringSettings, meaning="devices elsewhere than the host is told")
+
+
+def truth_names() -> list[str]:
+    """Name the truths that come with the package."""
+    return toml_names(_FOLDER / "truths")
+
+
+def load_truth(name_or_file: str) -> tuple[ArmTruth, dict[str, Any]]:
+    """Read a truth, a built-in name or a TOML file, and its sections of a scenario, unchecked. Raises ConfigError."""
+    table = _read("truth", name_or_file)
+    sections = {key: table.pop(key) for key in SCENARIO_SECTIONS if key in table}
+    try:
+        return parse(ArmTruth, table), sections
+    except ConfigError as error:
+        raise ConfigError(f"truth {name_or_file}: {error}") from None

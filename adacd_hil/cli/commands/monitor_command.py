@@ -10,7 +10,7 @@ from typing import Any
 from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.device.bus_view import BusView, MessageView, Snapshot
+from adacd_hil.device.survey import BusView, MessageView, Snapshot
 from adacd_hil.terminal import plain, write_screen
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
