@@ -29,7 +29,7 @@ from adacd_hil.device.network import Master
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Frame, Tap
-from adacd_hil.wire.traffic import LoadMeter
+from adacd_hil.wire.frame_time import LoadMeter
 
 
 class ZeroTorqueCycle(NamedTuple):

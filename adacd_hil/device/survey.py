@@ -20,7 +20,8 @@ from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Frame, Tap
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 from adacd_hil.wire.e2e import E2eStatus
-from adacd_hil.wire.traffic import LoadMeter, Talk, Traffic, listen
+from adacd_hil.wire.frame_time import LoadMeter
+from adacd_hil.wire.traffic import Talk, Traffic, listen
 
 LISTEN_S = 1.5
 """Default time to listen: longer than the usual heartbeat and status periods of up to 1 s."""

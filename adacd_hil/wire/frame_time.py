@@ -1,22 +1,34 @@
-"""How long a frame takes on the bus, exactly, at the pace of an emulated one.
+"""How long frames take on the bus, exactly: at the pace of an emulated one, and as the load of one that is listened to.
 
-The same count as `adacd_hil.wire.traffic.exact_frame`, from start of frame to the end of the intermission, but
-compiled, a byte at a time by table: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding.
+Compiled, a byte at a time by table: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding; what
+is counted, and CAN FD: `adacd_hil.wire.traffic`.
+
+The load is how much of the time frames take with the stuff bits that they really have. The bits of classic frames are
+those of can-utils' `canbusload -e`: from start of frame to the end of the intermission. CAN FD, which `canbusload -e`
+can't count, is measured likewise, each part of a frame at its own rate.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
-from adacd_hil.wire.traffic import CRC15, FRAME_LENGTHS, TAIL_BITS, unstuffed_fd_bits, worst_case_frame
+from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID, Frame
+from adacd_hil.wire.traffic import (
+    FRAME_LENGTHS,
+    TAIL_BITS,
+    FrameBits,
+    fd_head_bits,
+    unstuffed_fd_bits,
+    worst_case_frame,
+)
 
+_CRC_POLYNOMIAL: Final = 0x4599
 _HEAD_BITS: Final = 19  # start of frame, identifier, RTR, IDE, r0, DLC
 _EXTENDED_HEAD_BITS: Final = 39  # and SRR, 18 bits more of the identifier, r1
-_FD_HEAD_BITS: Final = 17  # start of frame, identifier, RRS, IDE, FDF, res, BRS
 _FD_CONTROL_BITS: Final = 5  # ESI, DLC
 
 FrameTime = Callable[[int, bytes], int]
@@ -48,7 +60,7 @@ def _crc_15() -> NDArray[np.int64]:
     """Tabulate the CRC of a classic frame by byte."""
     table = np.arange(256, dtype=np.int64) << 7
     for _ in range(8):
-        table = np.where(table & 0x4000, (table << 1) ^ CRC15, table << 1) & 0x7FFF
+        table = np.where(table & 0x4000, (table << 1) ^ _CRC_POLYNOMIAL, table << 1) & 0x7FFF
     return table
 
 
@@ -65,7 +77,7 @@ def _stuffed(head: int, head_bits: int, data: int, length: int) -> int:
     while left & 7:
         left -= 1
         bit = (head >> left) & 1
-        crc = ((crc << 1) ^ CRC15) & 0x7FFF if ((crc >> 14) ^ bit) & 1 else (crc << 1) & 0x7FFF
+        crc = ((crc << 1) ^ _CRC_POLYNOMIAL) & 0x7FFF if ((crc >> 14) ^ bit) & 1 else (crc << 1) & 0x7FFF
         step = _STUFF_1[state, bit]
         state, added = step & 7, added + (step >> 3)
     for place in range(left // 8 + length):
@@ -90,20 +102,20 @@ def _classic_bits(can_id: int, data: int, length: int) -> int:
 
 
 @compiled
-def _fd_stuff_bits(head: int, body: NDArray[np.uint8], code: int) -> tuple[int, int]:
+def _fd_stuff_bits(head: int, head_bits: int, body: NDArray[np.uint8], code: int) -> tuple[int, int]:
     """Count the dynamic stuff bits of an FD frame: up to BRS, and from there to the end of the data."""
     run = 0
     last = -1
     before = 0
     after = 0
-    total = _FD_HEAD_BITS + _FD_CONTROL_BITS + 8 * body.size
+    total = head_bits + _FD_CONTROL_BITS + 8 * body.size
     for place in range(total):
-        if place < _FD_HEAD_BITS:
-            bit = (head >> (_FD_HEAD_BITS - 1 - place)) & 1
-        elif place < _FD_HEAD_BITS + _FD_CONTROL_BITS:
-            bit = (code >> (_FD_HEAD_BITS + _FD_CONTROL_BITS - 1 - place)) & 1
+        if place < head_bits:
+            bit = (head >> (head_bits - 1 - place)) & 1
+        elif place < head_bits + _FD_CONTROL_BITS:
+            bit = (code >> (head_bits + _FD_CONTROL_BITS - 1 - place)) & 1
         else:
-            index = place - _FD_HEAD_BITS - _FD_CONTROL_BITS
+            index = place - head_bits - _FD_CONTROL_BITS
             bit = (body[index >> 3] >> (7 - (index & 7))) & 1
         if bit == last:
             run += 1
@@ -112,7 +124,7 @@ def _fd_stuff_bits(head: int, body: NDArray[np.uint8], code: int) -> tuple[int, 
             last = bit
         # The fixed stuff bit that begins the CRC field stands for a dynamic one after the last bit of the data.
         if run == 5 and place < total - 1:
-            if place < _FD_HEAD_BITS:
+            if place < head_bits:
                 before += 1
             else:
                 after += 1
@@ -121,34 +133,41 @@ def _fd_stuff_bits(head: int, body: NDArray[np.uint8], code: int) -> tuple[int, 
     return before, after
 
 
+def exact_frame(can_id: int, data: bytes) -> FrameBits:
+    """Bits of this frame of an error active sender, classic up to 8 bytes; identifiers beyond 0x7FF are 29-bit ones.
+
+    Where the data of CAN FD end with five equal bits, the fixed stuff bit that begins the CRC field stands for the
+    dynamic one. Raises ValueError when no such frame exists.
+    """
+    length, is_extended = len(data), can_id > MAX_STANDARD_ID
+    if length <= CLASSIC_BYTES:
+        return FrameBits(_classic_bits(can_id, int.from_bytes(data, "big", signed=True), length))
+    plain = unstuffed_fd_bits(length, is_extended)
+    # SOF, base, SRR, IDE, extension, RRS, FDF, res, BRS; or SOF, identifier, RRS, IDE, FDF, res, BRS
+    extended = (((can_id >> 18) << 2 | 3) << 18 | can_id & 0x3FFFF) << 4 | 0b0101
+    head = extended if is_extended else can_id << 5 | 0b00101
+    body = np.frombuffer(data, np.uint8)
+    before, after = _fd_stuff_bits(head, fd_head_bits(is_extended), body, FRAME_LENGTHS.index(length))
+    return FrameBits(plain.nominal + before, plain.data + after)
+
+
 def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
     """Make the exact time of frames at rates in bit/s, in ns, rounded up per rate.
 
     The result raises ValueError for a length that no frame has. Frames of more than 8 bytes are CAN FD with rate
-    switch and 11-bit identifier.
+    switch.
     """
     classic_bits = _classic_bits
-    bits_to_ns = _round_up(bitrate)
     whole_ns = 1_000_000_000 // bitrate if 1_000_000_000 % bitrate == 0 else 0
-
-    def fd(can_id: int, data: bytes) -> int:
-        plain = unstuffed_fd_bits(len(data))
-        body = np.frombuffer(data, dtype=np.uint8)
-        before, after = _fd_stuff_bits(can_id << 5 | 0b00101, body, FRAME_LENGTHS.index(len(data)))
-        return bits_to_ns(plain.nominal + before) - (-(plain.data + after) * 1_000_000_000 // data_bitrate)
 
     def exact(can_id: int, data: bytes, from_bytes: Callable[..., int] = int.from_bytes) -> int:
         length = len(data)
         if length > CLASSIC_BYTES:
-            return fd(can_id, data)
+            return exact_frame(can_id, data).duration_ns(bitrate, data_bitrate)
         bits = classic_bits(can_id, from_bytes(data, "big", signed=True), length)
-        return bits * whole_ns if whole_ns else bits_to_ns(bits)
+        return bits * whole_ns if whole_ns else -(-bits * 1_000_000_000 // bitrate)
 
     return exact
-
-
-def _round_up(bitrate: int) -> Callable[[int], int]:
-    return lambda bits: -(-bits * 1_000_000_000 // bitrate)
 
 
 def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
@@ -163,3 +182,64 @@ def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
         return found
 
     return time_ns
+
+
+@dataclass(frozen=True)
+class Load:
+    """What passed in an interval."""
+
+    interval_ns: int
+    frames: int
+    bits: FrameBits
+    payload_bits: int
+    bitrate: int
+    data_bitrate: int
+
+    @property
+    def percent(self) -> float:
+        """Share of the interval in which the bus was taken, in percent; 0 for an empty interval."""
+        if self.interval_ns <= 0:
+            return 0.0
+        return 100.0 * self.bits.duration_s(self.bitrate, self.data_bitrate) / (self.interval_ns * 1e-9)
+
+
+class LoadMeter:
+    """Counts frames; `take` returns the load since the last call. For `monitor`, not the cycle.
+
+    Error frames don't count: what they took of the bus isn't known. Identifiers above 0x7FF are taken as extended.
+    """
+
+    def __init__(self, bitrate: int, data_bitrate: int = 0, start_ns: int | None = None) -> None:
+        """Count at rates in bit/s, from `start_ns` (default: the first frame) on. Raises ValueError for a rate of 0."""
+        if bitrate <= 0:
+            raise ValueError(f"bitrate = {bitrate} bit/s is not above 0 bit/s")
+        exact_frame(0, bytes(FRAME_LENGTHS[-1] if data_bitrate else 0))  # compiled before the first frame comes
+        self._bitrate = bitrate
+        self._data_bitrate = data_bitrate
+        self._start_ns = start_ns
+        self._frames = self._nominal = self._data = self._payload = 0
+
+    def add(self, frame: Frame) -> None:
+        """Count a frame. Raises ValueError for one that can't be: no such length, or CAN FD without a data bit rate."""
+        if frame.is_error:
+            return
+        bits = exact_frame(frame.can_id, frame.data)
+        if bits.data and self._data_bitrate <= 0:
+            raise ValueError(
+                f"frame 0x{frame.can_id:X} has {len(frame.data)} bytes: CAN FD, but no data bit rate is given"
+            )
+        if self._start_ns is None:
+            self._start_ns = frame.t_ns
+        self._frames += 1
+        self._nominal += bits.nominal
+        self._data += bits.data
+        self._payload += 8 * len(frame.data)
+
+    def take(self, t_ns: int) -> Load:
+        """Return the load from the last call until now, and begin anew."""
+        interval_ns = 0 if self._start_ns is None else t_ns - self._start_ns
+        bits = FrameBits(self._nominal, self._data)
+        load = Load(interval_ns, self._frames, bits, self._payload, self._bitrate, self._data_bitrate)
+        self._start_ns = t_ns
+        self._frames = self._nominal = self._data = self._payload = 0
+        return load

@@ -1,6 +1,6 @@
-"""Lengths of CAN frames in bits, who sends what on a bus, and how much of the bus it takes.
+"""Lengths of CAN frames in bits, and who sends what on a bus.
 
-**Lengths**: without stuffing, at worst, and exactly.
+**Lengths**: without stuffing, and at worst; exactly: `adacd_hil.wire.frame_time`.
 All counts go from start of frame to the end of the intermission (3 bits), after which the next frame can begin, and are
 of data frames (no remote frames). Source: ISO 11898-1, frame formats and frame coding; the worst case of classic
 frames: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited and
@@ -11,30 +11,20 @@ In CAN FD the bits from BRS to the CRC delimiter run at the data bit rate. Each 
 its sample point; together they last as long as one bit of either rate, so BRS is counted as nominal and the CRC
 delimiter as data. The CRC field of CAN FD has stuff bits at fixed places, so its length doesn't depend on its value.
 
-**Traffic**: every identifier seen, with count, rate, lengths and its last frame; and the live load: how much of the
-time frames take with the stuff bits that they really have. The bits of classic frames are those of can-utils'
-`canbusload -e`: from start of frame to the end of the intermission. CAN FD, which `canbusload -e` can't count, is
-measured likewise, each part of a frame at its own rate.
+**Traffic**: every identifier seen, with count, rate, lengths and its last frame.
 """
 
-import functools
-import re
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from adacd_hil.clock import Clock
-from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS, MAX_STANDARD_ID, Bus, Frame
+from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS, Bus, Frame
 
 FRAME_LENGTHS = (*range(CLASSIC_BYTES + 1), *FD_LENGTHS)
 """Bytes that CAN FD can carry, by data length code."""
-CRC15 = 0x4599
 TAIL_BITS = 3 + 7 + 3  # CRC delimiter, acknowledgement, its delimiter; end of frame; intermission
 _FD_TAIL_BITS = 2 + 7 + 3  # the CRC delimiter is a data bit
 _LONG_CRC_BYTES = 16  # CRC-17 up to here, CRC-21 above
-
-# Every match is a run of bits that causes stuff bits: one after five equal bits; that stuff bit and four more equal to
-# it cause the next.
-_STUFFED = re.compile("0{5}(?:1{4}0{4})*(?:1{4})?|1{5}(?:0{4}1{4})*(?:0{4})?")
 
 
 class FrameBits(NamedTuple):
@@ -69,25 +59,14 @@ def worst_case_bits(length: int, is_extended: bool = False) -> int:
     return stuffable + TAIL_BITS + (stuffable - 1) // 4
 
 
-def exact_bits(can_id: int, data: bytes, is_extended: bool = False) -> int:
-    """Bits of this classic frame. Raises ValueError over 8 bytes."""
-    _check_classic(len(data))
-    # SOF, base, SRR, IDE, extension, RTR, r1, r0; or SOF, identifier, RTR, IDE, r0
-    extended = ((can_id >> 18 & 0x7FF) << 2 | 3) << 21 | (can_id & 0x3FFFF) << 3
-    head = extended if is_extended else (can_id & 0x7FF) << 3
-    content = (head << 4 | len(data)) << 8 * len(data) | int.from_bytes(data)
-    count = _stuffable_bits(len(data), is_extended)
-    # Leading zeros don't change a CRC that starts at zero, so the bits may be taken as whole bytes.
-    crc = _crc15(content.to_bytes((count - 15 + 7) // 8))
-    return count + TAIL_BITS + _count_stuff_bits(f"{content << 15 | crc:0{count}b}")
-
-
 def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
     """Bits of a CAN FD frame, dynamic stuff bits left out. Raises ValueError when no such frame exists."""
-    _check_fd(length)
+    if length not in FRAME_LENGTHS:
+        above = next((known for known in FRAME_LENGTHS if known > length), FRAME_LENGTHS[-1])
+        raise ValueError(f"a CAN FD frame can't have {length} bytes; next possible: {above}")
     crc, fixed_stuff = (17, 6) if length <= _LONG_CRC_BYTES else (21, 7)
     # ESI, DLC, data; stuff count; CRC with its fixed stuff bits; CRC delimiter
-    return FrameBits(_fd_head_bits(is_extended) + _FD_TAIL_BITS, 5 + 8 * length + 4 + crc + fixed_stuff + 1)
+    return FrameBits(fd_head_bits(is_extended) + _FD_TAIL_BITS, 5 + 8 * length + 4 + crc + fixed_stuff + 1)
 
 
 def worst_case_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
@@ -97,27 +76,10 @@ def worst_case_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
     rate switches are counted there, where they take longest. Raises ValueError when no such frame exists.
     """
     plain = unstuffed_fd_bits(length, is_extended)
-    head = _fd_head_bits(is_extended)
+    head = fd_head_bits(is_extended)
     stuff = (head + 5 + 8 * length - 1) // 4
     nominal_stuff = (head - 1) // 4
     return FrameBits(plain.nominal + nominal_stuff, plain.data + stuff - nominal_stuff)
-
-
-def exact_fd_bits(can_id: int, data: bytes, is_extended: bool = False) -> FrameBits:
-    """Bits of this CAN FD frame of an error active sender. Raises ValueError when no such frame exists.
-
-    Where the data end with five equal bits, the fixed stuff bit that begins the CRC field stands for the dynamic one.
-    """
-    plain = unstuffed_fd_bits(len(data), is_extended)
-    if is_extended:  # SOF, base, SRR, IDE, extension, RRS, FDF, res, BRS
-        head = (((can_id >> 18 & 0x7FF) << 2 | 3) << 18 | (can_id & 0x3FFFF)) << 4 | 0b0101
-    else:  # SOF, identifier, RRS, IDE, FDF, res, BRS
-        head = (can_id & 0x7FF) << 5 | 0b00101
-    # BRS is 1, ESI 0: no run of equal bits crosses the border of the rates.
-    body = f"{FRAME_LENGTHS.index(len(data)) << 8 * len(data) | int.from_bytes(data):0{5 + 8 * len(data)}b}"
-    stuff = _count_stuff_bits(body) - any(match.end() == len(body) for match in _STUFFED.finditer(body))
-    head_stuff = _count_stuff_bits(f"{head:0{_fd_head_bits(is_extended)}b}")
-    return FrameBits(plain.nominal + head_stuff, plain.data + stuff)
 
 
 def unstuffed_frame(length: int, is_extended: bool = False) -> FrameBits:
@@ -134,57 +96,16 @@ def worst_case_frame(length: int, is_extended: bool = False) -> FrameBits:
     return FrameBits(worst_case_bits(length, is_extended))
 
 
-def exact_frame(can_id: int, data: bytes, is_extended: bool = False) -> FrameBits:
-    """Bits of this frame, classic up to 8 bytes. Raises ValueError."""
-    if len(data) > CLASSIC_BYTES:
-        return exact_fd_bits(can_id, data, is_extended)
-    return FrameBits(exact_bits(can_id, data, is_extended))
-
-
-def _check_classic(length: int) -> None:
-    if not 0 <= length <= CLASSIC_BYTES:
-        raise ValueError(f"a classic frame can't have {length} bytes, at most {CLASSIC_BYTES}")
-
-
-def _check_fd(length: int) -> None:
-    if length not in FRAME_LENGTHS:
-        above = next((known for known in FRAME_LENGTHS if known > length), FRAME_LENGTHS[-1])
-        raise ValueError(f"a CAN FD frame can't have {length} bytes; next possible: {above}")
-
-
 def _stuffable_bits(length: int, is_extended: bool) -> int:
     """Start of frame to CRC."""
-    _check_classic(length)
+    if not 0 <= length <= CLASSIC_BYTES:
+        raise ValueError(f"a classic frame can't have {length} bytes, at most {CLASSIC_BYTES}")
     return (54 if is_extended else 34) + 8 * length
 
 
-def _fd_head_bits(is_extended: bool) -> int:
+def fd_head_bits(is_extended: bool) -> int:
     """Start of frame to BRS."""
     return 36 if is_extended else 17
-
-
-def _count_stuff_bits(bits: str) -> int:
-    return sum([(len(run) - 1) // 4 for run in _STUFFED.findall(bits)])
-
-
-@functools.cache
-def _crc15_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = byte << 7
-        for _ in range(8):
-            crc = crc << 1 ^ (CRC15 if crc & 0x4000 else 0)
-        table.append(crc & 0x7FFF)
-    return tuple(table)
-
-
-def _crc15(content: bytes) -> int:
-    """CRC of a classic frame: polynomial 0x4599, initial value 0, most significant bit first."""
-    table = _crc15_table()
-    crc = 0
-    for byte in content:
-        crc = (crc << 8 ^ table[crc >> 7 ^ byte]) & 0x7FFF
-    return crc
 
 
 _SLICE_S = 0.02
@@ -262,63 +183,3 @@ def listen(bus: Bus, clock: Clock, duration_s: float, traffic: Traffic) -> None:
     end_ns = clock.now_ns() + round(duration_s * 1e9)
     while (frame := receive_until(bus, clock, end_ns)) is not None:
         traffic.accept(frame)
-
-
-@dataclass(frozen=True)
-class Load:
-    """What passed in an interval."""
-
-    interval_ns: int
-    frames: int
-    bits: FrameBits
-    payload_bits: int
-    bitrate: int
-    data_bitrate: int
-
-    @property
-    def percent(self) -> float:
-        """Share of the interval in which the bus was taken, in percent; 0 for an empty interval."""
-        if self.interval_ns <= 0:
-            return 0.0
-        return 100.0 * self.bits.duration_s(self.bitrate, self.data_bitrate) / (self.interval_ns * 1e-9)
-
-
-class LoadMeter:
-    """Counts frames; `take` returns the load since the last call. About 10 µs per frame: for `monitor`, not the cycle.
-
-    Error frames don't count: what they took of the bus isn't known. Identifiers above 0x7FF are taken as extended.
-    """
-
-    def __init__(self, bitrate: int, data_bitrate: int = 0, start_ns: int | None = None) -> None:
-        """Count at rates in bit/s, from `start_ns` (default: the first frame) on. Raises ValueError for a rate of 0."""
-        if bitrate <= 0:
-            raise ValueError(f"bitrate = {bitrate} bit/s is not above 0 bit/s")
-        self._bitrate = bitrate
-        self._data_bitrate = data_bitrate
-        self._start_ns = start_ns
-        self._frames = self._nominal = self._data = self._payload = 0
-
-    def add(self, frame: Frame) -> None:
-        """Count a frame. Raises ValueError for one that can't be: no such length, or CAN FD without a data bit rate."""
-        if frame.is_error:
-            return
-        bits = exact_frame(frame.can_id, frame.data, frame.can_id > MAX_STANDARD_ID)
-        if bits.data and self._data_bitrate <= 0:
-            raise ValueError(
-                f"frame 0x{frame.can_id:X} has {len(frame.data)} bytes: CAN FD, but no data bit rate is given"
-            )
-        if self._start_ns is None:
-            self._start_ns = frame.t_ns
-        self._frames += 1
-        self._nominal += bits.nominal
-        self._data += bits.data
-        self._payload += 8 * len(frame.data)
-
-    def take(self, t_ns: int) -> Load:
-        """Return the load from the last call until now, and begin anew."""
-        interval_ns = 0 if self._start_ns is None else t_ns - self._start_ns
-        bits = FrameBits(self._nominal, self._data)
-        load = Load(interval_ns, self._frames, bits, self._payload, self._bitrate, self._data_bitrate)
-        self._start_ns = t_ns
-        self._frames = self._nominal = self._data = self._payload = 0
-        return load

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adacd_hil.wire.frame_time import exact_time, worst_time
-from adacd_hil.wire.traffic import FRAME_LENGTHS, exact_frame, worst_case_frame
+from adacd_hil.wire.frame_time import exact_frame, exact_time, worst_time
+from adacd_hil.wire.traffic import FRAME_LENGTHS, worst_case_frame
 
 RATE, DATA_RATE = 1_000_000, 5_000_000
 CLASSIC = exact_time(RATE)
@@ -24,7 +24,7 @@ def test_a_classic_frame_takes_its_exact_bits(can_id: int, content: list[int]) -
 @given(st.integers(0x800, 0x1FFFFFFF), BYTES.filter(lambda content: len(content) <= 8))
 def test_an_identifier_beyond_11_bits_makes_the_frame_longer(can_id: int, content: list[int]) -> None:
     data = bytes(content)
-    assert CLASSIC(can_id, data) == exact_frame(can_id, data, is_extended=True).duration_ns(RATE)
+    assert CLASSIC(can_id, data) == exact_frame(can_id, data).duration_ns(RATE)
 
 
 @pytest.mark.parametrize("length", [length for length in FRAME_LENGTHS if length > 8])

@@ -4,11 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from adacd_hil.wire.frame_time import exact_frame
 from adacd_hil.wire.traffic import (
     FRAME_LENGTHS,
     FrameBits,
-    exact_bits,
-    exact_fd_bits,
     unstuffed_bits,
     unstuffed_fd_bits,
     worst_case_bits,
@@ -16,8 +15,12 @@ from adacd_hil.wire.traffic import (
 )
 
 BASE_ID = st.integers(0, 0x7FF)
-EXTENDED_ID = st.integers(0, 0x1FFFFFFF)
-FD_DATA = st.sampled_from(FRAME_LENGTHS).flatmap(lambda length: st.binary(min_size=length, max_size=length))
+EXTENDED_ID = st.integers(0x800, 0x1FFFFFFF)
+FD_DATA = st.sampled_from(FRAME_LENGTHS[9:]).flatmap(lambda length: st.binary(min_size=length, max_size=length))
+# Bytes that make long runs of equal bits, so that stuffing is at its densest, and any.
+DENSE = st.sampled_from([0x00, 0xFF, 0x0F, 0xF0, 0x1F, 0xC1, 0x83, 0x55]) | st.integers(0, 255)
+DATA = st.lists(DENSE, max_size=8).map(bytes)
+exact_frame(0, b""), exact_frame(0, bytes(12))  # compiled before hypothesis looks at the time
 
 
 def to_bits(value: int, count: int) -> list[int]:
@@ -73,7 +76,7 @@ def test_lengths_without_stuffing_are_47_and_67_bits_and_the_data() -> None:
 
 def test_a_frame_of_zeros_is_stuffed_after_every_fifth_bit() -> None:
     # Identifier 0, no data: 19 zeros, and the CRC of zeros is zero: 34 bits, 6 whole runs of 5.
-    assert exact_bits(0, b"") == 47 + 6
+    assert exact_frame(0, b"") == FrameBits(47 + 6)
 
 
 def test_the_lengths_of_a_can_fd_frame_by_hand() -> None:
@@ -86,7 +89,7 @@ def test_the_lengths_of_a_can_fd_frame_by_hand() -> None:
 
 
 def test_data_that_end_with_five_equal_bits_get_the_fixed_stuff_bit_only() -> None:
-    assert exact_fd_bits(0x555, bytes(11) + b"\x10").data == exact_fd_bits(0x555, bytes(11) + b"\x20").data
+    assert exact_frame(0x555, bytes(11) + b"\x10").data == exact_frame(0x555, bytes(11) + b"\x20").data
 
 
 @pytest.mark.parametrize("length", [9, 13, 65, -1])
@@ -97,7 +100,9 @@ def test_a_length_that_no_can_fd_frame_has_is_refused(length: int) -> None:
 
 def test_nine_bytes_are_too_many_for_a_classic_frame() -> None:
     with pytest.raises(ValueError, match="a classic frame can't have 9 bytes, at most 8"):
-        exact_bits(1, bytes(9))
+        worst_case_bits(9)
+    with pytest.raises(ValueError, match="a CAN FD frame can't have 9 bytes"):
+        exact_frame(1, bytes(9))
 
 
 def test_times_are_rounded_up_to_whole_nanoseconds() -> None:
@@ -106,24 +111,22 @@ def test_times_are_rounded_up_to_whole_nanoseconds() -> None:
 
 
 @pytest.mark.slow
-@given(can_id=BASE_ID, data=st.binary(max_size=8))
+@given(can_id=BASE_ID, data=DATA)
 def test_a_base_frame_is_as_long_as_its_bits_put_one_after_the_other(can_id: int, data: bytes) -> None:
     bits = encode_classic(can_id, data, is_extended=False)
-    assert exact_bits(can_id, data) == len(bits) + count_stuff_bits(bits) + 13
+    assert exact_frame(can_id, data) == FrameBits(len(bits) + count_stuff_bits(bits) + 13)
 
 
-@given(can_id=EXTENDED_ID, data=st.binary(max_size=8))
+@given(can_id=EXTENDED_ID, data=DATA)
 def test_an_extended_frame_is_as_long_as_its_bits_put_one_after_the_other(can_id: int, data: bytes) -> None:
     bits = encode_classic(can_id, data, is_extended=True)
-    assert exact_bits(can_id, data, is_extended=True) == len(bits) + count_stuff_bits(bits) + 13
+    assert exact_frame(can_id, data) == FrameBits(len(bits) + count_stuff_bits(bits) + 13)
 
 
 @pytest.mark.slow
-@given(can_id=EXTENDED_ID, data=FD_DATA, is_extended=st.booleans())
-def test_a_can_fd_frame_is_as_long_as_its_bits_put_one_after_the_other(
-    can_id: int, data: bytes, is_extended: bool
-) -> None:
-    if is_extended:
+@given(can_id=BASE_ID | EXTENDED_ID, data=FD_DATA)
+def test_a_can_fd_frame_is_as_long_as_its_bits_put_one_after_the_other(can_id: int, data: bytes) -> None:
+    if can_id > 0x7FF:
         head = [0, *to_bits(can_id >> 18, 11), 1, 1, *to_bits(can_id, 18), 0, 1, 0, 1]
     else:
         head = [0, *to_bits(can_id, 11), 0, 0, 1, 0, 1]
@@ -133,20 +136,19 @@ def test_a_can_fd_frame_is_as_long_as_its_bits_put_one_after_the_other(
     nominal = len(head) + count_stuff_bits(head)
     stuffed = len(dynamic) + count_stuff_bits(dynamic[:-1])
     crc_field = 4 + 17 + 6 if len(data) <= 16 else 4 + 21 + 7
-    found = exact_fd_bits(can_id if is_extended else can_id & 0x7FF, data, is_extended)
-    assert found == FrameBits(nominal + 2 + 7 + 3, stuffed - nominal + crc_field + 1)
+    assert exact_frame(can_id, data) == FrameBits(nominal + 2 + 7 + 3, stuffed - nominal + crc_field + 1)
 
 
 @pytest.mark.slow
-@given(can_id=BASE_ID, data=st.binary(max_size=8))
+@given(can_id=BASE_ID, data=DATA)
 def test_no_frame_is_longer_than_the_worst_case(can_id: int, data: bytes) -> None:
-    assert unstuffed_bits(len(data)) <= exact_bits(can_id, data) <= worst_case_bits(len(data))
+    assert unstuffed_bits(len(data)) <= exact_frame(can_id, data).total <= worst_case_bits(len(data))
 
 
 @pytest.mark.slow
-@given(can_id=EXTENDED_ID, data=FD_DATA, is_extended=st.booleans(), rate=st.sampled_from([1, 2, 5, 8]))
-def test_no_can_fd_frame_is_longer_than_the_worst_case(can_id: int, data: bytes, is_extended: bool, rate: int) -> None:
-    exact, worst = exact_fd_bits(can_id, data, is_extended), worst_case_fd_bits(len(data), is_extended)
+@given(can_id=BASE_ID | EXTENDED_ID, data=FD_DATA, rate=st.sampled_from([1, 2, 5, 8]))
+def test_no_can_fd_frame_is_longer_than_the_worst_case(can_id: int, data: bytes, rate: int) -> None:
+    exact, worst = exact_frame(can_id, data), worst_case_fd_bits(len(data), can_id > 0x7FF)
     assert exact.nominal <= worst.nominal
     assert exact.total <= worst.total
     assert exact.duration_ns(1_000_000, rate * 1_000_000) <= worst.duration_ns(1_000_000, rate * 1_000_000)
@@ -169,11 +171,11 @@ def most_stuff_bits(length: int) -> int:
 
 def test_a_frame_built_for_it_has_the_most_stuff_bits_that_the_format_allows() -> None:
     # 0 0000 0111 11|.., then runs of four to the end of the data; identifier and data picked so that the CRC goes on.
-    found = exact_bits(0x01F, bytes.fromhex("8787c1e1e1e1e1")) - unstuffed_bits(7)
+    found = exact_frame(0x01F, bytes.fromhex("8787c1e1e1e1e1")).total - unstuffed_bits(7)
     assert found == most_stuff_bits(7)
     # The formula is one more: it doesn't know that the control field is fixed.
     assert found == worst_case_bits(7) - unstuffed_bits(7) - 1
 
 
 def test_the_longest_known_frame_of_8_bytes_is_two_bits_short_of_the_formula() -> None:
-    assert exact_bits(0x07C, bytes.fromhex("01e1e1e1f0787878")) == worst_case_bits(8) - 2
+    assert exact_frame(0x07C, bytes.fromhex("01e1e1e1f0787878")).total == worst_case_bits(8) - 2
