@@ -1,12 +1,14 @@
 """Opens a report in headless Chromium: lists its complaints, its requests to the network, and when it was drawn.
 
     python tools/browse_report.py runs/demo/report.html                 what was seen, one line each
-    python tools/browse_report.py runs/demo/report.html --out pictures  light.png, dark.png, zoomed.png, print.pdf
+    python tools/browse_report.py runs/demo/report.html --out pictures  light.png, dark.png, zoomed.png, print.pdf, and
+                                                                        phone.png, 420 px wide
     python tools/browse_report.py runs/demo/report.html --limit-s 2     fails when it takes longer to be drawn
 
 Chromium has no network but its own process, and a profile that is thrown away. Drawn: everything in view has been
 painted, and all traces if the page has any, counted from the beginning of the navigation. Exit status: 0 nothing to
-complain of, 1 an error on the console, a request, traces that were not drawn or too late, 2 wrong usage or no Chromium.
+complain of, 1 an error on the console, a request, traces that were not drawn or too late, a page or a table wider than
+a phone, 2 wrong usage or no Chromium.
 """
 
 import argparse
@@ -42,8 +44,19 @@ CLOSER = """new Promise((resolve) => {
   contact.click();
   requestAnimationFrame(() => requestAnimationFrame(() => resolve(performance.now() - began)));
 })"""
+SETTLED = "new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)))"
 REHEARSAL = "for (const when of ['beforeprint', 'afterprint']) dispatchEvent(new Event(when))"
 """What a page does to be printed and after it, without the printing."""
+PHONE_PX = 420
+WIDER = """(() => {
+  const most = document.documentElement.clientWidth;
+  const tables = [...document.querySelectorAll("table, .scroll:has(table)")];
+  const wide = tables.filter((box) => box.scrollWidth > box.clientWidth + 1);
+  const page = document.documentElement.scrollWidth;
+  const boxes = wide.map((box) => `a table ${box.scrollWidth} px wide: ${box.innerText.slice(0, 40).split("\\n")[0]}`);
+  return (page > most ? [`the page ${page} px wide`] : []).concat(boxes);
+})()"""
+"""What is wider than the screen, and not a figure in a box of its own."""
 TOP_OF_TRACES = """(() => {
   const box = document.querySelector(".bar").getBoundingClientRect();
   return [box.left + scrollX, box.top + scrollY];
@@ -158,7 +171,12 @@ def browse(page: Path, out: Path | None = None) -> Seen:
             left, top = tab.evaluate(TOP_OF_TRACES)
             clip = {"x": left - 20, "y": top - 60, "width": 1160, "height": 2000, "scale": 1}
             _save(tab, out / "zoomed.png", clip)
-        complaints, requests = _complaints(tab.events), _requests(tab.events)
+        tab.ask("Emulation.setDeviceMetricsOverride", **{**size, "width": PHONE_PX, "mobile": True})
+        tab.evaluate(SETTLED)
+        wider = [f"on {PHONE_PX} px: {what}" for what in tab.evaluate(WIDER)]
+        if out is not None:
+            _save(tab, out / "phone.png", _whole(tab, PHONE_PX))
+        complaints, requests = [*_complaints(tab.events), *wider], _requests(tab.events)
     if not has_traces and 'id="trace-plan"' in page.read_text(encoding="utf-8"):
         complaints.append("the traces were not drawn")
     return Seen(drawn_s, closer_ms, complaints, requests, page.stat().st_size * 1e-6)
@@ -171,13 +189,17 @@ def _colours(tab: Tab, scheme: str) -> None:
 def _take_pictures(tab: Tab, out: Path) -> None:
     for scheme in ("light", "dark"):
         _colours(tab, scheme)
-        tab.evaluate("new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)))")
-        box = tab.ask("Page.getLayoutMetrics")["cssContentSize"]
-        clip = {"x": 0, "y": 0, "width": 1280, "height": min(box["height"], 16_000), "scale": 1}
-        _save(tab, out / f"{scheme}.png", clip)
+        tab.evaluate(SETTLED)
+        _save(tab, out / f"{scheme}.png", _whole(tab, 1280))
     printed = tab.ask("Page.printToPDF", printBackground=True, preferCSSPageSize=True)["data"]  # while it is dark
     (out / "print.pdf").write_bytes(base64.b64decode(printed))
     _colours(tab, "light")
+
+
+def _whole(tab: Tab, width: int) -> dict[str, float]:
+    """Give the whole page as a clip, of a long one its beginning."""
+    box = tab.ask("Page.getLayoutMetrics")["cssContentSize"]
+    return {"x": 0, "y": 0, "width": width, "height": min(box["height"], 16_000), "scale": 1}
 
 
 def _save(tab: Tab, path: Path, clip: dict[str, float]) -> None:

@@ -120,6 +120,9 @@ def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> C
     return CycleColumns(np.array(t_ns, dtype=np.int64), columns)
 
 
+EMBEDDED: Final = "embedded"
+"""The interface that a log names where the arm is emulated in the host's own process."""
+
 _BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
 _NEVER: Final = 1 << 62
 

@@ -318,7 +318,9 @@ def test_a_force_is_told_as_far_as_it_is_known(location, words):
 def test_the_page_marks_a_margin_below_one():
     run = make_certified_run()
     run.certified.tau_ext[3000, 4] = 0.2
-    assert '<td class="bad">0.5 / 0.5</td>' in report_page(evaluate(run), run, ReportSource("run.mcap"), [], [])
+    assert '<td data-head="margin" class="bad">0.5 / 0.5</td>' in report_page(
+        evaluate(run), run, ReportSource("run.mcap"), [], []
+    )
 
 
 def test_a_margin_without_bound_is_null_in_the_table():

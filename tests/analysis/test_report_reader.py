@@ -1,13 +1,24 @@
 """The report for somebody who never read the paper: contrast, names of states, no paper where it was not played."""
 
 import re
+import shlex
+from dataclasses import replace
 from importlib import resources
 
 import pytest
+from hand_made_run import A, M, make_run, touched_run
 
+from adacd_hil.analysis.logged_run import Run
+from adacd_hil.analysis.report.next_steps import NextStep, next_steps, origin_words
+from adacd_hil.analysis.report.page import has_paper
+from adacd_hil.analysis.report.run_page import report_page
+from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.analysis.score.metrics import ReportSource
 from adacd_hil.analysis.score.wording import STATE_WORDS
-from adacd_hil.records import SchemeState
+from adacd_hil.log.reader import LoggedEvent
+from adacd_hil.records import Event, FaultReason, SchemeState
 
+SOURCE = ReportSource("run.mcap")
 CSS = resources.files("adacd_hil.analysis.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
 LIGHT, DARK = (
     dict(re.findall(r"--(\w+): (#[0-9a-f]{6})", block))
@@ -33,7 +44,9 @@ def contrast(one: str, other: str) -> float:
 def test_text_and_curves_are_told_from_their_ground(colours: dict[str, str]) -> None:
     text = {(ink, ground): contrast(colours[ink], colours[ground]) for ink in ("ink", "muted") for ground in GROUNDS}
     text |= {
-        (ink, ground): contrast(colours[ink], colours[ground]) for ink in ("alarm", "good") for ground in GROUNDS[:2]
+        (ink, ground): contrast(colours[ink], colours[ground])
+        for ink in ("alarm", "good", "identified")
+        for ground in GROUNDS[:2]
     }
     assert {pair: ratio for pair, ratio in text.items() if ratio < 4.5} == {}  # WCAG AA
     curves = {curve: contrast(colours[curve], colours["paper"]) for curve in CURVES}
@@ -43,3 +56,128 @@ def test_text_and_curves_are_told_from_their_ground(colours: dict[str, str]) -> 
 def test_every_state_has_a_name_in_words() -> None:
     assert set(STATE_WORDS) == set(SchemeState)
     assert len(set(STATE_WORDS.values())) == len(SchemeState)
+
+
+PHONE = re.search(r"@media screen and \(max-width: 640px\) \{(.*?)\n\}", CSS, re.DOTALL)[1]
+"""What the style says for a narrow screen."""
+
+
+def test_on_a_narrow_screen_cells_wrap_and_rows_of_wide_tables_become_blocks() -> None:
+    rules = {selector.strip(): said for selector, said in re.findall(r"([^{}]+)\{([^{}]*)\}", PHONE)}
+    assert "white-space: normal; overflow-wrap: anywhere" in rules["th, td, td.l, th.l"]
+    assert "grid-template-columns: repeat(auto-fill, minmax(100px, 1fr))" in rules[".folds tr"]
+    assert "attr(data-head)" in rules[".folds td[data-head]::before"]
+    widest = {selector: re.findall(r"min-width: (\d+)px", said) for selector, said in rules.items()}
+    assert {selector for selector, found in widest.items() if found} == {"figure .scroll svg"}
+
+
+def heads_over_cells(html: str) -> list[tuple[list[str], list[list[str]]]]:
+    """Give of each table that folds its heads, and the heads that its cells bear, row by row."""
+    found = []
+    for body in re.findall(r'<table class="folds">(.*?)</table>', html, re.DOTALL):
+        heads = re.findall(r"<th [^>]*>(.*?)</th>", body, re.DOTALL)
+        rows = re.findall(r"<tr>(.*?)</tr>", body.partition("</thead>")[2], re.DOTALL)
+        cells = [re.findall(r"<td([^>]*)>", row) for row in rows]
+        found.append(
+            (heads, [[(re.findall(r'data-head="([^"]*)"', each) or [""])[0] for each in row] for row in cells])
+        )
+    return found
+
+
+def test_each_cell_of_a_table_that_folds_bears_the_head_of_its_column() -> None:
+    run = touched_run()
+    html = report_page(evaluate(run), run, SOURCE, [], [])
+    tables = heads_over_cells(html)
+    assert len(tables) >= 4
+    wrong = [(heads, row) for heads, rows in tables if heads[0] != "µs" for row in rows if row != heads]
+    assert wrong == []
+    times = next(rows for heads, rows in tables if heads[0] == "µs")
+    assert (times[0][1:], times[-1][1:]) == (["p50", "p99", "p99.9", "max"], ["p50", "p1", "p0.1", "min"])
+
+
+def steps_of(run: Run, source: ReportSource = SOURCE) -> list[NextStep]:
+    return next_steps(evaluate(run), run, source)
+
+
+def test_a_good_run_needs_nothing_and_says_so() -> None:
+    run = make_run((A, 1000), (M, 1000))
+    texts = [step.text for step in steps_of(run)]
+    assert texts[0] == "Nothing went wrong."
+    assert [step.command for step in steps_of(run)][1:] == [
+        "adacd-hil replay run.mcap",
+        "adacd-hil replay run.mcap --set filter.a_rad_s=20",
+    ]
+
+
+def test_missed_contacts_and_false_alarms_come_first() -> None:
+    commands = [step.command for step in steps_of(touched_run())]
+    assert commands[:2] == ["adacd-hil thresholds run.mcap", "adacd-hil tune run.mcap"]
+    assert "Nothing went wrong." not in [step.text for step in steps_of(touched_run())]
+
+
+def on_a_bus(run: Run, **said: str) -> Run:
+    return replace(run, metadata={"interface": "socketcan", "channel": "can1", "config": "lab", **said})
+
+
+def test_a_fault_on_a_bus_leads_to_the_doctor_of_that_arm() -> None:
+    run = on_a_bus(make_run((A, 100), (SchemeState.FAULT, 50)))
+    run.fault[100:] = FaultReason.DRIVE
+    assert steps_of(run)[0].command == "adacd-hil doctor -i socketcan -c can1 --config lab.toml"
+
+
+def test_a_fault_of_an_emulated_arm_is_played_again() -> None:
+    run = on_a_bus(
+        make_run((A, 100), (SchemeState.FAULT, 50)), interface="embedded", config="certified", scenario="idle"
+    )
+    run.fault[100:] = FaultReason.DRIVE
+    assert steps_of(run)[0].command == "adacd-hil demo --config certified --scenario idle"
+
+
+def test_a_run_without_a_cycle_is_not_told_to_be_replayed() -> None:
+    run = make_run((A, 1))
+    run = replace(run, **{name: getattr(run, name)[:0] for name in ("state", "cycle", "t_ns", "fault")})
+    steps = next_steps(evaluate(make_run((A, 1))), on_a_bus(run), SOURCE)
+    assert [step.command.split()[1] for step in steps] == ["doctor"]
+
+
+def test_what_a_log_says_of_itself_is_quoted_for_the_shell() -> None:
+    run = on_a_bus(make_run((A, 100), (SchemeState.FAULT, 50)), config="$(reboot)\n;", channel="a b", interface="-x;y")
+    run.fault[100:] = FaultReason.DRIVE
+    command = steps_of(run, ReportSource("a'b.mcap"))[0].command
+    assert shlex.split(command) == [
+        "adacd-hil",
+        "doctor",
+        "-i",
+        "-x;y",
+        "-c",
+        "a b",
+        "--config",
+        "$(reboot)\\u000a;.toml",
+    ]
+    assert "\n" not in command
+    replayed = steps_of(run, ReportSource("a'b.mcap"))[-2].command
+    assert shlex.split(replayed)[-1] == "a'b.mcap"
+
+
+def test_the_head_names_ones_own_arm_and_where_it_is() -> None:
+    assert origin_words(on_a_bus(make_run())) == ["arm lab", "on socketcan can1"]
+    emulated = on_a_bus(make_run(), config="paper", profile="P", interface="embedded", clock="lockstep", version="1")
+    assert origin_words(emulated)[:2] == ["configuration paper, arm profile P", "emulated arm, simulated time"]
+
+
+def test_the_papers_numbers_are_those_of_its_arm_alone() -> None:
+    run = touched_run()
+    own = replace(run, settings=replace(run.settings, arm=replace(run.settings.arm, link_length_m=(0.4, 0.3))))
+    assert (has_paper(evaluate(run)), has_paper(evaluate(own))) == (True, False)
+    page = report_page(evaluate(own), own, SOURCE, [], [])
+    assert "eq. (15)" not in page.partition("How it is computed")[0]
+    assert "<h2>Measured</h2>" in page
+
+
+def test_notices_are_written_out_below_the_timeline() -> None:
+    run = make_run((A, 1000), (M, 1000))
+    event = LoggedEvent(int(run.t_ns[500]), Event("warning", "bus", "slow <&>"))
+    run = replace(run, events=(event,) * 14)
+    page = report_page(evaluate(run), run, SOURCE, [], [])
+    assert page.count("bus: slow &lt;&amp;&gt;</li>") == 12
+    assert "The first 12 of 14 notices." in page

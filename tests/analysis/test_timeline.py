@@ -26,7 +26,7 @@ def test_stays_follow_one_another_without_a_gap():
 
 
 def drawn(run):
-    return render("timeline.html.j2", timeline=timeline_of(run, evaluate(run)), state_key=state_key(run))
+    return render("timeline.html.j2", timeline=timeline_of(run, evaluate(run)), state_key=state_key(run), notices=())
 
 
 def titles_of(html):

@@ -38,6 +38,8 @@ CONTACTS: Final = 200
 """Contacts with a row in the table of contacts, and so many more that went wrong."""
 PRINTED_CONTACTS: Final = 40
 """The same for a terminal and on paper."""
+NOTICES: Final = 12
+"""Notices in words below the timeline."""
 ADAPTATIONS: Final = 8
 """Adaptations with a figure, and with columns in the tables of parameters."""
 MARKS: Final = 1_500
@@ -108,7 +110,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    bounds = {"ADAPTATIONS": ADAPTATIONS, "CONTACTS": CONTACTS, "SECTIONS": SECTIONS}
+    bounds = {"ADAPTATIONS": ADAPTATIONS, "CONTACTS": CONTACTS, "NOTICES": NOTICES, "SECTIONS": SECTIONS}
     environment.globals["bounds"] = bounds
     environment.filters |= {"number": number_text, "keep_units": lambda text: _UNIT.sub("\u00a0", text)}
     environment.policies["json.dumps_kwargs"] = {
@@ -125,7 +127,7 @@ def _asset(name: str) -> _Asset:
 
 _CONTACT_HEAD: Final = (
     "contact", "section", "link", "found", "at alarm", "onset s", "delay ms", "law ms", "ideal ms", "direction",
-    "right", "true Nm", "peak ratio",
+    "direction right", "true Nm", "peak ratio",
 )  # fmt: skip
 
 
@@ -208,6 +210,19 @@ def paper_head(metrics: Metrics) -> tuple[str, ...]:
     return ("", *paper, "certified")
 
 
+_PLAIN_NAMES: Final = {
+    "Frozen residual, first detection section, joints 1 / 2": "Largest unexplained torque, first detection section",
+    "Frozen residual, second detection section, joints 1 / 2": "Largest unexplained torque, second detection section",
+    "The CAD model's, first detection section": "The same with the CAD model, first detection section",
+    "The CAD model's, second detection section": "The same with the CAD model, second detection section",
+    "Bound β of eq. (15)": "Residual that learning must come below",
+    "Hold T of eq. (15)": "How long it must stay there, or was tested",
+    "Filter a / b": "Filter of the residual",
+    "Smallest threshold / residual": "Smallest margin: threshold over unexplained torque",
+}
+"""Names of quantities for a reader who has nothing of the paper before him; report.json keeps the others."""
+
+
 def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
     """Write a row per quantity."""
     rows = []
@@ -215,7 +230,8 @@ def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
         if row.paper is None and row.measured == NONE:
             continue
         beside = () if metrics.evidence is None or row.paper is None else (row.beside or NONE,)
-        rows.append((row.quantity, *(() if row.paper is None else (row.paper,)), *beside, row.measured))
+        quantity = row.quantity if row.paper is not None else _PLAIN_NAMES.get(row.quantity, row.quantity)
+        rows.append((quantity, *(() if row.paper is None else (row.paper,)), *beside, row.measured))
     return rows
 
 

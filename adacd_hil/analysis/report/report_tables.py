@@ -35,7 +35,7 @@ from adacd_hil.records import PARAMETER_UNITS
 def paper_table(metrics: Metrics) -> Table:
     """Put what the paper printed beside what was measured."""
     rows = [[*cells[:-1], Cell(cells[-1], "strong")] for cells in paper_cells(metrics)]
-    head = ("quantity", *paper_head(metrics)[1:])
+    head = paper_head(metrics)
     return make_table(head, rows, left=range(len(head)))
 
 
@@ -123,7 +123,8 @@ def sections_table(metrics: Metrics, run: Run) -> Table:
             )
         )
     head = (
-        "section", "", "from, s", "to, s", "lasts, s", "largest residual, frozen, Nm", "with CAD, Nm", "over cycles",
+        "section", "", "from, s", "to, s", "lasts, s", "largest unexplained torque, Nm", "with the CAD model, Nm",
+        "cycles judged",
     )  # fmt: skip
     return make_table(head, rows, left=(0, 1))
 

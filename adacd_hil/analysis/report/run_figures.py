@@ -137,12 +137,12 @@ def _panels(figure: Figure, lanes: int) -> tuple[list[Axes], list[list[Axes]]]:
 
 
 def _curves(axes: Axes, run: Run, metrics: Metrics, joint: int, shown: NDArray[np.bool_]) -> None:
-    """Draw a joint's residual of every model, against the paper's threshold."""
+    """Draw a joint's residual of every model, against the paper's threshold where it decides or is compared."""
     time_s = run.time_s()[shown]
     _shade(axes, metrics.sections)
     h = run.settings.detector.threshold_Nm[joint]
     label = "threshold" if run.certified is None else "the paper's threshold"
-    for level in (-h, h):
+    for level in (-h, h) if run.certified is None or has_paper(metrics) else ():
         axes.axhline(level, color=COLOURS["ink"], linewidth=0.8, dashes=(4, 2.5), label=label)
     if run.has_cad:
         cad = run.tau_ext_hat_cad[shown, joint]

@@ -1,7 +1,6 @@
 """The page of a report, put together, and its cards of contacts."""
 
 import math
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -10,6 +9,7 @@ import numpy as np
 
 from adacd_hil.analysis.drawing import Drawing
 from adacd_hil.analysis.logged_run import Run
+from adacd_hil.analysis.report.next_steps import next_steps, origin_words
 from adacd_hil.analysis.report.page import (
     CONTACTS,
     TRACED_CONTACTS,
@@ -24,7 +24,6 @@ from adacd_hil.analysis.report.page import (
     shown_beside,
     shown_contacts,
     stretch_text,
-    went_wrong,
 )
 from adacd_hil.analysis.report.report_tables import (
     counted_sentence,
@@ -38,7 +37,7 @@ from adacd_hil.analysis.report.report_tables import (
     sections_table,
     timing_tables,
 )
-from adacd_hil.analysis.report.timeline import SCRIPTS, STYLES, state_key, timeline_of, traces_of
+from adacd_hil.analysis.report.timeline import SCRIPTS, STYLES, notices_of, state_key, timeline_of, traces_of
 from adacd_hil.analysis.score.judge import row_at
 from adacd_hil.analysis.score.metrics import Beside, Metrics, ReportedContact, ReportSource
 from adacd_hil.analysis.score.verdict import LISTED
@@ -224,7 +223,7 @@ def _found(contact: ReportedContact) -> list[tuple[str, str]]:
     lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
     return [
         ("found after", number_text(contact.delay_ms, 0, "ms")),
-        ("direction", signs_text(contact.direction)),
+        ("pushes joints 1 / 2 to", signs_text(contact.direction)),
         _force(contact),
         ("lever arm", lever),
         ("place", _PLACES.get(contact.location or "", NONE)),
@@ -268,8 +267,8 @@ def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
     for joint, peak_Nm in enumerate(contact.tau_ext_peak_hat_Nm or ()):
         peak = uncertain_text(peak_Nm, peak_sigmas[joint], 2, "Nm")
         impulse = uncertain_text(impulses[joint], impulse_sigmas[joint], 3, "Nm s")
-        words = f"peak {number_text(peak_Nm, 2, 'Nm') if peak == NONE else peak}"
-        entries.append((f"joint {joint + 1}", words if impulse == NONE else f"{words}, impulse {impulse}"))
+        entries.append((f"joint {joint + 1}: peak", number_text(peak_Nm, 2, "Nm") if peak == NONE else peak))
+        entries.append((f"joint {joint + 1}: impulse", impulse))
     return entries
 
 
@@ -316,10 +315,11 @@ def report_page(
         SCRIPTS if traces else (),
         run=run,
         metrics=metrics,
-        next_steps=next_steps(metrics, source),
+        next_steps=next_steps(metrics, run, source),
         tiles=_tiles(metrics),
         timeline=timeline_of(run, metrics),
         state_key=state_key(run),
+        notices=notices_of(run, metrics),
         residuals=figures.get("fig5"),
         has_paper=has_paper(metrics),
         paper=paper_table(metrics),
@@ -350,57 +350,14 @@ def _name(run: Run, source: ReportSource) -> str:
     return " ".join(filter(None, words)) or source.log_name
 
 
-class NextStep(NamedTuple):
-    """What a reader may do next, and the command for it; empty where there is none."""
-
-    text: str
-    command: str = ""
-
-
-def next_steps(metrics: Metrics, source: ReportSource) -> list[NextStep]:
-    """Say what to do next, the gravest first."""
-    log = shlex.quote(source.log_name)
-    steps = []
-    if not source.is_complete:
-        steps.append(NextStep("The log is not whole. See what it lacks.", f"adacd-hil log check {log}"))
-    if metrics.fault or (not metrics.contacts and not metrics.adaptation_s):
-        steps.append(
-            NextStep("The run ended early. The notices of the timeline say why; doctor checks host, bus and arm.",
-                     "adacd-hil doctor")
-        )  # fmt: skip
-    if metrics.false_alarms:
-        steps.append(
-            NextStep("There were false alarms. Find thresholds from recorded motion that nobody touched.",
-                     f"adacd-hil thresholds {log}")
-        )  # fmt: skip
-    if any(went_wrong(contact) for contact in metrics.contacts):
-        steps.append(
-            NextStep("Some contacts were missed, or their link or direction is wrong: they are marked below. Try other "
-                     "thresholds and filters on this log.", f"adacd-hil tune {log}")
-        )  # fmt: skip
-    if not steps:
-        steps.append(NextStep("Nothing went wrong. Choose a contact below to see the torques of that moment."))
-    steps.append(NextStep("Check that the log gives the same decisions again.", f"adacd-hil replay {log}"))
-    steps.append(
-        NextStep("Try another setting on this log.", f"adacd-hil replay {log} --set certified.noise_sigmas=8")
-        if metrics.evidence is not None
-        else NextStep("Try another setting on this log.", f"adacd-hil replay {log} --set filter.a_rad_s=20")
-    )
-    return steps
-
-
 def _heading(metrics: Metrics, run: Run, source: ReportSource) -> Heading:
-    meta = [
-        ("configuration", "config"), ("profile", "profile"), ("clock", "clock"), ("interface", "interface"),
-        ("version", "version"),
-    ]  # fmt: skip
-    words = [f"{label} {run.metadata[key]}" for label, key in meta if run.metadata.get(key)]
+    words = origin_words(run)
     if run.stretch is not None:
         words.append(stretch_text(run.stretch))
     problems = [f"The log is not whole: {source.problem}"] if source.problem else []
     if not problems and metrics.dropped:
         problems = [f"{metrics.dropped} packets are not in the log."]
-    over = f"adacd-hil run report · {' · '.join(words)}"
+    over = " · ".join(["run report", *words])
     return Heading(over, metrics.verdict, problems, metrics.is_clean)
 
 

@@ -71,9 +71,9 @@ def trend_page(found: Sequence[Trend]) -> str:
 
 
 def draw_trend(trend: Trend, name: str = "trend") -> Drawing | None:
-    """Draw thresholds, friction, offsets and margins over the dates of the runs; None without a run to draw."""
+    """Draw thresholds, friction, offsets and margins over the dates of the runs; None with fewer than two dates."""
     dated = [row for row, run in enumerate(trend.runs) if run.started is not None]
-    if not dated:
+    if len(dated) < 2:
         return None
     joints = ("joint 1", "joint 2")
     places = {id(trend.runs[row]): place for place, row in enumerate(dated)}

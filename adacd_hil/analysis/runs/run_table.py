@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from adacd_hil.analysis.runs.run_summary import CERTIFIED, GOOD, NO_CERTIFICATE, NOT_JUDGED, RUNNING, RunSummary
-from adacd_hil.analysis.score.wording import NONE, number_text, pair_text
+from adacd_hil.analysis.score.wording import NONE, found_text, number_text, pair_text
 from adacd_hil.file_access import replace_files, replacing
 from adacd_hil.log.formats.signal_tables import import_pyarrow
 from adacd_hil.log.log_files import failing_as
@@ -126,7 +126,6 @@ def count_text(runs: Sequence[RunSummary]) -> str:
 
 def cells(run: RunSummary) -> tuple[str, ...]:
     """Write a run under HEAD."""
-    expected = NONE if run.expected is None else str(run.expected)
     return (
         run.name,
         NONE if run.started is None else f"{run.started:%Y-%m-%d %H:%M}",
@@ -134,7 +133,7 @@ def cells(run: RunSummary) -> tuple[str, ...]:
         certificate_text(run),
         pair_text(run.threshold_Nm, 3),
         number_text(run.margin, 2),
-        NONE if run.found is None else f"{run.found} of {expected}",
+        NONE if run.found is None else str(run.found) if run.expected is None else found_text(run.found, run.expected),
         number_text(run.duration_s, 1),
         run.arm or NONE,
         run.scenario or NONE,

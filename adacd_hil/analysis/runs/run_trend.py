@@ -19,6 +19,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from adacd_hil.analysis.logged_run import EMBEDDED
 from adacd_hil.analysis.runs.run_summary import FRICTION_AT_RAD_S, RunSummary
 from adacd_hil.analysis.runs.run_table import in_order
 from adacd_hil.records import JOINTS, Vector
@@ -33,7 +34,6 @@ _DETECTION: Final = ("certified.", "detector.", "estimator.", "filter.", "scheme
 _TOLD_KEYS: Final = 3
 _OF_A_RUN: Final = ("name", "history.", "operator.", "log.", "realtime.")
 """Settings that differ from run to run and say nothing of the detection."""
-_EMBEDDED: Final = "embedded"
 
 
 class TrendChange(NamedTuple):
@@ -112,7 +112,7 @@ def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE)
 
 def arm_of(run: RunSummary) -> str:
     """Name the arm of a run; one that was emulated in the host's process is another."""
-    return f"{run.arm or 'unknown arm'}{', emulated' if run.interface == _EMBEDDED else ''}"
+    return f"{run.arm or 'unknown arm'}{', emulated' if run.interface == EMBEDDED else ''}"
 
 
 def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Trend:
@@ -193,14 +193,25 @@ def _threshold_sentence(runs: Sequence[RunSummary], thresholds: TrendQuantity) -
     known = int(np.isfinite(thresholds.values).all(axis=1).sum())
     if not runs:
         return "No run is judged."
+    if len(runs) == 1:
+        return "Thresholds can't be compared: there is one run."
     if known < 2:
         return f"Thresholds can't be compared: {known} of {len(runs)} runs {'has' if known == 1 else 'have'} any."
     if not thresholds.changes:
         return f"Thresholds have not changed since {_when(runs[0])}: {known} runs."
-    run = thresholds.changes[-1].run
-    told = [change for change in thresholds.changes if change.run is run]
-    parts = "; ".join(f"joint {each.joint} {each.value_before:.3f} → {each.value:.3f} Nm" for each in told)
+    run, parts = _last_changes(thresholds)
     return f"Thresholds last changed with {_when(run)}: {parts}; {_settings_text(runs, run)}."
+
+
+def _last_changes(quantity: TrendQuantity) -> tuple[RunSummary, str]:
+    """Give the run of the last changes, and in words what changed at each joint."""
+    run = quantity.changes[-1].run
+    parts = []
+    for each in quantity.changes:
+        if each.run is run:
+            since = "" if each.sigmas is None else f", {each.sigmas:.1f} deviations since {each.before.name}"
+            parts.append(f"joint {each.joint} {each.value_before:.3f} → {each.value:.3f} Nm{since}")
+    return run, "; ".join(parts)
 
 
 def _settings_text(runs: Sequence[RunSummary], run: RunSummary) -> str:
@@ -223,13 +234,7 @@ def _drift_sentence(quantity: TrendQuantity, what: str) -> str:
         return f"Of {what} nothing is known to compare: {rows} certificate{'' if rows == 1 else 's'} with a deviation."
     if not quantity.changes:
         return f"{what.capitalize()}: no change beyond what the certificates' uncertainty explains."
-    run = quantity.changes[-1].run
-    told = [change for change in quantity.changes if change.run is run]
-    parts = "; ".join(
-        f"joint {each.joint} {each.value_before:.3f} → {each.value:.3f} Nm, {each.sigmas:.1f} deviations since "
-        f"{each.before.name}"
-        for each in told
-    )
+    run, parts = _last_changes(quantity)
     return f"{what.capitalize()} changed beyond the certificates' uncertainty, last with {_when(run)}: {parts}."
 
 

@@ -6,6 +6,7 @@ stands the result of the paper's scheme on the same stream, where it ran beside.
 
 import itertools
 from collections.abc import Sequence
+from functools import cache
 from typing import Final, TypeGuard
 
 import numpy as np
@@ -22,6 +23,8 @@ from adacd_hil.analysis.score.metrics import (
     Residual,
 )
 from adacd_hil.analysis.score.wording import NONE, found_text, number_of, percent_text, score_sentence
+from adacd_hil.settings.arm_settings import ArmSettings
+from adacd_hil.settings.configuration import load_settings
 
 LISTED: Final = 4
 """Adaptations that are listed one by one."""
@@ -141,7 +144,7 @@ def identified_text(
 
 
 _EXPERIMENT = "paper"
-"""The scenario that is the paper's experiment."""
+"""The scenario that is the paper's experiment, and the configuration that has its arm."""
 _ELSEWHERE = {
     "Adaptation after the payload change": "Second adaptation",
     "Payload": "Payload in the second adaptation",
@@ -154,8 +157,15 @@ _ELSEWHERE = {
 
 
 def is_papers_experiment(run: Run) -> bool:
-    """Tell whether the emulator played the paper's experiment; of a real arm nobody knows."""
-    return _EXPERIMENT in (run.metadata.get("scenario"), run.metadata.get("emulator_scenario"))
+    """Tell whether the emulator played the paper's experiment, with its arm; of a real arm nobody knows."""
+    played = (run.metadata.get("scenario"), run.metadata.get("emulator_scenario"))
+    arm, papers = run.settings.arm, _papers_arm(run.settings.arm.profile)
+    return _EXPERIMENT in played and (arm.link_length_m, arm.cad_theta) == (papers.link_length_m, papers.cad_theta)
+
+
+@cache
+def _papers_arm(profile: str) -> ArmSettings:
+    return load_settings(_EXPERIMENT, profile).arm
 
 
 def compare_with_paper(

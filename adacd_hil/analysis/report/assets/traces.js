@@ -1,5 +1,5 @@
 "use strict";
-// The traces of a run: data from the page's blocks (adacd_hil/analysis/trace_encoding.py says how they are written),
+// The traces of a run: data from the page's blocks (adacd_hil/analysis/report/traces.py says how they are written),
 // drawn by uPlot. All panels show the same stretch of time; where a pixel has several cycles, their smallest and largest
 // value are drawn, found through the extremes of blocks of 64 cycles.
 (async () => {
