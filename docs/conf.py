@@ -1,7 +1,9 @@
 """The documentation's site. `make docs` builds it with Sphinx from the same pages that a code host shows."""
 
+import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
 
@@ -12,6 +14,7 @@ author = "the adacd-hil authors"
 version = release = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 
 extensions = ["myst_parser"]
+source_suffix = {".md": "markdown", ".ipynb": "markdown"}
 root_doc = "index"
 exclude_patterns = ["examples", "_site"]
 nitpicky = True
@@ -27,10 +30,26 @@ OUTSIDE = {"](../CONTRIBUTING.md": "](contributing.md", "](../README.md": "](ind
 
 
 def setup(app: Sphinx) -> None:
-    """Lead links out of `docs/` to the site's own pages."""
-    app.connect("source-read", _lead_inside)
+    """Take notebooks as pages, and lead links out of `docs/` to the site's own pages."""
+    app.connect("source-read", _as_page)
 
 
-def _lead_inside(_app: Sphinx, _page: str, source: list[str]) -> None:
+def _as_page(app: Sphinx, page: str, source: list[str]) -> None:
+    if str(app.env.doc2path(page)).endswith(".ipynb"):
+        source[0] = "\n\n".join(text for cell in json.loads(source[0])["cells"] for text in _pieces(cell))
     for outside, inside in OUTSIDE.items():
         source[0] = source[0].replace(outside, inside)
+
+
+def _pieces(cell: dict[str, Any]) -> list[str]:
+    """Write a cell of a notebook as Markdown, with the outputs that are stored in it."""
+    text = "".join(cell["source"])
+    if cell["cell_type"] == "markdown":
+        return [text]
+    printed = ["".join(output["text"]) for output in cell["outputs"] if "text" in output]
+    drawn = [output["data"]["image/png"] for output in cell["outputs"] if "data" in output]
+    return [
+        f"```python\n{text}\n```",
+        *(f"```text\n{each}```" for each in printed),
+        *(f"![what the cell above draws](data:image/png;base64,{each})" for each in drawn),
+    ]

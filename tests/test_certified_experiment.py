@@ -1,18 +1,33 @@
-"""The experiment in one process with the command's own configuration: the certified scheme and, beside, the paper's."""
+"""The demo as README and notebook have it: the certified scheme and, beside, the paper's, of the default seed."""
 
+import copy
+import json
+import re
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
-from experiment_runs import adacd_hil
+from documents import ROOT
+from experiment_runs import Played, adacd_hil
+
+sys.path.insert(0, str(ROOT / "tools"))
+from notebook import pictures, printed, run_notebook
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    folder = tmp_path_factory.mktemp("certified")
-    played = adacd_hil(folder, "demo", "--out", str(folder), "--json", "--seed", "7")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
+    folder = tmp_path_factory.mktemp("certified") / "runs" / "demo"
+    folder.mkdir(parents=True)
+    played = adacd_hil(folder, "demo", "--out", str(folder), "--json")
     assert played.status == 0, played.stderr
+    return played
+
+
+@pytest.fixture(scope="module")
+def report(played: Played) -> Any:
     return played.json
 
 
@@ -44,3 +59,32 @@ def test_the_frozen_model_keeps_its_distance_from_every_threshold(report: Any) -
     residuals = report["frozen_residual_max_Nm"]
     assert max(*residuals["B"]["identified"], *residuals["E"]["identified"]) <= 0.04
     assert report["certified"]["smallest_margin"] > 1.0
+
+
+def test_the_readme_tells_the_figures_of_the_demo(report: Any) -> None:
+    (told,) = re.findall(r"^> Demo, default seed: .*$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    certified_s, beside_s = report["adaptation_s"], report["certified"]["paper_beside"]["adaptation_s"]
+    slowest_ms = max(contact["delay_ms"] for contact in report["contacts"])
+    assert f"all {len(report['contacts'])} contacts detected within {slowest_ms:.0f} ms, none false" in told
+    assert f"certified after {certified_s['A']:.2f} s, and again {certified_s['D']:.2f} s after 1 kg" in told
+    assert f"took {beside_s['A']:.2f} s and {beside_s['D']:.2f} s" in told
+
+
+def test_the_notebook_prints_what_is_stored_in_it(played: Played) -> None:
+    path = ROOT / "docs" / "notebooks" / "a-run.ipynb"
+    stored = json.loads(path.read_text())
+    folder: Path = played.folder.parent.parent / "docs" / "notebooks"
+    folder.mkdir(parents=True)
+    run_notebook(now := copy.deepcopy(stored), folder, path.name)
+    assert printed(now) == printed(stored)
+    assert len(pictures(now)) == len(pictures(stored)) == 2
+
+
+def test_a_velocity_whose_lag_nobody_gives_costs_what_the_page_says() -> None:
+    """The notebook's figures are those of docs/api.md: links that are wrong, and reversals that pass for touches."""
+    stored = json.loads((ROOT / "docs" / "notebooks" / "a-run.ipynb").read_text())
+    found = [re.findall(r"^ *([\d.]+) s  link (\d)  \(", text, re.MULTILINE) for text in printed(stored)]
+    naive, told = [lines for lines in found if lines]
+    assert [(float(at), int(link)) for at, link in told] == [(10.0, 1), (13.0, 1), (16.0, 2), (19.0, 2)]
+    assert sum(float(at) < 3.0 for at, _ in naive) == len(naive) - 4 == 4
+    assert sum(link != right for (_, link), (_, right) in zip(naive[4:], told, strict=True)) == 2

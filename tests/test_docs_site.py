@@ -25,7 +25,12 @@ def site(tmp_path_factory):
 
 
 def test_every_page_is_in_the_site(site):
-    pages = {path.relative_to(ROOT / "docs").with_suffix(".html") for path in (ROOT / "docs").rglob("*.md")}
+    pages = {
+        path.relative_to(ROOT / "docs").with_suffix(".html")
+        for pattern in ("*.md", "*.ipynb")
+        for path in (ROOT / "docs").rglob(pattern)
+        if not path.is_relative_to(ROOT / "docs" / "_site")
+    }
     assert {page for page in pages if not (site / page).is_file()} == set()
 
 
@@ -34,6 +39,13 @@ def test_pages_outside_of_the_folder_are_in_the_site_and_their_links_lead_inside
     assert "How a change lands" in contributing
     assert 'href="timing.html"' in contributing
     assert 'href="contributing.html"' in (site / "adding-things.html").read_text()
+
+
+def test_a_notebook_is_in_the_site_with_what_it_prints_and_draws(site):
+    page = (site / "notebooks" / "a-run.html").read_text()
+    assert "8 contacts, 2 certificates" in page
+    assert page.count('src="data:image/png;base64,') == 2
+    assert 'href="../api.html"' in page
 
 
 def test_a_broken_link_is_found(tmp_path):

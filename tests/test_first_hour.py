@@ -29,12 +29,16 @@ PROGRAMS = {
     "firmware-sim": "from firmware_sim.cli.start_emulator import start_emulator as start",
 }
 NOT_HERE = {
-    r"-c can0|tools/with-vcan ": "needs a bus",
+    r"-c can0|tools/with-vcan |report runs/vcan": "needs a bus",
     r"make test": "it is what runs this test",
     r"--rehearse": "plays the whole experiment",
     r"--scenario blow-chest|--truth": "played by the tests of scenarios and truths",
 }
-MADE_ON_A_BUS = {r"adacd-hil tare ": ("tare.toml", "short.toml"), r"--out runs/today": ("runs/today", "demo")}
+MADE_ON_A_BUS = {
+    r"adacd-hil tare ": ("tare.toml", "short.toml"),
+    r"--out runs/today": ("runs/today", "demo"),
+    r"--out runs/vcan": ("runs/vcan", "demo"),
+}
 """What commands that are not typed leave for later ones, and what stands for it."""
 
 

@@ -24,6 +24,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import termios
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -65,7 +66,7 @@ MOST_LINES = 4500
 """9 s of the recording, in which nobody touches the arm."""
 BUS = "can0"
 HANG_S = 1800.0
-FAILED, OF_THIS_MACHINE = r"FAILED|not sufficient: ", r"FAILED +rate |not sufficient: "
+FAILED, OF_THIS_MACHINE = r"FAILED|not sufficient: ", r"FAILED +(rate$|rate |SYNC )|not sufficient: "
 """What `doctor` and `commtest` say of what failed, and of a host that isn't on time: a guest of user-mode Linux."""
 MOST_LETTERS = 2000
 LAB = ("--scenario", "idle")
@@ -239,6 +240,7 @@ def told(step: Played) -> str:
 def type_in(done: Played, folder: Path, environment: dict[str, str]) -> None:
     """Type a command on a terminal of its own, and answer what it asks."""
     master, slave = pty.openpty()
+    termios.tcsetwinsize(master, (24, 80))
     begin = heard = time.monotonic()
     with subprocess.Popen(
         ["sh", "-c", done.text], cwd=folder, env=environment, stdin=slave, stdout=slave, stderr=slave,
@@ -312,7 +314,7 @@ def play_in_clone(way: Way) -> None:
     with tempfile.TemporaryDirectory(prefix="first-hour-") as parent:
         folder = Path(parent) / "adacd-hil"
         clone(folder)
-        environment = dict(os.environ)
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         if way.name != "arm":
             play(way, folder, environment, not_typed)
             return
@@ -333,6 +335,7 @@ def play_in_guest(way: Way, folder: Path) -> None:
     """Play all but the installation, beside an arm."""
     way.steps = [step for step in way.steps if not step.text.startswith("make ")]
     environment = {**os.environ, "ADACD_HIL_RUN_CLOCK": "lockstep"}
+    environment.pop("PYTHONPATH", None)
     with arm_on_bus(folder, environment):
         play(way, folder, environment, not_typed)
 
