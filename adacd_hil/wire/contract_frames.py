@@ -30,6 +30,8 @@ SYNC_OVERFLOW = 240
 """0x1019: the SYNC counter runs 1…240, as long as CiA 301 lets it."""
 NOT_VALID = 1 << 31
 """Of a COB-ID, CiA 301 clause 7.5.2.35: the PDO or EMCY is switched off."""
+DEFAULT_BITRATE = 1_000_000
+"""Of a DBC that doesn't say, bit/s."""
 ASSUMED_INTERVAL_MS = 100
 """Interval of an event frame that declares none: the usual heartbeat period."""
 _LAST_DEVICE = 126
@@ -79,16 +81,12 @@ def move_id(can_id: int, node_offset: int, host_node: int, name: str) -> int:
     return can_id + node_offset
 
 
-DEFAULT_BITRATE = 1_000_000
-"""Of a DBC that doesn't say."""
-
-
 def read_bitrates(codec: Codec) -> tuple[int, int]:
     """Return the nominal and the data bit rate; the data bit rate of a classic bus is 0."""
     database = cantools.database.load_string(codec.text.decode("utf-8"), "dbc")
-    attributes = database.dbc.attributes if isinstance(database, Database) and database.dbc else {}
-    found = {name: int(attributes[name].value) for name in ("Baudrate", "BaudrateCANFD") if name in attributes}
-    return found.get("Baudrate") or DEFAULT_BITRATE, found.get("BaudrateCANFD", 0)
+    if not isinstance(database, Database):
+        return DEFAULT_BITRATE, 0
+    return int(_attribute(database, "Baudrate")) or DEFAULT_BITRATE, int(_attribute(database, "BaudrateCANFD"))
 
 
 class Trigger(Enum):

@@ -24,7 +24,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.contract_frames import DEFAULT_BITRATE, read_contract
+from adacd_hil.wire.contract_frames import read_bitrates
 from adacd_hil.wire.frame_time import FrameTime, exact_time, worst_time
 from adacd_hil.wire.time_marks import (
     DEVICE_MARK,
@@ -393,10 +393,13 @@ class LockstepBus(Bus):
 
 
 def make_lockstep_bus(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> LockstepBus:
-    """Model the bus of a contract at the rates that its DBC gives, as `settings.lockstep` says. Raises CodecError."""
-    bitrate, data_bitrate = bit_rates(codec)
+    """Model the bus of a contract at the rates that its DBC gives, as `settings.lockstep` says. Raises CodecError.
+
+    A DBC without rates means 1 and 5 Mbit/s.
+    """
+    bitrate, data_bitrate = read_bitrates(codec)
     make = worst_time if settings.lockstep.stuffing == "worst" else exact_time
-    frame_time = make(bitrate, data_bitrate)
+    frame_time = make(bitrate, data_bitrate or DEFAULT_DATA_BITRATE)
     return LockstepBus(
         bus,
         clock,
@@ -407,11 +410,3 @@ def make_lockstep_bus(bus: Bus, clock: VirtualClock, codec: Codec, settings: Set
         patience_s=settings.bus.feedback_timeout_ms * 1e-3,
         is_fifo=settings.lockstep.queue == "fifo",
     )
-
-
-def bit_rates(codec: Codec) -> tuple[int, int]:
-    """Give the nominal and the data bit rate of a contract, bit/s; a DBC without them means 1 and 5 Mbit/s."""
-    if b'"Trigger"' not in codec.text:
-        return DEFAULT_BITRATE, DEFAULT_DATA_BITRATE
-    contract = read_contract(codec.text, codec.path.name)
-    return contract.bitrate or DEFAULT_BITRATE, contract.data_bitrate or DEFAULT_DATA_BITRATE

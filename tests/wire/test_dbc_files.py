@@ -9,7 +9,8 @@ import cantools
 import pytest
 from hang import HANG_S
 
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.codec import contract_folder, load_codec, parse_codec
+from adacd_hil.wire.contract_frames import read_bitrates
 
 FILES = sorted(contract_folder().glob("*.dbc"))
 EVERY_FILE = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -72,6 +73,18 @@ def test_a_tool_finds_bit_rates_and_period_in_the_fd_contracts(name: str, data_r
     attributes = cantools.database.load_file(contract_folder() / f"{name}.dbc").dbc.attributes
     found = [attributes[key].value for key in ("Baudrate", "BaudrateCANFD", "BusPeriod_us")]
     assert found == [1_000_000, data_rate, period_us]
+
+
+@FD_FILES
+def test_bit_rates_of_a_contract_are_those_it_states_else_its_defaults(
+    name: str, data_rate: int, period_us: int
+) -> None:
+    codec = load_codec(contract_folder() / f"{name}.dbc")
+    assert read_bitrates(codec) == (1_000_000, data_rate)
+    text = codec.text.decode()
+    unsaid = text.replace(f'BA_ "BaudrateCANFD" {data_rate};', "").replace('BA_ "Baudrate" 1000000;', "")
+    unsaid = unsaid.replace('BA_DEF_DEF_ "Baudrate" 1000000', 'BA_DEF_DEF_ "Baudrate" 500000')
+    assert read_bitrates(parse_codec(unsaid.encode(), codec.path)) == (500_000, 0)
 
 
 @FD_FILES
