@@ -106,7 +106,7 @@ def _wait_for_cycles(process: "subprocess.Popen[bytes]", path: Path) -> int:
     while time.monotonic() < end_s:
         if process.poll() is not None:
             raise RunEndedError(f"the run ended by itself, exit status {process.returncode}")
-        time.sleep(0.1)  # as above
+        time.sleep(0.1)  # another process writes the file: there is nothing else to wait on
         if path.exists() and len(read_log(path, ("/cycle",)).cycle):
             return _writer_of(process.pid, path)
     raise RunEndedError(f"no cycle within {START_S:g} s")

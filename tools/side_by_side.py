@@ -224,7 +224,7 @@ def wait_for(word: str, process: "subprocess.Popen[Any]", complaints: Path) -> N
         if process.poll() is not None or time.monotonic() > limit_s:
             text = " | ".join(complaints.read_text().split("\n")).strip(" |")
             raise TimingError(f"{Path(str(process.args[0])).name} did not get to {word!r}: {text}")  # type: ignore[index]
-        time.sleep(0.05)  # a file: there is nothing to wait on
+        time.sleep(0.05)  # another process writes the file: there is nothing to wait on
 
 
 def take_window(pids: dict[str, int]) -> Window:

@@ -88,7 +88,7 @@ def main() -> None:
             [BIN / "dask", "scheduler", "--scheduler-file", scheduler_file, "--no-dashboard", "--port", "0"], **quiet
         )
         while not scheduler_file.exists():
-            time.sleep(0.1)
+            time.sleep(0.1)  # Dask's file: there is nothing to wait on
         command = [BIN / "dask", "worker", "--scheduler-file", scheduler_file, "--nthreads", "1", "--no-dashboard"]
         workers = [subprocess.Popen(command, **quiet) for _ in range(2)]
         try:

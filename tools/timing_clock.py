@@ -56,7 +56,7 @@ def run_step(step_s: float, chosen: argparse.Namespace, folder: Path) -> dict[st
         stack.enter_context(emulator(CHANNEL, *options, folder=folder))
         config = patient_config(folder, more=chosen.settings)
         begun = stack.enter_context(running(host_run(CHANNEL, folder, config), folder))
-        time.sleep(chosen.seconds)
+        time.sleep(chosen.seconds)  # before, then after the step: what is measured
         set_ns = time.monotonic_ns()
         if step_s:
             set_clock(step_s)

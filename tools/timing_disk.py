@@ -64,7 +64,7 @@ class SlowDisk:
             while data := pipe.read(SLOW_BYTES_S // 10 if self.is_slow else 1 << 16):
                 file.write(data)
                 if self.is_slow:
-                    time.sleep(0.1)
+                    time.sleep(0.1)  # the disk's speed
 
     def close(self) -> None:
         """Wait for the end of the pipe."""
@@ -153,7 +153,7 @@ def run_disk_case(case: str, chosen: argparse.Namespace, folder: Path) -> dict[s
         begin, end = disturbance(case, out, begun, slow)
         time.sleep(2.0)  # the drives are enabled by now
         marks_ns = [time.time_ns()]
-        time.sleep(chosen.seconds)
+        time.sleep(chosen.seconds)  # before, then with the disturbance: what is measured
         marks_ns.append(time.time_ns())
         begin()
         time.sleep(chosen.stopped if case == "stopped" else chosen.seconds)

@@ -85,7 +85,7 @@ def run_hogs(chosen: argparse.Namespace) -> dict[str, Any]:
         stack.enter_context(hogs(chosen.processors, chosen.disks, folder))
         end_s = time.monotonic() + lasts_s
         while time.monotonic() < end_s and begun.process.poll() is None:
-            time.sleep(0.2)
+            time.sleep(0.2)  # until the run is over, or ends by itself
         status = begun.end() if begun.process.poll() is None else begun.process.returncode
     return {"config": config.name, "contacts": contacts, "status": status, "said": begun.told}
 

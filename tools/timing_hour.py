@@ -83,7 +83,7 @@ def run_hour(chosen: argparse.Namespace) -> dict[str, Any]:
             if len(memory) % 6 == 1:
                 shown = ", ".join(f"{value:.1f}" for value in memory[-1][1:])
                 print(f"{elapsed_s:6.0f} s of {total_s:.0f}, MB of host, logger, emulator: {shown}", file=sys.stderr)
-            time.sleep(min(MEMORY_EVERY_S, max(0.1, total_s - elapsed_s)))
+            time.sleep(min(MEMORY_EVERY_S, max(0.1, total_s - elapsed_s)))  # between two readings of memory
         status = begun.end()
     return {"status": status, "said": begun.told, "contacts_planned": contacts, "memory_MB": memory, "witness": counts}
 

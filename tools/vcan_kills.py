@@ -92,7 +92,7 @@ def _attempt(seed: int, folder: Path) -> VcanKill:
         arm = _arm(folder)
         stack.callback(_kill, arm)
         begun = stack.enter_context(running(host_run(CHANNEL, folder, config), folder))
-        time.sleep(wait_s)
+        time.sleep(wait_s)  # when the kill comes is drawn by lot
         if begun.process.poll() is not None:
             raise TimingError(f"the host ended by itself, exit status {begun.process.returncode}")
         killed_ns = time.time_ns()
@@ -104,7 +104,7 @@ def _attempt(seed: int, folder: Path) -> VcanKill:
                 os.kill(pid, signal.SIGKILL)
             except ProcessLookupError:
                 raise TimingError(f"process {pid} ended by itself") from None
-        time.sleep(WATCHED_S)
+        time.sleep(WATCHED_S)  # what the survivors do in this time is what is recorded
         if "host" not in result.victim:
             result.status = begun.end()
             result.said = str(begun.told.get("fault", ""))
@@ -144,7 +144,7 @@ def _await_closed(path: Path) -> None:
     """Wait until nobody has a file open, so that an orphaned logger has ended it."""
     end_s = time.monotonic() + 30.0
     while time.monotonic() < end_s and _is_open(path):
-        time.sleep(0.05)
+        time.sleep(0.05)  # a stranger's process: nothing tells when it closes a file
 
 
 def _is_open(path: Path) -> bool:

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import itertools
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -224,7 +225,7 @@ def draft_profile(eds: Path, ratings: DeviceRatings = DeviceRatings()) -> Profil
     return ProfileDraft(kind, text, tuple(writer.guesses))
 
 
-class _ProfileWriter:
+class _ProfileWriter(ABC):
     kind = ""
 
     def __init__(self, eds: Path, objects: Any, ratings: DeviceRatings) -> None:
@@ -273,11 +274,13 @@ class _ProfileWriter:
         """Whether a feature is one of this kind of device."""
         return self.kind == DRIVE or feature in ("heartbeat_consumer", "sync_counter")
 
+    @abstractmethod
     def scale(self) -> list[str]:
-        raise NotImplementedError
+        """Write what a count is worth."""
 
+    @abstractmethod
     def frames(self) -> list[str]:
-        raise NotImplementedError
+        """Write the PDOs."""
 
     def pdo(self, message: str, number: int, cob_id: int, places: list[_Place], further: str = "") -> list[str]:
         """Write one PDO; a fixed one has what the EDS maps by default."""

@@ -311,7 +311,7 @@ class LiveServer:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LINGER_S):
                 while self._ring.waiting or not all(viewer.is_served for viewer in self._viewers):
-                    await asyncio.sleep(0.01)
+                    await asyncio.sleep(0.01)  # the ring and each viewer empty at their own pace
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LINGER_S):
                 await asyncio.gather(*(each.close(1001, "the run is over") for each in list(server.connections)))
