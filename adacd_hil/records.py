@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -412,6 +412,29 @@ class Event(NamedTuple):
     level: str  # "info", "warning", "error"
     name: str
     message: str
+
+    @property
+    def told(self) -> str:
+        """What who stands beside the arm is told of it."""
+        return self.message
+
+
+class BriefedEvent(Event):
+    """An event whose message is more than somebody beside the arm needs. Equal to the event of the same message."""
+
+    brief: str
+
+    @classmethod
+    def of(cls, event: Event, brief: str) -> Self:
+        """Give an event its brief."""
+        briefed = cls(*event)
+        briefed.brief = brief
+        return briefed
+
+    @property
+    def told(self) -> str:
+        """What who stands beside the arm is told of it."""
+        return self.brief
 
 
 DETECTOR_EVENT: Final = "detector"

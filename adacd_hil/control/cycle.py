@@ -261,7 +261,7 @@ class Cycle:
             for event in source.take_events():
                 recorder.event(t_ns, event)
                 if event.name in CERTIFICATE_EVENTS:
-                    self._narration.event(t_ns, event.message)
+                    self._narration.event(t_ns, event.told)
         if output.state is not self._state:
             event = self._transition(output, arm)
             recorder.event(t_ns, event)

@@ -258,6 +258,9 @@ class TouchedLoop(ExcitedLoop):
     def said(self, name):
         return [event.message for event in self.events if event.name == name]
 
+    def told(self, name):
+        return [event.told for event in self.events if event.name == name]
+
     def levels(self, name):
         return [event.level for event in self.events if event.name == name]
 

@@ -88,6 +88,11 @@ def test_what_can_not_be_told_is_said_in_the_certificate():
         f"{margin.describe_sight(memory)}; {margin.describe_false_alarms(constants, memory)}; {THIS_RUN_ONLY}"
     ]
     assert loop.levels("certificate") == ["warning"]
+    (told,) = loop.told("certificate")
+    assert told == (
+        "warning: who has leaned on joint 1 and joint 2 since before the start is learnt as a torque offset; "
+        f"{margin.describe_push(memory)}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,6 +112,10 @@ def test_a_certificate_says_of_each_joint_what_anchors_it(settings, level, joint
         rf"torque offsets anchored: joint 1 {joint_1}; joint 2 to ± 0\.0\d\d Nm by .*; {THIS_RUN_ONLY}", text
     )
     assert loop.levels("certificate") == [level]
+    (told,) = loop.told("certificate")
+    warned = "warning: who has leaned on joint 1 since before the start is learnt as a torque offset; "
+    push = r"pushes of 0\.\d\d / 0\.\d\d Nm at the joints: found within 100 ms \(estimate\)"
+    assert re.fullmatch(f"{warned * (level == 'warning')}{push}", told)
 
 
 def test_an_untouched_arm_is_certified_at_once_whatever_its_offset():

@@ -90,6 +90,10 @@ def test_a_contact_that_never_ends_has_an_exit():
     loop.offset_Nm[0] = 0.5
     loop.run_until(SchemeState.STOPPED, 15_000)
     assert re.match(r"something still pushes the arm at rest, -?0\.[45]\d, ", loop.said("touch")[-1])
+    assert re.fullmatch(
+        r"something still pushes the arm, -?0\.[45] / 0\.0 Nm at the joints: let go; if nothing touches it.*`relearn`",
+        loop.told("touch")[-1],
+    )
     loop.request = Request.ACKNOWLEDGE
     assert {output.state for output in loop.run(1000)} == {SchemeState.STOPPED}
     loop.request = Request.RELEARN
@@ -103,6 +107,7 @@ def test_a_contact_that_never_ends_has_an_exit():
     loop.recover()
     assert abs(loop.offset_error_Nm[0]) < 0.03
     assert loop.said("certificate")[1].endswith(f"; {BY_WORD}the certificate that was taken back")
+    assert loop.told("certificate")[1].endswith(f"(estimate); {BY_WORD}the certificate that was taken back")
 
 
 @pytest.mark.long

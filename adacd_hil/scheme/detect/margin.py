@@ -285,6 +285,12 @@ def describe_sight(m: Any) -> str:
     )
 
 
+def describe_push(m: Any) -> str:
+    """Say in brief what the last test has seen."""
+    pushes = " / ".join(f"{value:.2f}" for value in m["seen_push_Nm"])
+    return f"pushes of {pushes} Nm at the joints: found within {1e3 * WITHIN_S:g} ms (estimate)"
+
+
 def take_warning(m: Any) -> str:
     """Say which joints have seen less since the last call than in the test; empty if none."""
     lines = []

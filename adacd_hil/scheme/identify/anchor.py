@@ -198,9 +198,14 @@ def tightest(k: Any, m: Any, joint: int) -> int | None:
     return None if is_open(k, m, joint) else int(np.argmin(m["bound_Nm"][:, joint]))
 
 
+def open_joints(k: Any, m: Any) -> list[int]:
+    """List the joints whose offset that was judged last has no anchor, from 0."""
+    return [i for i in range(m["judged_Nm"].shape[0]) if tightest(k, m, i) is None]
+
+
 def is_anchored(k: Any, m: Any) -> bool:
     """Tell whether every offset that was judged last has an anchor."""
-    return all(tightest(k, m, i) is not None for i in range(m["judged_Nm"].shape[0]))
+    return not open_joints(k, m)
 
 
 def describe(k: Any, m: Any) -> str:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.compiled import Structured
-from adacd_hil.records import JOINTS, Event, SchemeState, Vector
+from adacd_hil.records import JOINTS, BriefedEvent, Event, SchemeState, Vector
 from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.identify import anchor, certificate, earlier, missing_torque
 from adacd_hil.scheme.identify.certificate import Certificate
@@ -106,7 +106,15 @@ class CertificateWatch:
         text = f"{anchor.describe(k, m)}; {seen}; {known_by}{by_place}"
         self._is_standing = True
         self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))
-        return Event(level, "certificate", text)
+        return BriefedEvent.of(Event(level, "certificate", text), self._certified_in_brief(known_by))
+
+    def _certified_in_brief(self, known_by: str) -> str:
+        """Say what a certificate lets expect, and for what it can't vouch."""
+        told = [margin.describe_push(self._memory)]
+        joints = " and ".join(f"joint {i + 1}" for i in anchor.open_joints(self._constants, self._memory))
+        if joints:
+            told.insert(0, f"warning: who has leaned on {joints} since before the start is learnt as a torque offset")
+        return "; ".join([*told, *[known_by] * known_by.startswith(BY_WORD)])
 
     def _known_by(self) -> str:
         if self._vouched_against:
@@ -154,7 +162,13 @@ class CertificateWatch:
         """Say that the arm, stopped, is still pushed. torque_Nm (n,): external, filtered."""
         torque = ", ".join(f"{value:.2f}" for value in torque_Nm)
         remedy = "if nobody touches it the model is wrong, and `relearn` learns it anew"
-        return Event("warning", "touch", f"something still pushes the arm at rest, {torque} Nm by joint: {remedy}")
+        text = f"something still pushes the arm at rest, {torque} Nm by joint: {remedy}"
+        rounded = " / ".join(f"{round(float(value), 1) + 0.0:.1f}" for value in torque_Nm)
+        brief = (
+            f"something still pushes the arm, {rounded} Nm at the joints: let go; if nothing touches it, the model has "
+            "become wrong: `relearn`"
+        )
+        return BriefedEvent.of(Event("warning", "touch", text), brief)
 
     def contradiction(self) -> CommonCause:
         """Return what contradicts the certificate while the arm monitors: an offset that drifts, a torque by place."""
