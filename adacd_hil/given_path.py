@@ -1,4 +1,7 @@
-"""Paths on the command line, with what is wrong with them said before any work: what no `click.Path` looks at."""
+"""What both command lines have beyond click's: paths with what is wrong with them, and lists of commands uncut.
+
+What is wrong with a path is said before any work: what no `click.Path` looks at.
+"""
 
 import os
 from pathlib import Path
@@ -35,3 +38,16 @@ class WrittenPath(GivenPath):
         if link is not None:
             self.fail(f"link {link} leads to {os.fsdecode(link.readlink())}, which is not there", param, ctx)
         return path
+
+
+class CommandGroup(click.Group):
+    """Commands whose summaries stand in the list as a whole, folded: click cuts those that a line has no room for."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list."""
+        commands = [(name, self.commands[name]) for name in self.list_commands(ctx)]
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, command.get_short_help_str(_LONGEST)) for name, command in commands])
+
+
+_LONGEST = 1000

@@ -12,13 +12,11 @@ import io
 import os
 import re
 import select
-import shutil
 import signal
 import stat
 import sys
 import textwrap
 import threading
-from collections.abc import Iterable, Sequence
 from types import FrameType
 from typing import TextIO
 
@@ -53,91 +51,75 @@ def one_line(text: object) -> str:
     return line if len(line) <= _MOST_LETTERS else f"{line[:_MOST_LETTERS]} …"
 
 
-def terminal_columns() -> int | None:
-    """Give the width of the terminal that standard output is; None where it is none and COLUMNS is not set."""
-    try:
-        is_terminal = sys.stdout.isatty()
-    except ValueError:  # it is closed
-        is_terminal = False
-    return shutil.get_terminal_size().columns if is_terminal or "COLUMNS" in os.environ else None
+def terminal_columns(stream: "TextIO | Terminal | None" = None) -> int | None:
+    """Give the width to which text for a stream, else standard output, is laid out; None: a line stays a line.
 
-
-def fit_table(lines: Sequence[Sequence[str]], right: Sequence[int] = (), width: int | None = None) -> list[str]:
-    """Align lines of cells; columns in `right` to the right. A table wider than `width` is told in parts.
-
-    A cell is one line, whatever is in it.
-
-    Each part begins with the first column and has as many of the others as there is room for. Where one alone has no
-    room its cells are parted between words, on lines of their own.
+    It is COLUMNS where that is set, else the width of the terminal that the stream is. What isn't a terminal has none,
+    but for standard output where COLUMNS is set.
     """
-    if not lines:
-        return []
-    lines = [[in_line(cell) for cell in line] for line in lines]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    if width is None or sum(widths) + len(_GAP) * (len(widths) - 1) <= width or len(widths) == 1:
-        return _aligned(lines, range(len(widths)), widths, right)
-    parts: list[list[int]] = [[0]]
-    for column in range(1, len(widths)):
-        taken = sum(widths[place] + len(_GAP) for place in parts[-1])
-        if len(parts[-1]) > 1 and taken + widths[column] > width:
-            parts.append([0])
-        parts[-1].append(column)
-    told: list[str] = []
-    for part in parts:
-        told += [""] if told else []
-        room = max(width - widths[0] - len(_GAP), _LEAST_ROOM)
-        cells = lines if len(part) > 2 or widths[part[-1]] <= room else _parted(lines, part, room)
-        told += _aligned(cells, part, widths, right)
-    return told
+    is_output = stream is None or stream is sys.stdout
+    stream = stream or sys.stdout
+    told = os.environ.get("COLUMNS", "")
+    columns = int(told) if told.isdecimal() and len(told) <= _MOST_DIGITS else 0
+    if not _is_terminal(stream):
+        return max(columns, _LEAST_COLUMNS) if columns and is_output else None
+    return max(columns or os.get_terminal_size(stream.fileno()).columns or _COLUMNS, _LEAST_COLUMNS)
+
+
+def _is_terminal(stream: "TextIO | Terminal") -> bool:
+    try:
+        return stream.isatty()
+    except ValueError:  # it is closed
+        return False
+
+
+_COLUMNS, _LEAST_COLUMNS, _MOST_DIGITS = 80, 20, 5
+"""Of a terminal that doesn't say how wide it is; what words need; of COLUMNS."""
+_FIRST_FIELD = re.compile(r"\s*(?:\S+ )*\S+\s{2,}")
 
 
 def fold(text: str, width: int | None) -> str:
-    """Part lines that are longer than `width` between words; what follows is indented two letters more.
+    """Part lines that are longer than `width` between words. None: nothing is parted.
 
-    A word that is longer, as a path, is left whole, so that it can be copied. None: nothing is parted.
+    What follows stands below the text of a line that begins with a word and a gap, as a time, else it is indented two
+    letters more. A word that is longer, as a path, is left whole, so that it can be copied.
     """
     if width is None:
         return text
-    folded: list[str] = []
-    for line in text.split("\n"):
-        indent = " " * min(len(line) - len(line.lstrip()) + 2, max(0, width - _LEAST_ROOM))
-        is_long = len(line) > width
-        folded += _parts(line, width, indent) if is_long else [line]
-    return "\n".join(folded)
+    return "\n".join(part for line in text.split("\n") for part in _parts(line, width))
 
 
-def _parts(line: str, width: int, indent: str) -> list[str]:
+def _parts(line: str, width: int) -> list[str]:
+    if len(line) <= width:
+        return [line]
+    field = _FIRST_FIELD.match(line, 0, width // 3)
+    hang = field.end() if field else len(line) - len(line.lstrip()) + 2
     return textwrap.wrap(
-        line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False, replace_whitespace=False
+        line,
+        width,
+        subsequent_indent=" " * min(hang, width // 2),
+        break_long_words=False,
+        break_on_hyphens=False,
+        replace_whitespace=False,
     )
 
 
-_GAP = "  "
-_LEAST_ROOM = 20
-"""Letters that a cell is given, however narrow the terminal."""
+_MARKS = {
+    **dict.fromkeys(("FAILED", "error:", "fault:", "adacd-hil:", "firmware-sim:"), 31),
+    **dict.fromkeys(("WARNING", "warning:"), 33),
+    "ok": 32,
+    "next:": 1,
+}
+"""Words that are red, yellow, green or bold where a line begins with them, after its time."""
+_MARK = re.compile(rf"^(\s*\d+\.\d\d s  |)({'|'.join(map(re.escape, _MARKS))})(?!\S)", re.MULTILINE)
 
 
-def _aligned(
-    lines: Sequence[Sequence[str]], columns: Iterable[int], widths: Sequence[int], right: Sequence[int]
-) -> list[str]:
-    return [
-        _GAP.join(
-            line[column].rjust(widths[column]) if column in right else line[column].ljust(widths[column])
-            for column in columns
-        ).rstrip()
-        for line in lines
-    ]
-
-
-def _parted(lines: Sequence[Sequence[str]], part: Sequence[int], room: int) -> list[list[str]]:
-    """Part the cells of a part's last column between words."""
-    found = []
-    for line in lines:
-        for row, text in enumerate(textwrap.wrap(line[part[-1]], room, break_long_words=False) or [""]):
-            cells = list(line) if row == 0 else [""] * len(line)
-            cells[part[-1]] = text
-            found.append(cells)
-    return found
+def for_people(text: str, stream: "TextIO | Terminal") -> str:
+    """Lay a text out for a stream: free of control characters but its own, folded, with colours where it has them."""
+    text = fold(plain(text), terminal_columns(stream))
+    if not has_colour(stream):
+        return text
+    return _MARK.sub(lambda found: f"{found[1]}\x1b[{_MARKS[found[2]]}m{found[2]}\x1b[0m", text)
 
 
 class Terminal(io.TextIOBase):
@@ -182,7 +164,7 @@ class Terminal(io.TextIOBase):
         """Write a text, free of control characters. Raises OSError where the stream is needed."""
         if not isinstance(text, str):
             raise TypeError(f"{self.name} takes text, not {type(text).__name__}")
-        self.write_raw(plain(text))
+        self.write_raw(plain(text) if self._is_needed else for_people(text, self))
         return len(text)
 
     def write_raw(self, text: str) -> None:
@@ -240,38 +222,42 @@ def hurry() -> None:
             stream.hurry()
 
 
-def write_screen(text: str) -> None:
-    """Write to standard output what moves the cursor of a terminal: own escape sequences around plain text."""
-    if isinstance(sys.stdout, Terminal):
-        sys.stdout.write_raw(text)
+def write_screen(text: str, stream: TextIO | None = None) -> None:
+    """Write what moves a cursor or has colours to a stream, else standard output: own sequences around plain text."""
+    stream = stream or sys.stdout
+    if isinstance(stream, Terminal):
+        stream.write_raw(text)
     else:
-        sys.stdout.write(text)
-        sys.stdout.flush()
+        stream.write(text)
+        stream.flush()
 
 
-def moves_cursor(stream: TextIO) -> bool:
+def write_told(text: str) -> None:
+    """Write a result for people to standard output, as it is laid out there, and the end of its line."""
+    write_screen(for_people(f"{text}\n", sys.stdout))
+
+
+def moves_cursor(stream: "TextIO | Terminal") -> bool:
     """Tell whether a stream is a terminal that can overwrite a line; TERM=dumb can't."""
-    try:
-        return stream.isatty() and os.environ.get("TERM", "dumb") != "dumb"
-    except ValueError:  # it is closed
+    return _is_terminal(stream) and os.environ.get("TERM", "dumb") != "dumb"
+
+
+def has_colour(stream: "TextIO | Terminal") -> bool:
+    """Tell whether colours may be written: to terminals that aren't dumb.
+
+    NO_COLOR, set to anything, refuses them; else FORCE_COLOR and CLICOLOR_FORCE, but for 0, ask for them everywhere.
+    """
+    if os.environ.get("NO_COLOR"):
         return False
-
-
-def has_colour(stream: TextIO) -> bool:
-    """Tell whether colours may be written: to a terminal that isn't dumb, unless NO_COLOR is set, to anything."""
-    return moves_cursor(stream) and not os.environ.get("NO_COLOR")
+    if any(os.environ.get(name, "0") not in ("", "0") for name in ("FORCE_COLOR", "CLICOLOR_FORCE")):
+        return True
+    return moves_cursor(stream)
 
 
 def write_line(stream: TextIO, text: str, is_over: bool, has_end: bool) -> None:
     """Write a line, over the one that the cursor is in where `is_over`; without `has_end` the cursor stays in it."""
-    if not has_end:
-        text = text[: shutil.get_terminal_size().columns - 1]
-    whole = f"{_ERASE_LINE if is_over else ''}{plain(text)}{_LINE_END if has_end else ''}"
-    if isinstance(stream, Terminal):
-        stream.write_raw(whole)
-    else:
-        stream.write(whole)
-        stream.flush()
+    shown = f"{for_people(text, stream)}{_LINE_END}" if has_end else plain(text)[: (terminal_columns(stream) or 80) - 1]
+    write_screen(f"{_ERASE_LINE if is_over else ''}{shown}", stream)
 
 
 _ERASE_LINE = "\r\x1b[2K"

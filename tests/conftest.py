@@ -7,6 +7,8 @@ import pytest
 
 os.environ.pop("COLUMNS", None)  # pytest-xdist gives its workers 80; what no terminal shows has none
 os.unsetenv("COLUMNS")  # readline, which pytest loads, sets it behind Python's back
+for name in ("FORCE_COLOR", "CLICOLOR_FORCE"):  # as of a CI: what programs read has no colours
+    os.environ.pop(name, None)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's job in the background: Ctrl-C would reach nobody
     signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup's children would inherit that it is ignored

@@ -18,9 +18,10 @@ from hang import HANG_S
 from long_cases import long_but
 
 from adacd_hil.cli.commands.monitor_command import Screen
-from adacd_hil.cli.output import Progress
 from adacd_hil.log.reader import read_log
-from adacd_hil.terminal import fit_table, in_line, one_line, plain, terminal_columns
+from adacd_hil.progress_lines import Progress
+from adacd_hil.table_layout import fit_table
+from adacd_hil.terminal import for_people, has_colour, in_line, one_line, plain, terminal_columns
 from firmware_sim.bench.bench_time import TruthLog
 
 OK, USAGE, PARTIAL, INTERRUPTED = 0, 2, 3, 130
@@ -77,7 +78,7 @@ def test_a_table_that_is_redrawn_moves_the_cursor_by_its_own_sequences_only(monk
     screen = Screen(True, written.append)
     screen.draw("name\x1b[2J\nother\x0c")
     screen.end("name\x1b[2J")
-    assert "".join(written) == "\x1b[Hname\\u001b[2J\x1b[K\nother\\u000c\x1b[K\n\x1b[J\x1b[H\x1b[Jname\\u001b[2J\n"
+    assert "".join(written) == "\x1b[H\x1b[Kname\\u001b[2J\n\x1b[Kother\\u000c\n\x1b[J\x1b[H\x1b[Jname\\u001b[2J\n"
 
 
 @pytest.mark.long
@@ -248,49 +249,68 @@ def test_ctrl_c_in_what_raises_nothing_is_not_lost_and_no_traceback() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (OK, b"ended\n", b"")
 
 
-WIDE = [("name", "count", "words", "more"), ("first", "1", "one two three four", "x" * 20), ("2nd", "22", "", "y")]
-
-
-def test_a_table_that_fits_is_one():
-    assert fit_table(WIDE, (1,), 80) == fit_table(WIDE, (1,))
-    assert fit_table(WIDE, (1,), 80) == [
-        "name   count  words               more",
-        "first      1  one two three four  xxxxxxxxxxxxxxxxxxxx",
-        "2nd       22                      y",
-    ]
-
-
-def test_a_wider_table_is_told_in_parts_that_begin_with_the_first_column():
-    assert fit_table(WIDE, (1,), 40) == [
-        "name   count  words",
-        "first      1  one two three four",
-        "2nd       22",
-        "",
-        "name   more",
-        "first  xxxxxxxxxxxxxxxxxxxx",
-        "2nd    y",
-    ]
-
-
-def test_a_cell_without_room_is_parted_between_words():
-    lines = [("", "found"), ("a", "a sentence that is longer than the terminal is wide")]
-    assert fit_table(lines, width=30) == ["   found", "a  a sentence that is longer", "   than the terminal is wide"]
-
-
-@pytest.mark.parametrize("width", [80, 120])
-def test_no_line_of_a_table_is_wider_than_the_terminal(width):
-    rows = [tuple(f"cell {row} {column}" for column in range(30)) for row in range(4)]
-    lines = fit_table(rows, width=width)
-    assert max(map(len, lines)) <= width
-    assert {cell for row in rows for cell in row} <= set("  ".join(lines).split("  "))
-
-
 def test_columns_are_those_of_the_environment_where_there_is_no_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stdout", io.StringIO())
     monkeypatch.delenv("COLUMNS", raising=False)
     assert terminal_columns() is None
     monkeypatch.setenv("COLUMNS", "97")
     assert terminal_columns() == 97
+
+
+@pytest.mark.parametrize(
+    ("environment", "is_terminal", "has_them"),
+    [
+        ({"TERM": "xterm"}, True, True),
+        ({"TERM": "xterm"}, False, False),
+        ({"TERM": "dumb"}, True, False),
+        ({}, True, False),
+        ({"TERM": "xterm", "NO_COLOR": "1"}, True, False),
+        ({"TERM": "xterm", "NO_COLOR": ""}, True, True),
+        ({"FORCE_COLOR": "1"}, False, True),
+        ({"CLICOLOR_FORCE": "1", "TERM": "dumb"}, False, True),
+        ({"FORCE_COLOR": "0", "CLICOLOR_FORCE": "0"}, False, False),
+        ({"FORCE_COLOR": "1", "NO_COLOR": "1"}, True, False),
+    ],
+)
+def test_colours_are_as_the_environment_says(environment, is_terminal, has_them, monkeypatch) -> None:
+    for name in ("TERM", "NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    stream = io.StringIO()
+    monkeypatch.setattr(stream, "isatty", lambda: is_terminal)
+    assert has_colour(stream) is has_them
+
+
+def test_no_text_of_others_has_a_colour_of_its_own(monkeypatch) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    text = "ok \x1b[31mowned\nokay\n     2.00 s  fault: it\nwarning: no\n a FAILED b"
+    assert for_people(text, io.StringIO()) == (
+        "\x1b[32mok\x1b[0m \\u001b[31mowned\nokay\n     2.00 s  \x1b[31mfault:\x1b[0m it\n"
+        "\x1b[33mwarning:\x1b[0m no\n a FAILED b"
+    )
+
+
+@pytest.mark.parametrize("told", ["0", "-5", "x", "", "9" * 400])
+def test_columns_that_are_none_are_not_heard(told: str, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    monkeypatch.setenv("COLUMNS", told)
+    assert terminal_columns() is None
+
+
+def test_errors_are_lines_for_programs_though_columns_are_set(monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    assert terminal_columns(io.StringIO()) is None
+
+
+def test_a_screen_says_how_much_of_a_table_it_has_no_room_for(monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("LINES", "5")
+    written: list[str] = []
+    Screen(True, written.append).draw("\n".join(f"line {number}" for number in range(9)))
+    shown = "".join(written).replace("\x1b[K", "").removeprefix("\x1b[H").removesuffix("\x1b[J")
+    assert shown == "line 0\nline 1\nline 2\n… 6 lines more: a higher terminal shows them\n"
 
 
 @pytest.mark.long

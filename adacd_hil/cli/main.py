@@ -33,8 +33,8 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, complain, explained, show, tell, tried
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.cli.output import EPILOG, ExitCode, answer, complain, explained, show, tell, tried
+from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.terminal import is_interrupted, one_line, open_terminals
 
@@ -44,7 +44,11 @@ if TYPE_CHECKING:
     from adacd_hil.log.log_files import TimeWindow
 
 
-@click.group(epilog=EPILOG, context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=CommandGroup,
+    epilog=EPILOG,
+    context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]},
+)
 @click.version_option(__version__)
 def cli() -> None:
     """Identify an arm online from its joint torques over CAN, then detect collisions."""
@@ -172,7 +176,7 @@ def tare(
     from adacd_hil.cli.commands.tare_command import tare_on_bus
 
     result = tare_on_bus(connection, clock, out, poses, seconds, auto_zero)
-    print(json.dumps(result.as_json(), indent=2) if as_json else result.as_text())
+    answer(as_json, result.as_json(), result.as_text())
     return ExitCode.OK
 
 
@@ -305,7 +309,7 @@ def budget(
     from adacd_hil.cli.commands import budget_command as budgets
 
     found = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
-    print(json.dumps(budgets.as_json(found), indent=2) if as_json else budgets.as_text(found))
+    answer(as_json, budgets.as_json(found), budgets.as_text(found))
     return found.code
 
 
@@ -323,7 +327,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
     from adacd_hil.cli.commands.scan_command import as_text, scan_bus
 
     result, code = scan_bus(connection, seconds)
-    print(json.dumps(result, indent=2) if as_json else as_text(result))
+    answer(as_json, result, as_text(result))
     return code
 
 
@@ -346,7 +350,7 @@ def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: P
     from adacd_hil.cli.commands.commtest_command import as_text, run_commtest
 
     result, code = run_commtest(connection, seconds, is_enabling, out)
-    print(json.dumps(result, indent=2) if as_json else as_text(result))
+    answer(as_json, result, as_text(result))
     return code
 
 
@@ -363,7 +367,7 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
     from adacd_hil.cli.commands import doctor_command as command
 
     findings, code = command.examine(connection, is_moving)
-    print(json.dumps(command.as_json(findings), indent=2) if as_json else command.as_text(findings))
+    answer(as_json, command.as_json(findings), command.as_text(findings))
     return code
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.completion import complete_channel, complete_configuration, complete_interface
+from adacd_hil.cli.completion import complete_channel, complete_configuration, complete_interface, complete_setting
 from adacd_hil.cli.output import CommandError, ExitCode, explained
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import MOST_VIEWERS
@@ -31,6 +31,16 @@ config_option = click.option(
 )
 profile_option = click.option(
     "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
+)
+
+
+set_option = click.option(
+    "--set",
+    "changes",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change a setting, such as filter.a_rad_s=50.",
+    shell_complete=complete_setting,
 )
 
 

@@ -7,25 +7,24 @@ import contextlib
 import errno
 import functools
 import itertools
+import json
 import os
-import queue
 import shlex
 import shutil
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
-from adacd_hil.clock import MonotonicClock, wall_ns
-from adacd_hil.compile_progress import telling
+from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
-from adacd_hil.terminal import fit_table, fold, in_line, moves_cursor, one_line, terminal_columns, write_line
+from adacd_hil.table_layout import fit_table
+from adacd_hil.terminal import fold, in_line, one_line, terminal_columns, write_told
 
 PROGRAM = "adacd-hil"
 
@@ -136,16 +135,26 @@ def complain(error: BaseException) -> ExitCode:
     return error.code if isinstance(error, CommandError) else code
 
 
-def format_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """Align rows under a head; columns in `right` to the right. An empty head is left out."""
+def format_table(
+    head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = (), is_cut: bool = False
+) -> str:
+    """Align rows under a head; columns in `right` to the right. An empty head is left out. is_cut: a row is a line."""
     lines = [tuple(head), *map(tuple, rows)] if any(head) else [*map(tuple, rows)]
-    return "\n".join(fit_table(lines, right, terminal_columns()))
+    return "\n".join(fit_table(lines, right, terminal_columns(), is_cut))
 
 
 def show(text: str, *next_commands: str) -> None:
     """Print a result for people, folded to their terminal; on standard error, what they may type next."""
-    print(fold(text, terminal_columns()))
+    write_told(text)
     suggest(*next_commands)
+
+
+def answer(as_json: bool, described: Any, text: str) -> None:
+    """Print a result: for machines as it is described, or for people."""
+    if as_json:
+        print(json.dumps(described, indent=2))
+    else:
+        show(text)
 
 
 def suggest(*next_commands: str) -> None:
@@ -153,64 +162,25 @@ def suggest(*next_commands: str) -> None:
     called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     for place, command in enumerate(next_commands):
         typed = f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
-        print(f"{'next:' if place == 0 else '     '} {in_line(typed)}", file=sys.stderr)
+        print(_as_typed(f"{'next:' if place == 0 else '     '} {in_line(typed)}"), file=sys.stderr)
+
+
+def _as_typed(line: str) -> str:
+    """Part a command so that a shell takes it from a narrow terminal: its comment, and what a quote doesn't hold."""
+    columns = terminal_columns(sys.stderr)
+    command, mark, comment = line.partition("   # ")
+    if columns is None or len(line) <= columns:
+        return line
+    parts = [command] if "'" in command else fold(command, columns - len(_GOES_ON)).split("\n")
+    return f"{_GOES_ON}\n".join(parts) + (f"\n      # {comment}" if mark else "")
+
+
+_GOES_ON = " \\"
 
 
 def quoted(path: Path) -> str:
     """Quote a path for a shell."""
     return shlex.quote(str(path))
-
-
-class Progress:
-    """Lines on stderr about work in progress; their end waits for the last one, but not for ever.
-
-    A thread of their own prints them: a stuck terminal must not stop the arm. How far compiling is takes one line of a
-    terminal, which the next line overwrites; elsewhere it is said every few seconds.
-    """
-
-    CLOSE_TIMEOUT_S = 2.0
-    COUNT_EVERY_NS = 1_000_000_000
-    TOLD_EVERY_NS = 4_000_000_000
-    """Between two counts in one line of a terminal, and between two lines elsewhere."""
-
-    def __init__(self) -> None:
-        self._lines: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
-        self._has_cursor = moves_cursor(sys.stderr)
-        self._pause_ns = self.COUNT_EVERY_NS if self._has_cursor else self.TOLD_EVERY_NS
-        self._clock = MonotonicClock()
-        self._counted_ns = self._clock.now_ns() - self._pause_ns
-        self._thread = threading.Thread(target=self._print, name="progress", daemon=True)
-        self._thread.start()
-        self._told = ExitStack()
-        self._told.enter_context(telling(self.count))
-
-    def __call__(self, line: str) -> None:
-        """Queue a line."""
-        self._lines.put((line, False))
-
-    def count(self, line: Callable[[], str]) -> None:
-        """Queue a line that the next one may overwrite, if it is time for one."""
-        if self._clock.now_ns() - self._counted_ns >= self._pause_ns:
-            self._counted_ns = self._clock.now_ns()
-            self._lines.put((line(), self._has_cursor))
-
-    def _print(self) -> None:
-        is_overwritten = False
-        while (said := self._lines.get()) is not None:
-            line, is_count = said
-            write_line(sys.stderr, in_line(line), is_overwritten, has_end=not is_count)
-            is_overwritten = is_count
-        if is_overwritten:
-            write_line(sys.stderr, "", is_overwritten, has_end=False)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Print what is queued and end."""
-        self._told.close()
-        self._lines.put(None)
-        self._thread.join(self.CLOSE_TIMEOUT_S)
 
 
 @contextmanager
@@ -245,7 +215,7 @@ def tell(said: str, out: Path | None, content: str, has_all: bool) -> None:
             replace_file(out, content)
         except OSError as error:
             failure = error
-    print(said if has_all else fold(said, terminal_columns()))
+    print(said) if has_all else write_told(said)
     if failure is None:
         return
     if not has_all:

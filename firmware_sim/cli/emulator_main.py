@@ -15,13 +15,15 @@ import click
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.compiled import compiling
 from adacd_hil.file_access import in_words, tidied
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.log.editing.log_info import run_metadata
 from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError
 from adacd_hil.log.recording.run_folder import check_free
+from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.terminal import fit_table, in_line, one_line, open_terminals
+from adacd_hil.table_layout import fit_table
+from adacd_hil.terminal import in_line, one_line, open_terminals, terminal_columns, write_told
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from adacd_hil.wire.contract_frames import HOST_NODE, move_contract
@@ -111,7 +113,7 @@ def on_bus(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-@click.group(epilog=EPILOG, context_settings=_CONTEXT)
+@click.group(cls=CommandGroup, epilog=EPILOG, context_settings=_CONTEXT)
 def cli() -> None:
     """Play the drives, the torque sensors, the arm and the person who touches it, on a CAN bus."""
 
@@ -184,7 +186,7 @@ def run(
             log = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
             stack.enter_context(log)
         departure = Departure(bus)
-        with compiling(Body.compiled_functions):
+        with Progress(), compiling(Body.compiled_functions):
             bench = Bench(
                 resolved, codec, departure.send, clock_mode=clock_mode, contract=played, on_answer=departure.go
             )
@@ -255,7 +257,8 @@ def list_scenarios(as_json: bool) -> int:
         print(json.dumps(described, indent=2, ensure_ascii=False))
     else:
         columns = ("name", "group", "about")
-        print("\n".join(fit_table([columns, *([row[name] for name in columns] for row in described)])))
+        table = fit_table([columns, *([row[name] for name in columns] for row in described)], width=terminal_columns())
+        write_told("\n".join(table))
     return EmulatorExit.OK
 
 
@@ -267,8 +270,7 @@ def list_truths(as_json: bool) -> int:
     if as_json:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
     else:
-        width = max(len(row["name"]) for row in rows)
-        print("\n".join(f"{row['name'].ljust(width)}  {row['about']}" for row in rows))
+        write_told("\n".join(fit_table([(row["name"], row["about"]) for row in rows], width=terminal_columns())))
     return EmulatorExit.OK
 
 
@@ -301,7 +303,7 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
     if as_json:
         print(json.dumps([vars(finding) for finding in findings], indent=2, ensure_ascii=False))
     else:
-        print("\n".join(in_line(line) for finding in findings for line in finding.lines))
+        write_told("\n".join(in_line(line) for finding in findings for line in finding.lines))
     return EmulatorExit.USAGE if any(finding.problems for finding in findings) else EmulatorExit.OK
 
 

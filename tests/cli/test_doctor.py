@@ -310,5 +310,6 @@ def test_the_report_has_a_remedy_under_what_is_wrong() -> None:
         "            -> mend it",
         "",
         "1 ok, 0 warning, 1 failed, 0 skipped",
+        "FAILED   bb: mend it",
     ]
     assert json.loads(json.dumps(as_json(findings)))["checks"][1]["status"] == "failed"

@@ -90,7 +90,7 @@ def test_a_terminal_is_redrawn_in_place_and_not_scrolled() -> None:
     screen = Screen(True, written.append)
     screen.draw("\n".join(str(number) for number in range(200)))
     screen.end("last")
-    assert written[0].startswith("\x1b[H0\x1b[K\n1\x1b[K\n")
+    assert written[0].startswith("\x1b[H\x1b[K0\n\x1b[K1\n")
     assert written[0].count("\n") < 200
     assert written[1] == "\x1b[H\x1b[Jlast\n"
     assert screen.redraw_s == 0.2

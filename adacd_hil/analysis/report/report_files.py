@@ -44,7 +44,8 @@ from adacd_hil.analysis.score.metrics import Gathered, Metrics, ReportedContact,
 from adacd_hil.file_access import replace_files
 from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
 from adacd_hil.records import PARAMETER_UNITS
-from adacd_hil.terminal import fit_table, in_line, terminal_columns
+from adacd_hil.table_layout import fit_table
+from adacd_hil.terminal import in_line, terminal_columns
 
 HTML_NAME: Final = "report.html"
 _PNG_FIGURES: Final = ("fig5", "fig6", "fig7")

@@ -1,12 +1,12 @@
 """The bit budget of a contract, as text and as JSON."""
 
-import textwrap
 from typing import Any, NamedTuple
 
 from adacd_hil.cli.output import ExitCode
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.settings.configuration import load_settings
-from adacd_hil.terminal import fit_table, in_line
+from adacd_hil.table_layout import fit_table
+from adacd_hil.terminal import fold, in_line, terminal_columns
 from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, find_budget, us
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.contract_frames import read_contract, share_bus
@@ -57,7 +57,7 @@ def judge(
 
 
 def as_text(judgement: Judgement) -> str:
-    """Write a budget for people, at most 120 characters wide."""
+    """Write a budget for people, as wide as their terminal, else 120 letters."""
     budget = judgement.budget
     rates = f"{budget.bitrate} bit/s" + (f", data {budget.data_bitrate} bit/s" if budget.data_bitrate else "")
     findings = [
@@ -75,11 +75,11 @@ def as_text(judgement: Judgement) -> str:
         *(("note", note) for note in judgement.notes),
         ("verdict", budget.line),
     ]
-    table = fit_table([_COLUMNS, *map(_row, budget.frames)], right=_RIGHT_ALIGNED)
+    width = terminal_columns() or _WIDTH
+    table = fit_table([_COLUMNS, *map(_row, budget.frames)], _RIGHT_ALIGNED, width)
     lines = [f"{budget.contract.name}, {budget.period_us} µs, {rates}", "", *table, "", *_LEGEND, ""]
-    for title, finding in findings:
-        lines += textwrap.wrap(finding, _WIDTH, initial_indent=f"{title:14}", subsequent_indent=" " * 14)
-    return "\n".join(in_line(line) for line in lines)
+    lines += [f"{title:12}  {finding}" for title, finding in findings]
+    return "\n".join(fold(in_line(line), width) for line in lines)
 
 
 def _row(entry: FrameBudget) -> tuple[str, ...]:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import ExitCode, Progress, explained, format_table, show
+from adacd_hil.cli.output import ExitCode, explained, format_table, show
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
+from adacd_hil.progress_lines import Progress
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:

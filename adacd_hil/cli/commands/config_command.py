@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.completion import complete_configuration, complete_setting
-from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table
+from adacd_hil.cli.options import json_option, profile_option, set_option
+from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, show
+from adacd_hil.given_path import CommandGroup
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -16,12 +17,12 @@ if TYPE_CHECKING:
 EPILOG = "Exit status: 0 done, warnings included; 2 wrong usage, or a configuration that can't be used."
 
 
-@click.group("config")
+@click.group("config", cls=CommandGroup)
 def config() -> None:
     """Show, check and explain configurations."""
 
 
-@config.command(epilog=EPILOG)
+@config.command("show", epilog=EPILOG)
 @click.argument("keys", nargs=-1, metavar="[GROUP|KEY]...", shell_complete=complete_setting)
 @click.option(
     "--config",
@@ -33,18 +34,11 @@ def config() -> None:
     shell_complete=complete_configuration,
 )
 @profile_option
-@click.option(
-    "--set",
-    "changes",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Change a setting, such as filter.a_rad_s=50.",
-    shell_complete=complete_setting,
-)
+@set_option
 @click.option("--changed", "is_changed", is_flag=True, help="Only settings that differ from their default.")
 @json_option
 @explained
-def show(
+def show_settings(
     keys: tuple[str, ...], name: str, profile: str | None, changes: tuple[str, ...], is_changed: bool, as_json: bool
 ) -> ExitCode:
     """Show the settings in force, and where each is from: the default, a file or a profile of one, or --set.
@@ -57,7 +51,7 @@ def show(
     if as_json:
         print(json.dumps(rows, indent=2))
     elif rows:
-        print(format_table(("key", "value", "from"), [(row["key"], row["value"], row["origin"]) for row in rows]))
+        show(format_table(("key", "value", "from"), [(row["key"], row["value"], row["origin"]) for row in rows]))
     return ExitCode.OK
 
 
@@ -109,10 +103,8 @@ def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCod
         for name, found in findings.items():
             for kind, lines in (("error", found.errors), ("warning", found.warnings)):
                 for line in lines:
-                    print(f"{in_line(name)}: {kind}: {in_line(line)}")
-            print(
-                f"{in_line(name)}: {_counted(len(found.errors), 'error')}, {_counted(len(found.warnings), 'warning')}"
-            )
+                    show(f"{in_line(name)}: {kind}: {in_line(line)}")
+            show(f"{in_line(name)}: {_counted(len(found.errors), 'error')}, {_counted(len(found.warnings), 'warning')}")
     return ExitCode.USAGE if any(found.errors for found in findings.values()) else ExitCode.OK
 
 
@@ -135,12 +127,10 @@ def docs(keys: tuple[str, ...], as_json: bool) -> ExitCode:
         print(json.dumps(told, indent=2))
     elif len(rows) == 1:
         (row,) = rows
-        print(
-            f"{row.key}\n  {row.meaning}\n  default: {row.default}" + (f"\n  bounds: {row.bounds}" * bool(row.bounds))
-        )
+        show(f"{row.key}\n  {row.meaning}\n  default: {row.default}" + (f"\n  bounds: {row.bounds}" * bool(row.bounds)))
     else:
         table = [(row.key, row.default, row.bounds, row.meaning) for row in rows]
-        print(format_table(("key", "default", "bounds", "meaning"), table))
+        show(format_table(("key", "default", "bounds", "meaning"), table))
     return ExitCode.OK
 
 
@@ -155,7 +145,7 @@ def _list_groups(as_json: bool) -> None:
         print(json.dumps(groups, indent=2))
     else:
         rows = [(group["group"], str(group["keys"]), group["meaning"]) for group in groups]
-        print(format_table(("group", "keys", "meaning"), rows, right=(1,)))
+        show(format_table(("group", "keys", "meaning"), rows, right=(1,)))
 
 
 def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":

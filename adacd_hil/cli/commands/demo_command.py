@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from adacd_hil.analysis.score.emulator_truth import config_digest
 from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, exit_code, quoted, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.operator import ScriptedOperator
@@ -16,6 +16,7 @@ from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.file_access import in_words
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, LOG_NAME, TRUTH_NAME, LogError
+from adacd_hil.progress_lines import Progress
 from adacd_hil.records import TRUTH_LAYOUT, FaultReason, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import Settings, configuration_layers, load_settings, resolved_table

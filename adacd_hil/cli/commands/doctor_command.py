@@ -9,7 +9,9 @@ from adacd_hil.clock import MonotonicClock
 from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination
 from adacd_hil.commission.configuration_check import configuration_checks
 from adacd_hil.commission.host_checks import HOST_CHECKS, Finding, Host, Status, diagnose, summarise
+from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import request_realtime
+from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import open_bus
 from adacd_hil.wire.can_interface import InterfaceState, read_link
 from adacd_hil.wire.contract_frames import read_bitrates
@@ -38,8 +40,6 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
         lambda: request_realtime(settings.realtime_request),
         settings.realtime.cpu,
     )
-    findings = diagnose(configuration_checks(settings), settings, _report)
-    findings += diagnose(HOST_CHECKS, host, _report)
     patient = ArmExamination(
         settings,
         codec,
@@ -49,23 +49,26 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
         bitrate,
         data_bitrate,
     )
-    if is_moving and sys.stdin is not None and sys.stdin.isatty():
-        patient.ask = lambda line: print(f">>> {line}", file=sys.stderr, flush=True)
-    elif is_moving:
-        patient.no_move_reason = "nobody to ask: stdin is not a terminal"
-    try:
-        with on_interrupt(raise_interrupt):
-            findings += diagnose(ARM_CHECKS, patient, _report, findings)
-    finally:
-        trouble = patient.leave()
+    with Progress() as progress:
+
+        def report(finding: Finding) -> None:
+            progress.passing(f"{finding.name}: {finding.status.value}")
+
+        if is_moving and sys.stdin is not None and sys.stdin.isatty():
+            patient.ask = lambda line: progress(f">>> {line}")
+        elif is_moving:
+            patient.no_move_reason = "nobody to ask: stdin is not a terminal"
+        findings = diagnose(configuration_checks(settings), settings, report)
+        findings += diagnose(HOST_CHECKS, host, report)
+        try:
+            with on_interrupt(raise_interrupt):
+                findings += diagnose(ARM_CHECKS, patient, report, findings)
+        finally:
+            trouble = patient.leave()
     if trouble:
         findings.append(Finding("end", Status.FAILED, f"nodes were not stopped: {trouble}", "cut the drives' power"))
     has_failed = any(finding.status is Status.FAILED for finding in findings)
     return findings, ExitCode.FAILURE if has_failed else ExitCode.OK
-
-
-def _report(finding: Finding) -> None:
-    print(f"{finding.name}: {finding.status.value}", file=sys.stderr, flush=True)
 
 
 def as_json(findings: list[Finding]) -> dict[str, Any]:
@@ -75,10 +78,14 @@ def as_json(findings: list[Finding]) -> dict[str, Any]:
 
 
 def as_text(findings: list[Finding]) -> str:
-    """Write the findings for people: one line each, its remedy below."""
+    """Write the findings for people: one line each, its remedy below; what has failed once more at the end."""
     rows = []
     for finding in findings:
         rows.append((_MARKS[finding.status], finding.name, finding.reason))
         if finding.remedy:
             rows.append(("", "", f"-> {finding.remedy}"))
-    return f"{format_table(('', '', ''), rows)}\n\n{summarise(findings)}"
+    failed = [finding for finding in findings if finding.status is Status.FAILED]
+    last = [
+        f"{_MARKS[Status.FAILED]}   {finding.name}: {in_line(finding.remedy or finding.reason)}" for finding in failed
+    ]
+    return "\n".join([format_table(("", "", ""), rows), "", summarise(findings), *last])

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.analysis.excitation_search import ExcitationLimits, Figures, NoExcitationError, Search
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, format_table
+from adacd_hil.cli.output import CommandError, ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
+from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.toml_files import builtin_names, to_toml

@@ -1,14 +1,13 @@
 """`adacd-hil history`: what an arm's runs have certified."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, format_table
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained, format_table
 from adacd_hil.file_access import is_anothers, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
@@ -40,7 +39,7 @@ def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
         if is_anothers(plot, _PNG):
             raise CommandError(f"--plot {plot} is there already and no PNG; give another name", ExitCode.USAGE)
         replace_file(plot, _as_png(found))
-    print(json.dumps(dataclasses.asdict(found), indent=2) if as_json else _as_text(found))
+    answer(as_json, dataclasses.asdict(found), _as_text(found))
     return ExitCode.OK
 
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table, quoted, show
+from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show
 from adacd_hil.file_access import replace_file
 from adacd_hil.given_path import GIVEN_FILE, WrittenPath
+from adacd_hil.progress_lines import Progress
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:

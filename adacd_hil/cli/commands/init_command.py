@@ -10,7 +10,7 @@ import click
 from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
 from adacd_hil.cli.interview import Interview
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, show
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
@@ -76,14 +76,14 @@ def init(
     summary |= {"file": str(out), "written": [str(path) for path in writing.contents]}
     bus, code = summary.pop("bus", None), ExitCode.OK
     if not as_json:
-        print(as_text(summary, bus))
+        show(as_text(summary, bus))
     if interview.confirm(rehearse, "Rehearse with an emulated arm now?"):
         from adacd_hil.cli.commands.demo_command import play
 
         report, code = play(str(out), "paper", None, None, "lockstep", None)
         summary["rehearsal"] = report.as_json()
         if not as_json:
-            print(report.as_text())
+            show(report.as_text())
     if doctor and bus is None:
         raise CommandError("--doctor needs a bus: run `adacd-hil doctor` where the arm is", ExitCode.USAGE)
     if bus is not None and interview.confirm(doctor, "Check host, bus and arm now (`doctor`)?"):
@@ -95,7 +95,7 @@ def init(
         code = code or doctor_code
         summary["doctor"] = doctor_command.as_json(findings)
         if not as_json:
-            print(doctor_command.as_text(findings))
+            show(doctor_command.as_text(findings))
     if as_json:
         print(json.dumps(summary, indent=2))
     return code

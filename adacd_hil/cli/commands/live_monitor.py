@@ -29,7 +29,7 @@ from adacd_hil.records import (
     Location,
     SchemeState,
 )
-from adacd_hil.terminal import one_line, write_screen
+from adacd_hil.terminal import fold, moves_cursor, one_line, terminal_columns, write_screen
 
 TOPICS = ("/scheme", "/cycle", "/contact", "/events")
 _BAR_WIDTH = 40
@@ -134,7 +134,7 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
     Raises LogError.
     """
     clock = MonotonicClock()
-    screen = Screen(sys.stdout.isatty() and is_live and not as_json, write_screen)
+    screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
     is_stopped = False
 
     def stop() -> None:
@@ -157,10 +157,10 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
                 drawn_ns = now_ns
                 if is_live and not as_json:
                     with _understood():
-                        screen.draw(as_text(monitor.describe()))
+                        screen.draw(as_text(monitor.describe(), is_cut=screen.is_redrawn))
         with _understood():
             described = {"url": url} | monitor.describe()
-    screen.end(json.dumps(described, indent=2) if as_json else as_text(described))
+    screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))
     return ExitCode.OK
 
 
@@ -173,8 +173,8 @@ def _understood() -> Iterator[None]:
         raise LogError("it does not serve a log of adacd-hil") from None
 
 
-def as_text(described: dict[str, Any]) -> str:
-    """Write the view for people."""
+def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
+    """Write the view for people; is_cut: a line for each event, cut to the terminal."""
     if "state" not in described:
         return f"{described['messages']} messages, none of /scheme"
     fault = "" if described["fault"] == FaultReason.NONE.name else f" by {described['fault']}"
@@ -194,7 +194,7 @@ def as_text(described: dict[str, Any]) -> str:
             (f"{event['t_s']:.3f}", event["level"], one_line(event["name"]), one_line(event["message"]))
             for event in described["events"]
         ]
-        parts.append(format_table(("s", "level", "event", ""), rows, right=(0,)))
+        parts.append(format_table(("s", "level", "event", ""), rows, (0,), is_cut))
     return "\n\n".join(parts)
 
 

@@ -9,8 +9,8 @@ import click
 
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table, show
+from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def _tell(line: str) -> None:
     print(in_line(line), file=sys.stderr)
 
 
-@click.group("log")
+@click.group("log", cls=CommandGroup)
 def log() -> None:
     """Look at logs, check, recover, cut and merge them. A log is named by its first part."""
 
@@ -50,7 +50,7 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     if as_json:
         print(json.dumps([info_as_json(entry) for entry in found], indent=2))
     else:
-        print("\n\n".join(info_as_text(entry) for entry in found))
+        show("\n\n".join(info_as_text(entry) for entry in found))
     return ExitCode.PARTIAL if any(entry.problems for entry in found) else ExitCode.OK
 
 
@@ -69,7 +69,7 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     if as_json:
         print(json.dumps([check_as_json(entry) for entry in checked], indent=2))
     else:
-        print("\n".join(check_as_text(entry) for entry in checked))
+        show("\n".join(check_as_text(entry) for entry in checked))
     if any(entry.errors for entry in checked):
         return ExitCode.FAILURE
     return ExitCode.PARTIAL if any(entry.warnings for entry in checked) else ExitCode.OK
@@ -91,7 +91,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
 
     recovery = recover_log(log, out, _tell)
     as_table = recovery_as_json(recovery)
-    print(json.dumps(as_table, indent=2) if as_json else recovery_as_text(recovery))
+    answer(as_json, as_table, recovery_as_text(recovery))
     return ExitCode.PARTIAL if recovery.is_lossy else ExitCode.OK
 
 
@@ -130,7 +130,7 @@ def cut(
         stretch = find_contact(log, contact, around_s)
     done = cut_log(log, out or default_out(log), stretch, topics, _tell)
     result = {"out": str(done.out), **stretch.as_json(), "messages": done.messages}
-    print(json.dumps(result, indent=2) if as_json else in_line(f"{done.out}: {done.messages} messages"))
+    answer(as_json, result, in_line(f"{done.out}: {done.messages} messages"))
     return ExitCode.OK
 
 
@@ -148,7 +148,7 @@ def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) ->
     if done.shared and not has_prefix:
         _tell(f"topics of more than one log, told apart by their channels only: {', '.join(done.shared)}")
     result = {"out": str(done.out), "logs": list(done.names), "messages": done.messages, "shared": list(done.shared)}
-    print(json.dumps(result, indent=2) if as_json else in_line(f"{done.out}: {done.messages} messages"))
+    answer(as_json, result, in_line(f"{done.out}: {done.messages} messages"))
     return ExitCode.OK
 
 
@@ -334,7 +334,7 @@ def export(
         described, problem = _export_frames(log, out, kind, only, can_ids, codec, has_direction)
     if problem:
         print(in_line(f"warning: {problem}"), file=sys.stderr)
-    print(json.dumps(described | {"problem": problem}, indent=2) if as_json else described["text"])
+    answer(as_json, described | {"problem": problem}, described["text"])
     return ExitCode.PARTIAL if problem else ExitCode.OK
 
 

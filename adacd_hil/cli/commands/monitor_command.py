@@ -11,7 +11,7 @@ from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.device.survey import BusView, MessageView, Snapshot
-from adacd_hil.terminal import plain, write_screen
+from adacd_hil.terminal import fold, moves_cursor, plain, terminal_columns, write_screen
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
 from adacd_hil.wire.contract_frames import read_bitrates
@@ -33,6 +33,11 @@ class Screen:
         self._write = write
 
     @property
+    def is_redrawn(self) -> bool:
+        """Whether a table takes the place of the one before."""
+        return self._is_terminal
+
+    @property
     def redraw_s(self) -> float:
         """Time between two tables."""
         return REDRAW_S if self._is_terminal else PLAIN_S
@@ -44,8 +49,10 @@ class Screen:
             self._write(text + "\n\n")
             return
         columns, rows = shutil.get_terminal_size()
-        lines = [line[: columns - 1] + _CLEAR_LINE for line in text.split("\n")[: rows - 1]]
-        self._write(_HOME + "\n".join(lines) + "\n" + _CLEAR_BELOW)
+        lines = fold(text, columns).split("\n")
+        if len(lines) >= rows:
+            lines = [*lines[: rows - 2], f"… {len(lines) - rows + 2} lines more: a higher terminal shows them"]
+        self._write(_HOME + "".join(f"{_CLEAR_LINE}{line[:columns]}\n" for line in lines) + _CLEAR_BELOW)
 
     def end(self, text: str) -> None:
         """Show the last table."""
@@ -113,7 +120,7 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
     """
     clock = MonotonicClock()
     _, codec = connection.load()  # what is wrong with the configuration comes before what is wrong with the bus
-    screen = Screen(sys.stdout.isatty() and is_live and not as_json, write_screen)
+    screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
     with connection.bus(clock, codec.is_fd) as bus:
         monitor = Monitor(connection, bus, clock, node_id)
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
@@ -127,10 +134,10 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
                     if monitor.is_stopped or (end_ns is not None and clock.now_ns() >= end_ns):
                         break
                     if is_live and not as_json:
-                        screen.draw(as_text(monitor.describe()))
+                        screen.draw(as_text(monitor.describe(), is_cut=screen.is_redrawn))
             finally:  # a bus that fails leaves its last table, too
                 described = monitor.describe()
-                screen.end(json.dumps(described, indent=2) if as_json else as_text(described))
+                screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))
     return ExitCode.OK
 
 
@@ -162,8 +169,8 @@ def _describe_message(message: MessageView) -> dict[str, Any]:
     }
 
 
-def as_text(described: dict[str, Any]) -> str:
-    """Write the table for people."""
+def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
+    """Write the table for people; is_cut: a line for each message, cut to the terminal."""
     parts = [_head(described)]
     if described["nodes"]:
         rows = [
@@ -174,7 +181,7 @@ def as_text(described: dict[str, Any]) -> str:
     messages = described["messages"]
     if messages:
         head = ("id", "message", "Hz", "age ms", "lost", "bad", "values")
-        parts.append(format_table(head, [_row(message) for message in messages], right=(2, 3, 4, 5)))
+        parts.append(format_table(head, [_row(message) for message in messages], (2, 3, 4, 5), is_cut))
     else:
         parts.append("nothing heard")
     return "\n\n".join(parts)

@@ -1,6 +1,5 @@
 """`adacd-hil play`: the frames of a recording on a bus, at their times."""
 
-import json
 import queue
 import sys
 import threading
@@ -14,7 +13,7 @@ import click
 from adacd_hil.cli.commands.log_command import contract_of, dbc_option, id_option, only_option
 from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import LogError
@@ -103,7 +102,7 @@ def play(
     clock = MonotonicClock()
     bus = open_bus(interface, channel, clock, (), bitrate, is_fd or codec.is_fd)
     described, code = _run(playback, bus, clock, speed, times, longest_pause_s)
-    print(json.dumps(described, indent=2) if as_json else _as_text(described))
+    answer(as_json, described, _as_text(described))
     return code
 
 

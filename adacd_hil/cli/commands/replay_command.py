@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.completion import complete_run, complete_setting
-from adacd_hil.cli.options import json_option, profile_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table, quoted, show
+from adacd_hil.cli.options import json_option, profile_option, set_option, stretch_options
+from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
+from adacd_hil.progress_lines import Progress
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -30,14 +31,7 @@ _MOST_COLUMNS = 6
 
 @click.command(epilog=_EPILOG)
 @click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
-@click.option(
-    "--set",
-    "changes",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Change a setting, such as filter.a_rad_s=50.",
-    shell_complete=complete_setting,
-)
+@set_option
 @click.option(
     "--vary",
     multiple=True,

@@ -8,9 +8,10 @@ from adacd_hil.analysis.report.report_files import Report, write_report
 from adacd_hil.analysis.runs.run_pages import INDEX_NAME, ListedRun, runs_page
 from adacd_hil.analysis.runs.run_summary import BROKEN, RunSummary, find_runs, reported
 from adacd_hil.analysis.runs.run_table import count_text
-from adacd_hil.cli.output import CommandError, ExitCode, Progress
+from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, TimeWindow, failing_as, log_in
+from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import one_line
 

@@ -21,13 +21,14 @@ from adacd_hil.cli.connection import (
     never_stopped,
     on_interrupt,
 )
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, exit_code, quoted, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
 from adacd_hil.clock import format_date, wall_ns
 from adacd_hil.control.arm_records import Origin, UsedHistory, use_history, use_tare
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.progress_lines import Progress
 from adacd_hil.records import FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -171,6 +172,7 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
         }
     log = summary.log
     return described | {
+        "certificates": [certificate.text for certificate in summary.certificates],
         "frames": log.frames,
         "messages": log.messages,
         "dropped": log.dropped,
@@ -200,10 +202,14 @@ def _verdict(result: dict[str, Any]) -> str:
     return f"The run ended without a fault, in {result['state']}, after {result['cycles']} cycles{lost}."
 
 
+_FOR_MACHINES = ("data", "certificates")
+"""Of what `summarise` says: told otherwise, or while it runs."""
+
+
 def as_text(result: dict[str, Any]) -> str:
     """Lay out what `summarise` says for people, a line each."""
     data = result.get("data")
-    lines = [_verdict(result), *(f"{key}: {value}" for key, value in result.items() if key != "data")]
+    lines = [_verdict(result), *(f"{key}: {value}" for key, value in result.items() if key not in _FOR_MACHINES)]
     if data is not None:
         lines.append(f"incomplete cycles: {data['incomplete']:.2%}; samples used late: {data['late']:.2%}")
         for what, shares in (("no frame in time", data["no_new_data"]), ("repeated frames", data["repeated"])):

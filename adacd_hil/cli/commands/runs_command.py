@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table
+from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, show
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME, LogError
+from adacd_hil.progress_lines import Progress
 from adacd_hil.remedies import nearest_name
 from adacd_hil.terminal import in_line
 
@@ -128,7 +129,7 @@ def runs(
     if as_json:
         print(json.dumps({"folder": str(folder), "runs": run_table.as_json(found)}, indent=2, allow_nan=False))
     else:
-        print(_as_text(found))
+        show(_as_text(found))
     return _code(found)
 
 
@@ -164,7 +165,7 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
     if as_json:
         print(json.dumps({"folder": str(folder), "arms": [each.as_json() for each in made]}, indent=2))
     else:
-        print("\n\n".join(_trend_text(each) for each in made) or "no run")
+        show("\n\n".join(_trend_text(each) for each in made) or "no run")
     return _code(found)
 
 

@@ -12,9 +12,10 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, show
+from adacd_hil.cli.output import CommandError, ExitCode, explained, show
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.progress_lines import Progress
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
-from adacd_hil.cli.output import CommandError, ExitCode, Progress
+from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import VirtualClock
 from adacd_hil.commission.tare import TareRefusedError
 from adacd_hil.commission.tare_session import TareSession
@@ -16,6 +16,7 @@ from adacd_hil.control.arm_records import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import refuse_company
+from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.terminal import in_line
 

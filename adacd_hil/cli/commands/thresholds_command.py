@@ -6,8 +6,9 @@ from pathlib import Path
 
 from adacd_hil.analysis.thresholds.detector_comparison import Comparison, compare_detectors
 from adacd_hil.analysis.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
-from adacd_hil.cli.output import Progress, format_table
+from adacd_hil.cli.output import format_table
 from adacd_hil.log.log_files import WHOLE, TimeWindow, log_in
+from adacd_hil.progress_lines import Progress
 
 
 def find(

@@ -8,20 +8,10 @@ import click
 
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import (
-    CommandError,
-    ExitCode,
-    Progress,
-    explained,
-    format_table,
-    quoted,
-    show,
-    suggest,
-    tell,
-    tried,
-)
+from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show, suggest, tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
+from adacd_hil.progress_lines import Progress
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:

@@ -1,0 +1,74 @@
+"""Lines on standard error about work in progress, in both programs."""
+
+import queue
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Self
+
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.compile_progress import telling
+from adacd_hil.terminal import in_line, moves_cursor, write_line
+
+
+class Progress:
+    """Lines on stderr about work in progress; their end waits for the last one, but not for ever.
+
+    A thread of their own prints them: a stuck terminal must not stop the arm. How far compiling is takes one line of a
+    terminal, which the next line overwrites; elsewhere it is said every few seconds.
+    """
+
+    CLOSE_TIMEOUT_S = 2.0
+    COUNT_EVERY_NS = 1_000_000_000
+    TOLD_EVERY_NS = 4_000_000_000
+    """Before a count and the next, in one line of a terminal, and as lines elsewhere: what is loaded counts nothing."""
+
+    def __init__(self) -> None:
+        self._lines: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
+        self._has_cursor = moves_cursor(sys.stderr)
+        self._pause_ns = self.COUNT_EVERY_NS if self._has_cursor else self.TOLD_EVERY_NS
+        self._clock = MonotonicClock()
+        self._is_counting = False
+        self._begun_ns = self._counted_ns = 0
+        self._thread = threading.Thread(target=self._print, name="progress", daemon=True)
+        self._thread.start()
+        self._told = ExitStack()
+        self._told.enter_context(telling(self.count))
+
+    def __call__(self, line: str) -> None:
+        """Queue a line."""
+        self._is_counting = False
+        self._lines.put((line, False))
+
+    def passing(self, line: str) -> None:
+        """Queue a line in whose place a terminal shows the next one."""
+        self._is_counting = False
+        self._lines.put((line, self._has_cursor))
+
+    def count(self, line: Callable[[], str]) -> None:
+        """Queue a line that the next one may overwrite, if it is time for one, with the seconds that it has taken."""
+        now_ns = self._clock.now_ns()
+        if not self._is_counting:
+            self._is_counting, self._begun_ns, self._counted_ns = True, now_ns, now_ns
+        if now_ns - self._counted_ns >= self._pause_ns:
+            self._counted_ns = now_ns
+            self._lines.put((f"{line()}, {(now_ns - self._begun_ns) / 1e9:.0f} s", self._has_cursor))
+
+    def _print(self) -> None:
+        is_overwritten = False
+        while (said := self._lines.get()) is not None:
+            line, is_passing = said
+            write_line(sys.stderr, in_line(line), is_overwritten, has_end=not is_passing)
+            is_overwritten = is_passing
+        if is_overwritten:
+            write_line(sys.stderr, "", is_overwritten, has_end=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Print what is queued and end."""
+        self._told.close()
+        self._lines.put(None)
+        self._thread.join(self.CLOSE_TIMEOUT_S)

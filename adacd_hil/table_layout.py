@@ -1,0 +1,121 @@
+"""Tables for people: cells in columns, laid out to the width of a terminal.
+
+A table that is wider than the terminal gets narrower columns first: cells of words go on in further lines. Where
+columns have no room beside each other even so, the table is told in parts, each of which begins with the first column.
+On a screen that is redrawn a row is one line, and cells are cut.
+"""
+
+import re
+import textwrap
+from collections.abc import Collection, Sequence
+from itertools import zip_longest
+
+from adacd_hil.terminal import in_line
+
+_GAP = "  "
+_LEAST_ROOM, _LEAST_CUT = 16, 8
+"""Letters to which a column of words may shrink while others keep theirs."""
+_PIECES = re.compile(r"[^/_.,=:;]*[/_.,=:;]+|[^/_.,=:;]+")
+"""Of a word that has no room in a line: a path, a key."""
+
+
+def fit_table(
+    lines: Sequence[Sequence[str]], right: Collection[int] = (), width: int | None = None, is_cut: bool = False
+) -> list[str]:
+    """Align lines of cells; columns in `right` to the right. A cell is text of one line, whatever is in it.
+
+    No line is wider than `width`, of at least 20; None: as wide as it gets. is_cut: each is one line, its cells cut.
+    """
+    if not lines:
+        return []
+    lines = [[in_line(cell) for cell in line] for line in lines]
+    natural = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
+    if width is None or _sum(natural) <= width:
+        return _aligned(lines, natural, right)
+    least = [
+        most if column in right else min(most, _LEAST_CUT if is_cut else _least_room(column, lines))
+        for column, most in enumerate(natural)
+    ]
+    told: list[str] = []
+    for part in _parts(least, width):
+        widths = _shrunk([natural[column] for column in part], [least[column] for column in part], width)
+        cells = ([line[column] for column in part] for line in lines)
+        rows = [row for line in cells for row in (_cut(line, widths) if is_cut else _rows(line, widths))]
+        told += [""] if told else []
+        told += _aligned(rows, widths, [place for place, column in enumerate(part) if column in right])
+    return told
+
+
+def _sum(widths: Sequence[int]) -> int:
+    return sum(widths) + len(_GAP) * (len(widths) - 1)
+
+
+def _least_room(column: int, lines: Sequence[Sequence[str]]) -> int:
+    """Return to how many letters a column of words may shrink: words of the first stay whole, others have joints."""
+    words = (word for line in lines for word in line[column].split())
+    pieces = (piece for word in words for piece in (_PIECES.findall(word) if column else [word]))
+    return max(_LEAST_ROOM, *map(len, pieces), 0)
+
+
+def _parts(least: Sequence[int], width: int) -> list[list[int]]:
+    """Choose the columns of each part: as many as there is room for."""
+    parts: list[list[int]] = [[0]]
+    for column in range(1, len(least)):
+        if len(parts[-1]) > 1 and _sum([least[place] for place in (*parts[-1], column)]) > width:
+            parts.append([0])
+        parts[-1].append(column)
+    return parts
+
+
+def _shrunk(natural: list[int], least: list[int], width: int) -> list[int]:
+    """Take from the widest columns until a part fits; below what words need where nothing else helps."""
+    widths = [min(one, width) for one in natural]
+    while _sum(widths) > width:
+        able = [place for place, one in enumerate(widths) if one > least[place]] or range(len(widths))
+        widest = max(able, key=lambda place: widths[place])
+        if widths[widest] <= 1:
+            break
+        widths[widest] -= 1
+    return widths
+
+
+def _rows(line: Sequence[str], widths: Sequence[int]) -> list[tuple[str, ...]]:
+    """Part the cells of a line between words; the first is indented where it goes on, or it looked like a line more."""
+    cells = [
+        _wrapped(cell, width, "" if column else "  ")
+        for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+    ]
+    return list(zip_longest(*cells, fillvalue=""))
+
+
+def _cut(line: Sequence[str], widths: Sequence[int]) -> list[list[str]]:
+    return [[cell if len(cell) <= width else f"{cell[: width - 1]}…" for cell, width in zip(line, widths, strict=True)]]
+
+
+def _wrapped(text: str, width: int, indent: str) -> list[str]:
+    if len(text) <= width:
+        return [text]
+    indent = indent if len(indent) < width else ""
+    room = width - len(indent)
+    words = (word if len(word) <= room else _broken(word, room) for word in text.split(" "))
+    return textwrap.wrap(" ".join(words), width, subsequent_indent=indent, break_on_hyphens=False) or [""]
+
+
+def _broken(word: str, room: int) -> str:
+    """Part a word that has no room in a line where a path or a key has its joints."""
+    parts = [""]
+    for piece in _PIECES.findall(word):
+        if len(parts[-1]) + len(piece) > room:
+            parts.append("")
+        parts[-1] += piece
+    return " ".join(filter(None, parts))
+
+
+def _aligned(lines: Sequence[Sequence[str]], widths: Sequence[int], right: Collection[int]) -> list[str]:
+    return [
+        _GAP.join(
+            cell.rjust(width) if column in right else cell.ljust(width)
+            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    ]

@@ -1,0 +1,169 @@
+"""What the programs show on a terminal: no line longer than it is wide, colours only where they are wanted."""
+
+import json
+import os
+import re
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from shown_terminal import Shown, show_on_terminal
+
+from adacd_hil.cli.main import cli as host
+from firmware_sim.bench.bench_time import TruthLog
+from firmware_sim.cli.emulator_main import cli as emulator
+
+PLAY = """
+import importlib, json, sys
+from adacd_hil.terminal import open_terminals
+open_terminals()
+for program, *words in json.loads(sys.argv[1]):
+    main = importlib.import_module(program).main
+    sys.argv[0] = "/somewhere/bin/adacd-hil"
+    try:
+        main(words)
+    except SystemExit as end:
+        print(f"status {end.code}")
+"""
+COUNT = """
+import sys
+from adacd_hil import compile_progress
+from adacd_hil.progress_lines import Progress
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.terminal import open_terminals
+from firmware_sim.cli import emulator_main
+
+def compile_slowly(*_, **__):
+    for done in range(200):
+        for listener in compile_progress._listeners:
+            listener(lambda: f"compiling {done} of 43 functions" + ", of a long name" * 10)
+    raise ConfigError("and now it has an arm")
+
+open_terminals()
+Progress.COUNT_EVERY_NS = 0
+emulator_main.Bench = compile_slowly
+emulator_main.main(["run", "-i", "virtual", "-c", "x", "--scenario", "idle"])
+"""
+HOST, EMULATOR = "adacd_hil.cli.main", "firmware_sim.cli.emulator_main"
+CONFIGURATION = """
+extends = "certified"
+name = "mine"
+assumed = ["arm.link_length_m", "arm.rated_torque_Nm"]
+"""
+COMMANDS = [
+    (HOST, "budget"),
+    (HOST, "config", "show"),
+    (HOST, "config", "check", "mine.toml"),
+    (HOST, "config", "docs"),
+    (HOST, "config", "docs", "certified"),
+    (HOST, "config", "docs", "arm.torque_error_share"),
+    (HOST, "log", "info", "truth.mcap"),
+    (HOST, "log", "check", "truth.mcap"),
+    (HOST, "log", "export", "truth.mcap", "--format", "candump"),
+    (HOST, "runs", "."),
+    (HOST, "scan", "-i", "virtual", "-c", "empty", "--seconds", "0.1"),
+    (HOST, "monitor", "-i", "virtual", "-c", "empty", "--seconds", "0.1"),
+    (HOST, "doctor", "-i", "virtual", "-c", "empty", "--config", "mine.toml"),
+    (HOST, "replay", "truth.mcap"),
+    (HOST, "report", "none.mcap"),
+    (HOST, "history", "none.toml"),
+    (HOST, "identify", "none.csv"),
+    (HOST, "run", "-i", "sockecan", "-c", "x"),
+    (HOST, "demo", "--scenario", "bump"),
+    (HOST, "sweep", "--vary", "filter.a=1", "--out", "x"),
+    (EMULATOR, "list"),
+    (EMULATOR, "truths"),
+    (EMULATOR, "check", "mine.toml"),
+    (EMULATOR, "run", "-i", "socketcan", "-c", "can77"),
+]
+
+
+def commands_of(group: click.Group, program: str) -> list[tuple[str, ...]]:
+    """List the words of a program's commands."""
+    found: list[tuple[str, ...]] = [(program,)]
+    for name, command in group.commands.items():
+        below = commands_of(command, name) if isinstance(command, click.Group) else [(name,)]
+        found += [(program, *words) for words in below]
+    return found
+
+
+HELPS = [(*words, "--help") for words in (*commands_of(host, HOST), *commands_of(emulator, EMULATOR))]
+
+
+def play(folder: Path, commands: list[tuple[str, ...]], columns: int, **environment: str) -> Shown:
+    """Play commands in a process on a terminal; of each, its output and `status N`."""
+    kept = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "LINES", "NO_COLOR", "TERM")}
+    words = [sys.executable, "-c", f"import os; os.chdir({str(folder)!r})\n{PLAY}", json.dumps(commands)]
+    return show_on_terminal(words, columns, 24, {**kept, "TERM": "xterm", "PYTHONPATH": str(Path.cwd()), **environment})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a configuration and a log."""
+    made: Path = tmp_path_factory.mktemp("terminal")
+    (made / "mine.toml").write_text(CONFIGURATION)
+    with TruthLog(made / "truth.mcap", blocking=True) as log:
+        log.event(0, "info", "run", "begun")
+    return made
+
+
+def is_one_word(line: str) -> bool:
+    """Whether a line has nothing that could stand in the next one."""
+    return len(line.split()) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("columns", [80, 60, 40])
+def test_no_line_is_longer_than_the_terminal_and_plain_words_have_no_escape_code(folder: Path, columns: int) -> None:
+    shown = play(folder, COMMANDS, columns, NO_COLOR="1")
+    assert [line for line in shown.lines if len(line) > columns and not is_one_word(line)] == []
+    assert shown.text.count("status ") >= len(COMMANDS)
+    assert "Traceback" not in shown.text
+    assert shown.sequences <= {"\x1b[2K"}  # a line in progress is overwritten
+
+
+@pytest.mark.slow
+def test_a_terminal_that_is_dumb_gets_plain_text(folder: Path) -> None:
+    shown = play(folder, [*COMMANDS, (HOST, "monitor", "-i", "virtual", "-c", "x", "--once")], 80, TERM="dumb")
+    assert "\x1b" not in shown.text
+    assert "\r" not in shown.text.replace("\r\n", "")
+
+
+@pytest.mark.slow
+def test_marks_have_a_colour_and_say_the_same_without(folder: Path) -> None:
+    commands = [(HOST, "doctor", "-i", "virtual", "-c", "empty"), (HOST, "report", "none.mcap")]
+    shown = play(folder, commands, 80)
+    for mark in ("\x1b[32mok\x1b[0m ", "\x1b[31mFAILED\x1b[0m   nodes ", "\x1b[31madacd-hil:\x1b[0m log none.mcap"):
+        assert mark in shown.text
+    assert shown.lines == play(folder, commands, 80, NO_COLOR="1").lines
+
+
+@pytest.mark.slow
+def test_what_a_check_says_while_it_goes_on_is_gone_when_it_ends(folder: Path) -> None:
+    shown = play(folder, [(HOST, "doctor", "-i", "virtual", "-c", "empty")], 80)
+    assert "scheduler: " in shown.text
+    assert [line for line in shown.lines if ": ok" in line or ": skipped" in line] == []
+    assert shown.lines[0].startswith("ok       settings ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("columns", [80, 60])
+def test_help_is_whole_on_a_terminal(folder: Path, columns: int) -> None:
+    shown = play(folder, HELPS, columns)
+    assert [line for line in shown.lines if len(line) > columns and not is_one_word(line)] == []
+    assert shown.lines.count("status 0") == len(HELPS)
+    assert [line for line in shown.lines if re.search(r"[a-z,:]\.\.\.$", line)] == []  # cut
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("columns", [80, 60])
+def test_an_emulator_that_compiles_counts_in_one_line_and_leaves_nothing(columns: int) -> None:
+    environment = {**os.environ, "TERM": "xterm", "PYTHONPATH": str(Path.cwd()), "NO_COLOR": "1"}
+    shown = show_on_terminal([sys.executable, "-c", COUNT], columns, 24, environment)
+    written = [piece.removeprefix("\x1b[2K") for line in shown.text.split("\r\n") for piece in line.split("\r")]
+    counts = [piece for piece in written if piece.startswith("compiling ")]
+    assert len(counts) > 10
+    assert {len(count) for count in counts} == {columns - 1}
+    assert shown.lines == ["firmware-sim: and now it has an arm", ""]
+    assert shown.status == 2

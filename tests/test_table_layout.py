@@ -1,0 +1,117 @@
+"""Tables laid out to the width of a terminal."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+
+from adacd_hil.table_layout import fit_table
+from adacd_hil.terminal import fold
+
+WIDE = [("name", "count", "words", "more"), ("first", "1", "one two three four", "x" * 20), ("2nd", "22", "", "y")]
+
+
+def test_a_table_that_fits_is_one() -> None:
+    assert fit_table(WIDE, (1,), 80) == fit_table(WIDE, (1,))
+    assert fit_table(WIDE, (1,), 80) == [
+        "name   count  words               more",
+        "first      1  one two three four  xxxxxxxxxxxxxxxxxxxx",
+        "2nd       22                      y",
+    ]
+
+
+def test_a_table_that_is_a_little_wider_gets_narrower_columns_of_words() -> None:
+    assert fit_table(WIDE, (1,), 52) == [
+        "name   count  words             more",
+        "first      1  one two three     xxxxxxxxxxxxxxxxxxxx",
+        "              four",
+        "2nd       22                    y",
+    ]
+
+
+def test_a_much_wider_table_is_told_in_parts_that_begin_with_the_first_column() -> None:
+    assert fit_table(WIDE, (1,), 40) == [
+        "name   count  words",
+        "first      1  one two three four",
+        "2nd       22",
+        "",
+        "name   more",
+        "first  xxxxxxxxxxxxxxxxxxxx",
+        "2nd    y",
+    ]
+
+
+def test_where_the_first_column_goes_on_it_is_no_further_row() -> None:
+    lines = [("what", "a", "b"), ("the first thing that is told", "1", "x y"), ("other", "2", "z")]
+    assert fit_table(lines, width=26) == [
+        "what                a  b",
+        "the first thing     1  x y",
+        "  that is told",
+        "other               2  z",
+    ]
+
+
+def test_a_cell_without_room_goes_on_below_between_words() -> None:
+    lines = [("", "found"), ("a", "a sentence that is longer than the terminal is wide")]
+    assert fit_table(lines, width=30) == ["   found", "a  a sentence that is longer", "   than the terminal is wide"]
+
+
+def test_a_path_or_a_key_without_room_is_parted_at_its_joints() -> None:
+    lines = [("a", "/home/someone/runs/2026-11-25T10-00-00/run.mcap"), ("b", "certified.position_torque_Nm")]
+    assert fit_table(lines, width=31) == [
+        "a  /home/someone/runs/",
+        "   2026-11-25T10-00-00/run.mcap"[:31],
+        "b  certified.position_torque_Nm",
+    ]
+
+
+def test_a_row_of_a_screen_is_one_line_and_says_where_it_is_cut() -> None:
+    assert fit_table(WIDE, (1,), 40, is_cut=True) == [
+        "name   count  words         more",
+        "first      1  one two thr…  xxxxxxxxxxx…",
+        "2nd       22                y",
+    ]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_no_cell_is_lost_in_parts(width: int) -> None:
+    rows = [tuple(f"cell {row} {column}" for column in range(30)) for row in range(4)]
+    lines = fit_table(rows, width=width)
+    assert max(map(len, lines)) <= width
+    assert {cell for row in rows for cell in row} <= set("  ".join(lines).split("  "))
+
+
+CELLS = some.text(some.sampled_from("ab/._= \té\n\x1b"), max_size=60)
+
+
+@given(
+    some.integers(1, 6).flatmap(lambda n: some.lists(some.tuples(*[CELLS] * n), min_size=1, max_size=4)),
+    some.integers(40, 100),
+    some.sets(some.integers(0, 5)),
+    some.booleans(),
+)
+def test_whatever_is_in_a_table_no_line_is_wider_and_no_letter_lost(lines, width, right, is_cut) -> None:
+    told = fit_table(lines, right, width, is_cut)
+    assert max(map(len, told)) <= width
+    if not is_cut:
+        shown = sorted("".join(told).replace(" ", ""))
+        first = sorted("".join(fit_table([line[:1] for line in lines])).replace(" ", ""))
+        rest = sorted("".join(fit_table([line[1:] for line in lines] if lines[0][1:] else [])).replace(" ", ""))
+        missing = list(shown)
+        for letter in (*first, *rest):
+            missing.remove(letter)
+
+
+def test_lines_are_folded_below_their_text() -> None:
+    assert fold("     2.00 s  one two three four five six seven eight", 40).split("\n") == [
+        "     2.00 s  one two three four five six",
+        "             seven eight",
+    ]
+    assert fold("one two three four five six seven eight nine", 30) == "one two three four five six\n  seven eight nine"
+
+
+def test_a_word_that_is_longer_than_the_terminal_is_left_whole() -> None:
+    assert fold(f"report: {'x' * 50}", 40) == f"report:\n  {'x' * 50}"
+
+
+def test_nothing_is_folded_where_there_is_no_width() -> None:
+    assert fold("one two three " * 40, None) == "one two three " * 40
