@@ -1,7 +1,7 @@
 """What is wrong with a configuration, and what is odd about it: all of it at once, a line each, without a bus."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import NamedTuple
 
 from adacd_hil.commission.host_checks import Check, CheckOutcome, ok, warning
@@ -89,6 +89,19 @@ def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
 
 def _oddities(settings: Settings) -> list[str]:
     return [line for look in _LOOKS for line in look(settings)]
+
+
+_MOST_NAMED = 4
+"""Guesses that a run names; `config check` names all."""
+
+
+def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
+    """Say in a line which values of a configuration are guesses, but for those that are measured; "" without any."""
+    guesses = [f"`{key}`" for key in settings.assumed if key not in measured]
+    more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
+    named = f"{', '.join(guesses[:_MOST_NAMED])}{more}"
+    remedy = "`adacd-hil config check` names all" if more else "`adacd-hil doctor` asks for each"
+    return f"guesses that nobody has confirmed: {named}; {remedy}" if guesses else ""
 
 
 def _device_problems(settings: Settings) -> list[str]:

@@ -36,6 +36,8 @@ TARE_FORMAT = 1
 SMALLEST_STD_NM = 0.001
 """No zero is known better than this, however long it was measured."""
 _NS_PER_H = 3_600_000_000_000
+TARED = ("arm.torque_offset_Nm", "arm.torque_offset_std_Nm")
+"""Settings that a tare measures."""
 _CLOCK_TOLERANCE_H = 0.1
 
 

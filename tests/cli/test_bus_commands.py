@@ -1,9 +1,14 @@
 """Bad input to the commands that work on a bus: one line, a documented exit status, nothing on stdout."""
 
+from pathlib import Path
+from typing import NoReturn
+
 import pytest
 from click.testing import CliRunner
 
+from adacd_hil.cli.commands import run_command
 from adacd_hil.cli.main import cli
+from adacd_hil.cli.output import CommandError
 
 COMMANDS = ("scan", "commtest", "monitor")
 
@@ -58,3 +63,40 @@ def test_an_empty_bus_ends_with_devices_missing(command: str) -> None:
     status, _, stderr = call(command, "-i", "virtual", "-c", "empty", "--seconds", "0.1")
     assert status == 5
     assert not any("Traceback" in line for line in stderr)
+
+
+class NoSession:
+    """Ends before it looks for an arm."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        pass
+
+    def interrupt(self) -> None:
+        pass
+
+    def run(self) -> NoReturn:
+        raise CommandError("no arm")
+
+
+@pytest.mark.parametrize(
+    ("assumed", "line"),
+    [
+        ([], None),
+        (["arm.sign"], "`arm.sign`; `adacd-hil doctor` asks for each"),
+        (
+            ["arm.sign", "arm.joint", "arm.link_length_m", "arm.rated_torque_Nm", "devices.drive1.node", "bus.bitrate"],
+            "`arm.sign`, `arm.joint`, `arm.link_length_m`, `arm.rated_torque_Nm` and 2 more; "
+            "`adacd-hil config check` names all",
+        ),
+    ],
+)
+def test_a_run_names_at_once_what_nobody_has_confirmed(
+    assumed: list[str], line: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_command, "Session", NoSession)
+    config = tmp_path / "mine.toml"
+    config.write_text(f'extends = "certified"\nname = "mine"\nassumed = {assumed}\n')
+    out = str(tmp_path / "run")
+    status, _, stderr = call("run", "-i", "virtual", "-c", "x", "--config", str(config), "--out", out)
+    warnings = [] if line is None else [f"warning: guesses that nobody has confirmed: {line}"]
+    assert (status, stderr) == (1, [*warnings, "adacd-hil: no arm"])

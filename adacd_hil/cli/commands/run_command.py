@@ -23,7 +23,8 @@ from adacd_hil.cli.connection import (
 )
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
 from adacd_hil.clock import format_date, wall_ns
-from adacd_hil.control.arm_records import Origin, UsedHistory, use_history, use_tare
+from adacd_hil.commission.configuration_check import guesses_in_brief
+from adacd_hil.control.arm_records import TARED, Origin, UsedHistory, use_history, use_tare
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
@@ -125,6 +126,8 @@ def run_on_bus(
             live=live,
             on_started=functools.partial(folder.link, progress),
         )
+        if guesses := guesses_in_brief(settings, () if tare is None else TARED):
+            progress(f"warning: {guesses}")
         for used in (tare, history):
             for line in () if used is None else used.warnings:
                 progress(f"warning: {line}")
