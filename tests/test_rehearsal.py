@@ -1,10 +1,16 @@
 """The emulator plays the arm of the configuration that the host reads, and what a truth says otherwise."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
+from adacd_hil.settings.configuration import load_settings
+from firmware_sim.cli.own_devices import rehearse as rehearse_file
+from firmware_sim.scenario.scenario import Scenario
 
 OWN_ARM = """
 extends = "certified"
@@ -69,3 +75,62 @@ def test_a_truth_that_no_file_names_is_refused_with_the_nearest_name(folder: Pat
     status, lines = rehearse(folder, "none", "--truth", "wrong-lenght")
     assert status == 2
     assert "wrong-length" in lines.splitlines()[-1]
+
+
+BODY = """
+[arm]
+link_length_m = [0.4, 0.25]
+mass_kg = [2.0, 1.0]
+center_m = [0.25, 0.1]
+inertia_kg_m2 = [0.03, 0.006]
+viscous_Nm_s = [0.02, 0.01]
+coulomb_Nm = [0.3, 0.2]
+cad_theta = [0.5, 0.02, 0.04, 0.0, 0.0, 0.0, 0.0]
+"""
+
+
+def composed(folder: Path, text: str, scenario: str = "idle", truth: str | None = None) -> tuple[Scenario, list[str]]:
+    (folder / "mine.toml").write_text('extends = "certified"\n' + text)
+    rehearsed = rehearse_file(str(folder / "mine.toml"), scenario, truth)
+    return rehearsed.scenario, rehearsed.assumed
+
+
+def test_the_masses_of_the_file_are_played_and_those_of_a_truth_in_their_place(tmp_path: Path) -> None:
+    scenario, assumed = composed(tmp_path, BODY)
+    (tmp_path / "heavier.toml").write_text("[arm]\nmass_kg = [3.0, 2.0]\ncoulomb_Nm = [0.5, 0.4]\n")
+    truly, _ = composed(tmp_path, BODY, truth=str(tmp_path / "heavier.toml"))
+    told, true = scenario.own_arm, truly.own_arm
+    assert told is not None
+    assert true is not None
+    assert (told.mass_kg, told.center_m, told.inertia_kg_m2) == ((2.0, 1.0), (0.25, 0.1), (0.03, 0.006))
+    assert (told.viscous_Nm_s, told.coulomb_Nm) == ((0.02, 0.01), (0.3, 0.2))
+    assert not any("mass" in line or "friction" in line for line in assumed)
+    assert (true.mass_kg, true.center_m, true.viscous_Nm_s) == ((3.0, 2.0), (0.2, 0.125), (0.02, 0.01))
+    assert true.coulomb_Nm == (0.5, 0.4)
+
+
+def test_the_host_has_no_use_for_what_the_emulator_plays(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.toml"
+    mine.write_text('extends = "certified"\n' + BODY)
+    with_body = load_settings(str(mine))
+    names = ("mass_kg", "center_m", "inertia_kg_m2", "viscous_Nm_s", "coulomb_Nm")
+    without = dataclasses.replace(with_body, arm=dataclasses.replace(with_body.arm, **dict.fromkeys(names)))
+    assert constants_of(with_body).tobytes() == constants_of(without).tobytes()
+    assert new_memory(with_body).tobytes() == new_memory(without).tobytes()
+
+
+def test_a_light_arm_is_not_thrown_and_has_sensors_of_its_size(tmp_path: Path) -> None:
+    light = "[arm]\nlink_length_m = [0.25, 0.2]\nmass_kg = [0.2, 0.2]\nrated_torque_Nm = [2.0, 2.0]\n"
+    scenario, _ = composed(tmp_path, light, "paper")
+    model, _ = composed(tmp_path, "", "paper")
+    gamma = scenario.arm.inertia()[2]
+    torque_Nm = scenario.contacts[2].force_N * scenario.contacts[2].point_m
+    model_Nm = model.contacts[2].force_N * model.contacts[2].point_m
+    assert torque_Nm / gamma == pytest.approx(model_Nm / model.arm.inertia()[2])  # as fast as profile P
+    assert scenario.sensors.torque_range_Nm == pytest.approx((25.0 / 3.0, 50.0 / 3.0))
+
+
+def test_the_payload_of_a_heavy_arm_is_one_that_a_scenario_takes(tmp_path: Path) -> None:
+    heavy = "[arm]\nlink_length_m = [0.6, 0.3]\nmass_kg = [40.0, 30.0]\nrated_torque_Nm = [900.0, 500.0]\n"
+    scenario, _ = composed(tmp_path, heavy + "torque_limit_Nm = [900.0, 500.0]\n", "paper")
+    assert scenario.payloads[0].mass_kg == 10.0

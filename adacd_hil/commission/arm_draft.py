@@ -38,6 +38,7 @@ class PlanarArm(NamedTuple):
     """What a description says of an arm with two parallel axes.
 
     cad_theta: parameters, empty where the masses are not known. The rest: None where nothing is said of it.
+    mass_kg, center_m, inertia_kg_m2: of each link, about its centre of mass; the last two of no rod.
     doubts: what the model can't have as the description says, a line each.
     """
 
@@ -49,6 +50,11 @@ class PlanarArm(NamedTuple):
     effort_Nm: Pair | None = None
     doubts: tuple[str, ...] = ()
     is_tip_known: bool = True
+    mass_kg: Pair | None = None
+    center_m: Pair | None = None
+    inertia_kg_m2: Pair | None = None
+    viscous_Nm_s: Pair | None = None
+    coulomb_Nm: Pair | None = None
 
 
 def uniform_rods(link_length_m: Pair, mass_kg: Pair, is_upright: bool) -> PlanarArm:
@@ -58,7 +64,7 @@ def uniform_rods(link_length_m: Pair, mass_kg: Pair, is_upright: bool) -> Planar
     theta = [m1 * l1**2 / 3.0 + m2 * l1**2 + a3, m2 * l1 * l2 / 2.0, a3, 0.0, 0.0, 0.0, 0.0]
     if is_upright:
         theta += [STANDARD_GRAVITY_M_S2 * (m1 * l1 / 2.0 + m2 * l1), STANDARD_GRAVITY_M_S2 * m2 * l2 / 2.0]
-    return PlanarArm(link_length_m, _rounded(theta), is_upright)
+    return PlanarArm(link_length_m, _rounded(theta), is_upright, mass_kg=mass_kg)
 
 
 def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
@@ -75,8 +81,11 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
     turned = chain.rotation[1] @ chain.axis[1]  # in link 1's frame
     cosine = float(chain.axis[0] @ turned)
     if abs(cosine) < _PARALLEL:
-        raise UrdfError(f"the axes are {math.degrees(math.acos(min(abs(cosine), 1.0))):.0f} deg apart, not parallel")
-    doubts = []
+        raise UrdfError(
+            f"the axes are {math.degrees(math.acos(min(abs(cosine), 1.0))):.0f} deg apart, not parallel: "
+            "the model is of two parallel axes; compare <axis> and <origin rpy> with the arm"
+        )
+    doubts = _mass_doubts(arm)
     if cosine < 0.0:
         doubts.append("joint 2 turns the other way than joint 1: its `arm.sign` is -1 if its drive does so, too")
     offset = chain.translation[1]
@@ -95,6 +104,7 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
     if is_upright and vertical > math.sin(math.radians(2.0)):
         doubts.append("the axes are neither vertical nor horizontal: gravity's part is smaller than with `gravity`")
     theta: list[float] = []
+    body: dict[str, Pair] = {}
     if first[0] > 0.0 and second[0] > 0.0:
         inertia = [_about(link, axis) for link, axis in zip((first, second), chain.axis, strict=True)]
         along = across / l1
@@ -107,10 +117,11 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
             )
         turn = float(np.linalg.norm(moment))
         theta = [inertia[0] + second[0] * l1**2 + inertia[1], l1 * turn, inertia[1], 0.0, 0.0, 0.0, 0.0]
+        turn_1 = float(np.linalg.norm(first[1:4] - (first[1:4] @ chain.axis[0]) * chain.axis[0]))
         if is_upright:
-            along_1 = first[1:4] - (first[1:4] @ chain.axis[0]) * chain.axis[0]
             share = STANDARD_GRAVITY_M_S2 * math.sqrt(max(1.0 - vertical**2, 0.0))
-            theta += [share * (float(np.linalg.norm(along_1)) + second[0] * l1), share * turn]
+            theta += [share * (turn_1 + second[0] * l1), share * turn]
+        body = _body(arm, (first[0], second[0]), (turn_1, turn), inertia)
     return PlanarArm(
         (_short(l1), _short(l2)),
         _rounded(theta),
@@ -120,7 +131,38 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
         (float(arm.torque_limit[0]), float(arm.torque_limit[1])) if np.all(np.isfinite(arm.torque_limit)) else None,
         tuple(doubts),
         is_tip_known,
+        **body,
     )
+
+
+def _mass_doubts(arm: SerialArm) -> list[str]:
+    """Say which link has no mass. Raises UrdfError where its inertia can't be any body's."""
+    doubts = []
+    links = arm.theta_full.reshape(JOINTS, PER_LINK)
+    for name, link, axis in zip(arm.link_names, links, arm.chain.axis, strict=True):
+        if link[0] <= 0.0 and np.any(link):
+            raise UrdfError(f'link "{name}": an inertia without a mass; <mass value="..."> must be above 0 kg')
+        if link[0] > 0.0 and _about(link, axis) <= 0.0:
+            raise UrdfError(
+                f'link "{name}": mass {link[0]:g} kg without inertia about its joint; give <inertia>, or an '
+                "<origin> off the axis"
+            )
+        if not np.any(link):
+            doubts.append(
+                f'link "{name}" has no <inertial>: no CAD model is written, and the masses of the emulated arm are a '
+                "guess; add <inertial>, or give --length-m and --mass-kg in place of --urdf"
+            )
+    return doubts
+
+
+def _body(arm: SerialArm, mass_kg: Pair, moment_kg_m: Pair, inertia: list[float]) -> dict[str, Pair]:
+    """Return masses, their centres and the inertia about them, and friction where the URDF has some."""
+    center = [moment / mass for moment, mass in zip(moment_kg_m, mass_kg, strict=True)]
+    own = [max(whole - mass * c * c, 0.0) for whole, mass, c in zip(inertia, mass_kg, center, strict=True)]
+    named: dict[str, Sequence[float] | Vector] = {"mass_kg": mass_kg, "center_m": center, "inertia_kg_m2": own}
+    if np.any(arm.damping) or np.any(arm.friction):
+        named |= {"viscous_Nm_s": arm.damping, "coulomb_Nm": arm.friction}
+    return {name: (_short(float(pair[0])), _short(float(pair[1]))) for name, pair in named.items()}
 
 
 def _reach(arm: SerialArm) -> float:
@@ -178,6 +220,12 @@ _TRAVEL_SHARE, _SPEED_SHARE = 0.8, 0.8
 """Part of the position and velocity limit that the motion has."""
 _HEAVY = 2.0
 """Inertia per torque, against P, up to which the motion is as fast: that of arm S, which runs it."""
+_ALIKE = 2.0
+"""Factor of torques and inertia within which the scheme's numbers are those of arm P."""
+_HEAVY_INERTIA = 20.0
+"""Inertia, against P, up to which the evidence of a fit is as well conditioned; measured on 8 kg links."""
+_LAG = 5
+"""Place of lags among the kinds of parameters, whose numbers are no torques."""
 _LEAST_TORQUE_SHARE = 0.3
 """Part of the torque that gravity must leave."""
 
@@ -237,6 +285,16 @@ def draft_arm(facts: ArmFacts) -> ArmDraft:
     return ArmDraft(tuple(entries), tuple(warnings))
 
 
+_BODY = {
+    "mass_kg": "of the links",
+    "center_m": "of those masses, from the link's joint",
+    "inertia_kg_m2": "about them",
+    "viscous_Nm_s": "friction",
+    "coulomb_Nm": "friction",
+}
+"""What of a description the emulator plays, and the word for it."""
+
+
 def _arm(facts: ArmFacts) -> Iterator[Entry]:
     geometry, rated = facts.geometry, facts.rated_torque_Nm
     yield _stated("arm.link_length_m", Fact(geometry.link_length_m, facts.length_source), "axis to axis, axis to tip")
@@ -256,6 +314,9 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
         yield _stated("arm.cad_theta", Fact(theta, facts.mass_source), names)
     else:
         yield Entry("arm.cad_theta", (), "not known: the masses; the scheme identifies the arm without them")
+    for key, what in _BODY.items():
+        if (pair := getattr(geometry, key)) is not None:
+            yield Entry(f"arm.{key}", pair, f"{what}, for the emulator; the host doesn't read it: {facts.mass_source}")
     axes = "not vertical: gravity acts on them" if geometry.is_upright else "vertical: gravity doesn't act on them"
     yield _stated("estimator.gravity", Fact(geometry.is_upright, facts.gravity_source), f"joint axes {axes}")
 
@@ -291,11 +352,56 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
         gain = tuple(_round(model[i] * inertia[i] / _MODEL_INERTIA[i]) for i in range(JOINTS))
         told = "the inertia" if has_masses else "the rated torque, as the masses are not known"
         yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {told}", not has_masses)
-    prior = load_settings("certified").certified.prior_std
-    wanted = (2.0 * inertia[0], *prior[1:3], *(2.0 * g for g in _gravity(facts)[:1]), *prior[4:])
-    scaled = tuple(_round(max(pair)) for pair in zip(prior, wanted, strict=True))
-    if scaled != prior:
-        yield Entry("certified.prior_std", scaled, "inertia and gravity: twice what the description says")
+    yield from _certified(facts)
+
+
+def _certified(facts: ArmFacts) -> Iterator[Entry]:
+    """Propose the scheme's numbers that are torques or follow from the inertia, where the arm is unlike P."""
+    base = load_settings("certified")
+    found, inertia, rated = base.certified, _inertia(facts), facts.rated_torque_Nm.value
+    scale = _torque_scale(facts)
+    wanted = (2.0 * inertia[0], 0.0, 0.0, *(2.0 * g for g in _gravity(facts)[:1]), 0.0, 0.0, 0.0)
+    prior = [max(values) for values in zip(found.prior_std, _scaled(found.prior_std, scale), wanted, strict=True)]
+    entries: list[tuple[str, Any, Any, str]] = []
+    if scale != 1.0:
+        reason = f"torques are {scale:.2g} times those of the emulated arm"
+        enough = _scaled(found.enough_std, scale)
+        prior[-1] = enough[-1]  # further friction need not show itself: it is never known less well than it may be
+        entries += [
+            ("certified.residual_Nm", scale * found.residual_Nm, found.residual_Nm, reason),
+            ("certified.beta_Nm", scale * found.beta_Nm, found.beta_Nm, reason),
+            ("certified.enough_std", enough, found.enough_std, f"{reason}; lags stay"),
+            ("certified.drift_std", _scaled(found.drift_std, scale), found.drift_std, f"{reason}; lags stay"),
+        ]
+    reason = "what the arm may be; inertia and gravity: at least twice what the description says"
+    entries.append(("certified.prior_std", prior, found.prior_std, reason))
+    ratios = [inertia[i] / _MODEL_INERTIA[i] for i in range(JOINTS)]
+    light, heavy = min(1.0, _ALIKE * min(ratios)), max(1.0, max(ratios) / _HEAVY_INERTIA)
+    reason = "evidence of a lag grows with the inertia"
+    entries += [
+        ("certified.excitation_Nm2s", light**2 * found.excitation_Nm2s, found.excitation_Nm2s, reason),
+        ("certified.condition", (heavy / light) ** 2 * found.condition, found.condition, reason),
+    ]
+    upper = base.detector.collision_Nm
+    lower = [min(1.0, rated[i] / _MODEL_TORQUE_NM[i]) * upper[i] for i in range(JOINTS)]
+    entries.append(("detector.collision_Nm", lower, upper, "in proportion to the rated torque where that is smaller"))
+    for key, value, default, comment in entries:
+        rounded = tuple(map(_round, value)) if isinstance(default, tuple) else _round(value)
+        if rounded != default:
+            yield Entry(key, rounded, comment)
+
+
+def _torque_scale(facts: ArmFacts) -> float:
+    """Return torques over P's by the joint that is more like P's; 1 where one is about alike or one smaller."""
+    ratios = [facts.rated_torque_Nm.value[i] / _MODEL_TORQUE_NM[i] for i in range(JOINTS)]
+    if min(ratios) > _ALIKE:
+        return float(min(ratios))
+    return float(max(ratios)) if max(ratios) < 1.0 / _ALIKE else 1.0
+
+
+def _scaled(by_kind: Sequence[float], scale: float) -> list[float]:
+    """Scale numbers by kind of parameter but for lags, which are no torques."""
+    return [value if kind == _LAG else scale * value for kind, value in enumerate(by_kind)]
 
 
 def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) -> float:

@@ -57,8 +57,27 @@ class ArmSettings:
         (250.0, 300.0), unit="deg/s", low=1.0, high=3600.0, meaning="largest |dq|; beyond it the run faults"
     )
     cad_theta: tuple[float, ...] = setting((), low=0.0, meaning="the CAD model's parameters; empty: no model")
+    # How the emulator plays the arm of this file; the host has no use for it.
+    mass_kg: tuple[float, float] | None = setting(
+        None, unit="kg", low=1e-4, high=1000.0, meaning="mass of each link, for the emulator only"
+    )
+    center_m: tuple[float, float] | None = setting(
+        None, unit="m", low=-5.0, high=5.0, meaning="its centre from the link's joint, for the emulator; absent: middle"
+    )
+    inertia_kg_m2: tuple[float, float] | None = setting(
+        None, unit="kg m²", low=0.0, high=1000.0, meaning="about that centre, for the emulator; absent: a rod's"
+    )
+    viscous_Nm_s: tuple[float, float] | None = setting(
+        None, unit="Nm s/rad", low=0.0, high=1e4, meaning="viscous friction, for the emulator only"
+    )
+    coulomb_Nm: tuple[float, float] | None = setting(
+        None, unit="Nm", low=0.0, high=1e3, meaning="Coulomb friction, for the emulator only"
+    )
 
     def __post_init__(self) -> None:
+        for key in ("center_m", "inertia_kg_m2"):
+            if getattr(self, key) is not None and self.mass_kg is None:
+                raise ConfigError(f"`arm.{key}` needs `arm.mass_kg` beside it")
         if any(sign == 0 for sign in self.sign):
             raise ValueError(f"sign = {self.sign} must be +1 or -1 for each joint")
 

@@ -1,8 +1,9 @@
 """The arm of a configuration, composed for the emulator to play: mechanics, sensors, and a scenario to its size.
 
 The configuration is the one that the host reads. What it doesn't say is assumed and told, a line each; a truth
-outweighs both. Inertia, in the words of `firmware_sim.arm.arms`, is that of masses in the truth, else of
-`arm.cad_theta`, else of uniform rods as heavy as the drives' rated torque suggests:
+outweighs both. Inertia, in the words of `firmware_sim.arm.arms`, is that of masses in the truth, else of `arm.mass_kg`
+with what stands beside it, which the host doesn't read, else of `arm.cad_theta`, else of uniform rods as heavy as the
+drives' rated torque suggests:
 
     γ = m₂ l₂² / 3 = τ₂ γ_P / τ_P2        α + γ = τ₁ (α + γ)_P / τ_P1, with m₁ ≥ m₂ / 2        index P: profile P
 
@@ -10,7 +11,8 @@ From cad_theta = (a₁, a₂, a₃, …): α = a₁ − a₃, β = a₂, γ = a�
 β l₁ / α ≤ c₂ ≤ γ l₁ / β allows, m₂ = a₂ / (l₁ c₂), and link 1 is a rod with what is left of α.
 
 A scenario that comes with the package was made for profile P: places grow with the links, forces and payloads so that
-their torques grow with the rated torques.
+their torques grow with the rated torques or the inertia, whichever grows less: drives must be able to hold them, and a
+light arm must not be thrown beyond its limits before a host can react.
 """
 
 import math
@@ -18,13 +20,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
+from adacd_hil.settings.arm_settings import ArmSettings
 from adacd_hil.settings.configuration import ConfigurationLayer, Settings, resolved_table
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import STANDARD_GRAVITY_M_S2
 from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
-from firmware_sim.scenario.scenario import ArmTruth
+from firmware_sim.scenario.scenario import ArmTruth, TruthArmSettings
 
 Pair = tuple[float, float]
 _MODEL: Final = ARMS["P"]
@@ -36,9 +39,11 @@ _STOP_MARGIN_DEG: Final = 20.0
 _NOISE_SHARE: Final = TORQUE_NOISE_NM / TORQUE_RANGE_NM
 _RANGE_PER_RATED: Final = 4.0
 _HOLDING_SHARE: Final = 1.5
+_HEAVIEST: Final = 10.0
+"""Most that payloads are multiplied by: they go up to 1 kg, and a scenario takes 20 kg."""
 
 
-_GEOMETRY: Final = frozenset({"arm.link_length_m", "arm.cad_theta"})
+_GEOMETRY: Final = frozenset({"arm.link_length_m", "arm.cad_theta", "arm.mass_kg"})
 _OF_THE_ARM: Final = _GEOMETRY | {
     "arm.rated_torque_Nm",
     "arm.sign",
@@ -140,7 +145,7 @@ def compose_scenario(
     own = {key: list(value) if isinstance(value, tuple) else value for key, value in own.items()}
     composed = dict(table)
     if is_builtin:
-        _fit(composed, settings, links.length_m, rated, assumed)
+        _fit(composed, settings, links, rated, assumed)
     composed["own_arm"] = own
     if truth.arm.torque_offset_Nm is not None:
         composed["torque_offset_Nm"] = list(truth.arm.torque_offset_Nm)
@@ -179,7 +184,9 @@ def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
     if truth.arm.link_length_m is None and "arm.link_length_m" not in told.own_keys:
         assumed.append(f"links of {told_m[0]:g} and {told_m[1]:g} m, since the file has no arm.link_length_m")
     if truth.arm.mass_kg is not None:
-        links = _weighed(told_m, truth, assumed)
+        links = _weighed(told_m, truth.arm, "truth", assumed)
+    elif arm.mass_kg is not None:
+        links = _weighed(told_m, arm, "file", assumed)
     elif "arm.cad_theta" in told.own_keys and arm.cad_theta:
         links = _from_cad(told_m, arm.cad_theta)
         assumed.append(
@@ -206,18 +213,16 @@ def _multiply(links: _Links, truth: ArmTruth) -> _Links:
     )
 
 
-def _weighed(length_m: Pair, truth: ArmTruth, assumed: list[str]) -> _Links:
-    assert truth.arm.mass_kg is not None
-    rods = _rods(length_m, truth.arm.mass_kg)
+def _weighed(length_m: Pair, body: TruthArmSettings | ArmSettings, source: str, assumed: list[str]) -> _Links:
+    assert body.mass_kg is not None
+    rods = _rods(length_m, body.mass_kg)
     for key, meaning in (
         ("center_m", "the centre of mass in the middle of each link"),
         ("inertia_kg_m2", "a rod's inertia"),
     ):
-        if getattr(truth.arm, key) is None:
-            assumed.append(f"{meaning}, since the truth has no arm.{key}")
-    return _Links(
-        length_m, rods.mass_kg, truth.arm.center_m or rods.center_m, truth.arm.inertia_kg_m2 or rods.inertia_kg_m2
-    )
+        if getattr(body, key) is None:
+            assumed.append(f"{meaning}, since the {source} has no arm.{key}")
+    return _Links(length_m, rods.mass_kg, body.center_m or rods.center_m, body.inertia_kg_m2 or rods.inertia_kg_m2)
 
 
 def _rods(length_m: Pair, mass_kg: Pair) -> _Links:
@@ -267,9 +272,10 @@ def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -
     theta = told.settings.arm.cad_theta if "arm.cad_theta" in told.own_keys else ()
     known = theta[3:7] if any(theta[3:7]) else ()
     found: list[Pair] = []
+    arm = told.settings.arm
     for key, given, places, share, unit in (
-        ("viscous", truth.arm.viscous_Nm_s, slice(0, 2), _VISCOUS_SHARE_S, "Nm s/rad"),
-        ("Coulomb", truth.arm.coulomb_Nm, slice(2, 4), _COULOMB_SHARE, "Nm"),
+        ("viscous", truth.arm.viscous_Nm_s or arm.viscous_Nm_s, slice(0, 2), _VISCOUS_SHARE_S, "Nm s/rad"),
+        ("Coulomb", truth.arm.coulomb_Nm or arm.coulomb_Nm, slice(2, 4), _COULOMB_SHARE, "Nm"),
     ):
         if given is not None:
             found.append(given)
@@ -284,8 +290,8 @@ def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -
             first, second = _times(rated, (share, share))
             found.append((first, second))
             assumed.append(
-                f"{key} friction {first:.3g} and {second:.3g} {unit}, since arm.cad_theta has none: {100 * share:g} % "
-                "of rated torque"
+                f"{key} friction {first:.3g} and {second:.3g} {unit}, since the file has none: {100 * share:g} % of "
+                "rated torque"
             )
     viscous, coulomb = found
     return viscous, coulomb
@@ -312,8 +318,8 @@ def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: l
     sensors = dict(said)
     if "torque_range_Nm" not in sensors:
         ranges = [
-            min(max(TORQUE_RANGE_NM, _RANGE_PER_RATED * rated_Nm), most)
-            for rated_Nm, most in zip(rated, counts.torque_range_Nm, strict=True)
+            min(max(_RANGE_PER_RATED * rated_Nm, TORQUE_RANGE_NM * min(rated_Nm / model_Nm, 1.0)), most)
+            for rated_Nm, model_Nm, most in zip(rated, _MODEL.rated_torque_Nm, counts.torque_range_Nm, strict=True)
         ]
         sensors["torque_range_Nm"] = ranges
         assumed.append(f"torque sensors of ±{ranges[0]:.4g} and ±{ranges[1]:.4g} Nm in 16 bits; no file says")
@@ -356,15 +362,20 @@ def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list
 _LENGTHS: Final = ("x_m", "y_m", "radius_m", "room_m")
 
 
-def _fit(table: dict[str, Any], settings: Settings, length_m: Pair, rated: Pair, assumed: list[str]) -> None:
+def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, assumed: list[str]) -> None:
     """Fit a scenario that was made for profile P to the arm, in place."""
+    length_m = links.length_m
     longer = length_m[0] / _MODEL.link_length_m[0], length_m[1] / _MODEL.link_length_m[1]
-    stronger = rated[0] / _MODEL.rated_torque_Nm[0], rated[1] / _MODEL.rated_torque_Nm[1]
+    alpha, _, gamma = _MODEL.inertia()
+    inertia, model = _joint_inertia(links), (alpha + gamma, gamma)
+    first, second = (min(rated[i] / _MODEL.rated_torque_Nm[i], inertia[i] / model[i]) for i in range(2))
+    stronger = first, second
     reach = sum(length_m) / sum(_MODEL.link_length_m)
     first, second = settings.trajectory.amplitude_deg
     if "start_deg" in table:
         table["start_deg"] = [-first, -second]
-    heavier = stronger[1] / longer[1] ** 2
+    # Joint 1 swings a payload about joint 2 by m l1 l2, the more the longer link 1 is.
+    heavier = min(stronger[1] / (longer[1] * max(longer)), _HEAVIEST)
     if "payload_kg" in table:
         table["payload_kg"] *= heavier
     if "payloads" in table:

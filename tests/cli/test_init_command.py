@@ -1,6 +1,7 @@
 """`init` writes the configuration of one's own arm: from a bus, a URDF, a log, options, or answers on a terminal."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.scheme.model.urdf import UrdfError
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.wire.codec import contract_folder, load_codec
+from firmware_sim.cli.own_devices import rehearse
 
 USAGE, BUS_MISSING = 2, 5
 NO_BUS = ("--no-bus", "--yes")
@@ -191,6 +193,73 @@ def test_crossed_axes_are_refused_and_a_bent_zero_is_doubted() -> None:
     bent = planar_from_urdf(text.replace('<origin xyz="0.13 0 0"/>', '<origin xyz="0 0.13 0"/>').encode())
     (doubt,) = bent.doubts
     assert "90 deg off the line of link 1" in doubt
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (('<mass value="3"/>', '<mass value="0"/>'), 'link "upper": an inertia without a mass'),
+        (('<mass value="1.5"/>', '<mass value="-1.5"/>'), 'link "lower": mass -1.5 kg is negative'),
+        (
+            ('0.13 0 0"/><mass value="1.5"/>', '0 0 0"/><mass value="1.5"/>'),
+            'link "lower": mass 1.5 kg without inertia',
+        ),
+    ],
+)
+def test_a_mass_that_no_link_has_writes_nothing(tmp_path: Path, out: Path, change: tuple[str, str], line: str) -> None:
+    path = urdf(tmp_path)
+    path.write_text(path.read_text().replace('"0.015"', '"0"').replace(*change))
+    result = init(out, *NO_BUS, "--urdf", str(path))
+    assert (result.exit_code, out.exists()) == (USAGE, False)
+    assert line in "".join(complaints(result))
+
+
+def test_a_urdf_of_shapes_alone_says_how_the_masses_get_known(tmp_path: Path, out: Path) -> None:
+    path = urdf(tmp_path)
+    path.write_text(re.sub("<inertial>.*?</inertial>", "<visual/>", path.read_text(), flags=re.DOTALL))
+    result = init(out, *NO_BUS, "--urdf", str(path))
+    assert result.exit_code == 0
+    warned = [line for line in result.stdout.splitlines() if "has no <inertial>" in line]
+    assert [line.split('"')[1] for line in warned] == ["upper", "lower"]
+    assert "--length-m and --mass-kg" in warned[0]
+    assert written(out).arm.mass_kg is None
+
+
+def test_masses_and_friction_of_a_urdf_are_for_the_emulator(tmp_path: Path, out: Path) -> None:
+    path = urdf(tmp_path)
+    path.write_text(path.read_text().replace("</joint>", '<dynamics damping="0.05" friction="0.1"/></joint>'))
+    assert init(out, *NO_BUS, "--urdf", str(path)).exit_code == 0
+    arm = written(out).arm
+    assert (arm.mass_kg, arm.center_m, arm.inertia_kg_m2) == ((3.0, 1.5), (0.2, 0.13), (0.04, 0.015))
+    assert (arm.viscous_Nm_s, arm.coulomb_Nm) == ((0.05, 0.05), (0.1, 0.1))
+    played = rehearse(str(out), "idle").scenario.own_arm
+    assert played is not None
+    assert (played.mass_kg, played.coulomb_Nm) == ((3.0, 1.5), (0.1, 0.1))
+
+
+def test_an_arm_like_the_emulated_one_keeps_the_scheme_s_numbers(out: Path) -> None:
+    assert init(out, *NO_BUS, "--mass-kg", "1.5", "0.75").exit_code == 0
+    settings = written(out)
+    assert settings.certified == load_settings("certified").certified
+    assert settings.detector == load_settings("certified").detector
+
+
+def test_the_scheme_s_numbers_are_those_of_the_arm_s_torques(out: Path) -> None:
+    base = load_settings("certified")
+    light = ("--mass-kg", "0.2", "0.2", "--length-m", "0.25", "0.2", "--rated-torque-nm", "2", "2")
+    assert init(out, *NO_BUS, *light).exit_code == 0
+    settings = written(out)
+    assert settings.certified.residual_Nm == pytest.approx(base.certified.residual_Nm / 3.0, rel=1e-3)
+    assert settings.certified.enough_std[5] == base.certified.enough_std[5]
+    assert settings.certified.excitation_Nm2s < base.certified.excitation_Nm2s
+    assert settings.detector.collision_Nm == (0.3333, 0.3333)
+    heavy = ("--mass-kg", "8", "8", "--length-m", "0.6", "0.5", "--rated-torque-nm", "150", "150", "--force")
+    assert init(out, *NO_BUS, *heavy).exit_code == 0
+    settings = written(out)
+    assert settings.certified.beta_Nm == pytest.approx(12.5 * base.certified.beta_Nm, rel=1e-3)
+    assert settings.certified.prior_std[0] > 2.0 * settings.arm.cad_theta[0]
+    assert settings.certified.excitation_Nm2s == base.certified.excitation_Nm2s
+    assert settings.detector.collision_Nm == base.detector.collision_Nm  # never less careful than the base
 
 
 def test_three_joints_are_two_when_one_is_locked(tmp_path: Path, out: Path) -> None:

@@ -22,7 +22,8 @@ NAMED_IN = ("tests/**/*.py", "docs/**/*.md", "README.md", "adacd_hil/configs/*.t
 @pytest.fixture(scope="module")
 def read_names() -> set[str]:
     """Names of all attributes that the product reads, but for what it declares."""
-    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "adacd_hil").rglob("*.py"))
+    files = (path for package in ("adacd_hil", "firmware_sim") for path in (ROOT / package).rglob("*.py"))
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in files)
     return {
         node.attr
         for tree in trees

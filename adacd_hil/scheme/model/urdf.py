@@ -1,6 +1,6 @@
 """A serial arm read from the text of a URDF: geometry, limits and the parameters that its author gave its links.
 
-Read are link, inertial, joint, origin, parent, child, axis, limit; the rest (shapes, transmissions, plugins) is passed
+Read are link, inertial, joint, origin, parent, child, axis, limit, dynamics; the rest (shapes, transmissions) is passed
 over. Links on fixed joints become part of the link that carries them, whose frame is the URDF's frame of that link.
 Angles are rad, rpy as in the URDF: R = Rz(yaw) Ry(pitch) Rx(roll). Source: http://wiki.ros.org/urdf/XML.
 
@@ -59,6 +59,8 @@ class SerialArm:
     position_high: Vector  # (n,)
     velocity_limit: Vector  # (n,), rad/s or m/s
     torque_limit: Vector  # (n,), Nm or N
+    damping: Vector  # (n,), Nm s/rad or N s/m; 0 where <dynamics> says nothing
+    friction: Vector  # (n,), Nm or N
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,8 @@ class _Joint:
     high: float
     velocity: float
     effort: float
+    damping: float
+    friction: float
 
 
 def read_urdf(
@@ -162,6 +166,8 @@ def _assemble(
         np.array([joint.high for joint in moving]),
         np.array([joint.velocity for joint in moving]),
         np.array([joint.effort for joint in moving]),
+        np.array([joint.damping for joint in moving]),
+        np.array([joint.friction for joint in moving]),
     )
 
 
@@ -256,8 +262,15 @@ def _read_joint(joint: Element, name: str, links: Collection[str]) -> _Joint:
         velocity, effort = _number(limit, "velocity", where, math.inf), _number(limit, "effort", where, math.inf)
     if low > high:
         raise UrdfError(f"{where}: lower limit {low:g} is above the upper {high:g}")
+    dynamics = _only(joint, "dynamics", where)
+    damping, friction = (
+        0.0 if dynamics is None else _number(dynamics, key, where, 0.0) for key in ("damping", "friction")
+    )
+    if min(damping, friction) < 0.0:
+        raise UrdfError(f"{where}: <dynamics> damping {damping:g}, friction {friction:g}: neither may be negative")
+    origin = _read_origin(joint, where)
     return _Joint(
-        name, kind, ends[0], ends[1], _read_origin(joint, where), axis / max(length, 1e-6), low, high, velocity, effort
+        name, kind, ends[0], ends[1], origin, axis / max(length, 1e-6), low, high, velocity, effort, damping, friction
     )
 
 
