@@ -5,13 +5,15 @@ the page's own CSS variables and which carries no style, script, date or referen
 """
 
 import io
+import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import matplotlib as mpl
@@ -25,6 +27,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
+from adacd_hil.file_access import replace_files
+from adacd_hil.log.log_files import failing_as
 from adacd_hil.records import Vector
 
 # Each colour is written once on paper and once as the page's variable of the same name.
@@ -123,6 +127,15 @@ def paper_svg(drawing: Drawing) -> str:
         canvas: Any = FigureCanvasSVG(drawing.figure)
         canvas.print_svg(out, metadata={"Date": None})
     return out.getvalue()
+
+
+def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings: Iterable[Drawing]) -> tuple[Path, ...]:
+    """Write NAME.json, and each drawing as PNG and SVG, into a folder. Raises LogError when they can't be written."""
+    contents: dict[str, bytes | str] = {f"{name}.json": json.dumps(described, indent=2, allow_nan=False) + "\n"}
+    for drawing in drawings:
+        contents |= {f"{drawing.name}.png": drawing.png(), f"{drawing.name}.svg": paper_svg(drawing)}
+    with failing_as(f"report in {out_dir} can't be written"):
+        return replace_files(out_dir, contents)
 
 
 _SUPERSCRIPTS: Final = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -14,16 +14,18 @@ against false alarms, and how late.
 import json
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from adacd_hil import __version__
-from adacd_hil.analysis.drawing import COLOURS, Drawing, note, paper_svg, style
+from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style, write_figures
 from adacd_hil.analysis.logged_run import Progress
 from adacd_hil.analysis.replay.replay import replay_many
 from adacd_hil.analysis.replay.replayed_outcome import Replay
@@ -50,8 +52,7 @@ from adacd_hil.analysis.sweep.tune_roc import (
 )
 from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.clock import wall_ns
-from adacd_hil.file_access import replace_files
-from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
+from adacd_hil.log.log_files import WHOLE, TimeWindow
 from adacd_hil.settings.configuration import Settings, apply_settings, changed_keys, keep_facts, load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names, to_toml
@@ -271,26 +272,33 @@ _LEAST_RATE: Final = 1e-6
 """Per hour; what the model predicts below this nobody will ever check."""
 
 
-def curves(tuning: Tuning) -> list[tuple[str, Choice]]:
-    """Return what is drawn: the suggestion or else the logs' own filter, then the detectors."""
-    scheme = tuning.best or tuning.candidates[0]
-    return [(f"scheme: {scheme.name}", scheme.choice), *((choice.name, choice) for choice in tuning.detectors)]
-
-
-def draw_roc(tuning: Tuning) -> Drawing:
-    """Draw the share of contacts found against the upper bound of the rate that was counted; without truth, rates."""
+@contextmanager
+def _axes(title: str) -> Iterator[tuple[Figure, Axes]]:
+    """Give a figure and its axes, with room for a legend at the right."""
     with style():
         figure = Figure(figsize=(10.0, 4.6))
         axes = figure.subplots()
         figure.subplots_adjust(left=0.065, right=0.72, bottom=0.12, top=0.9)
-        for (name, choice), colour in zip(curves(tuning), ("alarm", *_LOOKS), strict=False):
+        axes.set_title(title)
+        yield figure, axes
+        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+
+
+def _curves(tuning: Tuning) -> Iterator[tuple[Choice, dict[str, Any]]]:
+    """Give what is drawn, and how: the suggestion or else the logs' own filter, then the detectors."""
+    scheme = tuning.best or tuning.candidates[0]
+    named = [(f"scheme: {scheme.name}", scheme.choice), *((choice.name, choice) for choice in tuning.detectors)]
+    for (name, choice), colour in zip(named, ("alarm", *_LOOKS), strict=False):
+        yield choice, {"color": COLOURS[colour], "linewidth": 2.0 if colour == "alarm" else 1.1, "label": name}
+
+
+def draw_roc(tuning: Tuning) -> Drawing:
+    """Draw the share of contacts found against the upper bound of the rate that was counted; without truth, rates."""
+    title = "False alarms and contacts found"
+    with _axes(title) as (figure, axes):
+        for place, (choice, look) in enumerate(_curves(tuning)):
             found = [each for _, each, _ in choice.roc]
             bounds = np.array([each.rate_bound_per_h for each in found])
-            look: dict[str, Any] = {
-                "color": COLOURS[colour],
-                "linewidth": 2.0 if colour == "alarm" else 1.1,
-                "label": name,
-            }
             if found[0].contacts is None:
                 axes.plot([factor for factor, _, _ in choice.roc], bounds, **look)
                 continue
@@ -298,54 +306,41 @@ def draw_roc(tuning: Tuning) -> Drawing:
             axes.plot(bounds, 100.0 * shares, marker="o", markersize=3.0, **look)
             predicted = [np.nan if rate is None or rate < _LEAST_RATE else rate for _, _, rate in choice.roc]
             axes.plot(predicted, 100.0 * shares, linestyle=":", **(look | {"label": None}))
-            if colour == "alarm":
+            if place == 0:
                 low, high = np.array([each.share_bounds for each in found]).T
-                axes.fill_between(bounds, 100.0 * low, 100.0 * high, color=COLOURS[colour], alpha=0.12, linewidth=0.0)
+                axes.fill_between(bounds, 100.0 * low, 100.0 * high, color=look["color"], alpha=0.12, linewidth=0.0)
         has_truth = tuning.candidates[0].choice.chosen.contacts is not None
         bound_label = "false alarms per hour, upper 95 % bound of what was counted"
         if has_truth:
             axes.set(xscale="log", ylim=(-3.0, 103.0), xlabel=bound_label, ylabel="contacts found, %")
         else:
             axes.set(xscale="log", yscale="log", xlabel="factor on the thresholds", ylabel=bound_label)
-        axes.set_title("False alarms and contacts found")
         note(axes, "counted where nothing was chosen; dotted: the tail model's prediction")
-        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
-        hours = tuning.candidates[0].choice.checked.hours
-        caption = (
-            f"All thresholds of a detector times one factor. {hours:.3f} h without an alarm leave a bound of "
-            f"{3.0 / hours:.3g} per hour, further left nothing can be counted."
-            if hours > 0.0
-            else "All thresholds of a detector times one factor."
-        )
-        return Drawing("roc", "False alarms and contacts found", caption, figure)
+    hours = tuning.candidates[0].choice.checked.hours
+    caption = (
+        f"All thresholds of a detector times one factor. {hours:.3f} h without an alarm leave a bound of "
+        f"{3.0 / hours:.3g} per hour, further left nothing can be counted."
+        if hours > 0.0
+        else "All thresholds of a detector times one factor."
+    )
+    return Drawing("roc", title, caption, figure)
 
 
 def draw_delays(tuning: Tuning) -> Drawing:
     """Draw the share of all contacts that is found within a time, at the chosen thresholds."""
-    with style():
-        figure = Figure(figsize=(10.0, 4.6))
-        axes = figure.subplots()
-        figure.subplots_adjust(left=0.065, right=0.72, bottom=0.12, top=0.9)
-        for (name, choice), colour in zip(curves(tuning), ("alarm", *_LOOKS), strict=False):
-            delays, contacts = _draw_delays(choice)
+    title = "Delay at the chosen thresholds"
+    with _axes(title) as (figure, axes):
+        for choice, look in _curves(tuning):
+            delays, contacts = _all_delays(choice)
             shares = 100.0 * np.arange(len(delays) + 1) / max(contacts, 1)
-            axes.step(
-                [0.0, *delays],
-                shares,
-                where="post",
-                color=COLOURS[colour],
-                linewidth=2.0 if colour == "alarm" else 1.1,
-                label=name,
-            )
+            axes.step([0.0, *delays], shares, where="post", **look)
         axes.set(ylim=(-3.0, 103.0), xlabel="time since the onset, ms", ylabel="contacts found, %")
-        axes.set_title("Delay at the chosen thresholds")
         note(axes, f"for {tuning.rate_per_h:g} false alarms per hour")
-        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
-        caption = "Contacts of all logs; what a curve lacks to 100 % is never found."
-        return Drawing("delays", "Delay at the chosen thresholds", caption, figure)
+    caption = "Contacts of all logs; what a curve lacks to 100 % is never found."
+    return Drawing("delays", title, caption, figure)
 
 
-def _draw_delays(choice: Choice) -> tuple[Sequence[float], int]:
+def _all_delays(choice: Choice) -> tuple[Sequence[float], int]:
     halves = (choice.chosen, choice.checked)
     return sorted(delay for half in halves for delay in half.delays_ms), sum(half.contacts or 0 for half in halves)
 
@@ -355,8 +350,4 @@ def write_tuning(tuning: Tuning, out_dir: Path) -> tuple[Path, ...]:
     drawings = [draw_roc(tuning)]
     if tuning.candidates[0].choice.chosen.contacts:
         drawings.append(draw_delays(tuning))
-    contents: dict[str, bytes | str] = {"tune.json": json.dumps(tuning.as_json(), indent=2, allow_nan=False) + "\n"}
-    for drawing in drawings:
-        contents |= {f"{drawing.name}.png": drawing.png(), f"{drawing.name}.svg": paper_svg(drawing)}
-    with failing_as(f"report in {out_dir} can't be written"):
-        return replace_files(out_dir, contents)
+    return write_figures(out_dir, "tune", tuning.as_json(), drawings)

@@ -8,7 +8,6 @@ A delay is from the onset to the sample with which the detector is over, in ms; 
 sample is not in it. A step that is not found within `HORIZON_S` has a delay of more than that.
 """
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +16,9 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from adacd_hil.analysis.drawing import COLOURS, Drawing, note, paper_svg, style
+from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style, write_figures
 from adacd_hil.analysis.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
 from adacd_hil.analysis.thresholds.recorded_thresholds import BLOCK_S, Statistics
-from adacd_hil.file_access import replace_files
-from adacd_hil.log.log_files import failing_as
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import detectors
 
@@ -252,12 +249,4 @@ def draw_comparison(comparison: Comparison) -> Drawing:
 
 def write_comparison(comparison: Comparison, out_dir: Path) -> tuple[Path, ...]:
     """Write detectors.json, .png and .svg into a folder. Raises LogError when they can't be written."""
-    drawing = draw_comparison(comparison)
-    text = json.dumps(comparison.as_json(), indent=2, allow_nan=False) + "\n"
-    contents: dict[str, bytes | str] = {
-        f"{NAME}.json": text,
-        f"{NAME}.png": drawing.png(),
-        f"{NAME}.svg": paper_svg(drawing),
-    }
-    with failing_as(f"report in {out_dir} can't be written"):
-        return replace_files(out_dir, contents)
+    return write_figures(out_dir, NAME, comparison.as_json(), [draw_comparison(comparison)])
