@@ -20,11 +20,16 @@ _PIECES = re.compile(r"[^/_.,=:;]*[/_.,=:;]+|[^/_.,=:;]+")
 
 
 def fit_table(
-    lines: Sequence[Sequence[str]], right: Collection[int] = (), width: int | None = None, is_cut: bool = False
+    lines: Sequence[Sequence[str]],
+    right: Collection[int] = (),
+    width: int | None = None,
+    is_cut: bool = False,
+    names: int = 1,
 ) -> list[str]:
     """Align lines of cells; columns in `right` to the right. A cell is text of one line, whatever is in it.
 
     No line is wider than `width`, of at least 20; None: as wide as it gets. is_cut: each is one line, its cells cut.
+    names: how many columns it takes to tell rows apart; each part begins with them, if they leave room for others.
     """
     if not lines:
         return []
@@ -37,7 +42,7 @@ def fit_table(
         for column, most in enumerate(natural)
     ]
     told: list[str] = []
-    for part in _parts(least, width):
+    for part in _parts(least, width, names):
         widths = _shrunk([natural[column] for column in part], [least[column] for column in part], width)
         cells = ([line[column] for column in part] for line in lines)
         rows = [row for line in cells for row in (_cut(line, widths) if is_cut else _rows(line, widths))]
@@ -57,12 +62,14 @@ def _least_room(column: int, lines: Sequence[Sequence[str]]) -> int:
     return max(_LEAST_ROOM, *map(len, pieces), 0)
 
 
-def _parts(least: Sequence[int], width: int) -> list[list[int]]:
+def _parts(least: Sequence[int], width: int, names: int) -> list[list[int]]:
     """Choose the columns of each part: as many as there is room for."""
-    parts: list[list[int]] = [[0]]
-    for column in range(1, len(least)):
-        if len(parts[-1]) > 1 and _sum([least[place] for place in (*parts[-1], column)]) > width:
-            parts.append([0])
+    if _sum([*least[:names], max(least[names:], default=0)]) > width:
+        names = 1
+    parts = [list(range(names))]
+    for column in range(names, len(least)):
+        if len(parts[-1]) > names and _sum([least[place] for place in (*parts[-1], column)]) > width:
+            parts.append(list(range(names)))
         parts[-1].append(column)
     return parts
 

@@ -116,7 +116,11 @@ _MARK = re.compile(rf"^(\s*\d+\.\d\d s  |)({'|'.join(map(re.escape, _MARKS))})(?
 
 def for_people(text: str, stream: "TextIO | Terminal") -> str:
     """Lay a text out for a stream: free of control characters but its own, folded, with colours where it has them."""
-    text = fold(plain(text), terminal_columns(stream))
+    return painted(fold(plain(text), terminal_columns(stream)), stream)
+
+
+def painted(text: str, stream: "TextIO | Terminal") -> str:
+    """Give marks in a plain text their colours, where the stream has them."""
     if not has_colour(stream):
         return text
     return _MARK.sub(lambda found: f"{found[1]}\x1b[{_MARKS[found[2]]}m{found[2]}\x1b[0m", text)

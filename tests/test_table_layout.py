@@ -40,6 +40,20 @@ def test_a_much_wider_table_is_told_in_parts_that_begin_with_the_first_column() 
     ]
 
 
+def test_each_part_begins_with_what_tells_rows_apart() -> None:
+    lines = [("who", "what", "one", "two"), ("a", "x", "1" * 12, "2" * 12), ("a", "y", "3", "4")]
+    assert fit_table(lines, (2, 3), 26, names=2) == [
+        "who  what           one",
+        "a    x     111111111111",
+        "a    y                3",
+        "",
+        "who  what           two",
+        "a    x     222222222222",
+        "a    y                4",
+    ]
+    assert fit_table(lines, (2, 3), 20, names=2)[0] == "who  what"  # no room for them beside the numbers
+
+
 def test_where_the_first_column_goes_on_it_is_no_further_row() -> None:
     lines = [("what", "a", "b"), ("the first thing that is told", "1", "x y"), ("other", "2", "z")]
     assert fit_table(lines, width=26) == [
@@ -88,9 +102,10 @@ CELLS = some.text(some.sampled_from("ab/._= \té\n\x1b"), max_size=60)
     some.integers(40, 100),
     some.sets(some.integers(0, 5)),
     some.booleans(),
+    some.integers(1, 3),
 )
-def test_whatever_is_in_a_table_no_line_is_wider_and_no_letter_lost(lines, width, right, is_cut) -> None:
-    told = fit_table(lines, right, width, is_cut)
+def test_whatever_is_in_a_table_no_line_is_wider_and_no_letter_lost(lines, width, right, is_cut, names) -> None:
+    told = fit_table(lines, right, width, is_cut, min(names, len(lines[0])))
     assert max(map(len, told)) <= width
     if not is_cut:
         shown = sorted("".join(told).replace(" ", ""))

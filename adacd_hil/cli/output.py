@@ -24,7 +24,7 @@ from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import fold, in_line, one_line, terminal_columns, write_told
+from adacd_hil.terminal import fold, in_line, one_line, painted, terminal_columns, write_screen, write_told
 
 PROGRAM = "adacd-hil"
 
@@ -136,11 +136,11 @@ def complain(error: BaseException) -> ExitCode:
 
 
 def format_table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = (), is_cut: bool = False
+    head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = (), is_cut: bool = False, names: int = 1
 ) -> str:
-    """Align rows under a head; columns in `right` to the right. An empty head is left out. is_cut: a row is a line."""
+    """Align rows under a head for standard output, as `fit_table` does. An empty head is left out."""
     lines = [tuple(head), *map(tuple, rows)] if any(head) else [*map(tuple, rows)]
-    return "\n".join(fit_table(lines, right, terminal_columns(), is_cut))
+    return "\n".join(fit_table(lines, right, terminal_columns(), is_cut, names))
 
 
 def show(text: str, *next_commands: str) -> None:
@@ -162,7 +162,8 @@ def suggest(*next_commands: str) -> None:
     called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     for place, command in enumerate(next_commands):
         typed = f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
-        print(_as_typed(f"{'next:' if place == 0 else '     '} {in_line(typed)}"), file=sys.stderr)
+        line = _as_typed(f"{'next:' if place == 0 else '     '} {in_line(typed)}")
+        write_screen(painted(f"{line}\n", sys.stderr), sys.stderr)
 
 
 def _as_typed(line: str) -> str:
@@ -176,6 +177,11 @@ def _as_typed(line: str) -> str:
 
 
 _GOES_ON = " \\"
+
+
+def counted(count: int, what: str) -> str:
+    """Say how many there are, in the plural unless it is one."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def quoted(path: Path) -> str:

@@ -167,3 +167,29 @@ def test_an_emulator_that_compiles_counts_in_one_line_and_leaves_nothing(columns
     assert {len(count) for count in counts} == {columns - 1}
     assert shown.lines == ["firmware-sim: and now it has an arm", ""]
     assert shown.status == 2
+
+
+SUGGEST = """
+from adacd_hil.terminal import open_terminals
+open_terminals()
+from adacd_hil.cli.output import suggest
+suggest("adacd-hil report runs/2026-11-25T10-00-00 --out /srv/reports/of/the/left/arm   # for others",
+        "xdg-open x.html",
+        "python -c 'a command of many words in one quote is what a shell takes as it is'   # of one piece")
+"""
+
+
+@pytest.mark.slow
+def test_a_command_that_may_be_typed_next_can_be_copied_from_a_narrow_terminal() -> None:
+    environment = {**os.environ, "TERM": "xterm", "PYTHONPATH": str(Path.cwd())}
+    shown = show_on_terminal([sys.executable, "-c", SUGGEST], 60, 24, environment)
+    assert shown.text.startswith("\x1b[1mnext:\x1b[0m ")
+    assert shown.lines == [
+        "next: adacd-hil report runs/2026-11-25T10-00-00 --out \\",
+        "  /srv/reports/of/the/left/arm",
+        "      # for others",
+        "      xdg-open x.html",
+        "      python -c 'a command of many words in one quote is what a shell takes as it is'",
+        "      # of one piece",
+        "",
+    ]

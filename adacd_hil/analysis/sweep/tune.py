@@ -74,7 +74,7 @@ def tune(
 
     Raises LogError, ConfigError, CodecError, TooLittleMotionError.
     """
-    progress(f"reading {len(paths)} logs")
+    progress(f"reading {len(paths)} log{'' if len(paths) == 1 else 's'}")
     logs = read_logs(paths, config, stretch, progress)
     has_truth = any(log.windows is not None for log in logs)
     notes = [] if has_truth else ["no truth.mcap beside the logs: contacts and delays are not known, and an alarm of a "

@@ -7,7 +7,7 @@ import click
 
 from adacd_hil.cli.completion import complete_configuration, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, set_option
-from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, show
+from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, format_table, show
 from adacd_hil.given_path import CommandGroup
 from adacd_hil.terminal import in_line
 
@@ -104,12 +104,8 @@ def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCod
             for kind, lines in (("error", found.errors), ("warning", found.warnings)):
                 for line in lines:
                     show(f"{in_line(name)}: {kind}: {in_line(line)}")
-            show(f"{in_line(name)}: {_counted(len(found.errors), 'error')}, {_counted(len(found.warnings), 'warning')}")
+            show(f"{in_line(name)}: {counted(len(found.errors), 'error')}, {counted(len(found.warnings), 'warning')}")
     return ExitCode.USAGE if any(found.errors for found in findings.values()) else ExitCode.OK
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 @config.command(epilog=EPILOG)

@@ -8,7 +8,7 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, set_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show
+from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, format_table, quoted, show
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.progress_lines import Progress
@@ -132,7 +132,7 @@ def _replay_one(
     variants = {_name(choice): apply_settings(base, choice) for choice in parse_variations(vary)} if vary else {}
     if not variants and base != own:
         variants = {", ".join(filter(None, [config or "", *changes])): base}
-    progress(f"replaying {given}" + (f" with {len(variants)} other settings" if variants else ""))
+    progress(f"replaying {given}" + (f" with {counted(len(variants), 'other setting')}" if variants else ""))
     truth = contacts_beside(log_in(against or given), progress)
     settings: list[Settings] = [own, *variants.values()]
     replays = replay_source(source, settings, truth, progress, tolerance, ScriptedOperator, shown, stretch=stretch)

@@ -102,7 +102,9 @@ def as_text(described: dict[str, Any]) -> str:
     talks += [("", talk) for talk in described["others"]]
     if talks:
         rows = [_talk_row(owner, talk) for owner, talk in talks]
-        parts.append(format_table(("node", "id", "message", "bytes", "frames", "Hz"), rows, right=(0, 3, 4, 5)))
+        parts.append(
+            format_table(("node", "id", "message", "bytes", "frames", "Hz"), rows, right=(0, 3, 4, 5), names=2)
+        )
     else:
         has_answers = any(node["is_present"] for node in nodes)
         what = "the nodes answered, and sent nothing by themselves" if has_answers else "nothing was heard"

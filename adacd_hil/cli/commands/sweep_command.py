@@ -12,7 +12,7 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, explained, show
+from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, show
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.progress_lines import Progress
@@ -90,7 +90,10 @@ def sweep(
     store = SweepStore(out)
     tls = TlsFiles(tls_ca_file, tls_cert, tls_key)
     with Progress() as progress:
-        progress(f"{plan.size} rows: {len(plan.subjects)} {'logs' if logs else 'runs'} × {len(plan.variants)} settings")
+        progress(
+            f"{counted(plan.size, 'row')}: {counted(len(plan.subjects), 'log' if logs else 'run')} × "
+            f"{counted(len(plan.variants), 'setting')}"
+        )
         if scheduler and not scheduler.startswith(TLS) and not any(tls):
             progress(
                 f"{scheduler} is open: it runs whatever anybody sends who reaches it; tls:// asks for a certificate"

@@ -51,7 +51,11 @@ def as_text(thresholds: Thresholds, comparison: Comparison | None) -> str:
                     row.limit[i] if row.limit else "",
                 )
             )
-    lines += [format_table(("detector", "channel", "joint", "threshold", "achievable", "limited by"), rows, (2, 3, 4))]
+    lines += [
+        format_table(
+            ("detector", "channel", "joint", "threshold", "achievable", "limited by"), rows, (2, 3, 4), names=3
+        )
+    ]
     checks = [
         (
             row.name,
