@@ -293,7 +293,7 @@ def test_the_text_puts_three_columns_side_by_side():
 def test_the_page_has_a_card_for_the_contact():
     run = reported_run()
     html = report_page(evaluate(run), run, ReportSource("run.mcap"), [], [])
-    assert "<dt>force</dt><dd>≥ 14.2 N</dd>" in html
+    assert "<dt>force</dt><dd>≥ 14.2 ± 0.5 N</dd>" in html
     assert "<dt>truth</dt><dd>link 1, 0.0 N</dd>" in html
     assert "only the moment is known" in html
 
@@ -303,7 +303,7 @@ def test_the_page_has_a_card_for_the_contact():
     [
         (Location.KNOWN, "force at right angles</dt><dd>−14.2 ± 0.5 N"),
         (Location.UNCERTAIN, "force at right angles</dt><dd>−14.2 ± 0.5 N"),
-        (Location.LINK_1, "force</dt><dd>≥ 14.2 N"),
+        (Location.LINK_1, "force</dt><dd>≥ 14.2 ± 0.5 N"),
         (Location.BEYOND_TIP, "force</dt><dd>not known"),
         (Location.INCONSISTENT, "force</dt><dd>not known"),
     ],

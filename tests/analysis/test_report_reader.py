@@ -14,7 +14,7 @@ from adacd_hil.analysis.report.page import has_paper
 from adacd_hil.analysis.report.run_page import report_page
 from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.metrics import ReportSource
-from adacd_hil.analysis.score.wording import STATE_WORDS
+from adacd_hil.analysis.score.wording import STATE_WORDS, uncertain_text
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
 
@@ -48,6 +48,7 @@ def test_text_and_curves_are_told_from_their_ground(colours: dict[str, str]) -> 
         for ink in ("alarm", "good", "identified")
         for ground in GROUNDS[:2]
     }
+    text["ink", "touch"] = contrast(colours["ink"], colours["touch"])  # a contact's number on its band
     assert {pair: ratio for pair, ratio in text.items() if ratio < 4.5} == {}  # WCAG AA
     curves = {curve: contrast(colours[curve], colours["paper"]) for curve in CURVES}
     assert {curve: ratio for curve, ratio in curves.items() if ratio < 3.0} == {}
@@ -167,11 +168,13 @@ def test_the_head_names_ones_own_arm_and_where_it_is() -> None:
 
 def test_the_papers_numbers_are_those_of_its_arm_alone() -> None:
     run = touched_run()
-    own = replace(run, settings=replace(run.settings, arm=replace(run.settings.arm, link_length_m=(0.4, 0.3))))
+    own = on_a_bus(run)
+    own = replace(own, settings=replace(run.settings, arm=replace(run.settings.arm, link_length_m=(0.4, 0.3))))
     assert (has_paper(evaluate(run)), has_paper(evaluate(own))) == (True, False)
     page = report_page(evaluate(own), own, SOURCE, [], [])
     assert "eq. (15)" not in page.partition("How it is computed")[0]
     assert "<h2>Measured</h2>" in page
+    assert "run report · arm lab · on socketcan can1</p>" in page
 
 
 def test_notices_are_written_out_below_the_timeline() -> None:
@@ -181,3 +184,17 @@ def test_notices_are_written_out_below_the_timeline() -> None:
     page = report_page(evaluate(run), run, SOURCE, [], [])
     assert page.count("bus: slow &lt;&amp;&gt;</li>") == 12
     assert "The first 12 of 14 notices." in page
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "text"),
+    [
+        (-0.0012, 0.0004, "−0.0012 ± 0.0004 Nm"),
+        (-0.0001, 0.004, "0.000 ± 0.004 Nm"),
+        (0.5, 1e-9, "0.500000 ± 0.000000 Nm"),
+        (0.5, 0.0, "0.500 ± 0.000 Nm"),
+        (0.5, None, "–"),
+    ],
+)
+def test_a_small_deviation_does_not_read_as_none(value: float, sigma: float | None, text: str) -> None:
+    assert uncertain_text(value, sigma, 3, "Nm") == text

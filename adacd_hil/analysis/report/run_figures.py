@@ -215,7 +215,7 @@ def _mark(axes: Axes, metrics: Metrics) -> None:
         mark_lane(axes, times_s, _LANE, color=alarm, **look)
     for contact in () if is_crowded else metrics.contacts:
         is_seen = contact.detected_s is not None
-        look = {"markerfacecolor": alarm if is_seen else "none", "markeredgecolor": alarm, "markeredgewidth": 0.9}
+        look = {"markerfacecolor": alarm if is_seen else PAPER, "markeredgecolor": alarm, "markeredgewidth": 0.9}
         mark_lane(axes, [contact.at_s], _LANE, color=alarm, marker="o", markersize=10.5, **look)
         axes.annotate(
             str(contact.number),
@@ -284,12 +284,13 @@ def adaptation(run: Run, metrics: Metrics, section: Section, number: int) -> Dra
     ordinal = ("first", "second", "third", "fourth", "fifth")[number] if number < 5 else f"{number + 1}th"
     payload_kg = metrics.payload_kg[section.label]
     payload = "" if payload_kg is None else f", {payload_kg:g} kg payload" if payload_kg else ", no payload"
+    title = f"Figure {6 + number} — model identification" if has_paper(metrics) else "Model identification"
     truth = "dashed the true values; " if identified and next(iter(identified.values()))[0] is not None else ""
     end = _end_text(section, metrics)
     band = "dotted one standard deviation of each; " if run.certified is not None else ""
     return Drawing(
         f"fig{6 + number}",
-        f"Figure {6 + number} — model identification, {ordinal} adaptation (section {section.label}{payload})",
+        f"{title}, {ordinal} adaptation (section {section.label}{payload})",
         f"Identified parameters over time, {truth}{band}{end}.",
         figure,
     )

@@ -253,7 +253,8 @@ def _force(contact: ReportedContact) -> tuple[str, str]:
     if text == NONE:
         return "force", "not known"
     if location is Location.LINK_1:
-        return "force", f"{text} N"
+        spread = contact.force_sigma_N
+        return "force", f"{text} N" if spread is None else f"{text} ± {number_text(spread, 1)} N"
     return "force at right angles", uncertain_text(contact.force_N, contact.force_sigma_N, 1, "N")
 
 

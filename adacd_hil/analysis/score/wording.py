@@ -10,6 +10,7 @@ from adacd_hil.analysis.score.judge import Score
 from adacd_hil.records import SchemeState
 
 NONE: Final = "–"
+_MORE_DIGITS: Final = 3
 
 
 STATE_WORDS: Final = {
@@ -36,7 +37,7 @@ def number_text(value: float | None, digits: int, unit: str = "") -> str:
     """Write a number with a fixed count of decimals and a true minus sign; a dash for None."""
     if value is None or not math.isfinite(value):
         return NONE
-    text = f"{value:.{digits}f}".replace("-", "−")
+    text = f"{value:z.{digits}f}".replace("-", "−")
     return f"{text} {unit}" if unit else text
 
 
@@ -66,9 +67,14 @@ def scaled(value: float | None, factor: float) -> float | None:
 
 
 def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: str) -> str:
-    """Write a value with its standard deviation; a dash where either is not known."""
+    """Write a value with its standard deviation, with as many more decimals as a small one needs not to read as none.
+
+    A dash where either is not known.
+    """
     if value is None or sigma is None:
         return NONE
+    if 0.0 < sigma < 0.5 * 10.0**-digits:
+        digits = min(-math.floor(math.log10(sigma)), digits + _MORE_DIGITS)
     return f"{number_text(value, digits)} ± {number_text(sigma, digits)} {unit}"
 
 

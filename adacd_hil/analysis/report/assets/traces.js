@@ -198,7 +198,7 @@
       ctx.lineTo(bbox.left + bbox.width, y);
       ctx.stroke();
     }
-    ctx.fillStyle = colour("alarm");
+    ctx.fillStyle = colour("ink");
     ctx.font = `600 ${10 * devicePixelRatio}px system-ui, sans-serif`;
     ctx.textBaseline = "top";
     ctx.textAlign = "left";
