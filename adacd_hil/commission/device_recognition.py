@@ -26,8 +26,9 @@ from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import parse_toml
-from adacd_hil.wire.bus import CLASSIC_BYTES, Bus, Tap
+from adacd_hil.wire.bus import Bus, Tap
 from adacd_hil.wire.codec import CodecError
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 DRIVE, SENSOR = "drive", "sensor"
 KINDS = {402: DRIVE, 404: SENSOR}

@@ -14,7 +14,6 @@ from adacd_hil.file_access import place_file
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.codec import Codec, MessageCodec, contract_folder, load_codec, parse_codec
 from adacd_hil.wire.contract_frames import (
     EMERGENCY_ID,
@@ -27,6 +26,7 @@ from adacd_hil.wire.contract_frames import (
     SYNC_ID,
     move_contract,
 )
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
 
 COMPOSED_NAME = "contract.dbc"
 WIRE_VERSION = 1

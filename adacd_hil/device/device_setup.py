@@ -18,9 +18,10 @@ from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes,
 from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Frame
+from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import NOT_VALID, SDO_REQUEST_ID, SDO_RESPONSE_ID
+from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 
 class Slave:

@@ -20,9 +20,10 @@ from adacd_hil.device.device_setup import (
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, place_devices
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Frame
+from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, SYNC_ID, SYNC_OVERFLOW
+from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 START, ENTER_PRE_OPERATIONAL, RESET_COMMUNICATION = 0x01, 0x80, 0x82
 """NMT commands."""

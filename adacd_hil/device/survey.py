@@ -16,10 +16,11 @@ from dataclasses import dataclass, field
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.device_setup import Slave
-from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Frame, Tap
+from adacd_hil.wire.bus import Bus, Frame, Tap
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 from adacd_hil.wire.e2e import E2eStatus
+from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 from adacd_hil.wire.frame_time import LoadMeter
 from adacd_hil.wire.traffic import Talk, Traffic, listen
 

@@ -28,7 +28,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from adacd_hil.wire.bus import CLASSIC_BYTES
 from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.contract_frames import (
     ASSUMED_INTERVAL_MS,
@@ -39,7 +38,7 @@ from adacd_hil.wire.contract_frames import (
     read_contract,
     share_bus,
 )
-from adacd_hil.wire.traffic import FrameBits, unstuffed_frame, worst_case_frame
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FrameBits, unstuffed_frame, worst_case_frame
 
 HORIZON_NS = 1_000_000_000
 """Longest busy period that is followed; what isn't through after it counts as unbounded."""

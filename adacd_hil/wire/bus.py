@@ -39,14 +39,6 @@ class BusOffError(BusError):
         self.frame = frame
 
 
-CLASSIC_BYTES = 8
-"""A frame with more data is CAN FD with bit rate switch; one with less is classic, on an FD bus too."""
-MAX_STANDARD_ID = 0x7FF
-"""Identifiers beyond it are 29-bit ones."""
-FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
-"""Counts of data bytes that an FD frame can have beyond those of a classic one. Source: ISO 11898-1, table of DLC."""
-
-
 class QueueBytes(NamedTuple):
     """What waits in a bus end's queues, in bytes of the kernel's memory: about 700 a frame."""
 

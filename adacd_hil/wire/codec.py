@@ -19,7 +19,6 @@ from cantools.database.can import Database, Message, Signal
 from cantools.database.errors import Error as DatabaseError
 
 from adacd_hil.file_access import read_input
-from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.codec_columns import MessageTable, SignalCodec
 from adacd_hil.wire.e2e import (
     E2eReceiver,
@@ -30,6 +29,7 @@ from adacd_hil.wire.e2e import (
     Profile5Sender,
     Protection,
 )
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
 
 logging.getLogger("cantools").addHandler(logging.NullHandler())  # it tells a terminal what is refused here in a line
 

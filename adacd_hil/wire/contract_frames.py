@@ -16,8 +16,8 @@ from pathlib import Path
 import cantools
 from cantools.database.can import Database, Message
 
-from adacd_hil.wire.bus import MAX_STANDARD_ID
 from adacd_hil.wire.codec import Codec, CodecError, parse_codec
+from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 HOST_NODE = 127
 """Node id of the host unless said otherwise."""

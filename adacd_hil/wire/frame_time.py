@@ -1,7 +1,7 @@
 """How long frames take on the bus, exactly: at the pace of an emulated one, and as the load of one that is listened to.
 
 Compiled, a byte at a time by table: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding; what
-is counted, and CAN FD: `adacd_hil.wire.traffic`.
+is counted, and CAN FD: `adacd_hil.wire.frame_lengths`.
 
 The load is how much of the time frames take with the stuff bits that they really have. The bits of classic frames are
 those of can-utils' `canbusload -e`: from start of frame to the end of the intermission. CAN FD, which `canbusload -e`
@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID, Frame
-from adacd_hil.wire.traffic import (
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.frame_lengths import (
+    CLASSIC_BYTES,
     FRAME_LENGTHS,
+    MAX_STANDARD_ID,
     TAIL_BITS,
     FrameBits,
     fd_head_bits,

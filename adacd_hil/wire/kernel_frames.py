@@ -19,8 +19,9 @@ from enum import Enum
 from typing import Any, Final, NamedTuple
 
 from adacd_hil.clock import Clock, MonotonicClock, wall_offset_ns
-from adacd_hil.wire.bus import MAX_STANDARD_ID, Frame
+from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.can_interface import CANFD_MTU
+from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 ERROR_CLASS_MASK = 0x1FFFFFFF
 """Subscribes to every class."""

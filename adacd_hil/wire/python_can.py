@@ -7,7 +7,8 @@ import can
 
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.remedies import nearest_name
-from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID, Bus, BusError, BusMissingError, Frame
+from adacd_hil.wire.bus import Bus, BusError, BusMissingError, Frame
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 
 _ECHOING_INTERFACES = ("udp_multicast",)
 

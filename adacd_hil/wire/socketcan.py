@@ -18,9 +18,6 @@ from typing import NoReturn
 
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.wire.bus import (
-    CLASSIC_BYTES,
-    FD_LENGTHS,
-    MAX_STANDARD_ID,
     NOTHING_QUEUED,
     Bus,
     BusError,
@@ -33,6 +30,7 @@ from adacd_hil.wire.bus import (
     take_first,
 )
 from adacd_hil.wire.can_interface import CanInterface
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS, MAX_STANDARD_ID
 from adacd_hil.wire.kernel_frames import CAN_ID_MASK, ERROR_CLASS_MASK, FrameReceiver, FrameSender, is_bus_off
 
 CAN_RTR_FLAG = 0x40000000

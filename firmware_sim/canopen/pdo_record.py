@@ -11,9 +11,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.contract_frames import NOT_VALID
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
 from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, one_of, refuse
 
 EVENT_DRIVEN = (254, 255)

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from pathlib import Path
 
-from adacd_hil.wire.bus import CLASSIC_BYTES
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.canopen.error_control import (
     ErrorReporter,

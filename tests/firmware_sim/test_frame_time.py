@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from adacd_hil.wire.frame_lengths import FRAME_LENGTHS, worst_case_frame
 from adacd_hil.wire.frame_time import exact_frame, exact_time, worst_time
-from adacd_hil.wire.traffic import FRAME_LENGTHS, worst_case_frame
 
 RATE, DATA_RATE = 1_000_000, 5_000_000
 CLASSIC = exact_time(RATE)

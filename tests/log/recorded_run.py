@@ -19,8 +19,9 @@ from adacd_hil.records import (
     SchemeState,
     scheme_layout,
 )
-from adacd_hil.wire.bus import FD_LENGTHS, Frame
+from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.frame_lengths import FD_LENGTHS
 
 PERIOD_NS = 1_000_000
 CODEC = load_codec()

@@ -20,7 +20,8 @@ from adacd_hil.log.recording.packet import (
     unpack_event,
 )
 from adacd_hil.records import Event
-from adacd_hil.wire.bus import CLASSIC_BYTES, Frame
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 TIMES = st.integers(0, 2**62)
 COUNTS = st.integers(0, 2**32 - 1)

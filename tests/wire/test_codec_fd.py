@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from cantools.autosar.end_to_end import compute_profile2_crc, compute_profile5_crc
 
-from adacd_hil.wire.bus import FD_LENGTHS
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
 from adacd_hil.wire.e2e import E2eReceiver, E2eSender, Protection
+from adacd_hil.wire.frame_lengths import FD_LENGTHS
 
 FD = load_codec(contract_folder() / "arm_fd.dbc")
 HALF_MS = load_codec(contract_folder() / "arm_fd_500us.dbc")

@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adacd_hil.wire.frame_time import exact_frame
-from adacd_hil.wire.traffic import (
+from adacd_hil.wire.frame_lengths import (
     FRAME_LENGTHS,
     FrameBits,
     unstuffed_bits,
@@ -13,6 +12,7 @@ from adacd_hil.wire.traffic import (
     worst_case_bits,
     worst_case_fd_bits,
 )
+from adacd_hil.wire.frame_time import exact_frame
 
 BASE_ID = st.integers(0, 0x7FF)
 EXTENDED_ID = st.integers(0x800, 0x1FFFFFFF)

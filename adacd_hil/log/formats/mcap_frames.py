@@ -48,7 +48,7 @@ from adacd_hil.log.types.message_types import (
     pack_fd_frame,
 )
 from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE
-from adacd_hil.wire.bus import CLASSIC_BYTES
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 CHANNEL_KEY = "can_channel"
 RATE_SWITCH_KEY = "bit_rate_switch"

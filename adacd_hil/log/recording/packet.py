@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.types.message_types import MAX_DATA
 from adacd_hil.records import Event
-from adacd_hil.wire.bus import CLASSIC_BYTES, Frame
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 CYCLE = 1
 EVENT = 2

@@ -47,8 +47,8 @@ from adacd_hil.log.types.message_types import (
 from adacd_hil.log.types.record_arrays import record_dtype
 from adacd_hil.log.types.topics import ChannelId
 from adacd_hil.records import JOINTS, Event
-from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
 from adacd_hil.wire.codec_columns import ColumnCodec, MessageTable
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 
 _HEAD = struct.Struct("<BQHIQQ")
 _CHANNEL = slice(9, 11)

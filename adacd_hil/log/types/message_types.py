@@ -26,7 +26,7 @@ import numpy as np
 
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import JOINT_NAMES, JOINTS, Event
-from adacd_hil.wire.bus import MAX_STANDARD_ID
+from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
 SEPARATOR = "=" * 80

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
 from adacd_hil.log.types.message_types import CAN_FRAME, FD_FRAME, LOG, MAX_DATA, is_log
-from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 
 if TYPE_CHECKING:
     from adacd_hil.log.mcap.chunks import Contents
