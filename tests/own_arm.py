@@ -1,11 +1,66 @@
 """An arm of one's own for rehearsals: what its user tells `init`, and touches that fit it."""
 
+from importlib import resources
 from pathlib import Path
+
+from adacd_hil.wire.codec import contract_folder
+
+OTHER_LAYOUT = """
+[[pdo]]
+message = "Feedback"
+number = 3
+cob_id = 0x380
+signals = [{ object = "0x2069", signal = "velocity" }, { object = "0x2063", signal = "position" }]
+
+[[pdo]]
+message = "Status"
+number = 4
+cob_id = 0x480
+transmission = 255
+event_timer_ms = 50
+signals = [{ object = "0x603F", signal = "error_code" }, { object = "0x6041", signal = "statusword" }]
+
+[[pdo]]
+message = "Command"
+number = 2
+cob_id = 0x300
+signals = [
+    { object = "0x6071", signal = "target_torque", unit = "permille" },
+    { object = "0x6040", signal = "controlword" },
+]
+"""
+
+
+def write_drive(folder: Path) -> Path:
+    """Write a drive that has position and velocity in objects of its maker, and its frames in other PDOs than ours."""
+    listed = "[ManufacturerObjects]\nSupportedObjects={}\n1=0x2211\n2=0x2212\n{}"
+    eds = (contract_folder() / "stock_drive.eds").read_text()
+    assert listed.format(2, "") in eds
+    eds = eds.replace(listed.format(2, ""), listed.format(4, "3=0x2063\n4=0x2069\n"))
+    for index, name in (("2063", "Position"), ("2069", "Velocity")):
+        eds += f"\n[{index}]\nParameterName={name}\nObjectType=0x7\nDataType=0x0004\nAccessType=ro\nDefaultValue=0\n"
+        eds += "PDOMapping=1\n"
+    (folder / "other_drive.eds").write_text(eds)
+    ours = (resources.files("adacd_hil") / "device_profiles" / "stock-drive.toml").read_text()
+    profile = folder / "other-drive.toml"
+    profile.write_text(ours.partition("[[pdo]]")[0].replace("stock_drive.eds", "other_drive.eds") + OTHER_LAYOUT)
+    return profile
+
+
+def write_sensor_eds(folder: Path) -> Path:
+    """Write the EDS of a torque sensor of 16 bits, whose mapping is fixed."""
+    eds = (contract_folder() / "int32_sensor.eds").read_text()
+    for old, new in (("0x91300120", "0x71300110"), ("9130", "7130"), ("32 bit", "16 bit"), ("int32", "int16")):
+        eds = eds.replace(old, new)
+    place = eds.index("[7130sub1]")
+    path = folder / "int16_sensor.eds"
+    path.write_text(eds[:place] + eds[place:].replace("DataType=0x0004", "DataType=0x0003"))
+    return path
 
 
 def describe_arm(folder: Path) -> list[str]:
-    """Give the words after `init` that write the arm's file, `my-arm.toml` in `folder`."""
-    values: dict[str, tuple[float, float]] = {
+    """Write the devices' files; give the words after `init` that write the arm's, `my-arm.toml` in `folder`."""
+    values: dict[str, tuple[object, object]] = {
         "--length-m": (0.4, 0.25),
         "--mass-kg": (2, 1),
         "--rated-torque-nm": (20, 8),
@@ -14,8 +69,9 @@ def describe_arm(folder: Path) -> list[str]:
         "--velocity-limit-deg-s": (220, 280),
         "--drive-node": (11, 12),
         "--sensor-node": (21, 22),
+        "--drive": (drive := write_drive(folder), drive),
     }
-    words = [str(folder / "my-arm.toml"), "--no-bus", "--flat", "--yes"]
+    words = [str(folder / "my-arm.toml"), "--no-bus", "--flat", "--yes", "--eds", str(write_sensor_eds(folder))]
     for option, pair in values.items():
         words += [option, *map(str, pair)]
     return words

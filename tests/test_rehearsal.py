@@ -7,8 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from adacd_hil.commission.configuration_check import examine_configuration
+from adacd_hil.device.profile import load_profile
 from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
 from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
 from firmware_sim.cli.own_devices import rehearse as rehearse_file
 from firmware_sim.scenario.scenario import Scenario
 
@@ -134,3 +137,28 @@ def test_the_payload_of_a_heavy_arm_is_one_that_a_scenario_takes(tmp_path: Path)
     heavy = "[arm]\nlink_length_m = [0.6, 0.3]\nmass_kg = [40.0, 30.0]\nrated_torque_Nm = [900.0, 500.0]\n"
     scenario, _ = composed(tmp_path, heavy + "torque_limit_Nm = [900.0, 500.0]\n", "paper")
     assert scenario.payloads[0].mass_kg == 10.0
+
+
+def test_a_sensor_whose_frames_carry_next_to_nothing_is_named(tmp_path: Path) -> None:
+    sensor = load_profile("int32-sensor", "sensor")
+    (tmp_path / "int32_sensor.eds").write_bytes(sensor.eds.read_bytes())
+    (tmp_path / "mine-sensor.toml").write_text(PROFILE)
+    text = '[arm]\nlink_length_m = [0.4, 0.25]\n[devices]\nsensor = ["mine-sensor.toml", "mine-sensor.toml"]\n'
+    with pytest.raises(ConfigError, match=r"torque sensor 1 carry ±0\.0215 Nm, rated torque is 12 Nm: `torque_Nm`"):
+        composed(tmp_path, text + 'contract = ""\n')
+    found = examine_configuration(str(tmp_path / "mine.toml"))
+    assert any("Sensor2Torque carries ±0.0215 Nm" in line for line in found.warnings)
+
+
+PROFILE = """
+kind = "sensor"
+eds = "int32_sensor.eds"
+mapping = "fixed"
+[scale]
+torque_Nm = 1e-11
+[[pdo]]
+message = "Torque"
+number = 1
+cob_id = 0x180
+signals = [{ object = "0x9130:1", signal = "torque" }]
+"""

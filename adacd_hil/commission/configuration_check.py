@@ -59,7 +59,7 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
         return ConfigurationFindings([str(error)], [], None)
     late = list(_budget_warnings(codec, settings))
     assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in settings.assumed)}"] if settings.assumed else []
-    warnings = [*_oddities(settings), *assumed, *_layer_warnings(layers), *late]
+    warnings = [*_oddities(settings), *_narrow(codec, settings), *assumed, *_layer_warnings(layers), *late]
     return ConfigurationFindings([], warnings, settings, bool(late))
 
 
@@ -176,6 +176,18 @@ def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
             for key in [f"{section}.{name}" for name in content] if isinstance(content, dict) else [section]:
                 found[key] = origin
     return found
+
+
+def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
+    """Look for torque sensors whose frames can't carry the rated torque."""
+    for joint, rated_Nm in enumerate(settings.arm.rated_torque_Nm):
+        message = codec.message(f"Sensor{joint + 1}Torque")
+        signal = message.values[message.place("torque")]
+        if (most_Nm := signal.raw_high * signal.scale) < rated_Nm:
+            yield (
+                f"{message.name} carries ±{most_Nm:.3g} Nm, `arm.rated_torque_Nm[{joint}]` = {rated_Nm:g} Nm: is "
+                f"`torque_Nm` of {settings.devices.sensor[joint]} right?"
+            )
 
 
 def _budget_warnings(codec: Codec, settings: Settings) -> Iterator[str]:

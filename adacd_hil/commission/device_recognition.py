@@ -192,7 +192,9 @@ _FEATURES = {
 _PERMILLE = ("torque_actual", "torque_demand", "target_torque", "torque_offset", "max_torque")
 _EVENT = "transmission = 255\nevent_timer_ms = 100\n"
 _Place = tuple[int, int]
-_GUESSED_INCREMENTS, _GUESSED_TORQUE_NM = 1 << 20, 1e-6
+_GUESSED_INCREMENTS = 1 << 20
+_GUESSED_TORQUE_NM = 1e-6, 2e-3
+"""What a count may be worth, of more than 16 bits and of 16: ±2147 Nm and ±65 Nm in all."""
 
 
 class ProfileDraft(NamedTuple):
@@ -351,13 +353,17 @@ class _SensorWriter(_ProfileWriter):
         torque_Nm = self.ratings.torque_Nm
         if torque_Nm is not None:
             return [f"torque_Nm = {torque_Nm!r}"]
-        self.guesses.append(f"torque_Nm = {_GUESSED_TORQUE_NM:g}: the worth of a count is in the data sheet")
-        return ["# A guess: the worth of a count is in the data sheet.", f"torque_Nm = {_GUESSED_TORQUE_NM!r}"]
+        place = next((place for place in _TORQUE_OBJECTS if self.has(*place)), _TORQUE_OBJECTS[0])
+        variable = find_variable(self.objects, *place)
+        guess_Nm = _GUESSED_TORQUE_NM[0 if variable is None or variable.bits > 16 else 1]
+        self.guesses.append(f"torque_Nm = {guess_Nm:g}: the worth of a count is in the data sheet")
+        return ["# A guess: the worth of a count is in the data sheet.", f"torque_Nm = {guess_Nm!r}"]
 
     def frames(self) -> list[str]:
         torque = next((place for place in _TORQUE_OBJECTS if self.has(*place)), None)
         if torque is None:
-            raise ConfigError(f"EDS {self.eds}: no 0x9130:1 or 0x7130:1 (torque), which a sensor needs")
+            told = "; its 0x6130:1 is a float, which no frame of a cycle can hold" if self.has(0x6130, 1) else ""
+            raise ConfigError(f"EDS {self.eds}: no 0x9130:1 or 0x7130:1 (torque), which a sensor needs{told}")
         lines = self.pdo("Torque", 1, 0x180, [torque])
         status = self.fill([(0x6150, 1), (0x1001, 0)])
         if not self.is_fixed and self.has(0x6150, 1) and self.has(0x1A01, 0):

@@ -73,6 +73,7 @@ class EdsVariable(NamedTuple):
     is_signed: bool
     default: int | None
     is_writable: bool
+    is_float: bool = False
 
 
 def read_eds(path: Path, node_id: int) -> Any:
@@ -131,7 +132,8 @@ def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
     is_number = entry.data_type in canopen.objectdictionary.NUMBER_TYPES
     is_signed = entry.data_type in canopen.objectdictionary.SIGNED_TYPES
     bits, number = len(entry) if is_number else 0, default if isinstance(default, int) else None
-    return EdsVariable(name, bits, is_signed, number, "w" in entry.access_type)
+    is_float = entry.data_type in canopen.objectdictionary.FLOAT_TYPES
+    return EdsVariable(name, bits, is_signed, number, "w" in entry.access_type, is_float)
 
 
 class _BusNetwork(canopen.Network):

@@ -346,6 +346,11 @@ class PlacedDevice:
         found = find_variable(self.objects, name.index, name.sub)
         if found is None:
             raise ConfigError(f"device profile {self.profile.name}: object {name} is not in {self.profile.eds.name}")
+        if found.is_float:
+            raise ConfigError(
+                f"device profile {self.profile.name}: object {name} ({found.name}) is a float, REAL{found.bits}; the "
+                "frames of a cycle hold integers: map the device's integer, as 0x9130 or 0x7130 of a sensor"
+            )
         if not found.bits:
             raise ConfigError(f"device profile {self.profile.name}: object {name} ({found.name}) fits no PDO")
         return found

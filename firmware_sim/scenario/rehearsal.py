@@ -38,6 +38,8 @@ _BRAKING_S: Final = 0.015
 _STOP_MARGIN_DEG: Final = 20.0
 _NOISE_SHARE: Final = TORQUE_NOISE_NM / TORQUE_RANGE_NM
 _RANGE_PER_RATED: Final = 4.0
+_LEAST_RANGE_SHARE: Final = 0.1
+"""Part of the rated torque that the frames of a sensor must be able to carry to be played."""
 _HOLDING_SHARE: Final = 1.5
 _HEAVIEST: Final = 10.0
 """Most that payloads are multiplied by: they go up to 1 kg, and a scenario takes 20 kg."""
@@ -316,6 +318,12 @@ def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
 def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
     """Give the sensors a range that their signals carry, and noise to it, where the scenario doesn't."""
     sensors = dict(said)
+    for joint, (rated_Nm, most_Nm) in enumerate(zip(rated, counts.torque_range_Nm, strict=True)):
+        if most_Nm < _LEAST_RANGE_SHARE * rated_Nm:
+            raise ConfigError(
+                f"the frames of torque sensor {joint + 1} carry ±{most_Nm:.3g} Nm, rated torque is {rated_Nm:g} Nm: "
+                "`torque_Nm` of the sensor's profile, the worth of a count, is wrong"
+            )
     if "torque_range_Nm" not in sensors:
         ranges = [
             min(max(_RANGE_PER_RATED * rated_Nm, TORQUE_RANGE_NM * min(rated_Nm / model_Nm, 1.0)), most)

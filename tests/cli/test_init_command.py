@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cli.bus_lab import complaints
 from click.testing import CliRunner, Result
+from own_arm import write_sensor_eds
 from rig import Rig, SessionRig
 
 from adacd_hil.cli.main import cli
@@ -296,6 +297,23 @@ def test_profiles_are_drafted_from_eds_files_beside_the_configuration(
         load_contract(load_settings("lab/my-arm.toml")).layout_digest
         == load_contract(load_settings("stock")).layout_digest
     )
+
+
+def test_the_guessed_worth_of_a_count_lets_16_bits_carry_a_joint_s_torque(tmp_path: Path, out: Path) -> None:
+    assert init(out, *NO_BUS, "--eds", str(write_sensor_eds(tmp_path))).exit_code == 0
+    assert "devices.sensor" in written(out).assumed
+    warned = examine_configuration(str(out)).warnings
+    assert not any("carries" in line for line in warned)
+    (signal,) = load_contract(written(out)).message("Sensor1Torque").values
+    assert (signal.bits, signal.scale) == (16, 2e-3)
+
+
+def test_an_eds_that_has_the_torque_as_a_float_only_is_refused(tmp_path: Path, out: Path) -> None:
+    eds = tmp_path / "float.eds"
+    eds.write_text((contract_folder() / "int32_sensor.eds").read_text().replace("9130", "6130"))
+    result = init(out, *NO_BUS, "--eds", str(eds))
+    assert result.exit_code == USAGE
+    assert complaints(result)[0].endswith("its 0x6130:1 is a float, which no frame of a cycle can hold")
 
 
 def test_what_the_device_says_outweighs_the_eds() -> None:

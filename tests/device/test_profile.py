@@ -1,5 +1,6 @@
 """Device profiles: what is wrong with one is one line that names it."""
 
+import dataclasses
 import tomllib
 from importlib import resources
 from pathlib import Path
@@ -9,6 +10,7 @@ from click.testing import CliRunner
 
 from adacd_hil.cli.main import cli
 from adacd_hil.device.canopen_bus import read_eds
+from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import ObjectName, ProfileSettings, load_profile, parse_object, profile_names
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
@@ -205,3 +207,17 @@ def test_the_budget_names_an_eds_that_it_cant_read(tmp_path: Path) -> None:
         done = CliRunner().invoke(cli, ["budget", "--config", "c.toml"])
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr == "adacd-hil: EDS torque_sensor.eds: [1018sub1] DefaultValue = 'ten' is no integer\n"
+
+
+def test_a_float_is_not_read_as_an_integer(tmp_path: Path) -> None:
+    eds = (contract_folder() / "int32_sensor.eds").read_text()
+    torque = eds.index("[9130sub1]")
+    (tmp_path / "torque_sensor.eds").write_text(
+        eds[:torque] + eds[torque:].replace("DataType=0x0004", "DataType=0x0008")
+    )
+    sensor = profile_file(tmp_path, SENSOR.replace("1e-6", "1.0"))
+    devices = dataclasses.replace(load_settings("certified").devices, sensor=(sensor, sensor), contract="")
+    with pytest.raises(
+        ConfigError, match=r"0x9130:1 \(AI input PV 32 bit, AI input PV 1\) is a float, REAL32; .* integers"
+    ):
+        load_contract(dataclasses.replace(load_settings("certified"), devices=devices))
