@@ -57,11 +57,11 @@ def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
         ),
         (
             not has_stopped and None in metrics.adaptation_s.values(),
-            NextStep("The model was not learned. Was the arm touched, or its load changed? Else find another motion.",
+            NextStep("The model was not learned: the notices below may say why. Another motion may show it better.",
                      f"adacd-hil excitation --config {_configuration(run)}"),
         ),
         (
-            bool(metrics.false_alarms) or is_margin_below_1(metrics.evidence),
+            (any(metrics.adaptation_s.values()) and bool(metrics.false_alarms)) or is_margin_below_1(metrics.evidence),
             NextStep("Nobody touched the arm, and a threshold was crossed: find thresholds from untouched motion.",
                      f"adacd-hil thresholds {log}"),
         ),

@@ -69,7 +69,7 @@ def residuals(run: Run, metrics: Metrics) -> Drawing:
     )
     if run.beside is not None:
         lanes += (("paper's", run.beside.tau_ext_hat, run.beside.threshold),)
-    figure = Figure(figsize=(10.0, 8.4 if has_beside else 6.6))
+    figure = Figure(figsize=(10.0, 8.1 if has_beside else 6.6))
     time_s = run.time_s()
     shown = time_s >= min(0.0, time_s[-1])
     end_s = float(time_s[-1])
@@ -132,8 +132,8 @@ def _panels(figure: Figure, lanes: int) -> tuple[list[Axes], list[list[Axes]]]:
     if lanes == 1:
         full = _stack(figure, (0.915, 0.475), 0.235)
         return full, [[axes] for axes in _stack(figure, (0.655, 0.215), 0.135)]
-    full = _stack(figure, (0.93, 0.487), 0.18)
-    return full, [_stack(figure, (top, top - 0.113), 0.095) for top in (0.735, 0.292)]
+    full = _stack(figure, (0.927, 0.468), 0.187)
+    return full, [_stack(figure, (top, top - 0.117), 0.0985) for top in (0.725, 0.266)]
 
 
 def _curves(axes: Axes, run: Run, metrics: Metrics, joint: int, shown: NDArray[np.bool_]) -> None:
