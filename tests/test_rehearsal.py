@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from adacd_hil.cli.commands.demo_command import resolve
 from adacd_hil.commission.configuration_check import examine_configuration
 from adacd_hil.device.profile import load_profile
 from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
@@ -58,6 +59,31 @@ def test_an_own_arm_is_composed_and_what_is_assumed_of_it_is_said(folder: Path) 
     assumed = [line for line in said.splitlines() if line.startswith("assumed: ")]
     assert any("link 1 mass" in line for line in assumed)
     assert any("joint stops" in line for line in assumed)
+
+
+@pytest.mark.parametrize(
+    ("assumption", "truth"),
+    [
+        ("quick stop and fault brake with", "[arm]\nbrake_damping_Nm_s = [10.0, 2.0]"),
+        ("link 1 mass", "[arm]\nmass_kg = [2.0, 1.0]"),
+        ("joint stops at", "[arm]\nstop_deg = [100.0, 130.0]"),
+        ("viscous friction", "[arm]\nviscous_Nm_s = [0.1, 0.05]"),
+        ("Coulomb friction", "[arm]\ncoulomb_Nm = [0.1, 0.05]"),
+        ("torque sensors of ±", "[sensors]\ntorque_range_Nm = [100.0, 50.0]"),
+        ("their noise", "[sensors]\ntorque_noise_Nm = [0.02, 0.02]"),
+        ("encoders of", "[sensors]\nencoder_bits = [18, 18]"),
+        ("drives with a torque loop of", "[drives]\ncurrent_loop_Hz = [500.0, 500.0]"),
+        ("stiff joints", "[mechanics]\nrotor_inertia_kg_m2 = [0.1, 0.01]"),
+    ],
+)
+def test_each_assumption_is_a_line_and_goes_when_the_truth_has_the_value(
+    folder: Path, assumption: str, truth: str
+) -> None:
+    (folder / "truth.toml").write_text(truth)
+    config = str(folder / "my-arm.toml")
+    assumed, known = (resolve(config, "paper", None, None, file).assumed for file in (None, str(folder / "truth.toml")))
+    assert [assumption in line for line in assumed].count(True) == 1
+    assert not any(assumption in line for line in known)
 
 
 @pytest.mark.parametrize(

@@ -141,6 +141,7 @@ class OwnArmSettings:
     drive_joint: Joints = setting(IN_ORDER, low=1, high=2, meaning="joint that each drive moves")
     sensor_joint: Joints = setting(IN_ORDER, low=1, high=2, meaning="joint that each torque sensor is at")
     drive_sign: Joints = setting((1, 1), low=-1, high=1, meaning="+1 or -1: joint direction to drive direction")
+    motor_sign: Joints = setting((1, 1), low=-1, high=1, meaning="-1: the drive's torque counts against its position")
     sensor_sign: Joints = setting((1, 1), low=-1, high=1, meaning="+1 or -1: joint direction to sensor direction")
     increments_per_joint_rev: Pair = setting(
         (0.0, 0.0), low=0.0, high=2.0**41, meaning="position counts per revolution of the joint; 0: 2^20"
@@ -156,7 +157,7 @@ class OwnArmSettings:
         for key in ("drive_joint", "sensor_joint"):
             if sorted(getattr(self, key)) != [1, 2]:
                 raise ConfigError(f"`own_arm.{key}` = {list(getattr(self, key))} must be [1, 2] or [2, 1]")
-        for key in ("drive_sign", "sensor_sign"):
+        for key in ("drive_sign", "motor_sign", "sensor_sign"):
             if 0 in getattr(self, key):
                 raise ConfigError(f"`own_arm.{key}` = {list(getattr(self, key))} must be +1 or -1 for each device")
 
@@ -180,17 +181,19 @@ class OwnArmSettings:
     def wiring(self) -> "Wiring":
         """How the devices are at the joints."""
         drive, sensor = (tuple(joint - 1 for joint in places) for places in (self.drive_joint, self.sensor_joint))
-        return Wiring(drive, sensor, self.drive_sign, self.sensor_sign)  # type: ignore[arg-type]
+        torque = tuple(turn * up for turn, up in zip(self.drive_sign, self.motor_sign, strict=True))
+        return Wiring(drive, sensor, self.drive_sign, self.sensor_sign, torque)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class Wiring:
-    """Which joint (0, 1) the device at each place is at, and which way it counts."""
+    """Which joint (0, 1) the device at each place is at, and which way it counts; torque_sign: a drive's torque."""
 
     drive_joint: Joints = (0, 1)
     sensor_joint: Joints = (0, 1)
     drive_sign: Joints = (1, 1)
     sensor_sign: Joints = (1, 1)
+    torque_sign: Joints = (1, 1)
 
     def read(self, measured: Measurement) -> Measurement:
         """Order the samples of the joints by the devices' places, each counted the device's way."""

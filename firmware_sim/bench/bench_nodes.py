@@ -120,7 +120,7 @@ class BenchNodes:
         torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
         modes = (drive1.motor_mode, drive2.motor_mode)
         if self.is_crossed:
-            up1, up2 = self.wiring.drive_sign
+            up1, up2 = self.wiring.torque_sign
             torque_Nm = (up1 * torque_Nm[0], up2 * torque_Nm[1])
             if self.wiring.drive_joint == (1, 0):
                 torque_Nm, modes = torque_Nm[::-1], modes[::-1]
@@ -138,10 +138,11 @@ class BenchNodes:
         return self.wiring.read(measured) if self.is_crossed else measured
 
     def _motor(self, place: int) -> Motor:
-        joint, sign = self.wiring.drive_joint[place], self.wiring.drive_sign[place]
+        wiring = self.wiring
+        joint, sign, torque_sign = wiring.drive_joint[place], wiring.drive_sign[place], wiring.torque_sign[place]
         return Motor(
             velocity_rad_s=lambda: sign * self._arm.drive_velocity_rad_s[joint],
-            torque_Nm=lambda: sign * self._arm.motor_torque_Nm[joint],
+            torque_Nm=lambda: torque_sign * self._arm.motor_torque_Nm[joint],
             is_limited=lambda: self._arm.is_torque_limited[joint],
             error_code=lambda: self._arm.motor_error_code[joint],
             is_ideal=self._arm.has_ideal_motors,

@@ -25,7 +25,7 @@ from adacd_hil.settings.configuration import ConfigurationLayer, Settings, resol
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.hardware_settings import STANDARD_GRAVITY_M_S2
+from firmware_sim.arm.hardware_settings import CURRENT_LOOP_HZ, STANDARD_GRAVITY_M_S2, VELOCITY_LOOP_HZ
 from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
 from firmware_sim.scenario.scenario import ArmTruth, TruthArmSettings
 
@@ -116,6 +116,11 @@ def compose_scenario(
     viscous, coulomb = _friction(told, truth, rated, assumed)
     inertia = _joint_inertia(links)
     braking = truth.arm.brake_damping_Nm_s or _times(inertia, (1.0 / _BRAKING_S, 1.0 / _BRAKING_S))
+    if truth.arm.brake_damping_Nm_s is None:
+        assumed.append(
+            f"quick stop and fault brake with {braking[0]:.3g} and {braking[1]:.3g} Nm s/rad, since no file says: to a "
+            f"third of the unloaded arm's speed in {1000 * _BRAKING_S:g} ms"
+        )
     stops = truth.arm.stop_deg
     if stops is None and not told.has_geometry:
         stops = ARMS[arm.profile].stop_deg
@@ -153,6 +158,11 @@ def compose_scenario(
         composed["torque_offset_Nm"] = list(truth.arm.torque_offset_Nm)
     composed["sensors"] = _sensors(rated, counts, composed.get("sensors", {}), assumed)
     composed["mechanics"] = _mechanics(told, links, composed.get("mechanics", {}), assumed)
+    if not composed.get("drives"):
+        assumed.append(
+            f"drives with a torque loop of {CURRENT_LOOP_HZ:g} Hz and a velocity filter of {VELOCITY_LOOP_HZ:g} Hz "
+            "that give their rated torque for ever; no file says"
+        )
     return composed, [f"assumed: {line}" for line in assumed]
 
 
@@ -306,11 +316,13 @@ def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
         (2, 1) if wiring.swapped in (what, "joints") else (1, 2) for what in ("drives", "sensors")
     )
     turned = [-1 if is_reversed else 1 for is_reversed in wiring.reversed_joint]
+    driven = [-1 if is_reversed else 1 for is_reversed in wiring.reversed_motor]
     sensed = [-1 if is_reversed else 1 for is_reversed in wiring.reversed_sensor]
     return {
         "drive_joint": list(drive_joint),
         "sensor_joint": list(sensor_joint),
         "drive_sign": [sign[place] * turned[joint - 1] for place, joint in enumerate(drive_joint)],
+        "motor_sign": [driven[joint - 1] for joint in drive_joint],
         "sensor_sign": [sign[place] * turned[j - 1] * sensed[j - 1] for place, j in enumerate(sensor_joint)],
     }
 
@@ -343,6 +355,7 @@ def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: l
             for increments in counts.increments_per_joint_rev
         ]
         sensors["encoder_bits"] = bits
+        assumed.append(f"encoders of {bits[0]} and {bits[1]} bits, as finely as the profiles count positions")
     return sensors
 
 
@@ -364,6 +377,8 @@ def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list
             )
     if holding is not None and any(holding) and "holding_brake_Nm" not in mechanics:
         mechanics["holding_brake_Nm"] = list(holding)
+    if "stiffness_Nm_rad" not in mechanics and "rotor_inertia_kg_m2" not in mechanics:
+        assumed.append("stiff joints without rotors or friction before the torque sensors, since no file has any")
     return mechanics
 
 

@@ -388,6 +388,9 @@ class WiringSettings:
     reversed_joint: tuple[bool, bool] = setting(
         (False, False), meaning="joints whose drive and sensor both count the other way"
     )
+    reversed_motor: tuple[bool, bool] = setting(
+        (False, False), meaning="joints whose drive counts its torque against its position"
+    )
     reversed_sensor: tuple[bool, bool] = setting((False, False), meaning="torque sensors that count the other way")
 
 
