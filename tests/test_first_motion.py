@@ -132,11 +132,55 @@ def test_a_position_that_is_not_its_velocity_s_is_named(feed: Feed, joint: int, 
     assert f"devices.drive[{joint - 1}]" in line
 
 
-def test_sensors_at_each_other_s_joint_are_named(feed: Feed) -> None:
-    feed.tau_J[:] = feed.tau_J[:, ::-1]
+@pytest.mark.parametrize(
+    ("exchanged", "said"),
+    [
+        (("tau_J",), "the sensors of joints 1 and 2 are exchanged: exchange devices.sensor_node = [3, 4]"),
+        (("q", "dq", "tau_c"), "the drives of joints 1 and 2 are exchanged: exchange devices.drive_node = [1, 2]"),
+        (
+            ("q", "dq", "tau_c", "tau_J"),
+            "joints 1 and 2 are exchanged, drives and sensors: exchange devices.drive_node",
+        ),
+    ],
+    ids=["sensors", "drives", "joints"],
+)
+def test_devices_at_each_other_s_joint_are_named(feed: Feed, exchanged: tuple[str, ...], said: str) -> None:
+    for name in exchanged:
+        setattr(feed, name, getattr(feed, name)[:, ::-1].copy())
+    assert said in feed.judged().line
+
+
+def test_a_joint_that_is_reversed_as_a_whole_is_named_as_far_as_that_can_be_known(feed: Feed) -> None:
+    for name in ("q", "dq", "tau_c", "tau_J"):
+        getattr(feed, name)[:, 1] *= -1.0
     line = feed.judged().line
-    assert "joints 1 and 2: each torque sensor measures what the drive of the other joint is commanded" in line
-    assert "devices.sensor_node" in line
+    assert (
+        "joint 2 turns the other way than arm.sign = [1, 1] says, if joint 1 is right: arm.sign = [1, -1], or " in line
+    )
+    assert "[-1, 1] if it is joint 1" in line
+
+
+def test_an_arm_whose_joints_are_both_reversed_is_its_own_mirror_image(feed: Feed) -> None:
+    for name in ("q", "dq", "tau_c", "tau_J"):
+        getattr(feed, name)[:] *= -1.0
+    assert feed.judged().line == ""
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+@pytest.mark.parametrize(("counted", "turns"), [(1.5, 0.67), (0.67, 1.5), (0.5, 2.0)])
+def test_a_gear_that_was_told_wrongly_is_named(feed: Feed, joint: int, counted: float, turns: float) -> None:
+    feed.q[:, joint - 1] *= counted
+    feed.dq[:, joint - 1] *= counted
+    line = feed.judged().line
+    check(line, r"joint (\d) turns about ([+-]?[\d.]+) times as far as position and velocity say", joint, turns)
+    assert f"scale.velocity_rad_s of devices.drive[{joint - 1}]" in line
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+def test_a_position_that_counts_against_the_torques_is_named(feed: Feed, joint: int) -> None:
+    feed.q[:, joint - 1] *= -1.0
+    feed.dq[:, joint - 1] *= -1.0
+    assert f"joint {joint}: its position counts against its torques" in feed.judged().line
 
 
 def test_a_torque_constant_that_is_off_by_a_fifth_is_a_warning(feed: Feed) -> None:
@@ -168,6 +212,21 @@ def test_a_mistake_that_would_be_certified_stops_the_arm_first_and_replays_to_th
     assert replayed.compared > 0
     assert replayed.mismatch_count == 0
     assert replayed.states[-1].fault is FaultReason.MISCONFIGURED
+
+
+RUN_AWAY = {
+    "wrong-motor-sign": "perhaps joint 2: it accelerates against the commanded torque",
+    "swapped-joints": "perhaps joints 1 and 2 are exchanged, drives and sensors: exchange devices.drive_node",
+}
+
+
+@pytest.mark.parametrize("truth", RUN_AWAY)
+def test_an_arm_that_runs_away_in_its_first_motion_is_told_what_is_likely(tmp_path: Path, truth: str) -> None:
+    summary = rehearse(tmp_path, truth)
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.LIMIT
+    [line] = [event.message for event in load(tmp_path / "run").events if "-> FAULT" in event.message]
+    assert RUN_AWAY[truth] in line
 
 
 def test_rotors_friction_before_the_sensors_and_slow_drives_are_no_mistake(tmp_path: Path) -> None:

@@ -145,6 +145,7 @@ class Cycle:
         self._timing.measure(self._progress)
         self._reference.compile()
         self._controller.compile()
+        self._first_motion.compile()
 
     def interrupt(self) -> None:
         """Ask the loop to park the arm and end; a second time, to end at once with a quick stop."""

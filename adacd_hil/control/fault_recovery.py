@@ -36,6 +36,7 @@ TORQUE_STATUSES = 2
 """Statuses in a row that have to show a wrong torque. One may be of the moment in which a command was late."""
 TORQUE_S = 0.05
 """How long a drive's torque may differ at the least: five times the settling time of a slow current loop."""
+_RUN_AWAY = (FaultReason.LIMIT, FaultReason.FOLLOWING)
 _JUDGED = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR, SchemeState.PAYLOAD)
 """States in which the arm follows a motion that nothing disturbs."""
 
@@ -72,6 +73,11 @@ class SelfChecks:
             return self._fail(FaultReason.MISCONFIGURED, Request.FAULT_MISCONFIGURED, self._first_motion.line)
         line = self._judge_motion(arm) if state in _JUDGED else self._follow()
         return self._fail(FaultReason.FOLLOWING, Request.FAULT_FOLLOWING, line) if line else Request.NONE
+
+    def suspicions(self, fault: FaultReason) -> list[str]:
+        """Say what may have led to a fault of an arm that has run away in its first motion; mostly nothing."""
+        line = self._first_motion.suspicion() if fault in _RUN_AWAY else ""
+        return [line] if line else []
 
     def _fail(self, reason: FaultReason, request: Request, line: str) -> Request:
         if self.reason is FaultReason.NONE:
@@ -164,6 +170,7 @@ class FaultReport:
         """Say what has led to a fault, one line each: the causes by its reason first."""
         return [
             *([self._checks.line] if fault is self._checks.reason else ()),
+            *self._checks.suspicions(fault),
             *(line for describe in self._causes.get(fault, ()) for line in describe()),
             *self._report.describe_faults(),
             *self._watch.lost,

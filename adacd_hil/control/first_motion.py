@@ -12,7 +12,8 @@ l, by which drive and bus are later than usual, the rotor R, and friction v, c.
     position    Δq = s ∫ dq dt,  s = 1 where increments and counts of velocity are worth what was told
 
 Each joint is judged until it is known well enough to be right or wrong. What is wrong stops the arm: `line`. What is
-off by less is worth a warning, for a torque constant has a tolerance.
+off by less is worth a warning, for a torque constant has a tolerance. Until the first certificate `DeviceReadings` ask
+the arm's own equation, too, on shorter blocks: it knows of joints that are exchanged or reversed as a whole.
 """
 
 import math
@@ -21,12 +22,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.control.device_readings import DeviceReadings
 from adacd_hil.device.arm import Arm
 from adacd_hil.records import JOINTS, ArmState, Event, SchemeState, Vector
 from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.settings.configuration import Settings
 
-BLOCK_S: Final = 0.02
+BLOCK_S, SHORT_BLOCK_S = 0.02, 0.008
 _FEWEST_BLOCKS: Final = 20
 """In motion, of a joint: twice and a half as many as the regression has unknowns."""
 _JUDGED_EVERY: Final = 5
@@ -44,6 +46,10 @@ _KNOWN: Final = 0.02
 _WARNED: Final = 0.15
 """A k that is off by more is worth a warning: torque constants are within ±10 %."""
 _LEAST_WAY_RAD: Final = 0.2
+_UNEVEN: Final = 0.1
+"""Largest share of Σ Δq² that one scale leaves over: a position that is stuck at times leaves a half."""
+_ALIGNED: Final = 0.7
+"""Correlation of torque and acceleration from which on one is along the other, or against it."""
 _OWN, _OTHER = 0, 1
 _COLUMNS: Final = 7
 
@@ -57,16 +63,15 @@ class FirstMotion:
         self._settings = settings
         self._error = settings.safety.first_motion_error
         self._period_s = settings.bus.period_s
-        self._cycles = max(2, round(BLOCK_S / self._period_s))
         # A command of cycle k acts from the next SYNC on, and the sample after that shows it; pipelined one later.
         self._commands = np.zeros((4 if settings.bus.is_pipelined else 3, JOINTS))
-        self._sums = np.zeros((3, JOINTS))  # of dq, tau_J, tau_c
-        self._ends = np.zeros((3, JOINTS))  # q, dq, tau_c as the block began
-        self._seen = 0
+        self._long, self._short = (_Blocks(span_s, self._period_s) for span_s in (BLOCK_S, SHORT_BLOCK_S))
         self._blocks = 0
+        self._readings: DeviceReadings | None = DeviceReadings(settings) if self._error > 0.0 else None
+        self._pushed = np.zeros((6, JOINTS))  # Σ of ddq², tau_c², tau_J², tau_c ddq, tau_J ddq, tau_c dq: short blocks
         self._normal = np.zeros((JOINTS, _COLUMNS + 1, _COLUMNS + 1))
         self._moving = [0] * JOINTS
-        self._path = np.zeros((2, JOINTS))  # Σ Δq ∫ dq dt, Σ (∫ dq dt)²
+        self._path = np.zeros((3, JOINTS))  # Σ Δq ∫ dq dt, Σ (∫ dq dt)², Σ Δq²
         self._way_rad = np.zeros(JOINTS)
         self._open = set(range(JOINTS)) if self._error > 0.0 else set[int]()
         self._events: list[Event] = []
@@ -75,7 +80,12 @@ class FirstMotion:
     @property
     def is_on(self) -> bool:
         """Whether a joint is still to be judged."""
-        return bool(self._open) and not self.line
+        return bool(self._open or self._readings) and not self.line
+
+    def compile(self) -> None:
+        """Compile what `note` calls."""
+        if self._readings is not None:
+            self._readings.compile()
 
     def take_events(self) -> list[Event]:
         """Return what is worth a line since the last call."""
@@ -91,39 +101,65 @@ class FirstMotion:
         commands[0] = tau_c
         is_usable = arm.is_complete and arm.periods == 1 and arm.steps == 1 and state in POWERED
         if not is_usable or any(drive.is_limited for drive in self._arm.drives):
-            self._seen = 0
+            self._long.break_off()
+            self._short.break_off()
             return
         acting = commands[-1]
-        if self._seen == 0:
-            self._sums[:] = 0.0
-            self._ends[:] = arm.q, arm.dq, acting
-        self._seen += 1
-        self._sums += (arm.dq, arm.tau_J, acting)
-        if self._seen > self._cycles:
-            self._take_block(arm, acting)
-            self._seen = 0
+        block = self._long.take(arm, acting)
+        if block is not None:
+            self._take_block(block)
+        self._read(self._short.take(arm, acting), state)
 
-    def _take_block(self, arm: ArmState, acting: Vector) -> None:
-        span_s = self._cycles * self._period_s
-        q, dq, tau_c = self._ends
-        means = self._sums / self._seen
-        way = (self._sums[0] - 0.5 * (dq + arm.dq)) * self._period_s  # by the trapezoidal rule
-        self._path += (arm.q - q) * way, way * way
-        self._way_rad += np.abs(way)
-        ddq, lag = (arm.dq - dq) / span_s, (acting - tau_c) / span_s
+    def _read(self, block: "_Block | None", state: SchemeState) -> None:
+        """Ask the arm's equation until the first certificate."""
+        readings = self._readings
+        if readings is None or self.line:
+            return
+        if state is SchemeState.MONITOR:
+            self._readings = None
+        elif block is not None:
+            readings.add(block.q, block.dq, block.ddq, block.tau_J, block.dtau_J)
+            ddq, tau_c, tau_J = block.ddq, block.tau_c, block.tau_J
+            self._pushed += ddq * ddq, tau_c * tau_c, tau_J * tau_J, tau_c * ddq, tau_J * ddq, tau_c * block.dq
+            reading = readings.step()
+            if reading is not None and (reading.kind != "torque" or not self._open):
+                self.line = readings.describe(reading)
+
+    def suspicion(self) -> str:
+        """Say what may have made the arm run away, by its first motion; empty where nothing is likely."""
+        if self._readings is None or self.line:
+            return ""
+        ddq, tau_c, tau_J, commanded, sensed, power = self._pushed
+        joint = int(np.argmin(power))  # it drives the other, which is dragged and takes less
+        along_c = commanded[joint] / math.sqrt(max(ddq[joint] * tau_c[joint], 1e-12))
+        along_J = sensed[joint] / math.sqrt(max(ddq[joint] * tau_J[joint], 1e-12))
+        if along_c < -_ALIGNED and abs(along_J) > _ALIGNED:
+            what = "motor" if along_J > 0.0 else "position"
+            return (
+                f"perhaps joint {joint + 1}: it accelerates against the commanded torque (correlation {along_c:+.2f}, "
+                f"with the sensed torque {along_J:+.2f}): its {what}, of devices.drive_node[{joint}], counts the other "
+                "way"
+            )
+        reading = self._readings.suspect()
+        return "" if reading is None else f"perhaps {self._readings.describe(reading)}"
+
+    def _take_block(self, block: "_Block") -> None:
+        self._path += block.travel * block.way, block.way * block.way, block.travel * block.travel
+        self._way_rad += np.abs(block.way)
         for joint in range(JOINTS):
-            speed, other = means[0, joint], 1 - joint
-            if min(dq[joint] * speed, arm.dq[joint] * speed) > 0.0 and abs(speed) >= _MOVING_RAD_S:
+            speed, other = block.dq[joint], 1 - joint
+            if block.least_speed[joint] > 0.0 and abs(speed) >= _MOVING_RAD_S:
                 sign = math.copysign(1.0, speed)
-                tau_J, own, cross = means[1, joint], means[2, joint], means[2, other]
-                row = np.array((own, cross, lag[joint], ddq[joint], speed, sign, 1.0, tau_J))
+                own, cross, lag = block.tau_c[joint], block.tau_c[other], block.dtau_c[joint]
+                row = np.array((own, cross, lag, block.ddq[joint], speed, sign, 1.0, block.tau_J[joint]))
                 self._normal[joint] += row[:, np.newaxis] * row
                 self._moving[joint] += 1
         self._blocks += 1
-        if self._blocks % _JUDGED_EVERY == 0:
+        if self._open and self._blocks % _JUDGED_EVERY == 0:
             self._judge()
         if self._blocks >= _MOST_BLOCKS:
             self._open.clear()
+            self._readings = None
 
     def _judge(self) -> None:
         self.line = self._judge_position() or self._judge_torque()
@@ -132,7 +168,10 @@ class FirstMotion:
         for joint in range(JOINTS):
             if self._way_rad[joint] < _LEAST_WAY_RAD:
                 continue
-            ratio = float(self._path[0, joint] / self._path[1, joint])
+            common, way, travel = self._path[:, joint].tolist()
+            ratio = common / way
+            if travel - ratio * common > _UNEVEN * travel:
+                continue  # it has not been the same all the time: no scale
             if not 1.0 - self._error <= ratio <= 1.0 / (1.0 - self._error):
                 return (
                     f"joint {joint + 1}: its position moves {ratio:+.2f} times as far as its velocity says, "
@@ -148,9 +187,10 @@ class FirstMotion:
         ]
         first, second = found
         if first is not None and second is not None and first.is_of_other and second.is_of_other:
+            what = "sensors" if self._readings is None else self._readings.exchanged()
             return (
-                "joints 1 and 2: each torque sensor measures what the drive of the other joint is commanded; exchange "
-                "devices.sensor_node if the sensors are at the wrong joints, devices.drive_node if the drives are"
+                "joints 1 and 2: each torque sensor measures what the drive of the other joint is commanded; by the "
+                f"arm's motion the {what} are exchanged: exchange devices.{what[:-1]}_node"
             )
         for joint, ratio in enumerate(found):
             if ratio is None or joint not in self._open or ratio.own_std > _SURE:
@@ -193,6 +233,55 @@ class FirstMotion:
             )
         low, high = 1.0 - self._error, 1.0 / (1.0 - self._error)
         return f"{head}, {low:.2f} to {high:.2f} allowed by safety.first_motion_error; correct {self._scales(joint)}"
+
+
+class _Block(NamedTuple):
+    """Means over a block, (2,) each, and changes over it: per second, but for `travel` of q and `way`, ∫ dq dt, rad.
+
+    least_speed: the smaller one at its ends, negative where the joint has turned round.
+    """
+
+    q: Vector
+    dq: Vector
+    tau_J: Vector
+    tau_c: Vector
+    ddq: Vector
+    dtau_J: Vector
+    dtau_c: Vector
+    travel: Vector
+    way: Vector
+    least_speed: Vector
+
+
+class _Blocks:
+    """Collects cycles in a row into blocks."""
+
+    def __init__(self, span_s: float, period_s: float) -> None:
+        self._period_s = period_s
+        self._cycles = max(2, round(span_s / period_s))
+        self._sums, self._first = np.zeros((4, JOINTS)), np.zeros((4, JOINTS))  # q, dq, tau_J, tau_c
+        self._seen = 0
+
+    def break_off(self) -> None:
+        """Begin a new block: cycles are missing."""
+        self._seen = 0
+
+    def take(self, arm: ArmState, acting: Vector) -> _Block | None:
+        """Take in a cycle; return a block that it completes, which shares it with the next."""
+        last = np.array((arm.q, arm.dq, arm.tau_J, acting))
+        if self._seen == 0:
+            self._sums[:], self._first = 0.0, last
+        self._seen += 1
+        self._sums += last
+        if self._seen <= self._cycles:
+            return None
+        first, span_s = self._first, self._cycles * self._period_s
+        q, dq, tau_J, tau_c = self._sums / self._seen
+        way = (self._sums[1] - 0.5 * (first[1] + last[1])) * self._period_s  # by the trapezoidal rule
+        travel, ddq, dtau_J, dtau_c = last - first
+        least_speed = np.minimum(first[1] * dq, last[1] * dq)
+        self._seen, self._first, self._sums = 1, last, last.copy()
+        return _Block(q, dq, tau_J, tau_c, ddq / span_s, dtau_J / span_s, dtau_c / span_s, travel, way, least_speed)
 
 
 class TorqueRatio(NamedTuple):

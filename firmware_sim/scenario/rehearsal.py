@@ -378,7 +378,7 @@ def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list
     if holding is not None and any(holding) and "holding_brake_Nm" not in mechanics:
         mechanics["holding_brake_Nm"] = list(holding)
     if "stiffness_Nm_rad" not in mechanics and "rotor_inertia_kg_m2" not in mechanics:
-        assumed.append("stiff joints without rotors or friction before the torque sensors, since no file has any")
+        assumed.append("stiff joints without rotors, whose torque sensors see all that the motors give; no file says")
     return mechanics
 
 
