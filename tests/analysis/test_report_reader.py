@@ -6,7 +6,7 @@ from dataclasses import replace
 from importlib import resources
 
 import pytest
-from hand_made_run import A, M, make_run, touched_run
+from hand_made_run import A, M, make_certified_run, make_run, touched_run
 
 from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.report.next_steps import NextStep, next_steps, origin_words
@@ -198,3 +198,17 @@ def test_notices_are_written_out_below_the_timeline() -> None:
 )
 def test_a_small_deviation_does_not_read_as_none(value: float, sigma: float | None, text: str) -> None:
     assert uncertain_text(value, sigma, 3, "Nm") == text
+
+
+def test_certificates_are_told_clause_by_clause_and_one_that_was_taken_back_is_marked() -> None:
+    run = make_certified_run()
+    told = (("certificate", "offsets anchored; a <push>"), ("revoked", "the load changed"), ("sight", "not of it"))
+    events = (LoggedEvent(int(run.t_ns[1100 + row]), Event("info", *each)) for row, each in enumerate(told))
+    run = replace(run, events=tuple(events))
+    page = report_page(evaluate(run), run, SOURCE, [], [])
+    section = page.partition("<h2>Certificates</h2>")[2].partition("</section>")[0]
+    assert re.findall(r"<li>(.*?)</li>", section) == ["offsets anchored", "a &lt;push&gt;", "the load changed"]
+    assert len(re.findall(r"<p>Given at \d+\.\d\d s:", section)) == 1
+    assert len(re.findall(r'<p class="bad">Taken back at', section)) == 1
+    bare = replace(run, events=())
+    assert "<h2>Certificates</h2>" not in report_page(evaluate(bare), bare, SOURCE, [], [])

@@ -37,7 +37,15 @@ from adacd_hil.analysis.report.report_tables import (
     sections_table,
     timing_tables,
 )
-from adacd_hil.analysis.report.timeline import SCRIPTS, STYLES, notices_of, state_key, timeline_of, traces_of
+from adacd_hil.analysis.report.timeline import (
+    SCRIPTS,
+    STYLES,
+    certificates_of,
+    notices_of,
+    state_key,
+    timeline_of,
+    traces_of,
+)
 from adacd_hil.analysis.score.judge import row_at
 from adacd_hil.analysis.score.metrics import Beside, Metrics, ReportedContact, ReportSource
 from adacd_hil.analysis.score.verdict import LISTED
@@ -321,6 +329,7 @@ def report_page(
         timeline=timeline_of(run, metrics),
         state_key=state_key(run),
         notices=notices_of(run, metrics),
+        certificates=certificates_of(run),
         residuals=figures.get("fig5"),
         has_paper=has_paper(metrics),
         paper=paper_table(metrics),

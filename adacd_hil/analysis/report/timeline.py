@@ -112,6 +112,23 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
     return sorted(notices[:_MOST_NOTICES])
 
 
+class CertificateNote(NamedTuple):
+    """What the log says of a certificate: given, or taken back, and each thing that it tells."""
+
+    at_s: float
+    is_taken_back: bool
+    clauses: list[str]
+
+
+def certificates_of(run: Run) -> list[CertificateNote]:
+    """List the certificates that were given and taken back, in the order of time."""
+    return [
+        CertificateNote((t_ns - run.zero_ns) * 1e-9, event.name == "revoked", event.message.split("; "))
+        for t_ns, event in run.events
+        if event.name in ("certificate", "revoked")
+    ]
+
+
 def state_key(run: Run) -> list[tuple[str, str]]:
     """Give colour and name of the states that the run has been in."""
     there = {stay.state for stay in stays_of(run)}
