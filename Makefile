@@ -39,6 +39,7 @@ $(VENV)/.dev: requirements-dev.lock $(VENV)/.run
 	@touch $@
 
 install: $(VENV)/.run
+	@echo "installed: $(BIN)/adacd-hil --help"
 
 demo: $(VENV)/.run
 	$(BIN)/adacd-hil demo

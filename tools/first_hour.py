@@ -65,7 +65,8 @@ BROUGHT = {
 MOST_LINES = 4500
 """9 s of the recording, in which nobody touches the arm."""
 BUS = "can0"
-HANG_S = 1800.0
+HANG_S = 900.0
+"""Longest that a command may take."""
 FAILED, OF_THIS_MACHINE = r"FAILED|not sufficient: ", r"FAILED +(rate$|rate |SYNC )|not sufficient: "
 """What `doctor` and `commtest` say of what failed, and of a host that isn't on time: a guest of user-mode Linux."""
 MOST_LETTERS = 2000
@@ -259,7 +260,7 @@ def type_in(done: Played, folder: Path, environment: dict[str, str]) -> None:
                     break
                 done.silence_s, heard = max(done.silence_s, now - heard), now
                 said += piece.decode(errors="replace")
-            elif re.search(r"(: |\? |\[y/N\]:? |Enter[^\n]*)$", said[unanswered:]):
+            elif re.search(r"(:|\?|Enter[^\n]*) ?$", said[unanswered:]):
                 unanswered = len(said)
                 done.questions += 1
                 os.write(master, b"\n")
