@@ -229,6 +229,16 @@ def test_an_arm_that_runs_away_in_its_first_motion_is_told_what_is_likely(tmp_pa
     assert RUN_AWAY[truth] in line
 
 
+def test_a_wrong_length_is_certified_with_a_warning_that_names_the_link(right_run: LoadedRun, tmp_path: Path) -> None:
+    assert not [event for event in right_run.events if event.name == "geometry"]
+    rehearse(tmp_path, "wrong-length", lasts_s=2.3)
+    run = load(tmp_path / "run")
+    assert len(run.certificates) == 1
+    [event] = [event for event in run.events if event.name == "geometry"]
+    assert event.level == "warning"
+    assert re.search(r"as if link 1 were 0\.(49|50)\d m long; arm\.link_length_m\[0\] = 0\.4 m", event.message)
+
+
 def test_rotors_friction_before_the_sensors_and_slow_drives_are_no_mistake(tmp_path: Path) -> None:
     truth = """
 drives = { torque_constant_error = [0.1, -0.1], current_loop_Hz = [100.0, 100.0] }

@@ -14,7 +14,7 @@ from adacd_hil.clock import Clock
 from adacd_hil.control.controller import Controller, Floating
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.fault_recovery import FaultReport, SelfChecks, StopEscalation
-from adacd_hil.control.first_motion import FirstMotion
+from adacd_hil.control.first_motion import FirstMotion, is_told
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator, RunNarration
 from adacd_hil.control.pacing import DetectorTiming, Pacer
@@ -261,7 +261,7 @@ class Cycle:
         for source in self._sources:
             for event in source.take_events():
                 recorder.event(t_ns, event)
-                if event.name in CERTIFICATE_EVENTS:
+                if event.name in CERTIFICATE_EVENTS or is_told(event):
                     self._narration.event(t_ns, event.told)
         if output.state is not self._state:
             event = self._transition(output, arm)
@@ -288,6 +288,8 @@ class Cycle:
             self._enabled_cycle = cycle
         if state is SchemeState.FAULT:
             self._faulted_cycle = cycle
+        if state is SchemeState.MONITOR and not self._first_motion.is_certified:
+            self._first_motion.certify(self._pipeline.certificates)
         self._kept.serve((state,))
 
     def _is_over(self, output: SchemeOutput | None) -> bool:

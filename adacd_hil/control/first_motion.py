@@ -23,8 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.control.device_readings import DeviceReadings
+from adacd_hil.control.geometry_check import EVENT as GEOMETRY
+from adacd_hil.control.geometry_check import geometry_event
 from adacd_hil.device.arm import Arm
 from adacd_hil.records import JOINTS, ArmState, Event, SchemeState, Vector
+from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.settings.configuration import Settings
 
@@ -54,6 +57,11 @@ _OWN, _OTHER = 0, 1
 _COLUMNS: Final = 7
 
 
+def is_told(event: Event) -> bool:
+    """Whether the user is told of an event as it happens."""
+    return event.name == GEOMETRY or (event.name == "first motion" and event.level == "warning")
+
+
 class FirstMotion:
     """Judges an arm that moves for the first time. `line`: what contradicts the configuration, empty while nothing."""
 
@@ -75,6 +83,8 @@ class FirstMotion:
         self._way_rad = np.zeros(JOINTS)
         self._open = set(range(JOINTS)) if self._error > 0.0 else set[int]()
         self._events: list[Event] = []
+        self.is_certified = False
+        """Whether a certificate has been compared with the lengths."""
         self.line = ""
 
     @property
@@ -124,6 +134,13 @@ class FirstMotion:
             reading = readings.step()
             if reading is not None and (reading.kind != "torque" or not self._open):
                 self.line = readings.describe(reading)
+
+    def certify(self, certificates: tuple[Certificate, ...]) -> None:
+        """Compare the first certificate of the run, if there is one, with the lengths that the host was told."""
+        self.is_certified = True
+        event = geometry_event(self._settings, certificates[0]) if certificates else None
+        if event is not None:
+            self._events.append(event)
 
     def suspicion(self) -> str:
         """Say what may have made the arm run away, by its first motion; empty where nothing is likely."""

@@ -1,0 +1,81 @@
+"""What a first certificate says of the lengths that the host was told, and what nothing says.
+
+Torques at the joints depend on a length through the inertia alone, whatever the length is called:
+
+    a2 = m2 c2 l1,   a1 − a3 = I1 + m1 c1² + m2 l1²,   a3 = I2 + m2 c2²        c: centre of mass, from the link's joint
+
+so a link that is s times as long as told, its masses in their places, has
+
+    link 1:  a2 → s a2,  a1 − a3 → s² (a1 − a3),  a3 as told        link 2:  a2 → s a2,  a3 → s² a3,  a1 − a3 as told
+
+of `arm.cad_theta`. Where gravity acts, a5 = m2 c2 g, and l1 = g a2 / a5 of an arm that moves upright; a base at a tilt
+makes it longer by the sine of it.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from adacd_hil.records import Event
+from adacd_hil.scheme.identify.certificate import Certificate
+from adacd_hil.scheme.model.regressor import A1, A2, A3, A5
+from adacd_hil.settings.configuration import Settings
+
+EVENT: Final = "geometry"
+_GRAVITY_M_S2: Final = 9.80665
+_ALIKE: Final = 0.08
+"""Share by which two figures may differ that agree; a CAD model is off by as much."""
+_LONGER: Final = 0.12
+"""Share by which a length has to be off to be told."""
+
+
+def geometry_event(settings: Settings, certificate: Certificate) -> Event | None:
+    """Compare the lengths with a certificate of the arm without a payload; None where they agree."""
+    theta, lengths = certificate.parameters, settings.arm.link_length_m
+    if len(theta) > A5:
+        return _by_gravity(theta, lengths[0])
+    cad = settings.arm.cad_theta
+    if not any(cad[: A3 + 1]):
+        text = (
+            f"assumed: arm.link_length_m = {list(lengths)} m, which nothing checks, since torques don't tell a length; "
+            "places and forces of contacts are wrong by as much as it is"
+        )
+        return Event("info", EVENT, text)
+    return _by_cad(theta, cad, lengths)
+
+
+def _by_gravity(theta: tuple[float, ...], told_m: float) -> Event | None:
+    found_m = _GRAVITY_M_S2 * theta[A2] / theta[A5] if theta[A5] else np.inf
+    if 1.0 / (1.0 + _LONGER) <= found_m / told_m <= 1.0 + _LONGER:
+        return None
+    text = f"link 1 is {found_m:.3f} m long by inertia over gravity, arm.link_length_m[0] = {told_m:g} m: measure it"
+    if found_m > told_m:
+        tilt_deg = np.degrees(np.arcsin(told_m / found_m))
+        text += f", unless the arm moves at {tilt_deg:.0f} deg to the level and not upright"
+    text += "; places and forces of contacts are wrong by as much"
+    return Event("warning", EVENT, text)
+
+
+def _by_cad(theta: tuple[float, ...], cad: tuple[float, ...], lengths: tuple[float, float]) -> Event | None:
+    cross, near, far = (
+        _ratio(theta[A2], cad[A2]),
+        _ratio(theta[A1] - theta[A3], cad[A1] - cad[A3]),
+        _ratio(theta[A3], cad[A3]),
+    )
+    for joint, (square, other) in enumerate(((near, far), (far, near))):
+        if abs(cross - 1.0) > _LONGER and _is_alike(square, cross * cross) and _is_alike(other, 1.0):
+            text = (
+                f"a2, a1 - a3 and a3 are {cross:.2f}, {near:.2f} and {far:.2f} times those of arm.cad_theta, as if "
+                f"link {joint + 1} were {cross * lengths[joint]:.3f} m long; arm.link_length_m[{joint}] = "
+                f"{lengths[joint]:g} m: measure it; places and forces of contacts are wrong by as much"
+            )
+            return Event("warning", EVENT, text)
+    return None
+
+
+def _ratio(found: float, told: float) -> float:
+    return found / told if told else 0.0
+
+
+def _is_alike(found: float, expected: float) -> bool:
+    return abs(found / expected - 1.0) <= _ALIKE if expected else False
