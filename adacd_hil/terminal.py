@@ -90,18 +90,21 @@ def fold(text: str, width: int | None) -> str:
 
 
 def _parts(line: str, width: int) -> list[str]:
-    if len(line) <= width:
+    if len(line.expandtabs()) <= width:
         return [line]
     field = _FIRST_FIELD.match(line, 0, width // 3)
     hang = field.end() if field else len(line) - len(line.lstrip()) + 2
-    return textwrap.wrap(
+    parts = textwrap.wrap(
         line,
         width,
         subsequent_indent=" " * min(hang, width // 2),
         break_long_words=False,
         break_on_hyphens=False,
         replace_whitespace=False,
-    )
+    ) or [""]
+    if line.endswith(" ") and len(parts[-1]) < width:  # a question: what is typed stands apart from it
+        parts[-1] += " "
+    return parts
 
 
 _MARKS = {

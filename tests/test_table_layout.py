@@ -128,5 +128,18 @@ def test_a_word_that_is_longer_than_the_terminal_is_left_whole() -> None:
     assert fold(f"report: {'x' * 50}", 40) == f"report:\n  {'x' * 50}"
 
 
+def test_what_is_typed_stands_apart_from_a_question_that_is_folded() -> None:
+    assert fold("Which of the many interfaces of this machine is it [none]: ", 40).endswith(
+        "\n  machine is it [none]: "
+    )
+
+
+@given(some.text(some.sampled_from("ab/._ \té\n"), max_size=300), some.integers(20, 100))
+def test_whatever_is_folded_no_line_is_wider_but_a_word_and_no_letter_is_lost(text, width) -> None:
+    told = fold(text, width)
+    assert told.split() == text.split()
+    assert all(len(line) <= width or len(line.split()) == 1 for line in told.expandtabs().split("\n"))
+
+
 def test_nothing_is_folded_where_there_is_no_width() -> None:
     assert fold("one two three " * 40, None) == "one two three " * 40

@@ -393,10 +393,11 @@ class Drafting:
     def _limit(self, key: str, option: str, proposal: Proposal) -> Fact:
 
         given = getattr(self.options, option[2:].replace("-", "_"))
+        meaning = known_keys()[f"arm.{key}"].meaning
         value, source = self.interview.ask(
             f"{option} A B",
             given,
-            f"{known_keys()[f'arm.{key}'].meaning}, {key.partition('_')[0]} of joint 1 and 2 ({key})",
+            f"{meaning[0].upper()}{meaning[1:]}: joint 1 and 2 (`arm.{key}`)",
             lambda value: _checked(key, _numbers(value, float, option)),
             proposal,
         )

@@ -110,7 +110,7 @@ def as_text(summary: dict[str, Any], bus: dict[str, Any] | None) -> str:
     where = "-i socketcan -c can0" if bus is None else f"-i {bus['interface']} -c {bus['channel']}"
     lines += [
         "next:",
-        f"  adacd-hil demo --config {summary['file']}    # rehearse with an emulated arm",
+        f"  adacd-hil demo --config {summary['file']}   # rehearse",
         f"  adacd-hil doctor {where} --config {summary['file']}",
     ]
     return "\n".join(map(in_line, lines))
