@@ -204,7 +204,9 @@ def test_an_offset_that_creeps_adds_up_and_one_within_its_deviations_does_not() 
 def test_what_has_no_deviation_is_not_said_to_have_changed() -> None:
     (trend,) = trends(series(friction_Nm=[(0.1, 0.1), (0.9, 0.9)]))
     assert trend.friction.changes == ()
-    assert trend.further[0].startswith("Of friction nothing is known to compare")
+    assert trend.further[0].startswith(
+        "Friction can't be compared: that takes two certificates with a deviation, there are 0."
+    )
     assert trend.sentence == "Thresholds can't be compared: 0 of 2 runs have any."
 
 
@@ -273,7 +275,8 @@ def test_a_choice_that_makes_no_sense_is_one_line(many: Path, options: tuple[str
 
 def test_a_folder_without_runs_is_one_line(tmp_path: Path) -> None:
     assert call("runs", tmp_path).stderr == f"adacd-hil: {tmp_path} has no run.mcap, nor has any folder in it\n"
-    assert call("runs", tmp_path / "none").stderr == f"adacd-hil: {tmp_path / 'none'} does not exist\n"
+    remedy = "`adacd-hil demo` and `run` make runs in `runs`"
+    assert call("runs", tmp_path / "none").stderr == f"adacd-hil: {tmp_path / 'none'} does not exist; {remedy}\n"
 
 
 def test_tables_have_a_row_for_each_run_and_fixed_types(many: Path, tmp_path: Path) -> None:

@@ -125,6 +125,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("report none.mcap", FAILURE, ("log none.mcap can't be read: No such file",)),
     ("report notes.txt", FAILURE, ("notes.txt is not an MCAP file",)),
     ("report cut.mcap", FAILURE, ("cut.mcap",)),
+    ("replay none", FAILURE, ("log none can't be read: No such file",)),
     ("replay folder", FAILURE, ("folder has no run.mcap", "name a log, or the folder of a run")),
     ("log info folder", FAILURE, ("folder folder has no .mcap file",)),
     ("history none.toml", USAGE, ("history none.toml does not exist", "`adacd-hil run --history` makes one")),

@@ -231,7 +231,8 @@ def _drift_sentence(quantity: TrendQuantity, what: str) -> str:
     known = np.isfinite(quantity.values) & np.isfinite(quantity.std)
     rows = int(known.all(axis=1).sum())
     if rows < 2:
-        return f"Of {what} nothing is known to compare: {rows} certificate{'' if rows == 1 else 's'} with a deviation."
+        there = f"there {'is' if rows == 1 else 'are'} {rows}"
+        return f"{what.capitalize()} can't be compared: that takes two certificates with a deviation, {there}."
     if not quantity.changes:
         return f"{what.capitalize()}: no change beyond what the certificates' uncertainty explains."
     run, parts = _last_changes(quantity)

@@ -152,7 +152,7 @@ def _open(
     path = log_in(given)
     if against is not None:
         return RecordingAgainstLog(path, log_in(against)), False
-    if path.suffix.lower() == ".mcap":
+    if path.suffix.lower() == ".mcap" or not path.exists():
         return LogSource(path), False
     config, profile, dbc = configured
     if config is None:

@@ -175,7 +175,10 @@ def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progre
     from adacd_hil.analysis.runs.run_summary import NOT_JUDGED, find_runs, judged, summarise
 
     if not folder.is_dir():
-        raise LogError(f"{folder} does not exist" if not folder.exists() else f"{folder} is no folder")
+        what = (
+            "does not exist; `adacd-hil demo` and `run` make runs in `runs`" if not folder.exists() else "is no folder"
+        )
+        raise LogError(f"{folder} {what}")
     found = [summarise(each, each.relative_to(folder).as_posix()) for each in find_runs(folder)]
     if not found:
         raise LogError(f"{folder} has no {LOG_NAME}, nor has any folder in it")
