@@ -45,15 +45,18 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
 
 
 def _by_gravity(theta: tuple[float, ...], told_m: float) -> Event | None:
-    found_m = _GRAVITY_M_S2 * theta[A2] / theta[A5] if theta[A5] else np.inf
+    if theta[A2] == 0.0 or theta[A5] == 0.0:
+        return None
+    found_m = _GRAVITY_M_S2 * abs(theta[A2] / theta[A5])
     if 1.0 / (1.0 + _LONGER) <= found_m / told_m <= 1.0 + _LONGER:
         return None
-    text = f"link 1 is {found_m:.3f} m long by inertia over gravity, arm.link_length_m[0] = {told_m:g} m: measure it"
-    if found_m > told_m:
+    told = f"arm.link_length_m[0] = {told_m:g} m"
+    if found_m > told_m:  # a tilt looks like it, and nobody has told one
         tilt_deg = np.degrees(np.arcsin(told_m / found_m))
-        text += f", unless the arm moves at {tilt_deg:.0f} deg to the level and not upright"
-    text += "; places and forces of contacts are wrong by as much"
-    return Event("warning", EVENT, text)
+        text = f"{told} is right if the arm moves at {tilt_deg:.0f} deg to the level; upright, link 1 is"
+        return Event("info", EVENT, f"{text} {found_m:.3f} m long by inertia over gravity")
+    text = f"link 1 is {found_m:.3f} m long by inertia over gravity, or shorter; {told}: measure it"
+    return Event("warning", EVENT, f"{text}; places and forces of contacts are wrong by as much")
 
 
 def _by_cad(theta: tuple[float, ...], cad: tuple[float, ...], lengths: tuple[float, float]) -> Event | None:

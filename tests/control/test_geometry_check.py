@@ -60,7 +60,9 @@ def test_without_a_cad_model_the_lengths_are_told_as_an_assumption() -> None:
     assert event.message.startswith("assumed: arm.link_length_m = [0.4, 0.25] m, which nothing checks")
 
 
-@pytest.mark.parametrize(("length_m", "said"), [(0.4, None), (0.5, "link 1 is 0.500 m long"), (0.32, "0.320 m long")])
+@pytest.mark.parametrize(
+    ("length_m", "said"), [(0.4, None), (0.5, "upright, link 1 is 0.500 m long"), (0.32, "link 1 is 0.320 m long")]
+)
 def test_gravity_tells_the_length_of_link_1(length_m: float, said: str | None) -> None:
     a5 = MASSES[1] * LENGTHS[1] / 2.0 * 9.80665
     event = event_of(told(()), *inertia(length_m, LENGTHS[1]), *FRICTION, 3.0, a5)
@@ -69,4 +71,6 @@ def test_gravity_tells_the_length_of_link_1(length_m: float, said: str | None) -
         return
     assert event is not None
     assert said in event.message
-    assert ("53 deg to the level" in event.message) == (length_m > LENGTHS[0])
+    is_longer = length_m > LENGTHS[0]
+    assert event.level == ("info" if is_longer else "warning")
+    assert ("is right if the arm moves at 53 deg to the level" in event.message) == is_longer
