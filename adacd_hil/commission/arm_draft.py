@@ -214,6 +214,8 @@ _MODEL_TORQUE_NM = (12.0, 6.0)
 _RATE_PER_NM = 1000.0 / 6.0
 """Torque rate limit per rated torque, 1/s."""
 _AMPLITUDE_DEG, _HALF_PERIOD_S, _EXCITATION_S = (30.0, 60.0), (1.125, 4.5), 2.4
+_UPRIGHT_DEG, _LEAST_UPRIGHT_DEG = (60.0, 60.0), 45.0
+"""Where gravity acts: amplitude, and that of joint 1 below which its offset is hardly seen beside gravity."""
 _PEAK_DEG_S = (100.0, 120.0)
 """Peak speed of the certified scheme's excitation at those amplitudes and that period, and of a withdrawal."""
 _TRAVEL_SHARE, _SPEED_SHARE = 0.8, 0.8
@@ -224,8 +226,10 @@ _ALIKE = 2.0
 """Factor of torques and inertia within which the scheme's numbers are those of arm P."""
 _HEAVY_INERTIA = 20.0
 """Inertia, against P, up to which the evidence of a fit is as well conditioned; measured on 8 kg links."""
-_LAG = 5
-"""Place of lags among the kinds of parameters, whose numbers are no torques."""
+_OFFSET, _LAG = 4, 5
+"""Places of torque offsets, and of lags, whose numbers are no torques, among the kinds of parameters."""
+_MOST_REST_NM = 100.0
+"""Bound of `safety.rest_torque_Nm`."""
 _LEAST_TORQUE_SHARE = 0.3
 """Part of the torque that gravity must leave."""
 
@@ -285,16 +289,6 @@ def draft_arm(facts: ArmFacts) -> ArmDraft:
     return ArmDraft(tuple(entries), tuple(warnings))
 
 
-_BODY = {
-    "mass_kg": "of the links",
-    "center_m": "of those masses, from the link's joint",
-    "inertia_kg_m2": "about them",
-    "viscous_Nm_s": "friction",
-    "coulomb_Nm": "friction",
-}
-"""What of a description the emulator plays, and the word for it."""
-
-
 def _arm(facts: ArmFacts) -> Iterator[Entry]:
     geometry, rated = facts.geometry, facts.rated_torque_Nm
     yield _stated("arm.link_length_m", Fact(geometry.link_length_m, facts.length_source), "axis to axis, axis to tip")
@@ -314,9 +308,9 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
         yield _stated("arm.cad_theta", Fact(theta, facts.mass_source), names)
     else:
         yield Entry("arm.cad_theta", (), "not known: the masses; the scheme identifies the arm without them")
-    for key, what in _BODY.items():
+    for key in ("mass_kg", "center_m", "inertia_kg_m2", "viscous_Nm_s", "coulomb_Nm"):
         if (pair := getattr(geometry, key)) is not None:
-            yield Entry(f"arm.{key}", pair, f"{what}, for the emulator; the host doesn't read it: {facts.mass_source}")
+            yield Entry(f"arm.{key}", pair, f"for the emulator; the host doesn't read it: {facts.mass_source}")
     axes = "not vertical: gravity acts on them" if geometry.is_upright else "vertical: gravity doesn't act on them"
     yield _stated("estimator.gravity", Fact(geometry.is_upright, facts.gravity_source), f"joint axes {axes}")
 
@@ -336,8 +330,16 @@ def _devices(facts: ArmFacts) -> Iterator[Entry]:
 
 def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
     limit, speed = facts.position_limit_deg.value, facts.velocity_limit_deg_s.value
-    amplitude = tuple(_round(min(_AMPLITUDE_DEG[i], _TRAVEL_SHARE * limit[i])) for i in range(JOINTS))
-    yield Entry("trajectory.amplitude_deg", amplitude, f"±, within {_TRAVEL_SHARE:.0%} of the position limit")
+    wanted, told = _AMPLITUDE_DEG, f"±, within {_TRAVEL_SHARE:.0%} of the position limit"
+    if facts.geometry.is_upright:
+        wanted, told = _UPRIGHT_DEG, f"{told}; wide, to tell gravity from the sensors' offsets"
+    amplitude = tuple(_round(min(wanted[i], _TRAVEL_SHARE * limit[i])) for i in range(JOINTS))
+    if facts.geometry.is_upright and amplitude[0] < _LEAST_UPRIGHT_DEG:
+        warnings.append(
+            f"joint 1 may swing by ±{amplitude[0]:g} deg only, {_LEAST_UPRIGHT_DEG:g} deg tell gravity from the offset "
+            "of its torque sensor: without a tare the arm may not be certified"
+        )
+    yield Entry("trajectory.amplitude_deg", amplitude, told)
     slower = _slowdown(facts, amplitude, warnings)
     half_period = tuple(_round(slower * period_s) for period_s in _HALF_PERIOD_S)
     reason = "as of the emulated arm" if slower == 1.0 else f"{slower:.2f} times slower than the emulated arm"
@@ -352,7 +354,19 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
         gain = tuple(_round(model[i] * inertia[i] / _MODEL_INERTIA[i]) for i in range(JOINTS))
         told = "the inertia" if has_masses else "the rated torque, as the masses are not known"
         yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {told}", not has_masses)
+    if facts.geometry.is_upright:
+        yield _rest_torque(facts)
     yield from _certified(facts)
+
+
+def _rest_torque(facts: ArmFacts) -> Entry:
+    """Allow gravity to load the sensors of an arm that its brakes hold."""
+    free, gravity = load_settings("certified").safety.rest_torque_Nm, _gravity(facts)[0]
+    load, told = 1.2 * gravity, f"gravity's {gravity:.3g} Nm on joint 1 and a fifth, which the arm's brakes hold"
+    if not gravity:
+        load = max(facts.torque_limit_Nm.value)
+        told = "a guess: as much as the drives may give, for gravity loads the sensors and the masses are not known"
+    return Entry("safety.rest_torque_Nm", _round(min(free + load, _MOST_REST_NM)), told, not gravity)
 
 
 def _certified(facts: ArmFacts) -> Iterator[Entry]:
@@ -363,6 +377,10 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
     wanted = (2.0 * inertia[0], 0.0, 0.0, *(2.0 * g for g in _gravity(facts)[:1]), 0.0, 0.0, 0.0)
     prior = [max(values) for values in zip(found.prior_std, _scaled(found.prior_std, scale), wanted, strict=True)]
     entries: list[tuple[str, Any, Any, str]] = []
+    if facts.geometry.is_upright and scale == 1.0:
+        enough = [2.0 * value if kind == _OFFSET else value for kind, value in enumerate(found.enough_std)]
+        reason = "offsets half as well as without gravity, which hides them; a tare shows them"
+        entries.append(("certified.enough_std", enough, found.enough_std, reason))
     if scale != 1.0:
         reason = f"torques are {scale:.2g} times those of the emulated arm"
         enough = _scaled(found.enough_std, scale)

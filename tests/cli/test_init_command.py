@@ -238,6 +238,21 @@ def test_masses_and_friction_of_a_urdf_are_for_the_emulator(tmp_path: Path, out:
     assert (played.mass_kg, played.coulomb_Nm) == ((3.0, 1.5), (0.1, 0.1))
 
 
+def test_an_upright_arm_may_rest_on_its_brakes_and_swings_wide(out: Path) -> None:
+    arm = ("--mass-kg", "1.5", "1", "--length-m", "0.3", "0.3", "--upright")
+    assert init(out, *NO_BUS, *arm, "--position-limit-deg", "90", "120").exit_code == 0
+    settings, base = written(out), load_settings("certified")
+    gravity_Nm = settings.arm.cad_theta[7] + settings.arm.cad_theta[8]
+    assert settings.safety.rest_torque_Nm == pytest.approx(1.0 + 1.2 * gravity_Nm, rel=1e-3)
+    assert "safety.rest_torque_Nm" not in settings.assumed
+    assert settings.trajectory.amplitude_deg == (60.0, 60.0)
+    assert settings.certified.enough_std[4] == 2.0 * base.certified.enough_std[4]
+    narrow = init(out, *NO_BUS, *arm, "--position-limit-deg", "40", "120", "--force")
+    assert "joint 1 may swing by ±32 deg only" in narrow.stdout
+    assert init(out, *NO_BUS, "--upright", "--force").exit_code == 0
+    assert "safety.rest_torque_Nm" in written(out).assumed
+
+
 def test_an_arm_like_the_emulated_one_keeps_the_scheme_s_numbers(out: Path) -> None:
     assert init(out, *NO_BUS, "--mass-kg", "1.5", "0.75").exit_code == 0
     settings = written(out)
