@@ -25,21 +25,25 @@ message = "Command"
 number = 2
 cob_id = 0x300
 signals = [
-    { object = "0x6071", signal = "target_torque", unit = "permille" },
+    { object = "0x2071", signal = "target_torque", unit = "permille" },
     { object = "0x6040", signal = "controlword" },
 ]
 """
 
 
 def write_drive(folder: Path) -> Path:
-    """Write a drive that has position and velocity in objects of its maker, and its frames in other PDOs than ours."""
+    """Write a drive with position, velocity and target torque in objects of its maker, in other PDOs than ours."""
     listed = "[ManufacturerObjects]\nSupportedObjects={}\n1=0x2211\n2=0x2212\n{}"
     eds = (contract_folder() / "stock_drive.eds").read_text()
     assert listed.format(2, "") in eds
-    eds = eds.replace(listed.format(2, ""), listed.format(4, "3=0x2063\n4=0x2069\n"))
-    for index, name in (("2063", "Position"), ("2069", "Velocity")):
-        eds += f"\n[{index}]\nParameterName={name}\nObjectType=0x7\nDataType=0x0004\nAccessType=ro\nDefaultValue=0\n"
-        eds += "PDOMapping=1\n"
+    eds = eds.replace(listed.format(2, ""), listed.format(5, "3=0x2063\n4=0x2069\n5=0x2071\n"))
+    for index, name, kind, access in (
+        ("2063", "Position", 4, "ro"),
+        ("2069", "Velocity", 4, "ro"),
+        ("2071", "Torque set-point", 3, "rww"),
+    ):
+        eds += f"\n[{index}]\nParameterName={name}\nObjectType=0x7\nDataType=0x000{kind}\nAccessType={access}\n"
+        eds += "DefaultValue=0\nPDOMapping=1\n"
     (folder / "other_drive.eds").write_text(eds)
     ours = (resources.files("adacd_hil") / "device_profiles" / "stock-drive.toml").read_text()
     profile = folder / "other-drive.toml"

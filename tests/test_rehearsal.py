@@ -6,8 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
+from own_arm import describe_arm
 
 from adacd_hil.cli.commands.demo_command import resolve
+from adacd_hil.cli.main import cli
 from adacd_hil.commission.configuration_check import examine_configuration
 from adacd_hil.device.profile import load_profile
 from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
@@ -163,6 +166,14 @@ def test_the_payload_of_a_heavy_arm_is_one_that_a_scenario_takes(tmp_path: Path)
     heavy = "[arm]\nlink_length_m = [0.6, 0.3]\nmass_kg = [40.0, 30.0]\nrated_torque_Nm = [900.0, 500.0]\n"
     scenario, _ = composed(tmp_path, heavy + "torque_limit_Nm = [900.0, 500.0]\n", "paper")
     assert scenario.payloads[0].mass_kg == 10.0
+
+
+def test_a_drive_with_its_maker_s_objects_follows_its_commands(tmp_path: Path) -> None:
+    written = CliRunner().invoke(cli, ["init", *describe_arm(tmp_path)])
+    assert written.exit_code == 0, written.stderr
+    (tmp_path / "short.toml").write_text("lasts_s = 1.0\nstart_deg = [-30.0, -60.0]\n")
+    status, lines = rehearse(tmp_path, "own")
+    assert status == 0, lines  # the host faults once the arm is 20 deg from where it should be
 
 
 def test_a_sensor_whose_frames_carry_next_to_nothing_is_named(tmp_path: Path) -> None:

@@ -91,6 +91,7 @@ class BenchNodes:
             for alias, place in description.aliases.items():
                 if alias != place:
                     device.serve(*alias, device.reader(*place))
+                    device.pdos.accept(*alias, device.pdos.writer(*place))
         injector.attach(self.devices, self.drives, self.sensors)
         self.period_ns = self.devices[0].value(0x1006) * 1000
         for device in self.devices:

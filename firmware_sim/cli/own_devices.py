@@ -35,6 +35,10 @@ _OBJECTS = {
     "torque_actual": (0x6077, 0),
     "torque_demand": (0x6074, 0),
     "error_code": (0x603F, 0),
+    "statusword": (0x6041, 0),
+    "controlword": (0x6040, 0),
+    "target_torque": (0x6071, 0),
+    "torque_offset": (0x60B2, 0),
     "torque": (0x9130, 1),
     "gross_torque": (0x2110, 1),
     "status": (0x6150, 1),
@@ -118,7 +122,6 @@ def _describe(device: PlacedDevice) -> DeviceDescription:
     aliases = {
         (signal.name.index, signal.name.sub): _OBJECTS[signal.signal]
         for pdo in device.settings.pdo
-        if not pdo.is_received
         for signal in pdo.signals
         if signal.signal in _OBJECTS
     }
