@@ -11,6 +11,7 @@ import pytest
 from adacd_hil.analysis.replay.replay import replay
 from adacd_hil.api import LoadedRun, load
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.control import first_motion
 from adacd_hil.control.first_motion import FirstMotion
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.records import ArmState, FaultReason, SchemeState
@@ -101,6 +102,17 @@ def test_a_right_arm_is_left_alone_and_what_its_sensors_measure_is_logged(right_
     assert [line[:7] for line in lines_of(right_run, "info")] == ["joint 1", "joint 2"]
     assert lines_of(right_run, "warning") == []
     assert feed.judged().line == ""
+
+
+def test_a_joint_that_moves_too_little_to_be_known_is_named_and_judged_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_motion, "_MOST_BLOCKS", 20)
+    judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=()))  # type: ignore[arg-type]
+    for _ in range(450):
+        judge.note(BLANK, SchemeState.ADAPT, np.zeros(2))
+    events = judge.take_events()
+    assert [(event.level, event.message[:7]) for event in events] == [("warning", "joint 1"), ("warning", "joint 2")]
+    assert "is not known after 0.4 s, it moves too little" in events[0].message
+    assert (judge.is_on, judge.line) == (False, "")
 
 
 TORQUE = r"joint (\d): its torque sensor measures ([+-][\d.]+) times the commanded torque"

@@ -36,7 +36,7 @@ _FEWEST_BLOCKS: Final = 20
 """In motion, of a joint: twice and a half as many as the regression has unknowns."""
 _JUDGED_EVERY: Final = 5
 _MOST_BLOCKS: Final = 3000
-"""A minute: who has not been known by then moves too little."""
+"""A minute: a joint that is not known by then moves too little, which is said."""
 _MOVING_RAD_S: Final = 0.05
 """Slower, friction before the sensor may hold anything."""
 _CORRELATED: Final = 4.0
@@ -175,8 +175,19 @@ class FirstMotion:
         if self._open and self._blocks % _JUDGED_EVERY == 0:
             self._judge()
         if self._blocks >= _MOST_BLOCKS:
-            self._open.clear()
-            self._readings = None
+            self._give_up()
+
+    def _give_up(self) -> None:
+        """Judge nothing more, and say what is not known."""
+        for joint in sorted(self._open):
+            text = (
+                f"joint {joint + 1}: what its torque sensor measures of the commanded torque is not known after "
+                f"{_MOST_BLOCKS * BLOCK_S:g} s, it moves too little: nothing has checked its sign, "
+                f"{self._scales(joint)}"
+            )
+            self._events.append(Event("warning", "first motion", text))
+        self._open.clear()
+        self._readings = None
 
     def _judge(self) -> None:
         self.line = self._judge_position() or self._judge_torque()
