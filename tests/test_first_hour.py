@@ -14,7 +14,7 @@ from documents import ROOT
 
 sys.path.insert(0, str(ROOT / "tools"))
 import first_hour
-from first_hour import Step, Way, concepts, logical_lines, play, read_way
+from first_hour import Played, Step, Way, concepts, judge, logical_lines, play, read_way
 
 pytestmark = pytest.mark.slow
 
@@ -116,3 +116,23 @@ def test_terms_are_found_in_prose_in_any_form_and_names_as_they_are_written() ->
         "tare",
         "SDO, PDO",
     ]
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "said", "is_good"),
+    [
+        ("doctor", 1, "ok       load\n\x1b[31mFAILED\x1b[0m   rate   SYNC 594/s of 1000\n", True),
+        ("doctor", 1, "FAILED   rate   SYNC 594/s\nFAILED   nodes   Drive2 is silent\n", False),
+        ("commtest", 1, "not sufficient: 8 % of the periods\n", True),
+        ("commtest", 5, "not sufficient: 8 % of the periods\n", False),
+        ("demo --truth wrong-sign", 4, "", True),
+        ("demo --truth wrong-sign", 0, "", False),
+        ("demo", 4, "", False),
+    ],
+)
+def test_only_a_late_machine_and_a_mistake_that_is_shown_may_end_otherwise(
+    text: str, status: int, said: str, is_good: bool
+) -> None:
+    step = Played("x.md", text, status)
+    judge(step, said)
+    assert step.is_good == is_good

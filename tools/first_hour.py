@@ -69,6 +69,8 @@ HANG_S = 900.0
 """Longest that a command may take."""
 FAILED, OF_THIS_MACHINE = r"FAILED|not sufficient: ", r"FAILED +(rate$|rate |SYNC )|not sufficient: "
 """What `doctor` and `commtest` say of what failed, and of a host that isn't on time: a guest of user-mode Linux."""
+MEANT = {r"--truth wrong-sign": 4}
+"""Exit statuses that a command is meant to have in place of 0: the arm is not what the host was told."""
 MOST_LETTERS = 2000
 LAB = ("--scenario", "idle")
 """Nobody touches the arm on the bus."""
@@ -281,8 +283,9 @@ def type_in(done: Played, folder: Path, environment: dict[str, str]) -> None:
 
 def judge(done: Played, said: str) -> None:
     """Say whether a newcomer goes on: exit status 0, or nothing has failed but the speed of this machine."""
-    if done.status == 0:
+    if done.status == next((status for pattern, status in MEANT.items() if re.search(pattern, done.text)), 0):
         return
+    said = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", said)
     failed = [line.strip() for line in said.splitlines() if re.match(FAILED, line)]
     done.is_good = done.status == 1 and bool(failed) and all(re.match(OF_THIS_MACHINE, line) for line in failed)
     done.why = "; ".join(failed) if done.is_good else " ".join(said.split())[-MOST_LETTERS:]
