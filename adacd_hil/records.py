@@ -21,6 +21,8 @@ Vector = NDArray[np.float64]
 
 JOINTS = 2
 JOINT_NAMES = ("joint1", "joint2")
+GRAVITY_M_S2 = 9.80665
+"""Standard acceleration of gravity. Source: 3rd CGPM, 1901."""
 
 PARAMETER_NAMES = ("a1", "a2", "a3", "F_v1", "F_v2", "F_c1", "F_c2")
 """Eq. (19): inertia kg m², viscous friction Nm s/rad, Coulomb friction Nm."""

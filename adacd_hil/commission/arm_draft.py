@@ -19,14 +19,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import GRAVITY_M_S2, JOINTS, Vector
 from adacd_hil.scheme.model.chain import PER_LINK
 from adacd_hil.scheme.model.urdf import BASE, SerialArm, UrdfError, read_urdf
 from adacd_hil.settings.configuration import known_keys, load_settings
 from adacd_hil.settings.toml_files import toml_value
 from adacd_hil.terminal import one_line
 
-STANDARD_GRAVITY_M_S2 = 9.80665
 Pair = tuple[float, float]
 _PARALLEL = math.cos(math.radians(2.0))
 """Least |cosine| between axes that count as parallel, and with the vertical for one that counts as vertical."""
@@ -63,7 +62,7 @@ def uniform_rods(link_length_m: Pair, mass_kg: Pair, is_upright: bool) -> Planar
     a3 = m2 * l2**2 / 3.0
     theta = [m1 * l1**2 / 3.0 + m2 * l1**2 + a3, m2 * l1 * l2 / 2.0, a3, 0.0, 0.0, 0.0, 0.0]
     if is_upright:
-        theta += [STANDARD_GRAVITY_M_S2 * (m1 * l1 / 2.0 + m2 * l1), STANDARD_GRAVITY_M_S2 * m2 * l2 / 2.0]
+        theta += [GRAVITY_M_S2 * (m1 * l1 / 2.0 + m2 * l1), GRAVITY_M_S2 * m2 * l2 / 2.0]
     return PlanarArm(link_length_m, _rounded(theta), is_upright, mass_kg=mass_kg)
 
 
@@ -119,7 +118,7 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
         theta = [inertia[0] + second[0] * l1**2 + inertia[1], l1 * turn, inertia[1], 0.0, 0.0, 0.0, 0.0]
         turn_1 = float(np.linalg.norm(first[1:4] - (first[1:4] @ chain.axis[0]) * chain.axis[0]))
         if is_upright:
-            share = STANDARD_GRAVITY_M_S2 * math.sqrt(max(1.0 - vertical**2, 0.0))
+            share = GRAVITY_M_S2 * math.sqrt(max(1.0 - vertical**2, 0.0))
             theta += [share * (turn_1 + second[0] * l1), share * turn]
         body = _body(arm, (first[0], second[0]), (turn_1, turn), inertia)
     return PlanarArm(

@@ -16,13 +16,12 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.records import Event
+from adacd_hil.records import GRAVITY_M_S2, Event
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.model.regressor import A1, A2, A3, A5
 from adacd_hil.settings.configuration import Settings
 
 EVENT: Final = "geometry"
-_GRAVITY_M_S2: Final = 9.80665
 _ALIKE: Final = 0.08
 """Share by which two figures may differ that agree; a CAD model is off by as much."""
 _LONGER: Final = 0.12
@@ -47,7 +46,7 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
 def _by_gravity(theta: tuple[float, ...], told_m: float) -> Event | None:
     if theta[A2] == 0.0 or theta[A5] == 0.0:
         return None
-    found_m = _GRAVITY_M_S2 * abs(theta[A2] / theta[A5])
+    found_m = GRAVITY_M_S2 * abs(theta[A2] / theta[A5])
     if 1.0 / (1.0 + _LONGER) <= found_m / told_m <= 1.0 + _LONGER:
         return None
     told = f"arm.link_length_m[0] = {told_m:g} m"

@@ -29,7 +29,7 @@ from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.records import Vector
 from adacd_hil.remedies import nearest_name
 from adacd_hil.scheme.identify.offline import OfflineSettings, Record
-from adacd_hil.scheme.model.urdf import SerialArm, UrdfError, read_urdf
+from adacd_hil.scheme.model.urdf import STANDARD_GRAVITY_M_S2, SerialArm, UrdfError, read_urdf
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import read_toml
 
@@ -45,7 +45,7 @@ class ArmSection:
 
     urdf: str = setting(meaning="file, relative to the map")
     gravity_m_s2: tuple[float, float, float] = setting(
-        (0.0, 0.0, -9.80665), unit="m/s²", low=-1e3, high=1e3, meaning="in the root's axes"
+        STANDARD_GRAVITY_M_S2, unit="m/s²", low=-1e3, high=1e3, meaning="in the root's axes"
     )
     locked: tuple[str, ...] = setting((), meaning="joints that do not move")
     has_rotors: bool = setting(False, meaning="torques are those of geared motors, which turn their rotors too")

@@ -25,10 +25,9 @@ from xml.etree.ElementTree import Comment, Element, SubElement
 
 import numpy as np
 
-from adacd_hil.records import JOINT_NAMES, PARAMETER_NAMES
+from adacd_hil.records import GRAVITY_M_S2, JOINT_NAMES, PARAMETER_NAMES
 from adacd_hil.settings.configuration import Settings
 
-GRAVITY_M_S2 = 9.80665
 _A1, _A2, _A3, _A4, _A5 = 0, 1, 2, 7, 8
 _ROD_C, _ROD_I = 1.0 / 2.0, 1.0 / 12.0  # of a uniform rod: place of its centre and inertia about it
 _AGREEMENT = 0.01

@@ -17,11 +17,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from adacd_hil.records import Vector
+from adacd_hil.records import GRAVITY_M_S2, Vector
 from adacd_hil.scheme.model.chain import PER_LINK, Chain
 
 MOVING = ("revolute", "continuous", "prismatic")
-STANDARD_GRAVITY_M_S2 = (0.0, 0.0, -9.80665)
+STANDARD_GRAVITY_M_S2 = (0.0, 0.0, -GRAVITY_M_S2)
 LARGEST = 1e18
 """Of any number, in its unit: products of lengths, masses and speeds stay finite."""
 BASE = -1
