@@ -117,7 +117,7 @@ def test_certificates_that_cant_be_used_are_one_line_and_status_2(
     more = [str(word) for pair in words.items() if pair[1] is not None for word in pair]
     monkeypatch.chdir(tmp_path)
     refused = CliRunner().invoke(cli, ["sweep", str(log), "--out", str(tmp_path / "out"), *more])
-    complaints = [line for line in refused.stderr.splitlines() if not line.startswith("1 rows")]
+    complaints = [line for line in refused.stderr.splitlines() if not line.startswith("1 row: ")]
     assert (refused.exit_code, len(complaints)) == (2, 1), refused.stderr
     assert reason in complaints[0]
 
