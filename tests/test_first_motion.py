@@ -115,6 +115,40 @@ def test_a_joint_that_moves_too_little_to_be_known_is_named_and_judged_no_more(m
     assert (judge.is_on, judge.line) == (False, "")
 
 
+def right_motion(seed: int, feed: Feed) -> None:
+    """Overwrite a feed with 8 s of a right, rigid arm of two links on sines; every fourth moves one joint mostly."""
+    rng, t_s = np.random.default_rng(seed), np.arange(8000) * 1e-3
+    amplitude, frequency = rng.uniform(0.03, 0.6, 2), 2.0 * np.pi * rng.uniform(0.15, 1.5, 2)
+    amplitude[1] *= 0.05 if seed % 4 == 0 else 1.0
+    amplitude[0] *= 0.05 if seed % 4 == 1 else 1.0
+    begun = np.clip(t_s, 0.0, 1.0)
+    ramp = begun**3 * (10.0 - 15.0 * begun + 6.0 * begun**2)
+    q = amplitude * np.sin(frequency * t_s[:, np.newaxis] + (0.0, 0.3)) * ramp[:, np.newaxis]
+    q += rng.uniform(-0.5, 0.5, 2)
+    dq = np.gradient(q, 1e-3, axis=0)
+    (ddq_1, ddq_2), (dq_1, dq_2) = np.gradient(dq, 1e-3, axis=0).T, dq.T
+    m2 = rng.uniform(0.5, 2.0)
+    a3, a2 = m2 * 0.25**2 / 3.0, m2 * 0.4 * 0.25 / 2.0
+    a1, cosine, sine = m2 * 0.4**2 * 1.6 + a3, a2 * np.cos(q[:, 1]), a2 * np.sin(q[:, 1])
+    tau_1 = (a1 + 2.0 * cosine) * ddq_1 + (a3 + cosine) * ddq_2 - sine * (2.0 * dq_1 * dq_2 + dq_2**2)
+    tau_2 = (a3 + cosine) * ddq_1 + a3 * ddq_2 + sine * dq_1**2
+    viscous, coulomb = rng.uniform(0.0, 0.4, 2), rng.uniform(0.0, 0.3, 2) * (1.0, 0.3)
+    tau = np.stack((tau_1, tau_2), axis=1) + viscous * dq + coulomb * np.sign(dq)
+    noise = (0.0, 1e-4, 1e-3, 1e-2)[rng.integers(0, 4)]
+    feed.q, feed.dq = q if noise == 0.0 else np.round(q, 5), dq + rng.normal(0.0, noise, q.shape)
+    feed.tau_J = np.roll(tau, 2, axis=0) + rng.normal(0.0, noise, q.shape)
+    feed.tau_c = tau + (0.2 * dq if seed % 3 == 0 else 0.0)  # friction before the sensor
+    feed.state = np.full(len(q), int(SchemeState.ADAPT))
+    feed.state[:4] = int(SchemeState.INIT)
+
+
+@pytest.mark.parametrize("seed", [14, 38, 176, 213, 219, 230, 293, 394])
+def test_a_right_arm_whose_motion_tells_little_is_left_alone(feed: Feed, seed: int) -> None:
+    """One joint hardly moves, nothing is noisy, so that any unknown explains the torque; or the velocity is noisy."""
+    right_motion(seed, feed)
+    assert feed.judged().line == ""
+
+
 TORQUE = r"joint (\d): its torque sensor measures ([+-][\d.]+) times the commanded torque"
 POSITION = r"joint (\d): its position moves ([+-][\d.]+) times as far as its velocity says"
 

@@ -27,8 +27,10 @@ from adacd_hil.settings.configuration import Settings
 _FEWEST_BLOCKS: Final = 15
 _BETTER: Final = 0.2
 """Share over that of the configuration, at most, of a reading that is right."""
-_EXPLAINED: Final = 0.02
+_EXPLAINED: Final = 0.004
 """Largest unexplained share of it."""
+_UNEXPLAINED: Final = 1e-4
+"""Least share as told: what explains all but 1 % of the torque is right. Mistakes leave 2 % and more."""
 _JUDGED_EVERY: Final = 4
 _ROUNDS: Final = 2
 """Verdicts in a row that have to agree."""
@@ -172,7 +174,8 @@ class DeviceReadings:
         if self._blocks < _FEWEST_BLOCKS or self._blocks % _JUDGED_EVERY:
             return None
         best = self._solve(range(len(READINGS)))
-        is_better = best != 0 and self._rank(best) <= min(_BETTER * self._shares[0], _EXPLAINED)
+        is_wrong = best != 0 and self._shares[0] >= _UNEXPLAINED
+        is_better = is_wrong and self._rank(best) <= min(_BETTER * self._shares[0], _EXPLAINED)
         self._agreed = (best, self._agreed[1] + 1 if best == self._agreed[0] else 1) if is_better else (0, 0)
         return READINGS[best] if self._agreed[1] >= _ROUNDS else None
 

@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.control.device_readings import DeviceReadings
+from adacd_hil.control.device_readings import RIDGE, DeviceReadings
 from adacd_hil.control.geometry_check import EVENT as GEOMETRY
 from adacd_hil.control.geometry_check import geometry_event
 from adacd_hil.device.arm import Arm
@@ -328,12 +328,15 @@ class TorqueRatio(NamedTuple):
 
 
 def ratio_of(normal: NDArray[np.float64], blocks: int) -> TorqueRatio:
-    """Solve the normal equations (8, 8) of a joint that has moved in so many blocks."""
+    """Solve the normal equations (8, 8) of a joint that has moved in so many blocks.
+
+    A motion that doesn't tell the unknowns apart is fitted well by any of them: what the ridge took counts as unknown.
+    """
     A, b, square = normal[:-1, :-1], normal[:-1, -1], float(normal[-1, -1])
     size = np.sqrt(np.maximum(np.diag(A), 1e-12))
-    inverse = np.linalg.inv(A / np.outer(size, size) + 1e-9 * np.eye(_COLUMNS))
+    inverse = np.linalg.inv(A / np.outer(size, size) + RIDGE * np.eye(_COLUMNS))
     x = inverse @ (b / size)
     left = max(square - float(x @ (b / size)), 0.0) / max(blocks - _COLUMNS, 1) * _CORRELATED
-    std = np.sqrt(left * np.diag(inverse)) / size
+    std = (np.sqrt(left * np.diag(inverse)) + RIDGE * np.abs(inverse) @ np.abs(x)) / size
     own, other = x[:2] / size[:2]
     return TorqueRatio(float(own), float(other), float(std[_OWN]), float(std[_OTHER]))
