@@ -104,14 +104,23 @@ def test_a_right_arm_is_left_alone_and_what_its_sensors_measure_is_logged(right_
     assert feed.judged().line == ""
 
 
-def test_a_joint_that_moves_too_little_to_be_known_is_named_and_judged_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(first_motion, "_MOST_BLOCKS", 20)
-    judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=()))  # type: ignore[arg-type]
-    for _ in range(450):
+@pytest.mark.parametrize(
+    ("is_limited", "periods"), [(False, (1,)), (True, (1,)), (False, (1, 1, 2))], ids=["still", "limited", "missing"]
+)
+def test_a_joint_that_is_not_known_in_time_is_named_and_judged_no_more(
+    monkeypatch: pytest.MonkeyPatch, is_limited: bool, periods: tuple[int, ...]
+) -> None:
+    monkeypatch.setattr(first_motion, "_LONGEST_S", 0.4)
+    drives = (SimpleNamespace(is_limited=is_limited),)
+    judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=drives))  # type: ignore[arg-type]
+    for k in range(399 * len(periods) // sum(periods)):
+        judge.note(BLANK._replace(periods=periods[k % len(periods)]), SchemeState.ADAPT, np.zeros(2))
+    assert (judge.is_on, judge.take_events()) == (True, [])
+    for _ in range(2):
         judge.note(BLANK, SchemeState.ADAPT, np.zeros(2))
     events = judge.take_events()
     assert [(event.level, event.message[:7]) for event in events] == [("warning", "joint 1"), ("warning", "joint 2")]
-    assert "is not known after 0.4 s, it moves too little" in events[0].message
+    assert "is not known after 0.4 s, since it moves too little" in events[0].message
     assert (judge.is_on, judge.line) == (False, "")
 
 
@@ -147,6 +156,12 @@ def test_a_right_arm_whose_motion_tells_little_is_left_alone(feed: Feed, seed: i
     """One joint hardly moves, nothing is noisy, so that any unknown explains the torque; or the velocity is noisy."""
     right_motion(seed, feed)
     assert feed.judged().line == ""
+
+
+def test_a_joint_is_not_known_before_its_position_is_compared(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_motion, "_LEAST_WAY_RAD", 1.8)  # both torques are known before
+    feed.q[:, 1] *= 0.6
+    check(feed.judged().line, POSITION, 2, 0.6)
 
 
 TORQUE = r"joint (\d): its torque sensor measures ([+-][\d.]+) times the commanded torque"

@@ -35,8 +35,8 @@ BLOCK_S, SHORT_BLOCK_S = 0.02, 0.008
 _FEWEST_BLOCKS: Final = 20
 """In motion, of a joint: twice and a half as many as the regression has unknowns."""
 _JUDGED_EVERY: Final = 5
-_MOST_BLOCKS: Final = 3000
-"""A minute: a joint that is not known by then moves too little, which is said."""
+_LONGEST_S: Final = 60.0
+"""A joint that is not known after so long with power is named, and judged no more."""
 _MOVING_RAD_S: Final = 0.05
 """Slower, friction before the sensor may hold anything."""
 _CORRELATED: Final = 4.0
@@ -48,7 +48,10 @@ _KNOWN: Final = 0.02
 """Largest one by which it is right, and judged no more."""
 _WARNED: Final = 0.15
 """A k that is off by more is worth a warning: torque constants are within ±10 %."""
+_NOTHING: Final = 0.1
+"""Largest |k| of a sensor that measures nothing of its joint."""
 _LEAST_WAY_RAD: Final = 0.2
+"""Way from which on a joint's position is compared with its velocity; it is known no sooner."""
 _UNEVEN: Final = 0.1
 """Largest share of Σ Δq² that one scale leaves over: a position that is stuck at times leaves a half."""
 _ALIGNED: Final = 0.7
@@ -74,7 +77,7 @@ class FirstMotion:
         # A command of cycle k acts from the next SYNC on, and the sample after that shows it; pipelined one later.
         self._commands = np.zeros((4 if settings.bus.is_pipelined else 3, JOINTS))
         self._long, self._short = (_Blocks(span_s, self._period_s) for span_s in (BLOCK_S, SHORT_BLOCK_S))
-        self._blocks = 0
+        self._blocks = self._powered = 0  # powered: cycles
         self._readings: DeviceReadings | None = DeviceReadings(settings) if self._error > 0.0 else None
         self._pushed = np.zeros((6, JOINTS))  # Σ of ddq², tau_c², tau_J², tau_c ddq, tau_J ddq, tau_c dq: short blocks
         self._normal = np.zeros((JOINTS, _COLUMNS + 1, _COLUMNS + 1))
@@ -105,6 +108,10 @@ class FirstMotion:
     def note(self, arm: ArmState, state: SchemeState, tau_c: Vector) -> None:
         """Take in a cycle; `tau_c` (2,): what was commanded in it, Nm. `state`: of the scheme before it."""
         if not self.is_on:
+            return
+        self._powered += arm.periods if state in POWERED else 0
+        if self._powered * self._period_s >= _LONGEST_S:
+            self._give_up()
             return
         commands = self._commands
         commands[1:] = commands[:-1]
@@ -174,15 +181,13 @@ class FirstMotion:
         self._blocks += 1
         if self._open and self._blocks % _JUDGED_EVERY == 0:
             self._judge()
-        if self._blocks >= _MOST_BLOCKS:
-            self._give_up()
 
     def _give_up(self) -> None:
         """Judge nothing more, and say what is not known."""
         for joint in sorted(self._open):
             text = (
-                f"joint {joint + 1}: what its torque sensor measures of the commanded torque is not known after "
-                f"{_MOST_BLOCKS * BLOCK_S:g} s, it moves too little: nothing has checked its sign, "
+                f"joint {joint + 1} is not known after {_LONGEST_S:g} s, since it moves too little, a drive is at a "
+                "limit, or cycles are missing: nothing has checked its signs, scales of position and velocity, "
                 f"{self._scales(joint)}"
             )
             self._events.append(Event("warning", "first motion", text))
@@ -229,7 +234,7 @@ class FirstMotion:
                     continue
                 return self._describe(joint, ratio)
             is_right = 1.0 - self._error <= ratio.own - slack and ratio.own + slack <= 1.0 / (1.0 - self._error)
-            if is_right and ratio.own_std <= _KNOWN:
+            if is_right and ratio.own_std <= _KNOWN and self._way_rad[joint] >= _LEAST_WAY_RAD:
                 self._close(joint, ratio)
         return ""
 
