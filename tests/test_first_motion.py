@@ -164,6 +164,14 @@ def test_a_joint_is_not_known_before_its_position_is_compared(feed: Feed, monkey
     check(feed.judged().line, POSITION, 2, 0.6)
 
 
+@pytest.mark.parametrize("joint", [1, 2])
+def test_a_sensor_that_measures_nothing_is_not_taken_for_reversed(feed: Feed, joint: int) -> None:
+    feed.tau_J[:, joint - 1] = 0.01
+    line = feed.judged().line
+    assert "nothing of it" in line
+    assert f"devices.sensor_node[{joint - 1}]" in line
+
+
 TORQUE = r"joint (\d): its torque sensor measures ([+-][\d.]+) times the commanded torque"
 POSITION = r"joint (\d): its position moves ([+-][\d.]+) times as far as its velocity says"
 

@@ -259,6 +259,11 @@ class FirstMotion:
 
     def _describe(self, joint: int, ratio: "TorqueRatio") -> str:
         head = f"joint {joint + 1}: its torque sensor measures {ratio.own:+.2f} times the commanded torque"
+        if abs(ratio.own) <= _NOTHING:
+            return (
+                f"{head}, +1 expected, so nothing of it: check that the sensor of devices.sensor_node[{joint}] is at "
+                f"this joint and measures, and {self._scales(joint)}"
+            )
         if ratio.own < 0.0:
             return (
                 f"{head}, +1 expected: one of the two counts the other way than arm.sign[{joint}] says; reverse the "
