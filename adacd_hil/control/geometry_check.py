@@ -31,16 +31,19 @@ _LONGER: Final = 0.12
 def geometry_event(settings: Settings, certificate: Certificate) -> Event | None:
     """Compare the lengths with a certificate of the arm without a payload; None where they agree."""
     theta, lengths = certificate.parameters, settings.arm.link_length_m
-    if len(theta) > A5:
-        return _by_gravity(theta, lengths[0])
-    cad = settings.arm.cad_theta
-    if not any(cad[: A3 + 1]):
-        text = (
-            f"assumed: arm.link_length_m = {list(lengths)} m, which nothing checks, since torques don't tell a length; "
-            "places and forces of contacts are wrong by as much as it is"
-        )
-        return Event("info", EVENT, text)
-    return _by_cad(theta, cad, lengths)
+    cad, is_upright = settings.arm.cad_theta, len(theta) > A5
+    has_masses = any(cad[: A3 + 1])
+    event = _by_cad(theta, cad, lengths) if has_masses else None
+    if event is None and is_upright:
+        event = _by_gravity(theta, lengths[0])
+    if event is not None or has_masses:
+        return event
+    unchecked = f"arm.link_length_m[1] = {lengths[1]:g} m" if is_upright else f"arm.link_length_m = {list(lengths)} m"
+    text = (
+        f"assumed: {unchecked}, which nothing checks, since torques don't tell a length; "
+        "places and forces of contacts are wrong by as much as it is"
+    )
+    return Event("info", EVENT, text)
 
 
 def _by_gravity(theta: tuple[float, ...], told_m: float) -> Event | None:

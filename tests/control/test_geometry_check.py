@@ -66,11 +66,23 @@ def test_without_a_cad_model_the_lengths_are_told_as_an_assumption() -> None:
 def test_gravity_tells_the_length_of_link_1(length_m: float, said: str | None) -> None:
     a5 = MASSES[1] * LENGTHS[1] / 2.0 * 9.80665
     event = event_of(told(()), *inertia(length_m, LENGTHS[1]), *FRICTION, 3.0, a5)
-    if said is None:
-        assert event is None
-        return
     assert event is not None
+    if said is None:
+        assert event.message.startswith("assumed: arm.link_length_m[1] = 0.25 m, which nothing checks")
+        return
     assert said in event.message
     is_longer = length_m > LENGTHS[0]
     assert event.level == ("info" if is_longer else "warning")
     assert ("is right if the arm moves at 53 deg to the level" in event.message) == is_longer
+
+
+@pytest.mark.parametrize(("l1", "l2", "joint"), [(0.4, 0.25, 0), (0.4, 0.3125, 2), (0.5, 0.25, 1)])
+def test_masses_tell_both_lengths_of_an_upright_arm_too(l1: float, l2: float, joint: int) -> None:
+    a5 = MASSES[1] * l2 / 2.0 * 9.80665
+    event = event_of(told(CAD), *inertia(l1, l2), *FRICTION, 13.7, a5)
+    if joint == 0:
+        assert event is None
+        return
+    assert event is not None
+    assert event.level == "warning"
+    assert f"as if link {joint} were" in event.message
