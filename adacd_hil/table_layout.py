@@ -6,11 +6,10 @@ On a screen that is redrawn a row is one line, and cells are cut.
 """
 
 import re
-import textwrap
 from collections.abc import Collection, Sequence
 from itertools import zip_longest
 
-from adacd_hil.terminal import in_line
+from adacd_hil.terminal import in_line, wrap_words
 
 _GAP = "  "
 _LEAST_ROOM, _LEAST_CUT = 16, 8
@@ -105,7 +104,7 @@ def _wrapped(text: str, width: int, indent: str) -> list[str]:
     indent = indent if len(indent) < width else ""
     room = width - len(indent)
     words = (word if len(word) <= room else _broken(word, room) for word in text.split(" "))
-    return textwrap.wrap(" ".join(words), width, subsequent_indent=indent, break_on_hyphens=False) or [""]
+    return wrap_words(" ".join(words), width, indent, is_breaking=True)
 
 
 def _broken(word: str, room: int) -> str:

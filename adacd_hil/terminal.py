@@ -94,19 +94,39 @@ def _parts(line: str, width: int) -> list[str]:
         return [line]
     field = _FIRST_FIELD.match(line, 0, width // 3)
     hang = field.end() if field else len(line) - len(line.lstrip()) + 2
-    parts = textwrap.wrap(
-        line,
-        width,
-        subsequent_indent=" " * min(hang, width // 2),
-        break_long_words=False,
-        break_on_hyphens=False,
-        replace_whitespace=False,
-    ) or [""]
+    parts = wrap_words(line, width, " " * min(hang, width // 2))
     if line.endswith(" ") and len(parts[-1]) < width:  # a question: what is typed stands apart from it
         parts[-1] += " "
     return parts
 
 
+def wrap_words(text: str, width: int, indent: str, is_breaking: bool = False) -> list[str]:
+    """Part a line between words, but not a number from its unit; what follows the first part has the indent.
+
+    is_breaking: a word that is longer than a part is parted, too.
+    """
+    parts = textwrap.wrap(
+        keep_units(text, _KEPT_GAP, width - len(indent)),
+        width,
+        subsequent_indent=indent,
+        break_long_words=is_breaking,
+        break_on_hyphens=False,
+        replace_whitespace=False,
+    )
+    return [part.replace(_KEPT_GAP, " ") for part in parts] or [""]
+
+
+def keep_units(text: str, gap: str, most: int | None = None) -> str:
+    """Put `gap` for the space between a number and its unit, unless both have more than `most` letters."""
+    return _QUANTITY.sub(
+        lambda found: found[0] if most and len(found[0]) > most else f"{found[1]}{gap}{found[2]}", text
+    )
+
+
+_KEPT_GAP = "\x00"
+"""Stands for a space at which no line ends; no plain text has it."""
+_UNITS = "%|A|Hz|kHz|K|N|Nm|bit|bytes|cm|deg|h|kg|m|min|mm|ms|rad|s|µs"
+_QUANTITY = re.compile(rf"(?<!\S)(\S*\d) ((?:{_UNITS})(?!\w)\S*)")
 _MARKS = {
     **dict.fromkeys(("FAILED", "error:", "fault:", "adacd-hil:", "firmware-sim:"), 31),
     **dict.fromkeys(("WARNING", "warning:"), 33),
@@ -263,7 +283,11 @@ def has_colour(stream: "TextIO | Terminal") -> bool:
 
 def write_line(stream: TextIO, text: str, is_over: bool, has_end: bool) -> None:
     """Write a line, over the one that the cursor is in where `is_over`; without `has_end` the cursor stays in it."""
-    shown = f"{for_people(text, stream)}{_LINE_END}" if has_end else plain(text)[: (terminal_columns(stream) or 80) - 1]
+    shown = (
+        f"{for_people(text, stream)}{_LINE_END}"
+        if has_end
+        else plain(text)[: (terminal_columns(stream) or _COLUMNS) - 1]
+    )
     write_screen(f"{_ERASE_LINE if is_over else ''}{shown}", stream)
 
 

@@ -69,6 +69,21 @@ def test_a_cell_without_room_goes_on_below_between_words() -> None:
     assert fit_table(lines, width=30) == ["   found", "a  a sentence that is longer", "   than the terminal is wide"]
 
 
+def test_a_number_has_its_unit_in_the_same_line_where_both_have_room() -> None:
+    lines = [("run", "certificate"), ("a", "certified after 2.0 s"), ("b", "a threshold of 0.002 rad/s, 3 times")]
+    assert fit_table(lines, width=23) == [
+        "run  certificate",
+        "a    certified after",
+        "     2.0 s",
+        "b    a threshold of",
+        "     0.002 rad/s, 3",
+        "     times",
+    ]
+    assert fold("certified after 2.0 s", 20) == "certified after\n  2.0 s"
+    assert fold("certified after 2.0 sails", 20) == "certified after 2.0\n  sails"
+    assert fold("0.0000000002 rad/s", 16) == "0.0000000002\n  rad/s"
+
+
 def test_a_path_or_a_key_without_room_is_parted_at_its_joints() -> None:
     lines = [("a", "/home/someone/runs/2026-11-25T10-00-00/run.mcap"), ("b", "certified.position_torque_Nm")]
     assert fit_table(lines, width=31) == [

@@ -10,7 +10,6 @@ The size of a report is bounded, whatever the length of the run. The tables as C
 
 import hashlib
 import math
-import re
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from functools import cache
@@ -22,6 +21,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from adacd_hil.analysis.logged_run import StretchOfRun
 from adacd_hil.analysis.score.metrics import Beside, Metrics, ReportedContact
 from adacd_hil.analysis.score.wording import NONE, number_text, pair_text, signs_text, why_not_found, yes_text
+from adacd_hil.terminal import keep_units
 
 TRACED_CONTACTS: Final = 60
 
@@ -47,8 +47,6 @@ MARKS: Final = 1_500
 
 
 _PACKAGE: Final = "adacd_hil.analysis.report"
-_UNIT: Final = re.compile(r"(?<=\d) (?=(?:s|kg|%)(?!\w))")
-"""The space between a number and its unit, where a line must not end."""
 
 
 class Heading(NamedTuple):
@@ -112,7 +110,7 @@ def _environment() -> Environment:
     )
     bounds = {"ADAPTATIONS": ADAPTATIONS, "CONTACTS": CONTACTS, "NOTICES": NOTICES, "SECTIONS": SECTIONS}
     environment.globals["bounds"] = bounds
-    environment.filters |= {"number": number_text, "keep_units": lambda text: _UNIT.sub("\u00a0", text)}
+    environment.filters |= {"number": number_text, "keep_units": lambda text: keep_units(text, "\u00a0")}
     environment.policies["json.dumps_kwargs"] = {
         "ensure_ascii": False, "allow_nan": False, "separators": (",", ":"),
     }  # fmt: skip
