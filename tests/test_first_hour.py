@@ -15,6 +15,7 @@ from documents import ROOT
 sys.path.insert(0, str(ROOT / "tools"))
 import first_hour
 from first_hour import Played, Step, Way, concepts, judge, logical_lines, play, read_way
+from long_cases import long_but
 
 pytestmark = pytest.mark.slow
 
@@ -67,7 +68,7 @@ def not_typed_here(text: str, folder: Path) -> str:
     return why
 
 
-@pytest.mark.parametrize("name", first_hour.WAYS)
+@pytest.mark.parametrize("name", long_but(2, ("arm", "recordings", "see")))  # the demo has tests of its own
 def test_a_newcomer_gets_there_by_the_text_alone(name: str, tmp_path: Path) -> None:
     way = read_way(name)
     play(way, tmp_path, newcomer_folder(tmp_path, LASTS_S[name]), lambda text: not_typed_here(text, tmp_path))
