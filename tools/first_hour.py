@@ -10,6 +10,8 @@ before it, and it must end with exit status 0. The way with an arm is played wit
 
 The table has, by way: commands, questions, minutes of machine and of reader (200 words a minute, half a minute a
 command and a question), and the terms of docs/glossary.md in the text before the first run of what is one's own.
+
+Exit status: 0 a newcomer gets there, 1 one would give up, or the guest has not started; 2 wrong usage.
 """
 
 import argparse
@@ -36,6 +38,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from documented_commands import command_complaints, split_commands  # noqa: E402
 from documents import Piece, parse_document  # noqa: E402
+
+from adacd_hil.table_layout import fit_table  # noqa: E402
 
 SECTION = "Three ways to begin"
 WAYS = {"see": "See it.", "recordings": "I have recordings", "arm": "I have an arm"}
@@ -380,10 +384,8 @@ def as_table(ways: list[Way]) -> str:
             f"{way.minutes:.0f}", f"{max((step.silence_s for step in typed), default=0.0):.0f}", len(way.concepts),
         )  # fmt: skip
         rows.append((way.name, *map(str, numbers)))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    lines += [f"{way.name}: {', '.join(way.concepts)}" for way in ways]
-    return "\n".join([*lines, *(line for way in ways for line in way.complaints)])
+    lines = [f"{way.name}: {', '.join(way.concepts)}" for way in ways]
+    return "\n".join([*fit_table(rows), *lines, *(line for way in ways for line in way.complaints)])
 
 
 def main() -> int:
@@ -394,6 +396,8 @@ def main() -> int:
     parser.add_argument("--in", dest="folder", type=Path, help="a clone that is installed, with an arm to be on can0")
     parser.add_argument("--json", action="store_true", help="print all as JSON")
     arguments = parser.parse_args()
+    if unknown := [name for name in arguments.ways if name not in WAYS]:
+        parser.error(f"{unknown[0]} is none of {', '.join(WAYS)}")
     ways = [read_way(name) for name in arguments.ways or WAYS]
     for way in ways:
         if arguments.folder is not None:

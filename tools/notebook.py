@@ -4,6 +4,8 @@
 
 Cells are plain Python here, without IPython's magics, so no Jupyter has to be installed. They run in the notebook's
 folder. A test runs them as well, and compares what they print.
+
+Exit status: 0 stored, 1 a cell has failed, with its traceback; 2 wrong usage.
 """
 
 import argparse
