@@ -64,6 +64,13 @@ def test_an_arm_with_all_the_evidence_is_fitted():
 )
 def test_with_any_part_missing_it_is_not(changes):
     assert not termination.is_complete(K, fitted_arm(**changes))
+    assert len(missing(fitted_arm(**changes))) == 1
+
+
+def test_motion_that_excites_too_little_or_leaves_parameters_alike_is_named_with_value_and_bound():
+    first, second = missing(fitted_arm(excitation=1e-5, condition=9.4e5))
+    assert first.startswith("the motion excites the parameters by 1e-05 Nm² s, certified.excitation_Nm2s = 5e-05")
+    assert second.startswith("the parameters can't be told apart: condition 9.4e+05, certified.condition = 1e+05")
 
 
 def test_a_payload_needs_neither_travel_nor_excitation_but_certain_parameters():

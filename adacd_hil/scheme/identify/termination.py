@@ -187,7 +187,21 @@ def describe_missing(k: Any, m: Any, names: tuple[str, ...], units: dict[str, st
     lines = []
     joints = m["q_low"].shape[0]
     travel, speed = float(np.degrees(k["travel_rad"])), float(np.degrees(k["velocity_rad_s"]))
+    enough_samples = k["fit_cycles"][int(m["is_payload"])]
+    if m["samples"] < enough_samples:
+        lines.append(f"{m['samples']:.0f} samples in a row are undisturbed, {enough_samples:.0f} needed")
     if m["is_payload"] == 0.0:
+        if not m["excitation"] >= k["excitation_Nm2s"]:
+            lines.append(
+                f"the motion excites the parameters by {m['excitation']:.2g} Nm² s, certified.excitation_Nm2s = "
+                f"{k['excitation_Nm2s']:.2g} needed: move the arm further and faster"
+            )
+        if not m["condition"] <= k["condition"]:
+            lines.append(
+                f"the parameters can't be told apart: condition {m['condition']:.2g}, certified.condition = "
+                f"{k['condition']:.2g} allowed: a motion that shows each of them, or a model with fewer "
+                "(estimator.gravity of an arm that hardly feels it)"
+            )
         for i in range(joints):
             travelled = max(float(np.degrees(m["q_high"][i] - m["q_low"][i])), 0.0)
             if not travelled >= travel:
