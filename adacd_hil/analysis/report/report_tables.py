@@ -28,7 +28,15 @@ from adacd_hil.analysis.score.metrics import (
     Residual,
     TimingEvidence,
 )
-from adacd_hil.analysis.score.wording import NONE, number_text, pair_text, percent_text, rate_sentence, signed_text
+from adacd_hil.analysis.score.wording import (
+    NONE,
+    number_of,
+    number_text,
+    pair_text,
+    percent_text,
+    rate_sentence,
+    signed_text,
+)
 from adacd_hil.records import PARAMETER_UNITS
 
 
@@ -236,8 +244,7 @@ def _times_table(evidence: TimingEvidence) -> Table:
     rows = [_time_row(quantity, evidence, PERCENTILE_NAMES) for quantity in QUANTITIES if not quantity.is_reserve]
     reaction = evidence.reaction
     if reaction is not None:
-        words = f"{reaction.count} reaction{'' if reaction.count == 1 else 's'}"
-        label = ("Reaction", f"detection decision to first reaction frame, {words}")
+        label = ("Reaction", f"detection decision to first reaction frame, {number_of(reaction.count, 'reaction')}")
         rows.append((label, *_values(reaction.percentiles, PERCENTILE_NAMES)))
     head = [None, *(Cell(name, "head") for name in LOW_PERCENTILE_NAMES)]
     rows += [head, *(_time_row(quantity, evidence, LOW_PERCENTILE_NAMES) for quantity in reserves)]

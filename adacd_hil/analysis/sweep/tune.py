@@ -30,7 +30,7 @@ from adacd_hil.analysis.logged_run import Progress
 from adacd_hil.analysis.replay.replay import replay_many
 from adacd_hil.analysis.replay.replayed_outcome import Replay
 from adacd_hil.analysis.score.judge import least_rate_per_h
-from adacd_hil.analysis.score.wording import delay_figures, delays_phrase, rate_phrase, share_phrase
+from adacd_hil.analysis.score.wording import delay_figures, delays_phrase, number_of, rate_phrase, share_phrase
 from adacd_hil.analysis.sweep.tune_candidates import (
     candidates,
     name_of,
@@ -74,7 +74,7 @@ def tune(
 
     Raises LogError, ConfigError, CodecError, TooLittleMotionError.
     """
-    progress(f"reading {len(paths)} log{'' if len(paths) == 1 else 's'}")
+    progress(f"reading {number_of(len(paths), 'log')}")
     logs = read_logs(paths, config, stretch, progress)
     has_truth = any(log.windows is not None for log in logs)
     notes = [] if has_truth else ["no truth.mcap beside the logs: contacts and delays are not known, and an alarm of a "

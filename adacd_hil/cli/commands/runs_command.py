@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, show
+from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, format_table, show
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.progress_lines import Progress
@@ -241,9 +241,8 @@ def _as_text(found: list["RunSummary"]) -> str:
 def _trend_text(made: "Trend") -> str:
     from adacd_hil.analysis.runs.run_table import HEAD, NUMBERS, cells
 
-    count = len(made.runs)
     left = f", {len(made.left_out)} left out" if made.left_out else ""
-    lines = [in_line(line) for line in (f"{made.arm}: {count} run{'' if count == 1 else 's'}{left}", made.sentence)]
+    lines = [in_line(line) for line in (f"{made.arm}: {counted(len(made.runs), 'run')}{left}", made.sentence)]
     lines += [in_line(line) for line in made.further]
     lines += [in_line(f"left out: {run.name}: {run.status}: {run.verdict}") for run in made.left_out]
     if made.runs:
