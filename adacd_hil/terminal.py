@@ -63,7 +63,9 @@ def terminal_columns(stream: "TextIO | Terminal | None" = None) -> int | None:
     columns = int(told) if told.isdecimal() and len(told) <= _MOST_DIGITS else 0
     if not _is_terminal(stream):
         return max(columns, _LEAST_COLUMNS) if columns and is_output else None
-    return max(columns or os.get_terminal_size(stream.fileno()).columns or _COLUMNS, _LEAST_COLUMNS)
+    with contextlib.suppress(OSError):  # it has hung up since
+        columns = columns or os.get_terminal_size(stream.fileno()).columns
+    return max(columns or _COLUMNS, _LEAST_COLUMNS)
 
 
 def _is_terminal(stream: "TextIO | Terminal") -> bool:

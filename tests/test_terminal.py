@@ -299,6 +299,13 @@ def test_columns_that_are_none_are_not_heard(told: str, monkeypatch) -> None:
     assert terminal_columns() is None
 
 
+def test_a_terminal_that_hangs_up_while_it_is_asked_for_its_width_is_no_error(monkeypatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    stream = io.StringIO()  # without a descriptor: asking raises OSError
+    monkeypatch.setattr(stream, "isatty", lambda: True)
+    assert terminal_columns(stream) == 80
+
+
 def test_errors_are_lines_for_programs_though_columns_are_set(monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "40")
     assert terminal_columns(io.StringIO()) is None
