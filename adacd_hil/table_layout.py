@@ -14,8 +14,8 @@ from adacd_hil.terminal import in_line, wrap_words
 _GAP = "  "
 _LEAST_ROOM, _LEAST_CUT = 16, 8
 """Letters to which a column of words may shrink while others keep theirs."""
-_PIECES = re.compile(r"[^/_.,=:;]*[/_.,=:;]+|[^/_.,=:;]+")
-"""Of a word that has no room in a line: a path, a key."""
+_JOINT = re.compile(r"(?<=[/_,=:;])|(?<=\.)(?!\d)")
+"""Where a word that has no room in a line is parted: a path, a key, but not a number."""
 
 
 def fit_table(
@@ -57,7 +57,7 @@ def _sum(widths: Sequence[int]) -> int:
 def _least_room(column: int, lines: Sequence[Sequence[str]]) -> int:
     """Return to how many letters a column of words may shrink: words of the first stay whole, others have joints."""
     words = (word for line in lines for word in line[column].split())
-    pieces = (piece for word in words for piece in (_PIECES.findall(word) if column else [word]))
+    pieces = (piece for word in words for piece in (_JOINT.split(word) if column else [word]))
     return max(_LEAST_ROOM, *map(len, pieces), 0)
 
 
@@ -104,13 +104,14 @@ def _wrapped(text: str, width: int, indent: str) -> list[str]:
     indent = indent if len(indent) < width else ""
     room = width - len(indent)
     words = (word if len(word) <= room else _broken(word, room) for word in text.split(" "))
-    return wrap_words(" ".join(words), width, indent, is_breaking=True)
+    first, *others = wrap_words(" ".join(words), room, "", is_breaking=True)
+    return [first, *(f"{indent}{other}" for other in others)]
 
 
 def _broken(word: str, room: int) -> str:
     """Part a word that has no room in a line where a path or a key has its joints."""
     parts = [""]
-    for piece in _PIECES.findall(word):
+    for piece in _JOINT.split(word):
         if len(parts[-1]) + len(piece) > room:
             parts.append("")
         parts[-1] += piece

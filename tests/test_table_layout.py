@@ -69,6 +69,16 @@ def test_a_cell_without_room_goes_on_below_between_words() -> None:
     assert fit_table(lines, width=30) == ["   found", "a  a sentence that is longer", "   than the terminal is wide"]
 
 
+def test_a_key_that_is_parted_has_no_space_in_it_and_a_number_is_not_parted() -> None:
+    lines = [("key", "value"), ("arm.cad_theta", "[0.178607, 0.036855]")]
+    assert fit_table(lines, width=20) == [
+        "key        value",
+        "arm.       [0.178607",
+        "  cad_     ,",
+        "  theta    0.036855]",
+    ]
+
+
 def test_a_number_has_its_unit_in_the_same_line_where_both_have_room() -> None:
     lines = [("run", "certificate"), ("a", "certified after 2.0 s"), ("b", "a threshold of 0.002 rad/s, 3 times")]
     assert fit_table(lines, width=23) == [
