@@ -32,7 +32,7 @@ _EXPLAINED: Final = 0.004
 _UNEXPLAINED: Final = 1e-4
 """Least share as told: what explains all but 1 % of the torque is right. Mistakes leave 2 % and more."""
 _JUDGED_EVERY: Final = 4
-_ROUNDS: Final = 2
+_ROUNDS: Final = 3
 """Verdicts in a row that have to agree."""
 _SUSPECT_BLOCKS: Final = 6
 _NEARLY: Final = 1.2
