@@ -24,9 +24,12 @@ def quarter(x):
     return halve(halve(x))
 
 
-@pytest.mark.skipif(
+needs_compiler = pytest.mark.skipif(
     not hasattr(halve, "py_func"), reason="NUMBA_DISABLE_JIT is set: nothing is compiled, so nothing is counted"
 )
+
+
+@needs_compiler
 def test_the_total_is_a_function_and_all_that_it_calls() -> None:
     assert list(functions_below([quarter], is_all=True)) == [f"{__name__}.quarter", f"{__name__}.halve"]
     below = functions_below([paper_kernel.step], is_all=True).values()
@@ -34,9 +37,7 @@ def test_the_total_is_a_function_and_all_that_it_calls() -> None:
     assert paper_kernel.run_paper not in set(below)
 
 
-@pytest.mark.skipif(
-    not hasattr(halve, "py_func"), reason="NUMBA_DISABLE_JIT is set: nothing is compiled, so nothing is counted"
-)
+@needs_compiler
 def test_whoever_listens_is_told_how_far_compiling_is(monkeypatch: pytest.MonkeyPatch) -> None:
     for function in (halve, quarter):
         monkeypatch.setattr(function._cache, "load_overload", lambda *_: None)  # an empty cache
