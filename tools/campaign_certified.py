@@ -7,7 +7,7 @@ from campaign_schemes import ADAPTING, ARMED, TESTING, Outcome
 from lab import PERIOD_S, Motion, Recording, paper_motion
 from played_record import play_record
 
-from adacd_hil.control.reference import Excitation
+from adacd_hil.control.motions import Excitation
 from adacd_hil.records import JOINTS, SchemeState
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.control.reference import PEAK_SPEED_FACTOR, SHORTEST_APPROACH_S, corner_to_corner, evaluate, to_rest
+from adacd_hil.control.motions import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
+from adacd_hil.control.reference import SHORTEST_APPROACH_S
 from adacd_hil.settings.run_settings import TrajectorySettings
 
 PERIOD_S = 1e-3

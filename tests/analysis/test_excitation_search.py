@@ -11,7 +11,7 @@ from scipy.signal import lsim
 
 from adacd_hil.analysis.excitation_search import TOLERANCE, NoExcitationError, Search
 from adacd_hil.cli.main import cli
-from adacd_hil.control.reference import Excitation
+from adacd_hil.control.motions import Excitation
 from adacd_hil.scheme.kernel.certified_memory import constants_of
 from adacd_hil.scheme.model.regressor import regressor
 from adacd_hil.settings.configuration import Settings, load_settings

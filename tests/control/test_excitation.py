@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adacd_hil.control.reference import Excitation
+from adacd_hil.control.motions import Excitation
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import parse
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adacd_hil.control.reference import corner_to_corner, evaluate, to_rest
+from adacd_hil.control.motions import corner_to_corner, evaluate, to_rest
 
 AMPLITUDE = np.radians([30.0, 60.0])
 AS_PRINTED_S = np.array([1.125, 4.5])

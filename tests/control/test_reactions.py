@@ -10,7 +10,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from contact_rig import Rig, Sample, reports, rig_settings
 
 from adacd_hil.control.controller import Floating
-from adacd_hil.control.reference import Admittance, Reference, corner_to_corner
+from adacd_hil.control.motions import Admittance, corner_to_corner
+from adacd_hil.control.reference import Reference
 from adacd_hil.records import ArmState, ContactKind, FaultReason, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 from firmware_sim.arm.touch_settings import BodySettings, ContactSettings

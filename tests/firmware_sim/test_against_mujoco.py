@@ -8,7 +8,7 @@ import pytest
 from general_arm import NOBODY, GeneralArm, without_friction
 from long_cases import long_but
 
-from adacd_hil.control.reference import corner_to_corner
+from adacd_hil.control.motions import corner_to_corner
 from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.plant import CURRENT_LOOP_RAD_S, mass_matrix
 from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_table

@@ -10,7 +10,7 @@ import numpy as np
 from planar_arm import ENCODER_LSB_RAD, THETA, TORQUE_LSB_NM, TORQUE_NOISE_NM, VELOCITY_LSB_RAD_S, advance
 
 from adacd_hil.compiled import compiled
-from adacd_hil.control.reference import Excitation
+from adacd_hil.control.motions import Excitation
 from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.pipeline import Pipeline

@@ -7,7 +7,7 @@ import pytest
 from excited_arm import PERIOD_S, SETTINGS, record
 from planar_arm import PAYLOAD_1KG, THETA
 
-from adacd_hil.control.reference import Excitation
+from adacd_hil.control.motions import Excitation
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme.detect.margin import MarginWatch
 from adacd_hil.scheme.pipeline.pipeline import CalmStretch, Pipeline, arm_at, layout_of

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from adacd_hil.cli.output import format_table
-from adacd_hil.control.reference import evaluate, to_rest
+from adacd_hil.control.motions import evaluate, to_rest
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.settings.configuration import Settings, load_settings
