@@ -9,8 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.control.motions import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
+from adacd_hil.compiled import compiled
+from adacd_hil.control.motions import PEAK_ACCELERATION_FACTOR, PEAK_SPEED_FACTOR, corner_to_corner
 from adacd_hil.control.reference import SHORTEST_APPROACH_S
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.settings.run_settings import TrajectorySettings
 
 PERIOD_S = 1e-3
@@ -21,7 +23,6 @@ BRAKE_S = 0.4
 """In which a motion that is broken off comes to rest."""
 ACCELERATION_RAD_S2 = np.radians(500.0)
 """Bound of random moves: not twice what the paper's motion of joint 1 has."""
-_PEAK_ACCELERATION_FACTOR = 10.0 / np.sqrt(3.0)  # of a rest-to-rest quintic, over travel / duration²
 _SYNCHRONOUS_HALF_PERIOD_S = (2.25, 2.25)
 
 
@@ -141,6 +142,34 @@ def _lead(before: Motion, end: NDArray[np.float64], speed_rad_s: float) -> Motio
     return _way(q, dq, ddq, end, max(duration_s, SHORTEST_APPROACH_S))
 
 
+def to_rest(q: Vector, dq: Vector, ddq: Vector, q_end: Vector, duration_s: float) -> Vector:
+    """Return the quintic's coefficients (6, 2), lowest order first, from (q, dq, ddq) to rest at `q_end`."""
+    T = duration_s
+    travel = q_end - q
+    return np.vstack(
+        [
+            q,
+            dq,
+            ddq / 2.0,
+            (20.0 * travel - 12.0 * dq * T - 3.0 * ddq * T**2) / (2.0 * T**3),
+            (-30.0 * travel + 16.0 * dq * T + 3.0 * ddq * T**2) / (2.0 * T**4),
+            (12.0 * travel - 6.0 * dq * T - ddq * T**2) / (2.0 * T**5),
+        ]
+    )
+
+
+@compiled
+def evaluate(coefficients: Vector, elapsed_s: float, q: Vector, dq: Vector, ddq: Vector) -> None:
+    """Fill the motion of a quintic at `elapsed_s`."""
+    t = elapsed_s
+    for i in range(JOINTS):
+        c0, c1, c2 = coefficients[0, i], coefficients[1, i], coefficients[2, i]
+        c3, c4, c5 = coefficients[3, i], coefficients[4, i], coefficients[5, i]
+        q[i] = c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
+        dq[i] = c1 + t * (2.0 * c2 + t * (3.0 * c3 + t * (4.0 * c4 + t * 5.0 * c5)))
+        ddq[i] = 2.0 * c2 + t * (6.0 * c3 + t * (12.0 * c4 + t * 20.0 * c5))
+
+
 def _way(
     q: NDArray[np.float64], dq: NDArray[np.float64], ddq: NDArray[np.float64], end: NDArray[np.float64], lasts_s: float
 ) -> Motion:
@@ -170,7 +199,7 @@ def _move(
 ) -> Motion:
     """Move by quintics that keep to peak speeds (2,) and ACCELERATION_RAD_S2; the quicker joint waits at its end."""
     travel = end - start
-    by_acceleration = np.sqrt(_PEAK_ACCELERATION_FACTOR * np.abs(travel) / ACCELERATION_RAD_S2)
+    by_acceleration = np.sqrt(PEAK_ACCELERATION_FACTOR * np.abs(travel) / ACCELERATION_RAD_S2)
     duration_s = np.maximum(PEAK_SPEED_FACTOR * np.abs(travel) / speed, by_acceleration) + PERIOD_S
     if is_synchronous:
         duration_s[:] = duration_s.max()

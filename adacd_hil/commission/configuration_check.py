@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import NamedTuple
 
 from adacd_hil.commission.host_checks import Check, CheckOutcome, ok, warning
+from adacd_hil.control.motions import motion_problems
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
 from adacd_hil.settings.configuration import (
@@ -51,6 +52,8 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
     if problems := find_problems(Settings, table):
         return ConfigurationFindings(problems, [], None)
     settings = parse(Settings, table)
+    if problems := motion_problems(settings):
+        return ConfigurationFindings([*problems, *_radians(settings)], [], None)
     if problems := _device_problems(settings):
         return ConfigurationFindings(problems, [], None)
     try:
@@ -118,8 +121,7 @@ def _device_problems(settings: Settings) -> list[str]:
 
 _BOUNDS = (
     ("arm.torque_limit_Nm", "arm.rated_torque_Nm", "Nm", ""),
-    ("trajectory.amplitude_deg", "arm.position_limit_deg", "deg", "; the motion would end in a fault"),
-    ("reaction.velocity_limit_deg_s", "arm.velocity_limit_deg_s", "deg/s", "; a withdrawal would end in a fault"),
+    ("reaction.velocity_limit_deg_s", "arm.velocity_limit_deg_s", "deg/s", "; a withdrawal keeps to the smaller one"),
 )
 """Keys of pairs that must not be larger than those of other keys, and what comes of it."""
 

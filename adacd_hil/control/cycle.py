@@ -18,7 +18,7 @@ from adacd_hil.control.first_motion import FirstMotion, is_told
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator, RunNarration
 from adacd_hil.control.pacing import DetectorTiming, Pacer
-from adacd_hil.control.reference import Reference
+from adacd_hil.control.reference import MOTION, Reference
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import DataShares, DataWatch
 from adacd_hil.device.arm_watch import ArmWatch, Recurrence
@@ -115,6 +115,7 @@ class Cycle:
             self._exchange.events,
             self._timing,
             self._first_motion,
+            self._reference,
             self._pipeline,
         )
         self._state = SchemeState.INIT
@@ -261,7 +262,7 @@ class Cycle:
         for source in self._sources:
             for event in source.take_events():
                 recorder.event(t_ns, event)
-                if event.name in CERTIFICATE_EVENTS or is_told(event):
+                if event.name in CERTIFICATE_EVENTS or event.name == MOTION or is_told(event):
                     self._narration.event(t_ns, event.told)
         if output.state is not self._state:
             event = self._transition(output, arm)

@@ -1,6 +1,6 @@
-"""Laws of motion: quintics from corner to corner and to rest, the excitation's Fourier series, the admittance.
+"""Laws of motion: quintics, the excitation's Fourier series, the pace along a path, the admittance.
 
-Shapes: positions, velocities, accelerations (2,); coefficients (6, 2), lowest order first. Units: rad, s, Nm.
+Shapes: positions, velocities, accelerations (2,). Units: rad, s, Nm.
 """
 
 import math
@@ -31,39 +31,100 @@ def corner_to_corner(
         ddq[i] = travel * rate * rate * x * (60.0 + x * (-180.0 + 120.0 * x))
 
 
-def to_rest(q: Vector, dq: Vector, ddq: Vector, q_end: Vector, duration_s: float) -> Vector:
-    """Return the coefficients (6, 2) that lead from (q, dq, ddq) to rest at `q_end` in `duration_s`."""
-    T = duration_s
-    travel = q_end - q
-    return np.vstack(
-        [
-            q,
-            dq,
-            ddq / 2.0,
-            (20.0 * travel - 12.0 * dq * T - 3.0 * ddq * T**2) / (2.0 * T**3),
-            (-30.0 * travel + 16.0 * dq * T + 3.0 * ddq * T**2) / (2.0 * T**4),
-            (12.0 * travel - 6.0 * dq * T - ddq * T**2) / (2.0 * T**5),
-        ]
-    )
+PEAK_ACCELERATION_FACTOR = 10.0 / math.sqrt(3.0)
+"""Peak acceleration of a rest-to-rest quintic over travel / duration²."""
 
 
-@compiled
-def evaluate(coefficients: Vector, elapsed_s: float, q: Vector, dq: Vector, ddq: Vector) -> None:
-    """Fill the motion of a quintic at `elapsed_s`."""
-    t = elapsed_s
-    for i in range(JOINTS):
-        c0, c1, c2 = coefficients[0, i], coefficients[1, i], coefficients[2, i]
-        c3, c4, c5 = coefficients[3, i], coefficients[4, i], coefficients[5, i]
-        q[i] = c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
-        dq[i] = c1 + t * (2.0 * c2 + t * (3.0 * c3 + t * (4.0 * c4 + t * 5.0 * c5)))
-        ddq[i] = 2.0 * c2 + t * (6.0 * c3 + t * (12.0 * c4 + t * 20.0 * c5))
+class QuinticMove:
+    """A straight move in joint space from rest to rest, all joints at once: the slowest one says how long it takes.
+
+    Speed and acceleration stay within their limits, and each position stays between start and end.
+    """
+
+    def __init__(
+        self, start: Vector, end: Vector, speed_rad_s: Vector, acceleration_rad_s2: Vector, shortest_s: float
+    ) -> None:
+        """Plan. start, end (2,); limits (2,); shortest_s: least duration, s."""
+        self._start, self._end, self._travel = start.copy(), end.copy(), end - start
+        distance = np.abs(self._travel)
+        by_speed_s = PEAK_SPEED_FACTOR * distance / speed_rad_s
+        by_acceleration_s = np.sqrt(PEAK_ACCELERATION_FACTOR * distance / acceleration_rad_s2)
+        self.duration_s = max(shortest_s, float(by_speed_s.max()), float(by_acceleration_s.max()))
+
+    def evaluate(self, elapsed_s: float, q: Vector, dq: Vector, ddq: Vector) -> None:
+        """Fill the motion (2,) at this time since the start; the end from the end on."""
+        if elapsed_s >= self.duration_s:
+            q[:], dq[:], ddq[:] = self._end, 0.0, 0.0
+            return
+        x, rate = elapsed_s / self.duration_s, 1.0 / self.duration_s
+        q[:] = self._start + self._travel * (x * x * x * (10.0 + x * (-15.0 + 6.0 * x)))
+        dq[:] = self._travel * (rate * x * x * (30.0 + x * (-60.0 + 30.0 * x)))
+        ddq[:] = self._travel * (rate * rate * x * (60.0 + x * (-180.0 + 120.0 * x)))
+
+
+CHANGE_S = 0.15
+"""Shortest change of pace. From 100 °/s to rest it takes 0.2 s, for 700 °/s² leave no more."""
+
+
+class Pace:
+    """The share of its planned speed with which the arm moves along a path.
+
+    A change of the share takes CHANGE_S, and longer where the path leaves less acceleration for it. Of each joint,
+
+        |share² ddq + dshare/dt dq| <= acceleration limit
+
+    So an arm that stops on its path stays on the path, within the path's speed, and within the acceleration limit.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._period_s = settings.bus.period_s
+        self._limit = np.radians(settings.reaction.acceleration_limit_deg_s2)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new path at full speed."""
+        self.share, self.change = 1.0, 0.0
+        """Share now, and by how much it changes, 1/s."""
+        self.lag_s = 0.0
+        """How far the arm is behind the plan, s."""
+        self._from = self._to = self._phase = 1.0
+
+    @property
+    def is_planned(self) -> bool:
+        """Whether the arm moves along the path as planned."""
+        return self.share == 1.0 and self.change == 0.0
+
+    def step(self, wanted: float, dq: Vector, ddq: Vector) -> None:
+        """Take the share one period closer to the wanted one. dq, ddq (2,): of the path as planned, at this place."""
+        if wanted != self._to:
+            self._from, self._to, self._phase = self.share, wanted, 0.0
+        before = self.share
+        if self._phase < 1.0:
+            self._phase = min(self._phase + self._phase_step(dq, ddq), 1.0)
+            x = self._phase
+            self.share = self._from + (self._to - self._from) * (x * x * (3.0 - 2.0 * x))
+        self.change = (self.share - before) / self._period_s
+        self.lag_s += (1.0 - self.share) * self._period_s
+
+    def _phase_step(self, dq: Vector, ddq: Vector) -> float:
+        """Return by how much of the change one period may take the share on."""
+        step, x = self._period_s / CHANGE_S, self._phase
+        steepest = min(max(x, 0.5), x + step)  # where d(share)/dx is largest in this period
+        slope = abs(self._to - self._from) * 6.0 * steepest * (1.0 - steepest)
+        largest = max(self.share, self._to) ** 2
+        for i in range(JOINTS):
+            room = max(float(self._limit[i]) - largest * abs(float(ddq[i])), 0.0)
+            needed = slope * abs(float(dq[i])) / CHANGE_S
+            if needed > room:
+                step = min(step, room / needed * self._period_s / CHANGE_S)
+        return step
 
 
 class Excitation:
     """The motion by which the certified scheme learns the arm: a short Fourier series per joint.
 
     It begins and ends at rest in the trajectory's start corner and moves both joints at once and both ways, so that no
-    combination of parameters stays hidden (`analysis.excitation` finds the coefficients).
+    combination of parameters stays hidden (`analysis.excitation_search` finds the coefficients).
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -75,6 +136,14 @@ class Excitation:
         self._rad_s = np.arange(1, self._sine.shape[1] + 1) * (2.0 * np.pi / period_s if period_s else 0.0)
         self._acceleration = self._rad_s**2
         self.is_on = bool(period_s and self._rad_s.size)
+
+    def peaks_deg(self) -> tuple[Vector, Vector, Vector]:
+        """Return the largest |q|, |dq| and |ddq| (2,) of a period in deg, deg/s and deg/s², at 1000 points of it."""
+        motion = np.zeros((1000, 3, JOINTS))
+        for row, elapsed_s in zip(motion, np.linspace(0.0, 2.0 * np.pi / self._rad_s[0], len(motion)), strict=True):
+            self.evaluate(float(elapsed_s), *row)
+        q, dq, ddq = np.degrees(np.max(np.abs(motion), axis=0))
+        return q, dq, ddq
 
     def evaluate(self, elapsed_s: float, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
         """Fill the desired motion (2,) at this time since its start; it goes on and on."""
@@ -97,7 +166,8 @@ class Admittance:
         wish = settings.reaction
         self._period_s = settings.bus.period_s
         self._mass, self._drag, self._deadband = wish.mass_kg_m2, wish.drag_Nm_s, wish.deadband_Nm
-        self._speed_limit = np.radians(wish.yield_limit_deg_s).tolist()
+        speed = np.minimum(np.radians(wish.yield_limit_deg_s), settings.arm.velocity_limit_rad_s)
+        self._speed_limit = speed.tolist()
         self._acceleration_limit = np.radians(wish.acceleration_limit_deg_s2).tolist()
         self._bound = (settings.arm.position_limit_rad - np.radians(wish.position_margin_deg)).tolist()
 
@@ -109,9 +179,43 @@ class Admittance:
             step = self._acceleration_limit[i] * self._period_s
             wanted = speed + self._period_s * (push - self._drag[i] * speed) / self._mass[i]
             limit = self._speed_limit[i]
-            room = max(self._bound[i] - math.copysign(float(q_d[i]), wanted * float(q_d[i])), 0.0)
-            limit = min(limit, math.sqrt(2.0 * self._acceleration_limit[i] * room))
+            room = self._bound[i] - math.copysign(float(q_d[i]), wanted * float(q_d[i]))
+            room -= (abs(speed) + step) * self._period_s  # what this period may still take of it
+            limit = min(limit, math.sqrt(2.0 * self._acceleration_limit[i] * max(room, 0.0)))
             new = min(max(min(max(wanted, -limit), limit), speed - step), speed + step)
             q_d[i] += 0.5 * (speed + new) * self._period_s
             dq_d[i] = new
             ddq_d[i] = (new - speed) / self._period_s
+
+
+_TOLERANCE = 1e-3
+"""Part by which an excitation may be over a limit: the search for it ends a little outside."""
+
+
+def motion_problems(settings: Settings) -> list[str]:
+    """Say of trajectory and excitation which limit of the arm they leave, a line each; empty if none."""
+    arm, trajectory = settings.arm, settings.trajectory
+    travel = 2.0 * np.array(trajectory.amplitude_deg)
+    half_period_s = np.array(trajectory.half_period_s)
+    needed = {
+        "`trajectory`": (
+            0.5 * travel,
+            PEAK_SPEED_FACTOR * travel / half_period_s,
+            PEAK_ACCELERATION_FACTOR * travel / half_period_s**2,
+        )
+    }
+    excitation = Excitation(settings)
+    if excitation.is_on:
+        needed["`excitation`"] = excitation.peaks_deg()
+    limits = (
+        ("arm.position_limit_deg", arm.position_limit_deg, "deg"),
+        ("arm.velocity_limit_deg_s", arm.velocity_limit_deg_s, "deg/s"),
+        ("reaction.acceleration_limit_deg_s2", settings.reaction.acceleration_limit_deg_s2, "deg/s²"),
+    )
+    return [
+        f"{name} takes joint {i + 1} to {peak[i]:.4g} {unit}, `{key}[{i}]` = {limit[i]:g} {unit}"
+        for name, peaks in needed.items()
+        for peak, (key, limit, unit) in zip(peaks, limits, strict=True)
+        for i in range(JOINTS)
+        if peak[i] > (1.0 + _TOLERANCE) * limit[i]
+    ]

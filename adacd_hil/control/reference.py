@@ -1,32 +1,37 @@
 """Where the arm should be: the desired motion in each state of the scheme.
 
-MONITOR follows the trajectory, ADAPT and CERTIFY the excitation where there is one, else the trajectory too, each
-approached from wherever the arm is; REACT does what the reaction says; STOPPED keeps to it, or holds; PAYLOAD and the
-end of a run park the arm in the trajectory's start corner; elsewhere the desired motion is the measured place. A run
-that ends while the arm reacts or is stopped does not move it: it ends there, or is parked when the stop has been
-acknowledged.
+MONITOR follows the trajectory, ADAPT and CERTIFY the excitation where there is one, else the trajectory too. REACT does
+what the reaction says. STOPPED keeps to it, or holds. PAYLOAD and the end of a run park the arm in the trajectory's
+start corner. Elsewhere the desired motion is the measured place. A run that ends while the arm reacts or is stopped
+does not move it: it ends there, or is parked when the stop has been acknowledged.
+
+**Limits.** The desired motion stays within the arm's position and velocity limits and the reaction's acceleration limit
+by construction. Trajectory and excitation are checked before the run. On the way to the corner the arm first comes to
+rest on the path that it is on (`Pace`), then goes straight (`QuinticMove`). Where there is no path, as after a
+reaction, it brakes with the acceleration limit. If it is too fast to stop before a position limit, it brakes all the
+same, and an event says so.
 
 Shapes: positions, velocities, accelerations (2,). Units: rad, s, Nm.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 
-from adacd_hil.control.motions import PEAK_SPEED_FACTOR, Admittance, Excitation, corner_to_corner, evaluate, to_rest
-from adacd_hil.records import JOINTS, ArmState, Reaction, SchemeOutput, SchemeState, Vector
+from adacd_hil.control.motions import Admittance, Excitation, Pace, QuinticMove, corner_to_corner, motion_problems
+from adacd_hil.records import JOINTS, ArmState, Event, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.contact.reaction import Withdrawal
-from adacd_hil.scheme.supervisor.supervisor import LEARNING, REACTING
+from adacd_hil.scheme.supervisor.supervisor import LEARNING, POWERED, REACTING
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError
 
 SHORTEST_APPROACH_S = 0.6
-"""Shortest way to the corner when it must also be stopped: from 100 °/s this stays below 400 °/s²."""
+"""Shortest way to the corner."""
 PARK_SETTLE_S = 0.3
 """How long a parked arm settles before its drives are disabled: three periods of joint 2's swing with 1 kg, 0.1 s."""
 AT_CORNER_RAD = 1e-3
 """Nearer than this the trajectory starts at once: a fifth of a degree, ten encoder steps of the noise."""
-SLOWING_S = 0.1
-"""From full speed along the path to none: 100 °/s then brakes with 1000 °/s²."""
 THROWN_S = 0.15
 """How long after a contact a blow may move the arm off its way: 5 times a blow against a chest."""
 THROWN_rad_s = 0.2
@@ -40,21 +45,30 @@ LOST_CYCLES = 5
 ENDING = 0.6
 """A blow ends when its torque has fallen to this part of its largest."""
 
+MOTION = "motion"
+"""Name of the events that say what the desired motion can't keep."""
+
 _FOLLOWING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
 _ON_PATH = (Reaction.NONE, Reaction.SLOW_DOWN)
 
-Segment = Callable[[float], None]
+Path = Callable[[float, Vector, Vector, Vector], None]
+"""Fills q, dq, ddq (2,) of a planned motion at a time since its start, s."""
 
 
 class Reference:
     """The desired motion. `q_d`, `dq_d`, `ddq_d` (2,) are views of the control block that it fills."""
 
     def __init__(self, settings: Settings, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
+        """Prepare. Raises ConfigError if trajectory or excitation leave the arm's limits."""
+        if problems := motion_problems(settings):
+            raise ConfigError("; ".join(problems))
         self._settings = settings
         self._period_s = settings.bus.period_s
         self._amplitude = np.radians(settings.trajectory.amplitude_deg)
         self._half_period_s = np.array(settings.trajectory.half_period_s)
-        self._approach_rad_s = float(np.radians(settings.trajectory.approach_deg_s))
+        approach = np.full(JOINTS, np.radians(settings.trajectory.approach_deg_s))
+        self._approach_rad_s = np.minimum(approach, settings.arm.velocity_limit_rad_s)
+        self._approach_rad_s2 = np.radians(settings.reaction.acceleration_limit_deg_s2)
         self._corner = -self._amplitude
         self._follows_thrown = settings.reaction.start == "measured"
         self._has_model = False
@@ -65,34 +79,35 @@ class Reference:
         self._state = SchemeState.INIT
         self._reaction = Reaction.NONE
         self._excitation = Excitation(settings)
-        self._segment: Segment | None = None
+        self._path: Path | None = None
+        self._pace = Pace(settings)
         self._start_cycle = 0
-        self._follows_at_cycle: int | None = None
-        self._rate = 1.0
-        self._lag_s = 0.0
+        self._is_stopping = False
+        """Whether the arm comes to rest to go to the corner then."""
+        self._arrival_cycle: int | None = None
+        """When a way to the corner ends that has begun."""
         self._push = np.zeros(JOINTS)
         self._contact_q = np.zeros(JOINTS)
         self._strongest = 0.0
         self._contact_cycle = 0
-        self._is_parking = False
-        self._park_end_cycle = 0
+        self._is_exciting = self._is_parking = False
         self._waited_cycles = 0
+        self._events: list[Event] = []
+        self._beyond: set[int] = set()
+        """Joints that brake beyond their position limit in this state; said once."""
 
     def compile(self) -> None:
-        """Plan and run every kind of motion once, so that nothing happens for the first time in the cycle."""
-        zeros = np.zeros(2)
-        self._follow(0.0)
+        """Evaluate every kind of motion once, so that nothing compiles in the cycle."""
+        zeros, scratch = np.zeros(JOINTS), np.zeros((3, JOINTS))
+        self._follow(0.0, *scratch)
         if self._excitation.is_on:
-            self._excite(0.0)
-        for plan in (
-            lambda: self._approach(0),
-            lambda: self._withdraw(Withdrawal(self._settings, zeros, zeros, np.ones(2)), 0),
-        ):
-            plan()
-            assert self._segment is not None
-            self._segment(0.0)
-        self._segment = None
-        self._q_d[:] = self._dq_d[:] = self._ddq_d[:] = 0.0
+            self._excitation.evaluate(0.0, *scratch)
+        Withdrawal(self._settings, zeros, zeros, np.ones(JOINTS)).evaluate(0.0, *scratch)
+
+    def take_events(self) -> list[Event]:
+        """Return what is worth a line since the last call."""
+        events, self._events = self._events, []
+        return events
 
     @property
     def is_floating(self) -> bool:
@@ -103,40 +118,41 @@ class Reference:
         """From the next step on, go to the start corner and stay there; stay where it is while the arm is stopped."""
         self._is_parking = True
         if self._state not in REACTING:
-            self._segment = None
+            self._approach()
 
     def is_parked(self, cycle: int) -> bool:
         """Whether a commanded parking has come to its end."""
         if not self._is_parking or self._state is SchemeState.REACT:
             return False
-        return self._state is SchemeState.STOPPED or (self._segment is not None and cycle >= self._park_end_cycle)
+        if self._state is SchemeState.STOPPED:
+            return True
+        settle_cycles = round(PARK_SETTLE_S / self._period_s)
+        return self._arrival_cycle is not None and cycle >= self._arrival_cycle + settle_cycles
 
     def step(self, arm: ArmState, output: SchemeOutput) -> None:
         """Fill the desired motion of this cycle."""
-        cycle = arm.cycle
         if output.state is not output.previous_state:
             self._enter(output, arm)
         elif self._waits(arm):
             return
         if self._state in REACTING and output.reaction is not self._reaction:
             self._react(output, arm)
-        if self._is_parking and self._segment is None and self._state not in REACTING:
-            self._park_end_cycle = self._approach(cycle) + round(PARK_SETTLE_S / self._period_s)
         if self._state in REACTING and self._is_yielding(arm, output):
             return
-        if self._segment is None:
+        if self._is_stopping:
+            self._stop(arm.cycle)
+        if self._path is None:
             self._stay(arm)
             return
-        self._advance(cycle)
+        self._advance(arm.cycle)
 
     def _waits(self, arm: ArmState) -> bool:
         """Let the desired motion wait while the feedback is old; go on, or begin anew, once it is fresh."""
         if max(arm.age_q) > OLD_CYCLES:
             self._waited_cycles += arm.periods
             self._start_cycle += arm.periods
-            self._park_end_cycle += arm.periods
-            if self._follows_at_cycle is not None:
-                self._follows_at_cycle += arm.periods
+            if self._arrival_cycle is not None:
+                self._arrival_cycle += arm.periods
             return True
         if self._waited_cycles > LOST_CYCLES:
             self._begin_anew(arm)
@@ -144,16 +160,13 @@ class Reference:
         return False
 
     def _begin_anew(self, arm: ArmState) -> None:
-        """Plan from the measured motion what the state asks for."""
+        """Brake from the measured motion, then do what the state asks for."""
         self._q_d[:], self._dq_d[:], self._ddq_d[:] = arm.q, arm.dq, 0.0
-        if self._is_parking and self._state not in REACTING:
-            self._segment = None
-        elif self._state in _FOLLOWING:
-            self._follows_at_cycle = self._approach(arm.cycle)
-        elif self._state is SchemeState.PAYLOAD:
-            self._approach(arm.cycle)
-        elif self._segment is not None:
-            self._brake(arm.cycle)
+        if self._path is None:
+            return
+        self._brake(arm.cycle)
+        if self._state not in REACTING:
+            self._approach()
 
     def _is_yielding(self, arm: ArmState, output: SchemeOutput) -> bool:
         """Fill the desired motion of a reaction that has no plan, or plan a blow's anew; tell whether it is filled."""
@@ -174,51 +187,60 @@ class Reference:
         self._ddq_d[:] = 0.0
 
     def _advance(self, cycle: int) -> None:
-        """Fill the desired motion of the segment, along which the arm may move slowly."""
-        wanted = self._slow_share if self._reaction is Reaction.SLOW_DOWN and self._state in REACTING else 1.0
-        change = min(max(wanted - self._rate, -self._period_s / SLOWING_S), self._period_s / SLOWING_S)
-        self._rate += change
-        self._lag_s += (1.0 - self._rate) * self._period_s
-        has_come = self._follows_at_cycle is not None and cycle - self._lag_s / self._period_s >= self._follows_at_cycle
-        if has_come and not self._is_parking:
-            assert self._follows_at_cycle is not None
-            is_learning = self._excitation.is_on and self._state in LEARNING
-            self._segment = self._excite if is_learning else self._follow
-            self._start_cycle = self._follows_at_cycle
-            self._follows_at_cycle = None
-        assert self._segment is not None
-        self._segment((cycle - self._start_cycle) * self._period_s - self._lag_s)
-        if self._rate != 1.0 or change != 0.0:
-            self._ddq_d[:] = self._rate**2 * self._ddq_d + change / self._period_s * self._dq_d
-            self._dq_d[:] *= self._rate
+        """Fill the desired motion of the path, along which the arm may move slowly, or stop."""
+        self._follow_on(cycle)
+        path, pace, motion = self._path, self._pace, (self._q_d, self._dq_d, self._ddq_d)
+        assert path is not None
+        planned_s = (cycle - self._start_cycle) * self._period_s
+        path(planned_s - pace.lag_s - (1.0 - pace.share) * self._period_s, *motion)
+        pace.step(self._wanted_share, self._dq_d, self._ddq_d)
+        if pace.is_planned:
+            return
+        path(planned_s - pace.lag_s, *motion)
+        self._ddq_d[:] = pace.share**2 * self._ddq_d + pace.change * self._dq_d
+        self._dq_d[:] *= pace.share
+
+    @property
+    def _wanted_share(self) -> float:
+        if self._is_stopping:
+            return 0.0
+        return self._slow_share if self._reaction is Reaction.SLOW_DOWN and self._state in REACTING else 1.0
+
+    def _follow_on(self, cycle: int) -> None:
+        """Begin the motion of the state once the arm has come to the corner."""
+        late = self._pace.lag_s / self._period_s
+        has_come = self._arrival_cycle is not None and cycle - late >= self._arrival_cycle
+        if not has_come or self._is_parking or self._state is SchemeState.PAYLOAD:
+            return
+        assert self._arrival_cycle is not None
+        self._path = self._excitation.evaluate if self._is_exciting else self._follow
+        self._start_cycle, self._arrival_cycle = self._arrival_cycle, None
 
     def _enter(self, output: SchemeOutput, arm: ArmState) -> None:
         """Choose the motion of a state that begins in this cycle."""
-        state, previous, cycle = output.state, self._state, arm.cycle
+        state, previous = output.state, self._state
         self._state = state
+        self._beyond.clear()
         if state is SchemeState.REACT:
             self._has_model = previous is SchemeState.MONITOR
-        was_on_path = previous in _FOLLOWING or (previous is SchemeState.REACT and self._reaction in _ON_PATH)
-        has_excited = self._excitation.is_on and previous in LEARNING and state is SchemeState.MONITOR
-        is_moving_on = state in _FOLLOWING and was_on_path and not has_excited
-        if state is SchemeState.REACT:
             self._react(output, arm)
-            return
-        if is_moving_on:
             return
         if state is SchemeState.STOPPED:
             if self._reaction in _ON_PATH:
-                self._brake(cycle)
+                self._brake(arm.cycle)
             return
-        self._follows_at_cycle = None
+        was_on_path = previous in _FOLLOWING or (previous is SchemeState.REACT and self._reaction in _ON_PATH)
+        has_excited = self._is_exciting and state not in LEARNING
+        goes_on = state in _FOLLOWING and was_on_path and not has_excited
         if self._is_parking:
-            self._segment = None if previous in REACTING else self._segment
-        elif state in _FOLLOWING:
-            self._follows_at_cycle = self._approach(cycle)
-        elif state is SchemeState.PAYLOAD:
-            self._approach(cycle)
+            goes_on = state in POWERED and previous not in REACTING
+        if goes_on:
+            return
+        if state in _FOLLOWING or state is SchemeState.PAYLOAD:
+            self._is_exciting = self._excitation.is_on and state in LEARNING
+            self._approach()
         else:
-            self._segment = None
+            self._path, self._arrival_cycle, self._is_stopping = None, None, False
 
     def _react(self, output: SchemeOutput, arm: ArmState) -> None:
         """Begin what the reaction says."""
@@ -226,7 +248,6 @@ class Reference:
         self._contact_cycle = arm.cycle
         if self._reaction in _ON_PATH:
             return
-        self._follows_at_cycle = None
         self._push[:] = output.tau_ext_hat
         self._contact_q[:] = self._q_d
         self._strongest = 0.0
@@ -234,9 +255,10 @@ class Reference:
             self._brake(arm.cycle)
         elif self._reaction is Reaction.WITHDRAW:
             self._withdraw(Withdrawal(self._settings, self._q_d, self._dq_d, self._push), arm.cycle)
-
-    def _brake(self, cycle: int) -> None:
-        self._withdraw(Withdrawal(self._settings, self._q_d, self._dq_d, np.zeros(JOINTS)), cycle)
+        else:
+            self._path, self._arrival_cycle, self._is_stopping = None, None, False
+        if self._reaction is Reaction.ADMITTANCE:
+            self._warn_beyond(self._stop_from(self._q_d, self._dq_d))
 
     def _is_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> bool:
         """Tell whether a blow that ends has made the arm faster than planned, away from what it has hit.
@@ -258,49 +280,57 @@ class Reference:
         """Go on from the measured motion; else the controller would pull the arm back to what it has hit."""
         if self._reaction is Reaction.ADMITTANCE:
             self._q_d[:], self._dq_d[:] = arm.q, arm.dq
+            self._warn_beyond(self._stop_from(arm.q, arm.dq))
         elif self._reaction is Reaction.WITHDRAW:
             withdrawal = Withdrawal(self._settings, arm.q, arm.dq, self._push, self._contact_q)
             self._withdraw(withdrawal, arm.cycle)
         elif self._reaction is Reaction.STOP:
-            self._withdraw(Withdrawal(self._settings, arm.q, arm.dq, np.zeros(JOINTS)), arm.cycle)
-
-    def _start(self, segment: Segment, cycle: int) -> None:
-        self._segment = segment
-        self._start_cycle = cycle
-        self._rate, self._lag_s = 1.0, 0.0
-
-    def _follow(self, elapsed_s: float) -> None:
-        corner_to_corner(elapsed_s, self._amplitude, self._half_period_s, self._q_d, self._dq_d, self._ddq_d)
-
-    def _excite(self, elapsed_s: float) -> None:
-        self._excitation.evaluate(elapsed_s, self._q_d, self._dq_d, self._ddq_d)
+            self._withdraw(self._stop_from(arm.q, arm.dq), arm.cycle)
 
     def _withdraw(self, withdrawal: Withdrawal, cycle: int) -> None:
-        def segment(elapsed_s: float) -> None:
-            self._q_d[:], self._dq_d[:], self._ddq_d[:] = withdrawal.at(elapsed_s)
+        """Begin a way from the present motion."""
+        self._warn_beyond(withdrawal)
+        self._start(withdrawal.evaluate, cycle)
+        self._arrival_cycle, self._is_stopping = None, False
 
-        self._start(segment, cycle)
+    def _warn_beyond(self, withdrawal: Withdrawal) -> None:
+        """Say, once in a state, which joints can't stop within their position limit."""
+        for joint in withdrawal.beyond:
+            if joint not in self._beyond:
+                self._events.append(Event("warning", MOTION, withdrawal.describe_beyond(joint)))
+        self._beyond.update(withdrawal.beyond)
 
-    def _approach(self, cycle: int) -> int:
-        """Start the way to the corner and return the cycle in which it ends."""
-        q, dq, ddq = self._q_d.copy(), self._dq_d.copy(), self._ddq_d.copy()
-        distance = float(np.max(np.abs(self._corner - q)))
-        is_moving = bool(np.any(dq) or np.any(ddq))
-        if distance < AT_CORNER_RAD and not is_moving:
-            duration_s = self._period_s
-        else:
-            duration_s = max(PEAK_SPEED_FACTOR * distance / self._approach_rad_s, SHORTEST_APPROACH_S)
-        cycles = max(1, round(duration_s / self._period_s))
-        duration_s = cycles * self._period_s
-        coefficients = to_rest(q, dq, ddq, self._corner, duration_s)
+    def _stop_from(self, q: Vector, dq: Vector) -> Withdrawal:
+        return Withdrawal(self._settings, q, dq, np.zeros(JOINTS))
 
-        def segment(elapsed_s: float) -> None:
-            if elapsed_s < duration_s:
-                evaluate(coefficients, elapsed_s, self._q_d, self._dq_d, self._ddq_d)
-            else:
-                self._q_d[:] = self._corner
-                self._dq_d[:] = 0.0
-                self._ddq_d[:] = 0.0
+    def _brake(self, cycle: int) -> None:
+        self._withdraw(self._stop_from(self._q_d, self._dq_d), cycle)
 
-        self._start(segment, cycle)
-        return cycle + cycles
+    def _approach(self) -> None:
+        """Come to rest, then go to the corner."""
+        self._arrival_cycle, self._is_stopping = None, True
+
+    def _stop(self, cycle: int) -> None:
+        """Go to the corner if the arm is at rest; brake where there is no path on which it comes to rest."""
+        if self._pace.share == 0.0 or not (np.any(self._dq_d) or np.any(self._ddq_d)):
+            self._go(cycle)
+        elif self._path is None:
+            self._brake(cycle)
+            self._is_stopping = True
+
+    def _go(self, cycle: int) -> None:
+        """Start the way from rest to the corner."""
+        shortest_s = SHORTEST_APPROACH_S
+        if float(np.max(np.abs(self._corner - self._q_d))) < AT_CORNER_RAD:
+            shortest_s = self._period_s
+        way = QuinticMove(self._q_d, self._corner, self._approach_rad_s, self._approach_rad_s2, shortest_s)
+        self._start(way.evaluate, cycle)
+        self._arrival_cycle = cycle + max(1, math.ceil(way.duration_s / self._period_s))
+        self._is_stopping = False
+
+    def _start(self, path: Path, cycle: int) -> None:
+        self._path, self._start_cycle = path, cycle
+        self._pace.restart()
+
+    def _follow(self, elapsed_s: float, q: Vector, dq: Vector, ddq: Vector) -> None:
+        corner_to_corner(elapsed_s, self._amplitude, self._half_period_s, q, dq, ddq)

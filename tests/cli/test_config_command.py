@@ -79,10 +79,8 @@ def test_all_errors_are_told_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("[arm]\nposition_limit_deg = [1.31, 2.09]", "looks like rad; in degrees that would be 75.1 and 120"),
-        ("[arm]\nposition_limit_deg = [25, 120]", "`trajectory.amplitude_deg[0]` = 30 deg exceeds"),
         ("[arm]\ntorque_limit_Nm = [12, 7]", "`arm.torque_limit_Nm[1]` = 7 Nm exceeds `arm.rated_torque_Nm[1]` = 6 Nm"),
-        ("[arm]\nvelocity_limit_deg_s = [90, 300]", "`reaction.velocity_limit_deg_s[0]` = 100 deg/s exceeds"),
+        ("[reaction]\nvelocity_limit_deg_s = [300, 300]", "`reaction.velocity_limit_deg_s[0]` = 300 deg/s exceeds"),
         ("[arm]\nlink_length_m = [0.4, 0.3]", "`arm.cad_theta` is that of an emulated arm, from paper [profiles.P]"),
         ("[arm]\nlink_length_m = [0.4, 0.3]", "`controller.Kp` is that of an emulated arm"),
         ("[filter]\na_rad_s = 11", "the scheme is the paper's, which certifies nothing"),
@@ -95,6 +93,27 @@ def test_what_is_likely_a_mistake_is_a_warning(tmp_path: Path, text: str, line: 
     path.write_text(text)
     result = config("check", str(path))
     assert result.exit_code == 0
+    assert line in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("[arm]\nposition_limit_deg = [1.31, 2.09]", "looks like rad; in degrees that would be 75.1 and 120"),
+        ("[arm]\nposition_limit_deg = [25, 120]", "`arm.position_limit_deg[0]` = 25 deg"),
+        ("[arm]\nvelocity_limit_deg_s = [90, 300]", "`arm.velocity_limit_deg_s[0]` = 90 deg/s"),
+        ("[trajectory]\nhalf_period_s = [0.5, 4.5]", "`reaction.acceleration_limit_deg_s2[0]` = 700 deg/s²"),
+        (
+            "[excitation]\nperiod_s = 3.0\nsine = [[2.0, -1.0], [0.0, 0.0]]\ncosine = [[0.0, 0.0], [0.0, 0.0]]\n",
+            "`arm.position_limit_deg[0]` = 75 deg",
+        ),
+    ],
+)
+def test_a_motion_that_leaves_the_arm_s_limits_is_an_error(tmp_path: Path, text: str, line: str) -> None:
+    path = tmp_path / "wide.toml"
+    path.write_text(text)
+    result = config("check", str(path))
+    assert result.exit_code == USAGE
     assert line in result.stdout
 
 

@@ -1,9 +1,9 @@
-"""The paper's motion, and ways to rest."""
+"""The paper's motion, and moves from rest to rest."""
 
 import numpy as np
 import pytest
 
-from adacd_hil.control.motions import corner_to_corner, evaluate, to_rest
+from adacd_hil.control.motions import QuinticMove, corner_to_corner
 
 AMPLITUDE = np.radians([30.0, 60.0])
 AS_PRINTED_S = np.array([1.125, 4.5])
@@ -45,17 +45,39 @@ def test_velocity_and_acceleration_are_the_derivatives(elapsed_s: float, order: 
     np.testing.assert_allclose((ahead - behind) / (2 * step_s), motion(elapsed_s)[order], rtol=1e-6, atol=1e-6)
 
 
-def on_the_way(elapsed_s: float) -> np.ndarray:
-    start = np.array([[0.1, -0.2], [1.0, -2.0], [3.0, 4.0]])
-    coefficients = to_rest(*start, np.array([-0.5, -1.0]), 0.8)
-    out = np.zeros((3, 2))
-    evaluate(coefficients, elapsed_s, out[0], out[1], out[2])
-    return out
+SPEED, ACCELERATION = np.radians([90.0, 60.0]), np.radians([300.0, 200.0])
 
 
-def test_a_way_to_rest_begins_with_the_present_motion() -> None:
-    np.testing.assert_allclose(on_the_way(0.0), [[0.1, -0.2], [1.0, -2.0], [3.0, 4.0]], atol=1e-12)
+def moves() -> list[tuple[QuinticMove, np.ndarray, np.ndarray, np.ndarray]]:
+    """Return random moves with their start, their end, and their motion (n, 3, 2)."""
+    random = np.random.default_rng(5)
+    found = []
+    for reach in np.exp(random.uniform(np.log(1e-3), np.log(2.0), 200)):
+        start, end = random.uniform(-reach, reach, (2, 2))
+        move = QuinticMove(start, end, SPEED, ACCELERATION, 0.01)
+        motion = np.zeros((201, 3, 2))
+        for row, elapsed_s in zip(motion, np.linspace(0.0, move.duration_s, 201), strict=True):
+            move.evaluate(float(elapsed_s), *row)
+        found.append((move, start, end, motion))
+    return found
 
 
-def test_a_way_to_rest_ends_at_rest_in_its_goal() -> None:
-    np.testing.assert_allclose(on_the_way(0.8), [[-0.5, -1.0], [0.0, 0.0], [0.0, 0.0]], atol=1e-9)
+def test_a_move_leads_from_rest_to_rest() -> None:
+    for _, start, end, motion in moves():
+        np.testing.assert_allclose(motion[0], [start, np.zeros(2), np.zeros(2)], atol=1e-12)
+        np.testing.assert_allclose(motion[-1], [end, np.zeros(2), np.zeros(2)], atol=1e-12)
+
+
+def test_a_move_uses_its_speed_or_its_acceleration_limit_and_no_more() -> None:
+    used = []
+    for move, _, _, motion in moves():
+        share = max(np.max(np.abs(motion[:, 1]) / SPEED), np.max(np.abs(motion[:, 2]) / ACCELERATION))
+        assert share <= 1.0 + 1e-9
+        used.append(1.0 if move.duration_s == 0.01 else share)
+    assert min(used) > 0.99
+
+
+def test_a_move_stays_between_its_ends() -> None:
+    for _, start, end, motion in moves():
+        assert np.all(motion[:, 0] >= np.minimum(start, end) - 1e-12)
+        assert np.all(motion[:, 0] <= np.maximum(start, end) + 1e-12)

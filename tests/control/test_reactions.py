@@ -8,53 +8,21 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from contact_rig import Rig, Sample, reports, rig_settings
+from desired_motion import START_DEG, Desired
 
 from adacd_hil.control.controller import Floating
 from adacd_hil.control.motions import Admittance, corner_to_corner
-from adacd_hil.control.reference import Reference
-from adacd_hil.records import ArmState, ContactKind, FaultReason, Reaction, SchemeOutput, SchemeState, Vector
+from adacd_hil.records import ContactKind, Reaction, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 from firmware_sim.arm.touch_settings import BodySettings, ContactSettings
 from firmware_sim.scenario.scenario import Scenario
 
 PERIOD_S = 1e-3
-START_DEG = (-30.0, -60.0)
 
 
 def reacting(collision: str, contact: str = "stop", **more: object) -> Settings:
     wishes = {"contact": [contact] * 2, "collision": [collision] * 2, "start": "measured", "rebound_s": 0.2, **more}
     return rig_settings(reaction=wishes)
-
-
-class Desired:
-    """A reference driven by hand: its arm is where it is told to be."""
-
-    def __init__(self, settings: Settings) -> None:
-        self.q, self.dq = np.radians(START_DEG), np.zeros(2)
-        self.q_d, self.dq_d, self.ddq_d = self.q.copy(), np.zeros(2), np.zeros(2)
-        self.reference = Reference(settings, self.q_d, self.dq_d, self.ddq_d)
-        self.state = SchemeState.INIT
-        self.cycle = 0
-        self.follows = True
-
-    def step(
-        self, state: SchemeState, reaction: Reaction = Reaction.NONE, tau: tuple[float, float] = (0, 0), cycles: int = 1
-    ) -> Vector:
-        """Return the desired motion (n, 3, 2)."""
-        rows = []
-        for _ in range(cycles):
-            arm = ArmState(self.cycle, 0, 1, self.q, self.dq, np.zeros(2), (0, 0), (0, 0), True, True, FaultReason.NONE)
-            output = SchemeOutput(
-                self.cycle, state, self.state, FaultReason.NONE, 0, True, np.zeros(7), np.zeros(7),
-                np.array(tau, dtype=np.float64), None, np.zeros(1), reaction,
-            )  # fmt: skip
-            self.reference.step(arm, output)
-            self.state = state
-            if self.follows:
-                self.q, self.dq = self.q_d.copy(), self.dq_d.copy()
-            rows.append([self.q_d.copy(), self.dq_d.copy(), self.ddq_d.copy()])
-            self.cycle += 1
-        return np.array(rows)
 
 
 def monitoring(settings: Settings, cycles: int = 500) -> Desired:

@@ -29,8 +29,10 @@ def sampled(q_d, dq_d, tau_ext_hat, settings=SETTINGS):
     """Return q_d, dq_d, ddq_d (n, 2) per period, to rest and ten periods longer."""
     withdrawal = Withdrawal(settings, np.array(q_d), np.array(dq_d), np.array(tau_ext_hat))
     count = int(withdrawal.duration_s / T) + 11
-    rows = [withdrawal.at(k * T) for k in range(count)]
-    return tuple(np.array(column) for column in zip(*rows, strict=True))
+    motion = np.zeros((3, count, 2))
+    for k in range(count):
+        withdrawal.evaluate(k * T, *motion[:, k])
+    return tuple(motion)
 
 
 @given(POSITIONS, VELOCITIES, TORQUES)

@@ -19,11 +19,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 from campaign_certified import CertifiedScheme
 from lab import PERIOD_S, Motion, cut, join, profile_arm, record
+from lab_motion import evaluate, to_rest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from adacd_hil.cli.output import format_table
-from adacd_hil.control.motions import evaluate, to_rest
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.settings.configuration import Settings, load_settings

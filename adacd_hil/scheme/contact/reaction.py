@@ -99,9 +99,12 @@ class Withdrawal:
         start: where the way began, if not here; what has been covered since is not covered again.
         """
         distance = np.radians(settings.reaction.distance_deg)
-        velocity_limit = np.radians(settings.reaction.velocity_limit_deg_s)
+        velocity_limit = np.minimum(
+            np.radians(settings.reaction.velocity_limit_deg_s), settings.arm.velocity_limit_rad_s
+        )
         acceleration_limit = np.radians(settings.reaction.acceleration_limit_deg_s2)
         position_limit = settings.arm.position_limit_rad - np.radians(settings.reaction.position_margin_deg)
+        self._settings = settings
         largest = float(np.max(np.abs(tau_ext_hat)))
         share = tau_ext_hat / largest if largest > 0.0 else np.zeros(JOINTS)
         way = share * distance
@@ -124,10 +127,33 @@ class Withdrawal:
         """Time until all joints are at rest."""
         return max(profile.duration_s for profile in self._profiles)
 
-    def at(self, elapsed_s: float) -> tuple[Vector, Vector, Vector]:
-        """Return desired q_d, dq_d, ddq_d (2,) at this time since the plan was made."""
-        samples = np.array([profile.at(elapsed_s) for profile in self._profiles])
-        return samples[:, 0].copy(), samples[:, 1].copy(), samples[:, 2].copy()
+    def evaluate(self, elapsed_s: float, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
+        """Fill the desired motion (2,) at this time since the plan was made."""
+        for i, profile in enumerate(self._profiles):
+            q_d[i], dq_d[i], ddq_d[i] = profile.at(elapsed_s)
+
+    @property
+    def beyond(self) -> list[int]:
+        """Joints that the acceleration limit lets stop only beyond their position limit, from 0."""
+        limit = self._settings.arm.position_limit_rad
+        return [i for i in range(JOINTS) if abs(self._soonest_stop(i)) > limit[i]]
+
+    def _soonest_stop(self, joint: int) -> float:
+        """Return where a joint stops that brakes with its acceleration limit at once, rad."""
+        profile = self._profiles[joint]
+        limit = math.radians(self._settings.reaction.acceleration_limit_deg_s2[joint])
+        return profile.position + profile.velocity * abs(profile.velocity) / (2.0 * limit)
+
+    def describe_beyond(self, joint: int) -> str:
+        """Say where such a joint stops."""
+        arm, wish = self._settings.arm, self._settings.reaction
+        profile = self._profiles[joint]
+        return (
+            f"joint {joint + 1} moves at {math.degrees(profile.velocity):.0f} deg/s at "
+            f"{math.degrees(profile.position):.1f} deg and can't stop within `arm.position_limit_deg[{joint}]` = "
+            f"{arm.position_limit_deg[joint]:g} deg: it brakes with {wish.acceleration_limit_deg_s2[joint]:g} deg/s² "
+            f"and stops at {math.degrees(self._soonest_stop(joint)):.1f} deg"
+        )
 
 
 def _withdraw(
