@@ -110,7 +110,9 @@ class ClosedLoop:
 
     def desired(self) -> np.ndarray:
         if self.withdrawal is not None:
-            return np.array(self.withdrawal.at((self.cycle - self.withdrawal_cycle) * self.settings.bus.period_s))
+            motion = np.zeros((3, 2))
+            self.withdrawal.evaluate((self.cycle - self.withdrawal_cycle) * self.settings.bus.period_s, *motion)
+            return motion
         t_s = self.motion_cycles * self.settings.bus.period_s
         return np.array(
             [quintic(t_s, self.amplitude[i], self.settings.trajectory.half_period_s[i]) for i in range(2)]

@@ -159,7 +159,10 @@ def test_a_push_is_detected_with_its_sign_and_the_arm_withdraws_along_it(joint, 
     loop.run_until(SchemeState.STOPPED, 1500)
     assert np.sign(alarm.tau_ext_hat[joint]) == sign
     assert alarm.contact_joints & 1 << joint
-    assert sign * loop.withdrawal.at(10.0)[0][joint] > sign * loop.withdrawal.at(0.0)[0][joint]
+    start, end = np.zeros((2, 3, 2))
+    loop.withdrawal.evaluate(0.0, *start)
+    loop.withdrawal.evaluate(10.0, *end)
+    assert sign * end[0, joint] > sign * start[0, joint]
 
 
 @pytest.mark.slow
