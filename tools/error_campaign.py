@@ -14,6 +14,7 @@ import argparse
 import fnmatch
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
@@ -32,7 +33,7 @@ from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.sensitivity import AGREES
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings, apply_settings, load_settings, parse_changes
 from firmware_sim.arm.arms import ArmProfile
 from firmware_sim.arm.hardware_settings import MechanicsSettings, SensorSettings
 
@@ -45,7 +46,7 @@ GRID, WITHIN = 20, 300
 APART = 300
 MOVING_RAD_S = 0.02
 STEPS_NM = (0.1, 0.3, 1.0)
-CABLE_NM = 0.1
+CABLES_NM = {"cable 0.05 Nm sin q": 0.05, "cable 0.1 Nm sin q": 0.1}
 ELASTIC_DAMPING, ROTOR_KG_M2 = 0.02, (0.05, 0.01)
 
 
@@ -94,7 +95,7 @@ SENSORS = {
 }
 ERRORS = (
     "clean", "lugre 1 mrad", "lugre 4 mrad", "load 6 %", "stribeck x 2", "tilt 0.5 deg", "tilt 1 deg", "ripple 0.05 Nm",
-    *SENSORS, "cable 0.1 Nm sin q", "elastic 8 Hz", "elastic 25 Hz",
+    *SENSORS, *CABLES_NM, "elastic 8 Hz", "elastic 25 Hz",
 )  # fmt: skip
 
 
@@ -168,11 +169,8 @@ def find_steps(
                 break
 
 
-def play(case: Case, minutes: float, position_torque_Nm: float = 0.0) -> Played:
-    """Record the arm, play the record through the compiled step, and measure.
-
-    position_torque_Nm: what the model is told of cables and tilts.
-    """
+def play(case: Case, minutes: float, changes: Mapping[str, str]) -> Played:
+    """Record the arm, play the record through the compiled step with these settings changed, and measure."""
     base = profile_arm(case.profile)
     arm = replace(
         base,
@@ -186,11 +184,10 @@ def play(case: Case, minutes: float, position_torque_Nm: float = 0.0) -> Played:
         feedforward.append((loaded_at * PERIOD_S + 1.0, arm.arm.theta(case.kg)))
     measured = record(arm, motion, seed=case.seed, feedforward=feedforward, payloads=payloads)
     tau_J = measured.tau_J
-    if case.error.startswith("cable"):  # as one whose torque the motor makes up for, on the same way
-        tau_J = tau_J + CABLE_NM * np.sin(measured.q)
-    settings = load_settings("certified", case.profile)
-    known = replace(settings.arm, link_length_m=arm.arm.link_length_m, position_torque_Nm=position_torque_Nm)
-    settings = replace(settings, arm=known)
+    if case.error in CABLES_NM:  # as one whose torque the motor makes up for, on the same way
+        tau_J = tau_J + CABLES_NM[case.error] * np.sin(measured.q)
+    settings = apply_settings(load_settings("certified", case.profile), changes)
+    settings = replace(settings, arm=replace(settings.arm, link_length_m=arm.arm.link_length_m))
     count = len(motion.q_d)
     state, observation, y, h, _, _ = play_record(settings, measured.q, measured.dq, tau_J, loaded_at)
     begin = max(loaded_at, 0)
@@ -277,7 +274,7 @@ def main() -> int:
     parser.add_argument("--kg", default="0", metavar="MASSES", help="0, or a payload that is announced")
     parser.add_argument("--seeds", default="1", metavar="NUMBERS")
     parser.add_argument("--minutes", type=float, default=3.0, help="of random motion; default 3")
-    parser.add_argument("--position-torque", type=float, default=0.0, metavar="NM", help="arm.position_torque_Nm")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting; repeatable")
     add_jobs(parser)
     parser.add_argument("--json", action="store_true", help="print each arm as JSON")
     options = parser.parse_args()
@@ -287,7 +284,7 @@ def main() -> int:
         parser.error(f"--only {options.only!r} fits none of {', '.join(ERRORS)}")
     lists = options.profiles.split(","), errors, options.kg.split(","), options.seeds.split(",")
     cases = [Case(profile, error, float(kg), int(seed)) for profile, error, kg, seed in product(*lists)]
-    one = partial(play, minutes=options.minutes, position_torque_Nm=options.position_torque)
+    one = partial(play, minutes=options.minutes, changes=parse_changes(options.set))
     rows = list(play_trials(one, cases, options.jobs, lambda played: f"{played.case.profile} {played.case.error}"))
     print(json.dumps([asdict(row) for row in rows]) if options.json else format_table(HEAD, map(row_of, rows)))
     return 0

@@ -1,7 +1,7 @@
 """Touches of an arm that learns, for tools/touch_campaign.py: the arm of the scheme's tests, in closed loop, by seed.
 
-Arm, motion and noise are those of tests/scheme (no emulator, no bus); the pipeline is the product's. The motors are
-free and said to be, so the reading at rest is an anchor.
+Arm and noise are those of tests/scheme (no emulator, no bus); pipeline, desired motion and controller are the product's.
+The motors are free and said to be, so the reading at rest is an anchor.
 """
 
 import sys
@@ -19,7 +19,9 @@ from mujoco_arm import MujocoArm
 from planar_arm import THETA
 
 from adacd_hil.compiled import Structured
-from adacd_hil.records import Request, SchemeOutput, SchemeState, Vector
+from adacd_hil.control.controller import Controller
+from adacd_hil.control.reference import Reference
+from adacd_hil.records import ArmState, Request, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.identify import earlier, fit_check
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model.regressor import payload_direction
@@ -45,6 +47,7 @@ KNOWN_S = 0.5
 """Before this nothing is known of the arm that a hand like a joint could contradict."""
 WIDE = 3.0
 """A wide arm has each parameter of profile M times or over at most this."""
+LIGHTEST_KGM2 = 0.04
 STEADY_S = 0.6
 """How long the user lets the arm stand in a stop."""
 UNTOUCHED_S, LONGEST_S, AFTER_S = 4.0, 14.0, 12.0
@@ -104,7 +107,10 @@ def draw_arm(random: np.random.Generator) -> tuple[str, Vector]:
         return kind, THETA[kind].copy()
     while True:
         theta = THETA["M"] * np.exp(random.uniform(-np.log(WIDE), np.log(WIDE), 7))
-        if theta[2] * (theta[0] - theta[2]) > 1.3 * theta[1] ** 2:
+        a1, a2, a3 = theta[:3]
+        is_possible = a3 * (a1 - a3) > 1.3 * a2**2
+        # What the controller, whose gains are profile P's, accelerates with joint 2 free; lighter arms vibrate.
+        if is_possible and (a1 - a3) - a2**2 / a3 > LIGHTEST_KGM2:
             return kind, theta
 
 
@@ -149,6 +155,8 @@ class HandLoop(TouchedLoop):
         self.free, self.random = free, random
         if is_foreign:
             self.advance = MujocoArm().advance
+        self.reference, self.controller = Reference(FREE, *self.desired), Controller(FREE)
+        self.tau_d = np.zeros(2)
         self.stopped_cycles = 0
         self.held_at: tuple[float, float] | None = None
 
@@ -176,6 +184,14 @@ class HandLoop(TouchedLoop):
         """End the touch."""
         self.theta, self.held_at = self.free, None
         self.tau_ext[:] = 0.0
+
+    def control(self, arm: ArmState, output: SchemeOutput) -> Vector:
+        """Return the torque that the product commands (2,)."""
+        self.reference.step(arm, output)
+        if output.is_model_valid:
+            self.controller.feed_forward(output.theta_ff)
+        self.controller.torque(arm.q, arm.dq, *self.desired, self.tau_d)
+        return self.tau_d.copy()
 
     def step(self) -> SchemeOutput:
         """Play one period, and acknowledge what has stood long enough."""

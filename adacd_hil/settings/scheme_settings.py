@@ -136,7 +136,7 @@ class CertifiedSettings:
         200.0, unit="rad/s", low=10.0, high=3000.0, meaning="second low-pass behind each filter, against velocity noise"
     )
     noise_sigmas: float = setting(6.5, low=1.0, high=50.0, meaning="threshold in deviations of the torque's noise")
-    model_sigmas: float = setting(5.0, low=1.0, high=50.0, meaning="threshold, in standard deviations of the model")
+    model_sigmas: float = setting(3.25, low=1.0, high=50.0, meaning="threshold, in standard deviations of the model")
     friction_terms: tuple[str, ...] = setting(
         ("stribeck", "load", "dahl_short", "dahl_long"),
         choices=FRICTION_TERMS,

@@ -186,14 +186,18 @@ class ExcitedLoop:
             lead(at_s / LEAD_S, LEAD_S, self.away, self.desired[0], self.desired[1])
         self.motion_cycles += 1
 
+    def control(self, arm: ArmState, output: SchemeOutput) -> np.ndarray:
+        """Return the torque that is commanded (2,)."""
+        self.move(output)
+        controller = self.settings.controller
+        return controller.Kp * (self.desired[0] - arm.q) + controller.Kd * (self.desired[1] - arm.dq)
+
     def step(self) -> SchemeOutput:
         arm = self.measure()
         output = self.pipeline.step(arm, self.request)
         self.request = Request.NONE
-        self.move(output)
-        controller = self.settings.controller
         self.tau = self.tau_next
-        self.tau_next = controller.Kp * (self.desired[0] - arm.q) + controller.Kd * (self.desired[1] - arm.dq)
+        self.tau_next = self.control(arm, output)
         push = self.tau + self.tau_ext
         self.advance(self.q, self.dq, self.tracked_q, self.tracked_dq, push, self.theta, PERIOD_S)
         self.cycle += 1

@@ -108,7 +108,8 @@ def test_an_arm_with_a_cable_that_passes_the_test_loses_its_certificate_with_tha
     loop.cable_Nm = 0.7 * CABLE_NM
     loop.run_until(SchemeState.MONITOR)
     outputs = loop.run_until(SchemeState.STOPPED, 20_000)
-    assert {output.contact for output in outputs} == {None}
+    alarms = sum(output.state is SchemeState.REACT is not output.previous_state for output in outputs)
+    assert alarms <= 3  # two that clear by themselves, and the stop itself
     (revoked,) = loop.said("revoked")
     assert "a torque that depends on where the arm is, " in revoked
     assert revoked.endswith("the certificate is taken back, `relearn` learns the arm anew")

@@ -36,7 +36,7 @@ def known_arm(seed=1):
 
 def thresholds_of(m):
     h = np.zeros((len(CHANNELS), 2))
-    sensitivity.follow_friction(K, m)
+    sensitivity.follow_friction(K, m, np.zeros(2))
     sensitivity.fill_thresholds(K, m, h)
     return h
 
@@ -98,7 +98,10 @@ def test_no_threshold_is_below_the_noise_of_its_channel(seed):
 
 
 def test_a_joint_at_rest_may_hold_what_static_friction_is_believed_to_hold():
-    """Coulomb and Stribeck friction, and a standard deviation of each, in the share of the filter that is of rest."""
+    """Coulomb and Stribeck friction, and a standard deviation of each, in the share of the filter that is of rest.
+
+    The deviation of the latter is no more than STATIC_SHARE of the former.
+    """
     m = known_arm()
     m["W_f"][:] = 0.0
     moving = thresholds_of(m)
@@ -120,25 +123,27 @@ def test_friction_that_was_learnt_negative_holds_nothing():
 
 
 def test_standstill_fills_a_filter_in_its_own_time():
-    still, smooth = np.zeros((3, 2)), np.zeros((3, 2))
+    still, smooth, slow = np.zeros((3, 3, 2))
     decay, smoothing = np.exp(-CUTOFFS * T), np.exp(-CERTIFIED.smoothing_rad_s * T)
     dq = np.array([0.0, -0.9 * CERTIFIED.still_rad_s])
     for _ in range(100):
-        sensitivity.follow_standstill(dq, dq, CERTIFIED.still_rad_s, decay, smoothing, still, smooth)
+        sensitivity.follow_standstill(dq, dq, CERTIFIED.still_rad_s, decay, smoothing, still, smooth, slow)
     np.testing.assert_allclose(still, np.tile(1.0 - np.exp(-CUTOFFS * 0.1)[:, None], (1, 2)), rtol=1e-12)
     assert np.all(smooth < still)
     np.testing.assert_allclose(smooth[1], 0.991, atol=0.002)  # 1 - (200 e^-5 - 50 e^-20) / 150
     dq = np.array([1.1, -1.1]) * CERTIFIED.still_rad_s
     before = still.copy()
-    sensitivity.follow_standstill(dq, dq, CERTIFIED.still_rad_s, decay, smoothing, still, smooth)
+    sensitivity.follow_standstill(dq, dq, CERTIFIED.still_rad_s, decay, smoothing, still, smooth, slow)
     np.testing.assert_allclose(still, before * decay[:, None], rtol=1e-12)
 
 
 def test_a_joint_that_turns_round_between_two_samples_has_stood_still():
-    still, smooth = np.zeros((3, 2)), np.zeros((3, 2))
+    still, smooth, slow = np.zeros((3, 3, 2))
     decay, smoothing = np.exp(-CUTOFFS * T), np.exp(-CERTIFIED.smoothing_rad_s * T)
     dq = np.array([0.3, 0.3])
-    sensitivity.follow_standstill(dq, np.array([-0.3, 0.1]), CERTIFIED.still_rad_s, decay, smoothing, still, smooth)
+    sensitivity.follow_standstill(
+        dq, np.array([-0.3, 0.1]), CERTIFIED.still_rad_s, decay, smoothing, still, smooth, slow
+    )
     np.testing.assert_allclose(still, np.column_stack([1.0 - decay, np.zeros(3)]), rtol=1e-12)
 
 
@@ -283,7 +288,7 @@ def stepped(step_Nm, std_Nm=0.02):
 def test_a_sensor_s_step_is_found_and_its_pull_is_what_rounding_does_to_a_mean(step_Nm):
     m, off_Nm = stepped(step_Nm)
     np.testing.assert_allclose(m["torque_step_Nm"], [step_Nm, 0.0], rtol=1e-9)
-    assert m["torque_pull_Nm"][0] == pytest.approx(off_Nm, rel=0.1, abs=2e-4)
+    assert m["torque_pull_Nm"][0] == pytest.approx(sensitivity.PULL * off_Nm, rel=0.1, abs=2e-4)
     assert m["torque_pull_Nm"][1] == 0.0
 
 
@@ -340,16 +345,16 @@ def test_a_peak_of_the_residual_holds_the_strain_for_a_while():
     assert np.all(m["strain"] < 8.0)
 
 
-def units_after(share, count, unit=1.0):
+def units_after(share, count, unit=1.0, is_monitored=False, sign=lambda _: 1.0):
     """Return the unit after samples whose squared residual is this share (2,) of what is believed."""
     m = known_arm()
-    m["unit"][:] = unit
+    m["unit"][:] = m["unit_by_sign"][:] = unit
     m["held"][:] = [[0.0, 0.3], [0.1, 0.2], [0.4, 0.0]]
     believed = CERTIFIED.residual_Nm**2 + m["held"][0] ** 2
     believed += np.einsum("ij,jk,ik->i", m["W_f"][0], m["P"], m["W_f"][0])
-    m["r"][0] = np.sqrt(share * believed)
-    for _ in range(count):
-        sensitivity.follow_unit(K, m, 0, K["unit_share"])
+    for sample in range(count):
+        m["r"][0] = sign(sample) * np.sqrt(share * believed)
+        sensitivity.follow_unit(K, m, 0, K["unit_share"], is_monitored)
     return m["unit"].copy()
 
 
@@ -357,6 +362,16 @@ def test_the_unit_follows_the_residual_over_twenty_seconds():
     left = (1.0 - T / sensitivity.UNIT_S) ** 1000
     target = sensitivity.UNIT_PEAK * np.array([0.1, 1.0])
     np.testing.assert_allclose(units_after(np.array([0.1, 1.0]), 1000), target + left * (1.0 - target), rtol=1e-10)
+
+
+def test_while_the_arm_is_monitored_the_unit_follows_an_error_of_both_signs():
+    swings = units_after(np.array([0.1, 1.0]), 1000, is_monitored=True, sign=lambda sample: (-1.0) ** sample)
+    np.testing.assert_allclose(swings, units_after(np.array([0.1, 1.0]), 1000), rtol=1e-3)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_while_the_arm_is_monitored_a_push_of_one_sign_raises_no_unit(sign):
+    assert np.all(units_after(np.full(2, 9.0), 1000, is_monitored=True, sign=lambda _: sign) < 1.0)
 
 
 def test_the_unit_keeps_to_its_bounds():

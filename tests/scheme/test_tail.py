@@ -21,11 +21,13 @@ MODEL_NM = 0.5
 
 
 def factor(nu_Hz, seen_s):
-    return np.minimum(np.sqrt(np.maximum(np.log(nu_Hz * HOUR_S) / np.log(nu_Hz * max(seen_s, 1.0)), 1.0)), 3.0)
+    return np.minimum(
+        np.sqrt(np.maximum(np.log(nu_Hz * HOUR_S) / np.log(nu_Hz * max(0.5 * seen_s, 1.0)), 1.0)), margin.LARGEST
+    )
 
 
 class Tailed:
-    """The memory of an arm that moves; its thresholds without a floor are MODEL_NM."""
+    """The memory of an arm that moves, with residuals of both signs; its thresholds without a floor are MODEL_NM."""
 
     def __init__(self):
         self.memory = certified_memory.new_memory(SETTINGS)
@@ -33,6 +35,12 @@ class Tailed:
         self.m["h_model"][:] = MODEL_NM
 
     def see(self, y, samples):
+        for sample in range(samples):
+            self.m["y"][:] = y if sample % 2 else np.negative(y)
+            margin.follow_tail(K, self.m)
+
+    def push(self, y, samples):
+        """See the same sign all the time."""
         self.m["y"][:] = y
         for _ in range(samples):
             margin.follow_tail(K, self.m)
@@ -40,8 +48,8 @@ class Tailed:
     def skip(self, blocks, y=0.0):
         """See as much as these blocks at once, each by its last sample."""
         for _ in range(blocks):
-            self.m["block_used"] = BLOCK - 1.0
-            self.see(y, 1)
+            self.m["block_used"] = BLOCK - 2.0
+            self.see(y, 2)
 
 
 @pytest.mark.parametrize("seen_s", [0.1, 1.0, 10.0, 600.0, HOUR_S, 2.0 * HOUR_S])
@@ -77,10 +85,10 @@ def test_the_largest_filtered_noise_of_an_hour_is_below_what_a_short_time_lets_e
 
 def test_a_residual_counts_when_its_block_and_the_one_after_it_are_over():
     tailed = Tailed()
-    tailed.see(0.2, 1)
-    tailed.see(-0.1, 2 * BLOCK - 2)
+    tailed.see(0.2, 2)
+    tailed.see(0.1, 2 * BLOCK - 3)
     assert not tailed.m["tail_Nm"].any()
-    tailed.see(-0.1, 1)
+    tailed.see(0.1, 1)
     np.testing.assert_allclose(tailed.m["peak"], 0.2)
 
 
@@ -92,14 +100,24 @@ def test_a_joint_that_has_just_rested_shows_no_tail():
     tailed.see(0.2, 2 * BLOCK)
     moving = np.full((5, 2), 0.2)
     moving[1, 0] = moving[4, 1] = 0.0
-    np.testing.assert_allclose(tailed.m["peak"], moving)
+    np.testing.assert_allclose(tailed.m["peak"], np.tile(moving, (2, 1, 1)))
 
 
-def test_a_push_raises_the_threshold_by_the_factor_at_most_however_often_it_comes():
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_push_of_one_sign_raises_no_floor_above_what_the_other_sign_has_shown(sign):
     tailed = Tailed()
-    for push_Nm in (0.45, 0.9, 2.0, 50.0):
-        tailed.skip(100, push_Nm)
-        np.testing.assert_allclose(tailed.m["peak"], min(push_Nm, MODEL_NM))
+    tailed.see(0.02, 20 * BLOCK)
+    before = tailed.m["tail_Nm"].copy()
+    for push_Nm in np.linspace(0.02, 0.4, 200):
+        tailed.push(sign * push_Nm, BLOCK)
+    assert np.all(tailed.m["tail_Nm"] <= before)
+
+
+def test_an_error_of_both_signs_raises_the_floor_by_the_factor_at_most():
+    tailed = Tailed()
+    for error_Nm in (0.45, 0.9, 2.0, 50.0):
+        tailed.skip(100, error_Nm)
+        np.testing.assert_allclose(tailed.m["peak"], min(error_Nm, MODEL_NM))
         assert np.all(tailed.m["tail_Nm"] <= factor(NU_HZ, 1.0)[:, None] * MODEL_NM)
 
 
@@ -163,9 +181,10 @@ def test_residuals_are_followed_while_a_frozen_model_is_in_use(mode, is_followed
 
 
 def steady(mode, samples=1000):
-    """Let an arm of nothing, with a model of nothing, move on with 5 mNm on it."""
+    """Let an arm of nothing, with a model of nothing, move on with 5 mNm on it, this way and that."""
     kernel = Kernel(theta=np.zeros(COUNT), P=np.zeros((COUNT, COUNT)))
-    go_on(kernel, mode, samples, 0.005)
+    go_on(kernel, mode, samples // 2, -0.005)
+    go_on(kernel, mode, samples // 2, 0.005)
     return kernel
 
 
@@ -188,18 +207,14 @@ def test_what_of_a_touch_was_seen_before_it_was_flagged_raises_no_threshold():
     assert kernel.m["recovering_cycles"] < RECOVER
     go_on(kernel, "REFINE", RECOVER + 3 * BLOCK, 0.005)
     assert kernel.m["recovering_cycles"] == 0.0
-    np.testing.assert_allclose(kernel.m["peak"], before, rtol=0.02)
+    np.testing.assert_allclose(kernel.m["peak"], before, rtol=0.06)
 
 
-def test_a_certificate_says_what_counting_and_what_a_gaussian_tail_let_expect_of_false_alarms():
+def test_the_largest_share_is_that_of_the_threshold_in_force():
     memory = certified_memory.new_memory(SETTINGS)[0]
-    memory["tail_s"] = 0.5
     memory["h_model"][:] = MODEL_NM
-    memory["peak"][:] = 0.0
-    nothing_seen = margin.describe_false_alarms(K, memory)
-    memory["peak"][1] = 0.4 * MODEL_NM, 0.5 * MODEL_NM
+    assert margin.largest_share(memory) == 0.0
+    memory["peak"][0, 1] = 0.4 * MODEL_NM, 0.5 * MODEL_NM
+    assert margin.largest_share(memory) == pytest.approx(0.5)
     memory["tail_Nm"][1, 1] = 1.25 * MODEL_NM  # where the floor is the threshold in force, it is what counts
-    expected = 2.0 * margin.rate_per_h(NU_HZ[1], 0.5, 0.4)
-    said = "false alarms per hour: at most 21569 by counting the 0.50 s of the test alone, at 95 %, "
-    assert nothing_seen == said + "0 if residuals have the tail of a Gaussian"
-    assert margin.describe_false_alarms(K, memory) == said + f"{expected:.1g} if residuals have the tail of a Gaussian"
+    assert margin.largest_share(memory) == pytest.approx(0.4)

@@ -1,6 +1,6 @@
 """The thresholds of the certified scheme: what each channel of the bank may show without a contact.
 
-    h = max(e sqrt((k_tau sigma_tau)² + nu² (M R M')_ii + (k_m g)² + G) + pull, tail) + F_c s
+    h = max(e sqrt((k_tau sigma_tau)² + nu² (M R M')_ii + (k_m g)² + G) + pull, tail) + F_s max(s, LOW_SPEED_SHARE s')
 
 - sigma_tau: white noise of the torque sensor through the channel. A filter of cut-off a leaves sigma sqrt(a T / 2), one
   that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor at rest that is found noisier raises it.
@@ -10,13 +10,15 @@
   (1 + a / 600) of a (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
 - g² = w (u P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
   parameter explains however long one learns. u is the unit of P's variances: 1 for what the settings say of a good
-  model's residual, less or more as the residual without contact turns out to be. In smoothed channels g is smoothed,
-  too: a bound, since |F x| <= F |x|.
+  model's residual, less or more as the residual without contact turns out to be. While the arm is monitored the mean
+  square of the positive residuals and that of the negative ones are followed apart, and the smaller one counts: a push
+  has one sign, an error of the model has both. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
 - R: by how much the velocity's noise exceeds that of the settings, seen in its second difference.
 - e: 1, or more of a joint that has shown contacts while the arm learnt, or right after going on (`strain`).
 - G: what lost samples leave open, see below. tail: floor by the largest residual seen (`margin`).
-- s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
-  where it is in the model, and as much more as these are uncertain.
+- s, s': how much of the filter's memory is of standstill, and of low speed. At standstill friction may hold any torque
+  up to F_s: F_c, static friction and friction by load where they are in the model, and as much more as the first two
+  are uncertain.
 
 Shapes: C filters, 2 C - 1 channels, n joints, p parameters; r, still, doubt (C, n); y, h (2 C - 1, n); W_f (C, n, p);
 M (n, n). Units: Nm.
@@ -49,6 +51,8 @@ SECOND_DIFFERENCE = 0.36
 """Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, and a fifth."""
 JUMP = 5.0
 """Deviations of the noise as which a jump counts at most."""
+PULL = 1.3
+"""How many times the pull of the sensor's steps a residual may show: the model has learnt some of it, too."""
 CHANGES, LARGEST_STEP_NM = 50.0, 0.2
 """Changes of a torque sensor's value from which on the smallest is its step, and the largest step that is believed."""
 ROUGHNESS_S, ROUGHNESS_LOST_S = 0.3, 20.0
@@ -60,6 +64,9 @@ STRAIN_S = 10.0
 """Time constant with which the strain goes back, and with which the residual's largest share is forgotten."""
 RELAXED = 0.6
 """Share of its threshold that the residual must stay below for that."""
+LOW_SPEED_RAD_S, LOW_SPEED_SHARE = 0.1, 0.1
+"""Below this speed friction is known less well, by this share of the static friction: bristles bend, lubricant thins.
+LuGre friction of 4 mrad on profile M errs by 0.02 Nm there, in each of 14 false alarms of 50 min without this."""
 RESTING, MOVING = 0.2, 0.05
 """Share of standstill in a filter's memory from which on a joint counts as resting, and below which friction is what
 the model says it is."""
@@ -67,7 +74,7 @@ AGREES = 0.4
 """Share of its threshold that the smoothed channel has at least when the bare one finds a push: 0.5 to 0.75."""
 BARE = 1.15
 """A bare filter leaves nothing else to average it: in 24 h of clean motion it came to 1.02 of a threshold without."""
-UNIT_PEAK = 4.0
+UNIT_PEAK = 2.5
 """Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
 UNIT_S = 20.0
 """Memory of the unit: some swings of a slow motion."""
@@ -109,8 +116,11 @@ def follow_standstill(
     smoothing: float,
     still: Vector,
     still_smooth: Vector,
+    low_speed: Vector,
 ) -> None:
     """Filter with DC gain 1, into `still` (C, n) from 0 to 1, whether each joint may stand still, and smooth it.
+
+    `low_speed` (C, n): the same of a joint that moves slowly or not at all, not smoothed.
 
     before (n,): dq one sample ago. One that turns round between two samples has stood still, and its lag lets friction
     turn a sample or two before the measured velocity does.
@@ -121,6 +131,8 @@ def follow_standstill(
             target = 1.0 if abs(dq[i]) < still_rad_s or has_turned else 0.0
             still[c, i] = target + decay[c] * (still[c, i] - target)
             still_smooth[c, i] = still[c, i] + smoothing * (still_smooth[c, i] - still[c, i])
+            target = 1.0 if abs(dq[i]) < LOW_SPEED_RAD_S or has_turned else 0.0
+            low_speed[c, i] = target + decay[c] * (low_speed[c, i] - target)
 
 
 @compiled
@@ -152,7 +164,7 @@ def follow_torque_step(k: Any, m: Any, tau_J: Vector) -> None:
         if m["torque_changes"][i] >= CHANGES and step_Nm != m["torque_step_Nm"][i]:
             m["torque_step_Nm"][i] = step_Nm
             variance = k["torque_noise_Nm"] ** 2 * m["roughness"][i]
-            m["torque_pull_Nm"][i] = step_Nm / np.pi * math.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
+            m["torque_pull_Nm"][i] = PULL * step_Nm / np.pi * math.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
 
 
 @compiled
@@ -219,10 +231,11 @@ def relax(k: Any, m: Any) -> None:
 
 
 @compiled
-def follow_unit(k: Any, m: Any, fit: int, share: float) -> None:
+def follow_unit(k: Any, m: Any, fit: int, share: float, is_monitored: bool) -> None:
     """Take one sample without contact into the unit (n,) of the belief's variances; share: what it counts.
 
-    fit: filter by whose residual. In a faster one the velocity's noise would count as the model's error.
+    fit: filter by whose residual. In a faster one the velocity's noise would count as the model's error. is_monitored:
+    the unit is the smaller one of both signs; else it is that of all residuals, and both signs begin with it.
     """
     for i in range(m["unit"].shape[0]):
         w = m["W_f"][fit, i]
@@ -234,9 +247,22 @@ def follow_unit(k: Any, m: Any, fit: int, share: float) -> None:
             believed += w[j] * row
         if not np.isfinite(believed):
             continue
-        ratio = m["r"][fit, i] ** 2 / believed
-        unit = m["unit"][i] + share * (UNIT_PEAK * ratio - m["unit"][i])
-        m["unit"][i] = min(max(unit, external_torque.SMALLEST_UNIT), external_torque.LARGEST_UNIT)
+        square = UNIT_PEAK * m["r"][fit, i] ** 2 / believed
+        if not is_monitored:
+            m["unit"][i] = _approach(m["unit"][i], square, share)
+            m["unit_by_sign"][:, i] = m["unit"][i]
+            continue
+        for sign in range(2):
+            has_sign = m["r"][fit, i] > 0.0 if sign else m["r"][fit, i] < 0.0
+            m["unit_by_sign"][sign, i] = _approach(m["unit_by_sign"][sign, i], 2.0 * square if has_sign else 0.0, share)
+        m["unit"][i] = np.min(m["unit_by_sign"][:, i])
+
+
+@compiled
+def _approach(unit: float, square: float, share: float) -> float:
+    """Return the unit after one sample, within its bounds."""
+    unit += share * (square - unit)
+    return float(min(max(unit, external_torque.SMALLEST_UNIT), external_torque.LARGEST_UNIT))
 
 
 @compiled
@@ -249,10 +275,12 @@ def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
         for c in range(filters):
             g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i], m["unit"][i]))
             m["doubt"][c, i] = g + k["smoothing"] * (m["doubt"][c, i] - g)
-            h[c, i] = _threshold(k, m, c, i, momentum, m["doubt"][c, i]) + hold * m["still_smooth"][c, i]
+            slow = LOW_SPEED_SHARE * m["low_speed"][c, i]
+            held = hold * max(m["still_smooth"][c, i], slow)
+            h[c, i] = _threshold(k, m, c, i, momentum, m["doubt"][c, i]) + held
             if c > 0:
                 bare = filters + c - 1
-                h[bare, i] = _threshold(k, m, bare, i, momentum, g) + hold * m["still"][c, i]
+                h[bare, i] = _threshold(k, m, bare, i, momentum, g) + hold * max(m["still"][c, i], slow)
 
 
 @compiled
@@ -265,13 +293,13 @@ def momentum_noise(m: Any, joint: int) -> float:
 
 
 @compiled
-def follow_friction(k: Any, m: Any) -> None:
+def follow_friction(k: Any, m: Any, tau_J: Vector) -> None:
     """Fill the torque (n,) that friction may hold at standstill, and how much of it is in each filter (C, n) now, Nm.
 
     Friction at rest is no noise that averages out: of a joint that mostly rested it is inf, so nothing is learnt.
     """
     for i in range(m["hold"].shape[0]):
-        m["hold"][i] = k["standstill_share"] * _static_friction(k, m, i)
+        m["hold"][i] = k["standstill_share"] * _static_friction(k, m, i, tau_J[i])
         for c in range(m["held"].shape[0]):
             m["held"][c, i] = held_Nm(m, i, m["still"][c, i])
 
@@ -283,15 +311,19 @@ def held_Nm(m: Any, joint: int, still: float) -> float:
 
 
 @compiled
-def _static_friction(k: Any, m: Any, joint: int) -> float:
-    """Return the most that friction is believed to hold of a joint that stands still, Nm."""
+def _static_friction(k: Any, m: Any, joint: int, load_Nm: float) -> float:
+    """Return the most that friction is believed to hold of a joint that stands still under a torque, Nm."""
     coulomb = int(k["first_coulomb"]) + joint
     total = max(m["theta"][coulomb], 0.0) + np.sqrt(max(m["P"][coulomb, coulomb], 0.0))
+    further = 0.0
     for position in range(k["terms"].shape[0]):
+        term = int(k["first_term"]) + position * m["r"].shape[1] + joint
         if k["terms"][position] == regressor.STRIBECK:
-            term = int(k["first_term"]) + position * m["r"].shape[1] + joint
-            total += max(m["theta"][term], 0.0) + np.sqrt(max(m["P"][term, term], 0.0))
-    return float(total)
+            open_Nm = min(np.sqrt(max(m["P"][term, term], 0.0)), STATIC_SHARE * total)
+            further += max(m["theta"][term], 0.0) + open_Nm
+        elif k["terms"][position] == regressor.LOAD:
+            further += max(m["theta"][term], 0.0) * abs(load_Nm)
+    return float(total + further)
 
 
 @compiled
@@ -355,6 +387,8 @@ def joints_over(y: Vector, h: Vector) -> int:
     return joints
 
 
+STATIC_SHARE = 1.0
+"""Static friction beyond Coulomb's that is left open at most, as a share of it: bearings and gears have up to twice."""
 CURVATURE_NM_S2 = 500.0
 """Second derivative of the torque: 2.5 Nm at 2.2 Hz, or 0.5 Nm at 5 Hz."""
 
@@ -363,8 +397,8 @@ MOST_FILLED = 8
 
 
 def shapes_of(filters: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    return {"lost": (filters, JOINTS)}
+    """Return the shapes of the memory, by name."""
+    return {"lost": (filters, JOINTS), "low_speed": (filters, JOINTS), "unit_by_sign": (2, JOINTS)}
 
 
 @compiled

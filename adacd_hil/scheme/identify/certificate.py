@@ -22,7 +22,7 @@ from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import anchor, earlier, missing_torque
 from adacd_hil.settings.configuration import Settings
 
-NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, ELASTIC = range(8)
+NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, ELASTIC, BLIND = range(9)
 """What contradicts a certificate that is withheld, or taken back: of the kernel's `withheld_by`."""
 LAST_SIGMAS = 4.0
 FLOOR_NM, FLOOR_KGM2 = 0.02, 0.006

@@ -11,6 +11,9 @@ A joint that rested before held some torque, which the filter forgets as fast as
 a torque explains goes from r and w: r - s Σ r s / Σ s², w likewise. What a good model leaves in n samples, n
 RESIDUAL_NM², goes from Σ r²; of a contact that was found soon that is much.
 
+A payload is named by contacts that tell enough of it, both of how it pulls one way and the other, or by ALIKE contacts in
+a row, each right after going on, that come to the same mass; another error likewise.
+
 Contacts that no cause explains take the certificate back, too, where a person is not likely: MANY in a row, each but
 the first within HELD_S of going on; or weak ones, less than WEAK times their threshold, that are likelier at
 OFTEN_PER_H than at RARELY_PER_H by ODDS. Three in 6.8 min are.
@@ -37,7 +40,7 @@ WITHIN_S = 60.0
 """How far back the end of a contact may lie."""
 RESIDUAL_NM = 0.012
 """Rms that a good model leaves behind it."""
-FEWEST_LOADED, FEWEST = 2, 3
+FEWEST_LOADED, FEWEST = 3, 3
 """Contacts that agree in a payload, or in another error."""
 SHARE, SHARE_OF_ALL = 0.75, 0.9
 """Of a contact's squared residual that one error explains; of all their residuals, that a payload does."""
@@ -47,6 +50,10 @@ SPREAD_LOADED, SPREAD = 0.15, 0.3
 """By how much of its size the contacts may differ, beside 2 sigma."""
 SURE = 8.0
 """Sigmas that a size is at least."""
+BOTH_WAYS = 0.1
+"""Of the evidence for a payload, the part in which it pulls the other way: who pushes twice pushes one way."""
+ALIKE = 4
+"""So many contacts, each so soon after going on that it tells little, agree in an error within SPREAD_LOADED."""
 PLAUSIBLE = 4.0
 """Deviations of the prior that a friction is at most."""
 AT_ONCE_S = 3.0
@@ -59,6 +66,8 @@ WEAK = 1.5
 """The residual of a weak contact comes to less than so many times its threshold."""
 RARELY_PER_H, OFTEN_PER_H, ODDS = 1.0, 30.0, 1000.0
 """Weak contacts an hour of a person, and of a model that is wrong; how many times likelier the latter must be."""
+LOAD = 0
+"""Place of a payload among the causes."""
 _FRICTIONS = (("Coulomb friction", "Nm"), ("viscous friction", "Nm s/rad"))
 TOLD_NOTHING = 0.6
 """Share of standstill in a filter's memory from which on a sample of its joint tells nothing of a cause."""
@@ -80,6 +89,7 @@ def shapes_of() -> dict[str, tuple[int, ...]]:
     return {
         "cause_rw": causes, "cause_ww": causes, "cause_ws": (*causes, JOINTS),
         "contact_rr": (), "contact_rows": (), "contact_peak": (), "contact_rs": each, "contact_ss": each,
+        "load_ww": (2,),
     }  # fmt: skip
 
 
@@ -101,6 +111,7 @@ def _clear(m: Any) -> None:
     m["cause_rw"][:] = 0.0
     m["cause_ww"][:] = 0.0
     m["cause_ws"][:] = 0.0
+    m["load_ww"][:] = 0.0
     m["contact_rs"][:] = 0.0
     m["contact_ss"][:] = 0.0
     m["contact_rr"] = 0.0
@@ -152,6 +163,8 @@ def _add(k: Any, m: Any, i: int, w: Vector, tau: float, still: float, weight: fl
         m["cause_rw"][h] += weight * r * left
         m["cause_ww"][h] += weight * left * left
         m["cause_ws"][h, i] += weight * left * still
+        if h == LOAD:
+            m["load_ww"][0 if left < 0.0 else 1] += weight * left * left
 
 
 class CommonCause(NamedTuple):
@@ -164,12 +177,13 @@ class CommonCause(NamedTuple):
 class _Weighed(NamedTuple):
     """One contact's sums (h,). waited_s: from when the arm went on to its begin; ended_s: when it was over.
 
-    peak: largest residual over its threshold; 0 of none.
+    peak: largest residual over its threshold; 0 of none. load_ww (2,): evidence for a payload that pulls either way.
     """
 
     rw: Vector
     ww: Vector
     rr: float
+    load_ww: Vector
     peak: float
     waited_s: float
     ended_s: float
@@ -225,18 +239,39 @@ class Doubt:
             self._weak += 1
         while self._contacts[0].ended_s < now_s - WITHIN_S:
             self._contacts.popleft()
-        return self._payload() or self._other() or self._unexplained()
+        return self._payload() or self._other() or self._alike() or self._unexplained()
 
     def _payload(self) -> CommonCause | None:
+        """Return the payload that the last contacts look like: few that tell much, or many that tell the same."""
         for count in range(FEWEST_LOADED, len(self._contacts) + 1):
             last = list(self._contacts)[-count:]
-            rw, ww, rr = (sum(column) for column in zip(*((c.rw[0], c.ww[0], c.rr) for c in last), strict=True))
-            kg = self._common(last, 0, SPREAD_LOADED)
-            if kg is not None and rw * rw > SHARE_OF_ALL * ww * rr and abs(kg) > SURE * self._sigma(ww):
-                kg, sigma = self._size(last, 0)
-                what = "picked up" if kg > 0.0 else "put down"
-                return CommonCause(f"{count} contacts look like {abs(kg):.2f} ± {sigma:.2f} kg {what}", is_payload=True)
+            if self._common(last, LOAD, SPREAD_LOADED) is None:
+                continue
+            rw, ww, rr = (sum(parts) for parts in zip(*((c.rw[LOAD], c.ww[LOAD], c.rr) for c in last), strict=True))
+            kg, sigma = self._size(last, LOAD)
+            ways = np.sum([contact.load_ww for contact in last], axis=0)
+            is_sure = abs(kg) > 0.5 * SURE * sigma and np.min(ways) > BOTH_WAYS * np.sum(ways)
+            if not (is_sure and rw * rw > SHARE_OF_ALL * ww * rr):
+                continue
+            return _named(count, LOAD, kg, sigma)
         return None
+
+    def _alike(self) -> CommonCause | None:
+        """Return the error to which contacts come alike, each so soon after going on that it tells little."""
+        last = list(self._contacts)[-ALIKE:]
+        if len(last) < ALIKE or max(contact.waited_s for contact in last) > HELD_S:
+            return None
+        found: list[tuple[float, int, float]] = []
+        for h in range(len(last[0].rw)):
+            if not all(contact.rw[h] ** 2 >= SHARE * contact.ww[h] * contact.rr > 0.0 for contact in last):
+                continue
+            sizes = np.array([contact.rw[h] / contact.ww[h] for contact in last])
+            size = float(np.mean(sizes))
+            found.append((float(np.max(np.abs(sizes / size - 1.0))), h, size))
+        spread, h, size = min(found, default=(np.inf, LOAD, 0.0))
+        if spread > SPREAD_LOADED or not (h == LOAD or self._can_be(h, size)):
+            return None
+        return _named(ALIKE, h, size, SPREAD * abs(size))
 
     def _other(self) -> CommonCause | None:
         last = list(self._contacts)[-FEWEST:]
@@ -246,9 +281,7 @@ class Doubt:
             size = self._common(last, h, SPREAD)
             ww = sum(contact.ww[h] for contact in last)
             if size is not None and abs(size) > SURE * self._sigma(ww) and self._can_be(h, size):
-                joint, kind = divmod(h - 1, len(_FRICTIONS))
-                text = _words(kind, joint, *self._size(last, h))
-                return CommonCause(f"{len(last)} contacts look like {text}", is_payload=False)
+                return _named(len(last), h, *self._size(last, h))
         return None
 
     def _unexplained(self) -> CommonCause | None:
@@ -262,7 +295,8 @@ class Doubt:
         if not text:
             return None
         return CommonCause(
-            f"{text}, and no one error explains them: a light touch, or the arm has changed", is_payload=False
+            f"{text}, and no one error explains them: light touches, a torque sensor that has moved, or another arm",
+            is_payload=False,
         )
 
     def _can_be(self, h: int, size: float) -> bool:
@@ -302,7 +336,7 @@ def _weighed(m: Any, waited_s: float, now_s: float) -> _Weighed:
     ww = np.maximum(m["cause_ww"] - (ws * ws) @ (1.0 / ss), 0.0)
     rr = float(m["contact_rr"] - np.sum(rs * rs / ss))
     rr = max(rr - RESIDUAL_NM**2 * float(m["contact_rows"]), LEAST_SHARE * rr)
-    return _Weighed(rw, ww, rr, float(m["contact_peak"]), waited_s, now_s)
+    return _Weighed(rw, ww, rr, m["load_ww"].copy(), float(m["contact_peak"]), waited_s, now_s)
 
 
 def _explained(contacts: list[_Weighed], h: int) -> float:
@@ -310,7 +344,13 @@ def _explained(contacts: list[_Weighed], h: int) -> float:
     return float(sum(contact.rw[h] ** 2 / contact.ww[h] for contact in contacts if contact.ww[h] > 0.0))
 
 
-def _words(kind: int, joint: int, size: float, sigma: float) -> str:
-    name, unit = _FRICTIONS[kind]
-    more = "more" if size > 0.0 else "less"
-    return f"{abs(size):.2f} ± {sigma:.2f} {unit} {more} {name} of joint {joint + 1} than was certified"
+def _named(count: int, h: int, size: float, deviation: float) -> CommonCause:
+    """Return cause h of this size as what the contacts look like."""
+    if h == LOAD:
+        text = f"{abs(size):.2f} ± {deviation:.2f} kg {'picked up' if size > 0.0 else 'put down'}"
+    else:
+        joint, kind = divmod(h - 1, len(_FRICTIONS))
+        name, unit = _FRICTIONS[kind]
+        more = "more" if size > 0.0 else "less"
+        text = f"{abs(size):.2f} ± {deviation:.2f} {unit} {more} {name} of joint {joint + 1} than was certified"
+    return CommonCause(f"{count} contacts look like {text}", is_payload=h == LOAD)

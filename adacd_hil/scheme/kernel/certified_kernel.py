@@ -256,9 +256,11 @@ def _take_sample(
     filter_bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
     filter_bank.smooth(k["smoothing"], m["r"], m["y"])
     still_rad_s, decay, smoothing = k["still_rad_s"], k["decay"], k["smoothing"]
-    sensitivity.follow_standstill(dq, m["dq_old"], still_rad_s, decay, smoothing, m["still"], m["still_smooth"])
+    sensitivity.follow_standstill(
+        dq, m["dq_old"], still_rad_s, decay, smoothing, m["still"], m["still_smooth"], m["low_speed"]
+    )
     sensitivity.follow_velocity_noise(k, m, dq, m["is_steady"] != 0.0)
-    sensitivity.follow_friction(k, m)
+    sensitivity.follow_friction(k, m, tau_J)
     external_torque.undo_filter(m["r"][filter_bank.WIDE], k["decay"][filter_bank.WIDE], m["history"], tau_ext_wide_hat)
 
 
@@ -349,7 +351,7 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     """
     m["tested"] += 1.0
     termination.widen(dq, m["dq_low"], m["dq_high"])
-    sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_test_share"])
+    sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_test_share"], False)
     margin.follow_test(k, m)
     has_moved = True
     for i in range(dq.shape[0]):
@@ -372,10 +374,9 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
 @compiled
 def _refine(k: Any, m: Any) -> int:
     """Learn on beside the model in use, and let what was learnt take over after its test; return what is against it."""
-    sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_share"])
+    sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_share"], True)
     sensitivity.relax(k, m)
-    margin.follow_sight(k, m)
-    m["withheld_by"] = certificate.NOTHING
+    m["withheld_by"] = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
     if belief.learn(k, m):
         belief.wander(k["drift_std"], m["W_learnt"], k["period_s"] * k["learn_every"], m["P_belief"])
         if missing_torque.is_found_in_time(k, m):

@@ -37,6 +37,7 @@ class _Cause(Enum):
     ELASTIC = "elastic", _BEGINS_ANEW, "the model needs encoders on the links, or stiffer joints"
     TOO_MUCH_BY_PLACE = "position", _BEGINS_ANEW, "who holds the arm shall let go, or that bound is too small"
     MORE_THAN_LAST = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm, which has changed"
+    BLIND = "sight", _BEGINS_ANEW, "`relearn` learns the arm anew"
 
 
 _CAUSES = {
@@ -47,6 +48,7 @@ _CAUSES = {
     certificate.BY_PLACE: _Cause.BY_PLACE,
     certificate.ELASTIC: _Cause.ELASTIC,
     certificate.TOO_MUCH_BY_PLACE: _Cause.TOO_MUCH_BY_PLACE,
+    certificate.BLIND: _Cause.BLIND,
 }
 
 
@@ -102,8 +104,7 @@ class CertificateWatch:
         k, m = self._constants, self._memory
         level = "info" if anchor.is_anchored(k, m) else "warning"
         by_place = anchor.describe_place(k, m)
-        seen = f"{margin.describe_sight(m)}; {margin.describe_false_alarms(k, m)}"
-        text = f"{anchor.describe(k, m)}; {seen}; {known_by}{by_place}"
+        text = f"{anchor.describe(k, m)}; {margin.describe_sight(m)}; {known_by}{by_place}"
         self._is_standing = True
         self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))
         return BriefedEvent.of(Event(level, "certificate", text), self._certified_in_brief(known_by))
@@ -171,7 +172,7 @@ class CertificateWatch:
         return BriefedEvent.of(Event("warning", "touch", text), brief)
 
     def contradiction(self) -> CommonCause:
-        """Return what contradicts the certificate while the arm monitors: an offset that drifts, a torque by place."""
+        """Return what contradicts the certificate while the arm monitors: offset, torque by place, too little sight."""
         cause = _CAUSES[int(self._memory["withheld_by"])]
         return CommonCause("; ".join(self._describe(cause)), is_payload=False)
 
@@ -192,6 +193,8 @@ class CertificateWatch:
                 lines = anchor.describe_place_refused(k, m)
             case _Cause.MORE_THAN_LAST:
                 lines = certificate.describe_more(m, self._last_utc)
+            case _Cause.BLIND:
+                lines = margin.describe_dim(m)
         return lines
 
     def accept(self) -> Event:

@@ -218,7 +218,8 @@ class CertifiedPolicy(SchemePolicy):
         self._monitored = 0
         self._margin.add(self._peak_share.copy())
         self._peak_share[:] = 0.0
-        for name, warning in (("margin", self._margin.warning), ("sight", margin.take_warning(self.numbers.memory[0]))):
+        dim = "; ".join(margin.describe_dim(self.numbers.memory[0]))
+        for name, warning in (("margin", self._margin.warning), ("sight", dim)):
             if warning and name not in self._warned:
                 self._events.append(Event("warning", name, warning))
             self._warned = self._warned | {name} if warning else self._warned - {name}
