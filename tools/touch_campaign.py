@@ -1,6 +1,7 @@
 """Plays hands on an arm that learns: the certificates' errors, and the time until the arm monitors again.
 
     python tools/touch_campaign.py --seeds 0:200 -j 2
+    python tools/touch_campaign.py --kind help --seeds 0:200
     python tools/touch_campaign.py --untouched --seeds 0:200
     python tools/touch_campaign.py --mujoco --seeds 0:200
 
@@ -16,7 +17,7 @@ from functools import partial
 
 import numpy as np
 from campaign_loop import Figure, add_jobs, add_seeds, exit_status, play_trials, print_figures
-from touch_trials import AFTER_S, KINDS, RULES, Trial, play
+from touch_trials import AFTER_S, RULES, SIZES, Trial, play
 
 from adacd_hil.cli.output import format_table
 
@@ -82,8 +83,10 @@ def kind_table(trials: list[Trial]) -> str:
     """Return a table with a row for each kind of touch."""
     head = ("touch", "played", "reported", "withheld", "certified", "> 0.05 Nm", "> 0.1 Nm", "worst, Nm")
     rows = []
-    for kind in KINDS:
+    for kind in SIZES:
         mine = [trial for trial in trials if trial.kind == kind]
+        if not mine:
+            continue
         errors = [max(trial.errors_Nm, default=0.0) for trial in mine]
         counts = (
             len(mine), sum(trial.is_reported for trial in mine), sum(trial.is_withheld for trial in mine),
@@ -99,11 +102,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Hands on an arm that learns.")
     add_seeds(parser, 200)
     parser.add_argument("--untouched", action="store_true", help="leave the arms alone")
+    parser.add_argument("--kind", choices=list(SIZES), default="", help="of all hands; help: one that helps the motion")
     parser.add_argument("--mujoco", action="store_true", help="play the arm in MuJoCo, with its friction")
     add_jobs(parser)
     parser.add_argument("--json", action="store_true", help="print each trial as JSON")
     options = parser.parse_args()
-    one = partial(play, is_touched=not options.untouched, is_foreign=options.mujoco)
+    one = partial(play, is_touched=not options.untouched, is_foreign=options.mujoco, kind=options.kind)
     trials = list(play_trials(one, options.seeds, options.jobs))
     figures = untouched_figures(trials) if options.untouched else touched_figures(trials)
     if options.json:

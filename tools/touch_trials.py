@@ -1,13 +1,14 @@
 """Touches of an arm that learns, for tools/touch_campaign.py: the arm of the scheme's tests, in closed loop, by seed.
 
-Arm and noise are those of tests/scheme (no emulator, no bus); pipeline, desired motion and controller are the product's.
-The motors are free and said to be, so the reading at rest is an anchor.
+Arm and noise are those of tests/scheme (no emulator, no bus); pipeline, desired motion and controller are the
+product's. The motors are free and said to be, so the reading at rest is an anchor.
 """
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,16 +38,19 @@ KINDS = {
 """Kinds of touch, and their shares."""
 SIZES = {
     "lean": (0.1, 2.0), "tip force": (1.0, 8.0), "drag": (0.1, 1.0), "viscous": (0.05, 0.3), "spring": (0.5, 10.0),
-    "inertia": (0.01, 0.1), "payload": (0.05, 1.0), "ramp": (0.02, 1.0),
+    "inertia": (0.01, 0.1), "payload": (0.05, 1.0), "ramp": (0.02, 1.0), "help": (0.05, 0.5),
 }  # fmt: skip
-"""Nm, N, Nm, Nm s/rad, N/m, kg m², kg, Nm/s; log-uniform."""
+"""Nm, N, Nm, Nm s/rad, N/m, kg m², kg, Nm/s, Nm; log-uniform. A hand that helps pushes along the motion, as friction
+pulls against it."""
 RULES = ("one model of the whole fit", "each sample explained", "borne out by what came later", "no more than before")
-LIKE_A_JOINT = ("drag", "viscous", "inertia", "payload")
+LIKE_A_JOINT = ("drag", "viscous", "inertia", "payload", "help")
 """Whose torque is a change of the arm's parameters."""
 KNOWN_S = 0.5
 """Before this nothing is known of the arm that a hand like a joint could contradict."""
 WIDE = 3.0
 """A wide arm has each parameter of profile M times or over at most this."""
+HELPS_FROM_RAD_S = 0.02
+"""Speed from which on a hand that helps pushes with all its torque."""
 LIGHTEST_KGM2 = 0.04
 STEADY_S = 0.6
 """How long the user lets the arm stand in a stop."""
@@ -69,6 +73,7 @@ class Hand:
     torque_Nm: Vector
     tip_N: float = 0.0
     spring_N_m: float = 0.0
+    help_Nm: Vector = field(default_factory=lambda: np.zeros(2))
     ramp_s: float = 0.0
 
     @property
@@ -114,17 +119,17 @@ def draw_arm(random: np.random.Generator) -> tuple[str, Vector]:
             return kind, theta
 
 
-def draw_hand(random: np.random.Generator) -> Hand:
-    """Draw a touch: a quarter from before the start, a fifth without end."""
+def draw_hand(random: np.random.Generator, kind: str = "") -> Hand:
+    """Draw a touch, of a kind or of any: a quarter from before the start, a fifth without end."""
 
     def between(low: float, high: float) -> float:
         return float(np.exp(random.uniform(np.log(low), np.log(high))))
 
-    kind = str(random.choice(list(KINDS), p=list(KINDS.values())))
+    kind = kind or str(random.choice(list(KINDS), p=list(KINDS.values())))
     joint, sign = int(random.integers(2)), float(random.choice([-1.0, 1.0]))
     added, torque = np.zeros(7), np.zeros(2)
     size = between(*SIZES[kind])
-    more: dict[str, float] = {}
+    more: dict[str, Any] = {}
     if kind == "lean":
         torque[joint] = sign * size
     elif kind == "ramp":
@@ -136,6 +141,8 @@ def draw_hand(random: np.random.Generator) -> Hand:
         added[3 + joint] = size
     elif kind == "inertia":
         added[[0, 2] if joint else [0]] = size
+    elif kind == "help":
+        more["help_Nm"] = size * np.eye(2)[joint]
     elif kind == "payload":
         added[:] = size * payload_direction(FREE.arm.link_length_m, 7)
     else:
@@ -176,7 +183,7 @@ class HandLoop(TouchedLoop):
         self.held_at = self.held_at or (x, y)
         pull = hand.spring_N_m * np.subtract(self.held_at, (x, y))
         self.theta = self.free + hand.added
-        self.tau_ext[:] = share * hand.torque_Nm
+        self.tau_ext[:] = share * hand.torque_Nm + hand.help_Nm * np.clip(self.dq / HELPS_FROM_RAD_S, -1.0, 1.0)
         self.tau_ext += hand.tip_N * np.array([l2 + l1 * np.cos(self.q[1]), l2])
         self.tau_ext += (x * pull[1] - y * pull[0], l2 * (np.cos(q12) * pull[1] - np.sin(q12) * pull[0]))
 
@@ -212,7 +219,7 @@ def rule_shares(constants: Structured, memory: Structured) -> tuple[float, ...]:
     explained = max((abs(fit_check.residual(m, *place)) for place in places), default=0.0) / fit_check.limit_Nm(m)
     later = max((earlier.later_share(k, m, s) for s in steps), default=0.0)
     earlier.forget(m)
-    earlier.keep(m)
+    earlier.keep(constants[0], m)
     earlier.is_no_more(k, m)
     return float(changed), float(explained), float(later), float(np.max(m["change"] / m["change_limit"]))
 
@@ -233,10 +240,10 @@ def paper_rows() -> Vector:
     return found
 
 
-def play(seed: int, is_touched: bool, is_foreign: bool = False) -> Trial:
-    """Play one arm, and unless it stays untouched one hand. is_foreign: the arm is MuJoCo's."""
+def play(seed: int, is_touched: bool, is_foreign: bool = False, kind: str = "") -> Trial:
+    """Play one arm, and unless it stays untouched one hand. is_foreign: the arm is MuJoCo's. kind: of the hand."""
     loop = HandLoop(seed, is_foreign)
-    hand = draw_hand(loop.random) if is_touched else None
+    hand = draw_hand(loop.random, kind) if is_touched else None
     begins_s, ends_s = (0.0, 0.0) if hand is None else (hand.begins_s, hand.begins_s + hand.lasts_s)
     until_s = UNTOUCHED_S if hand is None else LONGEST_S if np.isinf(ends_s) else ends_s + AFTER_S
     loop.run_until(SchemeState.ADAPT)
