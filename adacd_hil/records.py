@@ -442,7 +442,7 @@ class BriefedEvent(Event):
 DETECTOR_EVENT: Final = "detector"
 """Name of the events that say which live detector has found a contact."""
 CERTIFICATE_EVENTS: Final = frozenset(
-    ("anchor", "touch", "position", "elastic", "certificate", "revoked", "sight", DETECTOR_EVENT)
+    ("anchor", "touch", "position", "certificate", "revoked", "sight", DETECTOR_EVENT)
 )
 """Names of what the scheme says of its certificates and its live detectors: the user is told as it happens, and a
 replay must say it again."""

@@ -249,9 +249,9 @@ class TouchedLoop(ExcitedLoop):
         """Of the model in use: how far its offsets are off (2,)."""
         return self.model_theta[OFFSETS] - self.offset_Nm
 
-    def recover(self):
+    def recover(self, within_s=9.0):
         """Run until it monitors; the user acknowledges a release that was a collision."""
-        for _ in range(9000):
+        for _ in range(round(within_s / PERIOD_S)):
             state = self.step().state
             if state is SchemeState.MONITOR:
                 return

@@ -149,7 +149,7 @@ def test_where_nothing_else_anchors_an_offset_the_last_certificate_does():
     assert SchemeState.MONITOR not in {output.state for output in leant}
     assert re.search(
         r"joint 1 has a fitted torque offset of -0\.[12]\d\d Nm, by the last certificate it is 0\.100 ± 0\.0\d\d Nm: "
-        "somebody leans on it, or the sensor has moved",
+        "somebody leans on it, the sensor has moved, or a cable pulls on it",
         loop.said("anchor")[0],
     )
     loop.recover()

@@ -15,17 +15,23 @@ from adacd_hil.settings.scheme_settings import LiveDetectorSettings
 
 REST = 60
 """Cycles at rest, the first of them without drives."""
-PAUSES_S = ((4.6, 5.5), (6.2, 7.5), (8.0, 9.2))
-PUSHES = ((4.55, 4.7, (3.0, 0.8)), (6.15, 6.5, (0.0, -0.6)), (6.5, 6.6, (0.0, -3.0)), (7.9, 8.03, (1.5, 0.3)))
+PAUSES_S = ((4.6, 5.5), (6.2, 8.4), (8.9, 10.1))
+PUSHES = (
+    (4.55, 4.7, (3.0, 0.8)),
+    (6.15, 6.5, (0.0, -0.6)),
+    (6.5, 6.6, (0.0, -3.0)),
+    (6.6, 7.5, (0.0, -0.6)),  # until something still pushes at rest
+    (8.8, 8.93, (1.5, 0.3)),
+)
 REQUESTS = (
     (4.6, Request.ACKNOWLEDGE),  # too early
     (5.2, Request.ACKNOWLEDGE),
-    (7.0, Request.ACKNOWLEDGE),
-    (7.2, Request.PAYLOAD),
-    (7.333, Request.PAYLOAD_CHANGED),
+    (7.9, Request.ACKNOWLEDGE),
+    (8.1, Request.PAYLOAD),
+    (8.233, Request.PAYLOAD_CHANGED),
 )
-PAYLOAD_S = 7.27
-SECONDS = 11.7
+PAYLOAD_S = 8.17
+SECONDS = 12.6
 
 
 def settings_of(scheme):

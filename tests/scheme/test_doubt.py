@@ -48,6 +48,7 @@ def test_a_payload_that_nobody_announced_is_named_and_learnt_at_a_word(profile, 
     loop = MonitoredLoop(profile)
     loop.theta = loop.theta + kg * PAYLOAD_1KG
     assert loop.run_until_taken_back() <= 5
+    assert any("s after going on: if nobody has touched the arm, a load was picked up" in t for t in loop.said("touch"))
     (text,) = loop.said("revoked")
     named = re.fullmatch(r"\d contacts look like (\S+) ± (\S+) kg picked up: .*, `changed` learns it", text)
     assert float(named[1]) == pytest.approx(kg, rel=0.1)
@@ -84,11 +85,23 @@ def test_friction_that_is_not_the_certified_one_is_named_and_learnt_at_a_word(ha
     assert loop.said("certificate")[1].endswith(f"; {BY_WORD}the certificate that was taken back")
 
 
+@pytest.mark.parametrize(("seconds", "is_said"), [(0.4, False), (4.0, True)])
+def test_a_push_at_rest_is_said_once_the_filters_have_forgotten_a_hand_that_has_gone(seconds, is_said):
+    loop = MonitoredLoop()
+    outputs = loop.lean(0, 2.0, seconds) + loop.run(2000)
+    stopped = [output.state for output in outputs].index(SchemeState.STOPPED) * PERIOD_S
+    assert stopped < seconds + 0.3  # the slowest filter still has a part of the hand
+    assert [text.startswith("something still pushes the arm at rest, 2.0") for text in loop.said("touch")] == [
+        True
+    ] * is_said
+
+
 def test_a_contact_that_never_ends_has_an_exit():
     """A sensor that has moved by 0.5 Nm looks like somebody who leans: only the user knows, and says it by a word."""
     loop = MonitoredLoop()
     loop.offset_Nm[0] = 0.5
     loop.run_until(SchemeState.STOPPED, 15_000)
+    loop.run(1100)
     assert re.match(r"something still pushes the arm at rest, -?0\.[45]\d, ", loop.said("touch")[-1])
     assert re.fullmatch(
         r"something still pushes the arm, -?0\.[45] / 0\.0 Nm at the joints: let go; if nothing touches it.*`relearn`",

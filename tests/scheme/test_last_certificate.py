@@ -153,6 +153,17 @@ class Asked:
         return certificate.is_no_more(self.k, self.m)
 
 
+def test_a_viscous_hand_stands_out_from_a_joints_viscous_friction_before_it_does_from_the_friction_at_any_speed():
+    """Of friction that is mostly Coulomb's a fifth is more than the hand makes at any speed."""
+    asked = Asked(friction_share=0.2, inertia_share=0.0)  # 0.1 Nm and 0.1 Nm s/rad
+    bound = 0.02 + 4.0 * 0.2 * 0.1
+    assert asked.agrees_with("F_v2", 0.99 * bound)
+    assert not asked.agrees_with("F_v2", 1.01 * bound)
+    assert certificate.describe_more(asked.m, DATE) == [
+        f"viscous friction of joint 2 is 0.101 Nm s/rad more than in the certificate of {DATE}, bound 0.100 Nm s/rad"
+    ]
+
+
 @pytest.mark.parametrize(("name", "floor"), [("F_c2", 0.02), ("a3", 0.006)])
 def test_less_than_the_floor_is_nothing(name, floor):
     asked = Asked(friction_share=0.0, inertia_share=0.0)

@@ -41,8 +41,8 @@ from adacd_hil.settings.configuration import Settings
 REST, TARE, ACCEPTED, LAST = range(4)
 KINDS = 4
 NAMES = ("the reading at rest", "the tare", "the user's word", "the last certificate")
-_HELD = "the sensor has moved, or the motor holds more at rest than `arm.holding_torque_Nm` says"
-_MOVED = "or the sensor has moved"
+_HELD = "the sensor has moved, a cable pulls on it, or the motor holds more at rest than `arm.holding_torque_Nm` says"
+_MOVED = "the sensor has moved, or a cable pulls on it"
 SIGMAS = 4.0
 """Two joints, two-sided: 1.3e-4 of clean arms, each time that it is asked."""
 REST_STD_NM = 0.004

@@ -106,7 +106,7 @@ def learn(k: Any, m: Any) -> bool:
     else:
         m["ring_used"] += 1.0
     m["ring_W"][place] = W
-    missing_torque.keep(k, m, place)
+    missing_torque.keep(m, place)
     for i in range(still.shape[0]):
         m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > regressor.SLOW_RAD_S else 1.0
     m["ring_tau"][place] = tau_J

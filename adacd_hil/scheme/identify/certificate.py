@@ -3,14 +3,16 @@
 **The last certificate.** A hand that drags from before the first motion to the end of learning, or moves like a mass,
 is the arm as far as one run can tell. The last certificate knows the arm without it, or with another. As within a run,
 **less is the arm's**: a fit gets no certificate while one of the quantities c of `earlier`, a joint's friction at some
-speed or an inertia, is
+speed or an inertia, or its viscous friction, which is the friction at the highest of these speeds less that at the
+lowest, over their difference, is
 
     c theta > last + floor + LAST_SIGMAS sqrt(share² last² + std² + c P c')
 
 until the user says that nobody touches the arm. share: `history.friction_share`, `inertia_share`, how far one run
 differs from another. Not asked with a payload that was announced. It judges the fit, and never pulls it.
 
-Shapes: quantities (q,), friction of each joint by speed first, then a1, a2, a3; parameters p.
+Shapes: quantities (q,), friction of each joint by speed first, then a1, a2, a3, then each joint's viscous friction;
+parameters p.
 """
 
 from typing import Any, NamedTuple
@@ -22,11 +24,11 @@ from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import anchor, earlier, missing_torque
 from adacd_hil.settings.configuration import Settings
 
-NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, ELASTIC, BLIND = range(9)
+NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, BLIND = range(8)
 """What contradicts a certificate that is withheld, or taken back: of the kernel's `withheld_by`."""
 LAST_SIGMAS = 4.0
-FLOOR_NM, FLOOR_KGM2 = 0.02, 0.006
-"""Of friction and of inertia: less is nothing."""
+FLOOR_NM, FLOOR_KGM2, FLOOR_NM_S = 0.02, 0.006, 0.02
+"""Of friction, inertia, viscous friction: less is nothing."""
 
 
 class Certificate(NamedTuple):
@@ -48,25 +50,37 @@ class Certificate(NamedTuple):
     text: str
 
 
-def constants_of(settings: Settings) -> dict[str, Vector]:
-    """Return `last_certified` (q,), `_std`, `_floor`; nan where there is no last certificate."""
+def constants_of(settings: Settings, compared: Vector, prior_std: Vector) -> dict[str, Vector]:
+    """Return `last_compared` (q, p), `last_prior` (q,), `last_certified`, `_std`, `_floor`; nan of no last certificate.
+
+    compared (…, p): the quantities of `earlier`; prior_std (p,). The deviations of the two frictions that a viscous
+    friction is between count as if they were independent, which is more than they make.
+    """
     history = settings.history
-    counts = (earlier.FRICTIONS, earlier.INERTIAS)
+    counts = (earlier.FRICTIONS, earlier.INERTIAS, JOINTS)
+    first = sum(counts[:2])
+    slope = np.zeros((JOINTS, first))
+    for i, speeds in enumerate(slope):
+        speeds[[len(earlier.SPEEDS_RAD_S) * i, len(earlier.SPEEDS_RAD_S) * (i + 1) - 1]] = (-1.0, 1.0)
+    slope /= earlier.SPEEDS_RAD_S[-1] - earlier.SPEEDS_RAD_S[0]
+    quantities = np.vstack((np.eye(first), slope))
     last, std = np.full(sum(counts), np.nan), np.zeros(sum(counts))
     if history.is_known:
-        last = np.array((*history.friction_Nm, *history.inertia_kgm2))
-        std = np.array((*history.friction_std_Nm, *history.inertia_std_kgm2))
-    share = np.repeat((history.friction_share, history.inertia_share), counts)
+        last = quantities @ (*history.friction_Nm, *history.inertia_kgm2)
+        std = np.sqrt(quantities**2 @ np.square((*history.friction_std_Nm, *history.inertia_std_kgm2)))
+    share = np.repeat((history.friction_share, history.inertia_share, history.friction_share), counts)
     return {
+        "last_compared": quantities @ compared[:first],
+        "last_prior": np.square(quantities @ compared[:first]) @ prior_std**2,
         "last_certified": last,
         "last_certified_std": np.hypot(std, share * last),
-        "last_certified_floor": np.repeat((FLOOR_NM, FLOOR_KGM2), counts),
+        "last_certified_floor": np.repeat((FLOOR_NM, FLOOR_KGM2, FLOOR_NM_S), counts),
     }
 
 
 def shapes_of() -> dict[str, tuple[int, ...]]:
     """Return the shapes of what is remembered, by name."""
-    quantities = (earlier.FRICTIONS + earlier.INERTIAS,)
+    quantities = (earlier.FRICTIONS + earlier.INERTIAS + JOINTS,)
     return {"is_last_believed": (), "last_change": quantities, "last_limit": quantities}
 
 
@@ -91,19 +105,10 @@ def contradicted_by(k: Any, m: Any) -> int:
     elif not earlier.is_no_more(k, m):
         cause = MORE
     if cause != NOTHING:
-        missing = missing_cause(k, m)
-        return missing if missing != NOTHING and cause == CHANGED else cause
+        return BY_PLACE if missing_torque.is_found(k, m) and cause == CHANGED else cause
     if not anchor.is_place_bounded(k, m):
         return TOO_MUCH_BY_PLACE
     return NOTHING if is_no_more(k, m) else MORE_THAN_LAST
-
-
-@compiled
-def missing_cause(k: Any, m: Any) -> int:
-    """Return what the model lacks, by what this adaptation has learnt."""
-    if not missing_torque.is_found(k, m):
-        return NOTHING
-    return ELASTIC if m["is_elastic"] != 0.0 else BY_PLACE
 
 
 @compiled
@@ -114,12 +119,9 @@ def is_no_more(k: Any, m: Any) -> bool:
     unit = earlier.unit_of(m["fit_square"], m["fit_rows"])
     is_agreed = True
     for q in range(m["last_change"].shape[0]):
-        row = k["compared"][q]
-        now = 0.0
-        for j in range(row.shape[0]):
-            now += row[j] * m["belief"][j]
-        fitted = earlier.split(earlier.variance_of(row, m["P_belief"]), k["compared_prior"][q], unit)
-        m["last_change"][q] = now - k["last_certified"][q]
+        row = k["last_compared"][q]
+        fitted = earlier.split(earlier.variance_of(row, m["P_belief"]), k["last_prior"][q], unit)
+        m["last_change"][q] = earlier.value_of(row, m["belief"]) - k["last_certified"][q]
         m["last_limit"][q] = k["last_certified_floor"][q] + LAST_SIGMAS * np.sqrt(
             k["last_certified_std"][q] ** 2 + fitted
         )
@@ -130,10 +132,13 @@ def is_no_more(k: Any, m: Any) -> bool:
 def describe_more(m: Any, date_utc: str) -> list[str]:
     """Say of which quantities the fit has more than the last certificate, and by how much, a line each."""
     excess = m["last_change"] / m["last_limit"]
+    first = earlier.FRICTIONS + earlier.INERTIAS
+    viscous = [(first + i, f"viscous friction of joint {i + 1}", "Nm s/rad") for i in range(JOINTS)]
+    found = [*earlier.foremost(excess[:first]), *(row for row in viscous if excess[row[0]] > 1.0)]
     return [
         f"{what} is {float(m['last_change'][q]):.3f} {unit} more than in the certificate of {date_utc}, "
         f"bound {float(m['last_limit'][q]):.3f} {unit}"
-        for q, what, unit in earlier.foremost(excess)
+        for q, what, unit in found
     ]
 
 

@@ -11,8 +11,8 @@ A joint that rested before held some torque, which the filter forgets as fast as
 a torque explains goes from r and w: r - s Σ r s / Σ s², w likewise. What a good model leaves in n samples, n
 RESIDUAL_NM², goes from Σ r²; of a contact that was found soon that is much.
 
-A payload is named by contacts that tell enough of it, both of how it pulls one way and the other, or by ALIKE contacts in
-a row, each right after going on, that come to the same mass; another error likewise.
+A payload is named by contacts that tell enough of it, both of how it pulls one way and the other, or by ALIKE contacts
+in a row, each right after going on, that come to the same mass; another error likewise.
 
 Contacts that no cause explains take the certificate back, too, where a person is not likely: MANY in a row, each but
 the first within HELD_S of going on; or weak ones, less than WEAK times their threshold, that are likelier at
@@ -240,6 +240,16 @@ class Doubt:
         while self._contacts[0].ended_s < now_s - WITHIN_S:
             self._contacts.popleft()
         return self._payload() or self._other() or self._alike() or self._unexplained()
+
+    def describe_again(self) -> str | None:
+        """Say what the last contact may be, if it came at once after the arm had gone on from another."""
+        if len(self._contacts) < 2 or self._contacts[-1].waited_s > AT_ONCE_S:
+            return None
+        waited_s = self._contacts[-1].waited_s
+        return (
+            f"a contact again, {waited_s:.1f} s after going on: if nobody has touched the arm, a load was picked up or "
+            "put down (`changed` learns it), or the model has become wrong (`relearn`)"
+        )
 
     def _payload(self) -> CommonCause | None:
         """Return the payload that the last contacts look like: few that tell much, or many that tell the same."""

@@ -17,27 +17,29 @@ This sees a weak touch of the beginning, when theta_0 is not known well enough t
 are kept.
 
 **Over a touch** the fit's earlier beliefs are *kept*: where a contact interrupted it all of them and the one at the
-contact, those of before a change, or where a test has refuted the model all of them and the model. When the touch began
-is not known, so a later fit must agree with each, in each quantity c that a hand can look like, a joint's friction at
-some speed, an inertia, an offset that nothing anchors:
+contact, those of before a change. When the touch began is not known, so a later fit must agree with each, in each
+quantity c that a hand can look like, a joint's friction at some speed, an inertia, an offset that nothing anchors:
 
     c (theta - theta_0) <= max(floor, SIGMAS sqrt(c (P_0 + P) c'))
 
-The first ones know little and bound little. The last ones may have been touched, and say anything. So one that is
-apart from an earlier one (`fit_check`) is forgotten: with each of the last samples that the next fit learns, one
-pair is compared.
+Friction and an offset that nothing anchors must agree both ways: who pushes the arm on takes friction away. Of an
+inertia **less is the arm's**, and more is a touch that has not been seen to end. Where an anchor gives the offset, a
+belief that differs has been leant on, and is forgotten. The first beliefs know little and bound little. A variance's
+part that the samples say is scaled by u, the prior's is not. A fit that a contact interrupts is asked as a finished one
+is: if no one model explains it, only the beliefs from before the change are kept.
 
-A hand that doesn't help the arm only adds friction and inertia. So **less is the arm's**, and more is a touch that has
-not been seen to end. Of an offset that nothing anchors neither value is known to be the arm's, so both signs count; of
-one that is anchored the fit's value is, so a belief that differs has been leant on, and is forgotten. A variance's part
-that the samples say is scaled by u, the prior's is not.
+**Kept beliefs lapse** where fits in a row, without a contact between, agree with each other against them: LITTLE_FITS,
+if they have more by LITTLE times a bound and by LITTLE_NM on the trajectory at most, for a touch that nobody noticed
+bends the beliefs it comes into; LESS_FITS, if they have less friction, and no more of anything and the same offsets,
+for the hand that was there before may have dragged. A hand as small as that, or that helps as long, is learnt then.
 
-Shapes: p parameters, q quantities, s steps, n kept; rows (q, p); kept (n, p), P_kept (n, p, p), kept_unit (n,), 0 of
-one that is forgotten, kept_age_s (n,); apart_n, apart_s: the pair that is compared next, the later one first;
-steps_theta (s, p), steps_P (s, p, p), steps_square, steps_rows (s,); change, change_limit, change_age_s (q,): as
-compared last with the belief that it contradicts most.
+Shapes: p parameters, q quantities, s steps, n kept, and a refused fit behind them; rows (q, p); kept (n, p), P_kept
+(n, p, p), kept_unit (n,), 0 of one that is forgotten, kept_age_s (n,); steps_theta (s, p), steps_P (s, p, p),
+steps_square, steps_rows (s,); change, change_limit, change_age_s (q,): as compared last with the belief that it
+contradicts most.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -63,8 +65,12 @@ STEPS = 8
 YOUNG_STEPS = 1
 """The first ones are not kept: for so long a hand may have been there all the time, and nothing could tell."""
 KEPT = STEPS + 1
-"""How many beliefs may be kept: the steps, and what the fit had come to in the end."""
-PAIRS = KEPT * (KEPT - 1) // 2
+"""How many beliefs may be kept: the steps, and that at the contact. Behind them is the place of a refused fit."""
+LITTLE, LITTLE_NM, LITTLE_FITS = 2.0, 0.06, 2.0
+"""How many times a bound fits that agree may have more, what may come of that on the trajectory, and how many they must
+be, so that the kept beliefs lapse."""
+LESS_FITS = 5.0
+"""So many in a row, some 7 s, if they have less friction: a hand that dragged has let go then."""
 SIGMAS = 3.5
 """With the floors below: the same fits had 0.23 of what is allowed more in the middle, 0.73 at most."""
 SPEEDS_RAD_S = (0.2, 0.6, 1.2)
@@ -80,15 +86,17 @@ HARD = 2.0
 """Mean square of the learnt residuals in their hard moments over that of all: much of them is noise of the velocity."""
 SMALLEST_UNIT = 0.1
 """Least unit of the variances; the rest of it as `sensitivity` has it."""
+PEAK_ACCELERATION = 10.0 / math.sqrt(3.0)
+"""Of a rest-to-rest quintic, over travel / duration²."""
 _INERTIAS = ("a1", "a2", "a3")
 FRICTIONS, INERTIAS = JOINTS * len(SPEEDS_RAD_S), len(_INERTIAS)
 """How many quantities are a joint's friction at some speed, and how many an inertia."""
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
-    """Return `compared` (q, p), `compared_floor`, `_share`, `_prior` (q,), `step_samples` and `apart_samples` (2,).
+    """Return `compared` (q, p), `compared_floor`, `_share`, `_prior` (q,), `step_samples`, and `change_Nm` (q,).
 
-    prior_std (p,). apart_samples: of an arm's fit, and of a payload's.
+    change_Nm: torque that one unit of the quantity makes at most on the trajectory. prior_std (p,).
     """
     unit = np.eye(prior_std.size)
     base = len(settings.estimator.parameter_names)
@@ -97,8 +105,7 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
     inertia = [unit[PARAMETER_NAMES.index(name)] for name in _INERTIAS]
     offset = [unit[base + i] for i in range(JOINTS)]
     rows = np.array(friction + inertia + offset)
-    certified = settings.certified
-    learn_s = settings.bus.period_s * certified.learn_every
+    learn_s = settings.bus.period_s * settings.certified.learn_every
     return {
         "compared": rows,
         "compared_floor": np.array(
@@ -106,9 +113,16 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
         ),
         "compared_share": np.repeat((0.0, INERTIA_SHARE, 0.0), (len(friction), len(inertia), JOINTS)),
         "compared_prior": rows**2 @ prior_std**2,
+        "change_Nm": np.concatenate([np.ones(len(friction)), _accelerations(settings), np.ones(JOINTS)]),
         "step_samples": np.array(max(round(STEP_S / learn_s), 1)),
-        "apart_samples": np.array([(fit_s - certified.hold_back_s) / learn_s - PAIRS for fit_s in certified.fit_s]),
     }
+
+
+def _accelerations(settings: Settings) -> tuple[float, ...]:
+    """Return the largest accelerations on the trajectory that go with a1, a2, a3, rad/s²."""
+    travel_rad = 2.0 * np.radians(settings.trajectory.amplitude_deg)
+    first, second = PEAK_ACCELERATION * travel_rad / np.square(settings.trajectory.half_period_s)
+    return first, 2.0 * first + second, first + second
 
 
 def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
@@ -125,12 +139,12 @@ def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
         "steps_rows": (STEPS,),
         "has_kept": (),
         "kept_count": (),
-        "kept": (KEPT, count),
-        "P_kept": (KEPT, count, count),
-        "kept_unit": (KEPT,),
-        "kept_age_s": (KEPT,),
-        "apart_s": (),
-        "apart_n": (),
+        "refused_fits": (),
+        "has_lapsed": (),
+        "kept": (KEPT + 1, count),
+        "P_kept": (KEPT + 1, count, count),
+        "kept_unit": (KEPT + 1,),
+        "kept_age_s": (KEPT + 1,),
         "later": (count,),
         "change": quantities,
         "change_limit": quantities,
@@ -151,8 +165,6 @@ def begin(m: Any) -> None:
 def follow(k: Any, m: Any) -> None:
     """Take in that the fit has learnt a sample."""
     m["fit_samples"] += 1.0
-    if m["has_kept"] != 0.0 and m["fit_samples"] > k["apart_samples"][int(m["is_payload"])]:
-        _compare_kept(m)
     if m["fit_samples"] % k["step_samples"] != 0.0:
         return
     s = int(m["steps_used"]) % m["steps_rows"].shape[0]
@@ -167,24 +179,17 @@ def follow(k: Any, m: Any) -> None:
 def forget(m: Any) -> None:
     """Keep nothing: a certificate stands, or the user says that nobody touches the arm."""
     m["has_kept"] = 0.0
+    m["refused_fits"] = 0.0
+    m["has_lapsed"] = 0.0
 
 
 @compiled
-def keep(m: Any) -> None:
+def keep(k: Any, m: Any) -> None:
     """Keep what the fit has come to, and how it came about, if nothing is kept yet: a touch may have begun."""
-    if m["has_kept"] == 0.0 and m["steps_used"] > YOUNG_STEPS:
+    m["refused_fits"] = 0.0
+    if m["has_kept"] == 0.0 and m["steps_used"] > YOUNG_STEPS and is_steady(m) and is_explained(k, m):
         _keep_steps(m, int(m["steps_used"]) - 1)
         _keep(m, m["belief"], m["P_belief"], unit_of(m["fit_square"], m["fit_rows"]), 0.0)
-
-
-@compiled
-def keep_refuted(m: Any) -> None:
-    """Do so with a model whose test has failed.
-
-    Not with a new payload: hands have been on the arm, and friction may depend on the load.
-    """
-    if m["is_payload"] == 0.0:
-        keep(m)
 
 
 @compiled
@@ -192,11 +197,12 @@ def _keep_steps(m: Any, last: int) -> None:
     """Keep the fit's steps up to this number, in place of nothing."""
     steps = m["steps_rows"].shape[0]
     m["kept_count"] = 0.0
-    m["apart_s"], m["apart_n"] = 0.0, 1.0
+    m["refused_fits"] = 0.0
     for number in range(max(int(m["steps_used"]) - steps, YOUNG_STEPS), last + 1):
         s = number % steps
         age_s = STEP_S * (m["steps_used"] - 1.0 - number)
-        _keep(m, m["steps_theta"][s], m["steps_P"][s], unit_of(m["steps_square"][s], m["steps_rows"][s]), age_s)
+        unit = unit_of(m["steps_square"][s], m["steps_rows"][s])
+        _keep(m, m["steps_theta"][s], m["steps_P"][s], unit, age_s)
 
 
 @compiled
@@ -291,48 +297,64 @@ def later_share(k: Any, m: Any, s: int) -> float:
 
 
 @compiled
-def _compare_kept(m: Any) -> None:
-    """Compare the next pair of kept beliefs, if one is left; forget the later one if they are apart."""
-    s, n = int(m["apart_s"]), int(m["apart_n"])
-    if n >= m["kept_count"]:
-        return
-    is_judged = s < n and m["kept_unit"][s] > 0.0 and m["kept_unit"][n] > 0.0
-    if is_judged and fit_check.is_apart(
-        m, m["kept"][s], m["P_kept"][s], m["kept"][n], m["P_kept"][n], m["kept_unit"][n]
-    ):
-        m["kept_unit"][n] = 0.0
-    m["apart_s"] = float(s + 1)
-    if s + 1 >= n:
-        m["apart_s"], m["apart_n"] = 0.0, float(n + 1)
-
-
-@compiled
 def is_no_more(k: Any, m: Any) -> bool:
-    """Tell whether the fit has no more friction and inertia, and no other unanchored offset, than what was kept.
+    """Tell whether the fit has the friction of what was kept, no more inertia, and no other unanchored offset.
 
     The fit's offsets keep to their anchors. A kept belief whose offsets don't has been leant on, and is forgotten.
     """
     if m["has_kept"] == 0.0:
         return True
-    while m["apart_n"] < m["kept_count"]:
-        _compare_kept(m)
     unit = unit_of(m["fit_square"], m["fit_rows"])
     m["change"][:] = 0.0
     m["change_limit"][:] = 1.0
-    is_agreed = True
     m["has_kept"] = 0.0
     for n in range(int(m["kept_count"])):
-        if m["kept_unit"][n] > 0.0 and _is_leant(k, m, n, unit):
+        if m["kept_unit"][n] > 0.0 and _is_touched(k, m, n, unit):
             m["kept_unit"][n] = 0.0
         if m["kept_unit"][n] > 0.0:
             m["has_kept"] = 1.0
-            is_agreed = _is_agreed(k, m, n, unit) and is_agreed
-    return is_agreed
+            _note_change(k, m, n, unit)
+    if np.all(np.abs(m["change"]) <= m["change_limit"]):
+        return True
+    if _lapses(k, m, unit):
+        m["has_kept"] = 0.0
+        m["has_lapsed"] = 1.0
+        return True
+    return False
 
 
 @compiled
-def _is_leant(k: Any, m: Any, n: int, unit: float) -> bool:
-    """Tell whether an anchored offset of a kept belief is another than the fit's, or any that its anchor excludes."""
+def _lapses(k: Any, m: Any, unit: float) -> bool:
+    """Tell whether enough fits in a row have been refused for the same, as large as it is; remember this one."""
+    last = m["kept"].shape[0] - 1
+    is_little, is_less, is_same, friction_Nm, else_Nm = True, True, True, 0.0, 0.0
+    for q in range(m["change"].shape[0]):
+        excess = m["change"][q] / m["change_limit"][q]
+        is_little = is_little and abs(excess) <= (LITTLE if excess > 0.0 or q >= FRICTIONS else 1.0)
+        is_less = is_less and excess <= 1.0 and (q < FRICTIONS + INERTIAS or excess >= -1.0)
+        change_Nm = abs(m["change"][q]) * k["change_Nm"][q] if abs(excess) > 1.0 else 0.0
+        if q < FRICTIONS:
+            friction_Nm = max(friction_Nm, change_Nm)
+        else:
+            else_Nm += change_Nm
+        if m["refused_fits"] > 0.0:
+            change, limit = _compare(k, m, last, q, unit)
+            is_same = is_same and abs(change) <= limit
+    m["kept"][last] = m["belief"]
+    m["P_kept"][last] = m["P_belief"]
+    m["kept_unit"][last] = unit
+    m["refused_fits"] = m["refused_fits"] + 1.0 if is_same else 1.0
+    if is_little and friction_Nm + else_Nm <= LITTLE_NM:
+        return bool(m["refused_fits"] >= LITTLE_FITS)
+    return bool(is_less and m["refused_fits"] >= LESS_FITS)
+
+
+@compiled
+def _is_touched(k: Any, m: Any, n: int, unit: float) -> bool:
+    """Tell whether a kept belief has a hand in it: in its anchored offset, or in friction that is less than none.
+
+    The offset is another than the fit's, or one that the anchor excludes.
+    """
     joints = m["bound_Nm"].shape[1]
     first_offset = m["change"].shape[0] - joints
     for i in range(joints):
@@ -340,40 +362,47 @@ def _is_leant(k: Any, m: Any, n: int, unit: float) -> bool:
         is_another = not abs(change) <= limit
         if is_another and (not anchor.is_open(k, m, i) or anchor.is_excluded(m, i, m["judged_Nm"][i] - change)):
             return True
+    for q in range(FRICTIONS):
+        known = split(variance_of(k["compared"][q], m["P_kept"][n]), k["compared_prior"][q], m["kept_unit"][n])
+        if value_of(k["compared"][q], m["kept"][n]) < -max(k["compared_floor"][q], SIGMAS * np.sqrt(known)):
+            return True
     return False
 
 
 @compiled
-def _is_agreed(k: Any, m: Any, n: int, unit: float) -> bool:
-    """Tell whether the fit agrees with a kept belief; note each quantity where it contradicts this one most."""
+def _note_change(k: Any, m: Any, n: int, unit: float) -> None:
+    """Note each quantity where the fit contradicts a kept belief more than those before it."""
     first_offset = m["change"].shape[0] - m["bound_Nm"].shape[1]
-    is_agreed = True
     for q in range(m["change"].shape[0]):
         change, limit = _compare(k, m, n, q, unit)
-        more = change
-        if q >= first_offset:
-            more = abs(change) if anchor.is_open(k, m, q - first_offset) else 0.0
-        if not more * m["change_limit"][q] <= abs(m["change"][q]) * limit:
+        is_either = anchor.is_open(k, m, q - first_offset) if q >= first_offset else False
+        is_either = is_either or q < FRICTIONS
+        is_asked = is_either or (change > 0.0 and q < first_offset) or not np.isfinite(change)
+        if is_asked and not abs(change) * m["change_limit"][q] <= abs(m["change"][q]) * limit:
             m["change"][q], m["change_limit"][q], m["change_age_s"][q] = change, limit, m["kept_age_s"][n]
-        is_agreed = is_agreed and more <= limit
-    return bool(is_agreed)
 
 
 @compiled
 def _compare(k: Any, m: Any, n: int, q: int, unit: float) -> tuple[float, float]:
     """Return by how much the fit has more of a quantity than a kept belief, and how much is nothing."""
     row, prior = k["compared"][q], k["compared_prior"][q]
-    before, now = 0.0, 0.0
-    for j in range(row.shape[0]):
-        if row[j] != 0.0:
-            before += row[j] * m["kept"][n, j]
-            now += row[j] * m["belief"][j]
+    before, now = value_of(row, m["kept"][n]), value_of(row, m["belief"])
     if q < FRICTIONS + INERTIAS:
         before = max(before, 0.0)  # who pushes the arm on looks like less than none
     known = split(variance_of(row, m["P_kept"][n]), prior, m["kept_unit"][n])
     fitted = split(variance_of(row, m["P_belief"]), prior, unit)
     floor = max(k["compared_floor"][q], k["compared_share"][q] * abs(before))
     return now - before, max(floor, SIGMAS * np.sqrt(known + fitted))
+
+
+@compiled
+def value_of(row: Vector, theta: Vector) -> float:
+    """Return c theta. row, theta (p,)."""
+    total = 0.0
+    for j in range(row.shape[0]):
+        if row[j] != 0.0:
+            total += row[j] * theta[j]
+    return float(total)
 
 
 @compiled
@@ -393,14 +422,13 @@ def split(variance: float, prior: float, unit: float) -> float:
     return 1.0 / (1.0 / prior + max(1.0 / variance - 1.0 / prior, 0.0) / unit)
 
 
-def describe_more(k: Any, m: Any) -> list[str]:
-    """Say of which quantities the fit has more than what was kept, by how much and since when, a line each.
+def describe_more(m: Any) -> list[str]:
+    """Say in which quantities the fit contradicts what was kept, by how much and since when, a line each.
 
     Of a joint's friction only the speed at which it stands out most.
     """
-    excess = m["change"] / m["change_limit"]
-    excess[-JOINTS:] = [abs(excess[i - JOINTS]) if anchor.is_open(k, m, i) else 0.0 for i in range(JOINTS)]
-    return [_more(m, q, what, unit) for q, what, unit in foremost(excess)]
+    excess = np.abs(m["change"]) / m["change_limit"]
+    return [_changed(m, q, what, unit) for q, what, unit in foremost(excess)]
 
 
 def foremost(excess: Vector) -> list[tuple[int, str, str]]:
@@ -420,9 +448,13 @@ def foremost(excess: Vector) -> list[tuple[int, str, str]]:
     return [(q, what, unit) for q, what, unit in found if excess[q] > 1.0]
 
 
-def _more(m: Any, q: int, what: str, unit: str) -> str:
+def _changed(m: Any, q: int, what: str, unit: str) -> str:
     change, limit, age_s = float(m["change"][q]), float(m["change_limit"][q]), float(m["change_age_s"][q])
+    is_helped = q < FRICTIONS and change < 0.0
+    why = "a hand helps the motion, or one that dragged has let go"
+    if not is_helped:
+        why = "a touch that began then has not been seen to end, or the arm does what the model doesn't know"
     return (
         f"{what} is {abs(change):.3f} {unit} {'more' if change > 0.0 else 'less'} than {age_s:.1f} s ago, "
-        f"bound {limit:.3f} {unit}: a touch that began then has not been seen to end"
+        f"bound {limit:.3f} {unit}: {why}"
     )

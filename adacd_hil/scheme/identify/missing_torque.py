@@ -1,12 +1,11 @@
-"""Evidence that the model lacks a torque: one that depends on where the arm is, or that of elastic joints.
+"""Evidence that the model lacks a torque that depends on where the arm is.
 
 Each sample that the belief learns, a row w of the regressor with its torque and variance R, also goes into the sums
 
-    L = Σ v v'/R,   b = Σ v r/R,   r = tau_f - w prior,   v = (w, x, e)
+    L = Σ v v'/R,   b = Σ v r/R,   r = tau_f - w prior,   v = (w, x)
 
-with x the columns of `regressor` behind the filter that is learnt from, and e those of elastic joints: encoders on the
-motors see q + tau_J/K in place of q, which leaves M d²tau_J/dt² / K, filtered as the rest. From a prior N(0, S²) of the
-parameters less their mean, with x, with e, or without, each sum says how likely the samples are:
+with x the columns of `regressor` behind the filter that is learnt from. From a prior N(0, S²) of the parameters less
+their mean, with x or without, each sum says how likely the samples are:
 
     log evidence = ½ b' S M^-1 S b - ½ log det M,   M = I + S L S
 
@@ -15,19 +14,14 @@ squares that the basic model leaves, and comes to LEAST_NM rms. Of clean arms, w
 `tools/error_campaign.py` but a tilt and a cable, the gain was -25 to -3, or the share below 0.4; tilts of 0.5 and 1
 deg and a cable of 0.1 Nm came to a gain of 20 and more on a motion that shows them.
 
-Its joints are elastic if e makes them e^ELASTIC_GAIN times likelier, with x and without. The same errors came to a
-gain of -10 to 10, elastic joints that swing at 8 Hz to 380 and more, at 15 Hz to 10 after 1.4 s and 24 after 2.4 s, at
-25 Hz to -4 to 2. 1/K itself is not to be had: torque noise is in e, and makes it too small.
-
 Asked of an adaptation as a whole, when it refuses a fit. A torque by place is asked for while the arm monitors, too: of
 the first 2 s, the next 4, 8, 16 s and then of each 16 s of learnt samples. Not of longer ones: the drift of a sensor
 over a minute looks like this. There one stretch is not enough, since on one way much depends on the place: what it says
 must explain SAID_SHARE of the squares that the basic model leaves in a later one.
 
-Shapes: p parameters, n joints, t = PLACE_TERMS, f = p + n t + n; evidence_L (n, f, f): by the joint of the row, lower
-half; evidence_b, _basic, _full, _row, _scale (f,); evidence_M (f, f); evidence_said (n t,): coefficients of the last
-stretch that came to a torque by place, all 0 if none did; missing_rms_Nm (n,): what was found last, 0 where nothing
-was; is_elastic: whether that was elasticity.
+Shapes: p parameters, n joints, t = PLACE_TERMS, f = p + n t; evidence_L (n, f, f): by the joint of the row, lower half;
+evidence_b, _basic, _full, _row, _scale (f,); evidence_M (f, f); evidence_said (n t,): coefficients of the last stretch
+that came to a torque by place, all 0 if none did; missing_rms_Nm (n,): what was found last, 0 where nothing was.
 """
 
 import math
@@ -43,11 +37,8 @@ from adacd_hil.settings.configuration import Settings
 
 EXPECTED_NM = 0.06
 """Standard deviation of a coefficient, of an arm that has a cable."""
-EXPECTED_RAD_NM = 3e-3
-"""Standard deviation of 1/K, of an arm whose joints are elastic."""
 GAIN, SHARE, LEAST_NM = 8.0, 0.6, 0.01
 """Of one stretch."""
-ELASTIC_GAIN = 20.0
 SAID_SHARE = 0.4
 LEAST_BACK = 0.2
 """Share of a joint's samples that are of its less frequent direction: on a way in one direction what depends on speed,
@@ -62,10 +53,7 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
     """Return `evidence_std` (f,), and `evidence_first`, `evidence_longest` in learnt samples. prior_std (p,)."""
     learn_s = settings.bus.period_s * settings.certified.learn_every
     return {
-        "evidence_std": np.concatenate(
-            [prior_std, np.full(JOINTS * PLACE_TERMS, EXPECTED_NM), np.full(JOINTS, EXPECTED_RAD_NM)]
-        ),
-        "smoothing_rad_s": np.array(settings.certified.smoothing_rad_s),
+        "evidence_std": np.concatenate([prior_std, np.full(JOINTS * PLACE_TERMS, EXPECTED_NM)]),
         "evidence_first": np.array(round(FIRST_S / learn_s)),
         "evidence_longest": np.array(round(LONGEST_S / learn_s)),
     }
@@ -73,18 +61,17 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
 
 def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of what is remembered, by name, of a model with this many parameters and a ring so long."""
-    full = count + JOINTS * PLACE_TERMS + JOINTS
+    full = count + JOINTS * PLACE_TERMS
     columns = (JOINTS, PLACE_TERMS)
     return {
         "X": columns, "X_old": columns, "X_f": columns, "X_learnt": columns, "ring_X": (waiting, *columns),
-        "ring_E": (waiting, JOINTS, JOINTS),
         "evidence_L": (JOINTS, full, full), "evidence_M": (full, full),
         "evidence_b": (full,), "evidence_basic": (full,), "evidence_full": (full,), "evidence_row": (full,),
         "evidence_scale": (full,),
         "evidence_said": (JOINTS * PLACE_TERMS,),
         "evidence_yy": (), "evidence_weight": (JOINTS,), "evidence_ways": (JOINTS, 2),
         "evidence_samples": (), "evidence_wanted": (),
-        "missing_rms_Nm": (JOINTS,), "is_elastic": (),
+        "missing_rms_Nm": (JOINTS,),
     }  # fmt: skip
 
 
@@ -106,19 +93,9 @@ def follow(m: Any, q: Vector, rates: Vector, smoothing: float, is_seen: bool) ->
 
 
 @compiled
-def keep(k: Any, m: Any, slot: int) -> None:
-    """Put the columns of this sample into a slot of the ring, where they wait with the row of the regressor.
-
-    The second derivative of a torque is that of its lag's column, which is the first.
-    """
+def keep(m: Any, slot: int) -> None:
+    """Put the columns of this sample into a slot of the ring, where they wait with the row of the regressor."""
     m["ring_X"][slot] = m["X_learnt"]
-    joints = m["X_learnt"].shape[0]
-    first_lag = int(k["base"]) + joints
-    for i in range(joints):
-        lag = first_lag + i
-        ddtau_J = k["smoothing_rad_s"] * (m["W_f"][filter_bank.LEARNT, i, lag] - m["W_learnt"][i, lag])
-        for joint in range(joints):
-            m["ring_E"][slot, joint, i] = m["M"][joint, i] * ddtau_J
 
 
 @compiled
@@ -126,14 +103,8 @@ def clear(k: Any, m: Any) -> None:
     """Begin anew: with another arm, as one with another payload, or with a certificate."""
     _clear_sums(m)
     m["evidence_said"][:] = 0.0
-    _clear_found(m)
-    m["evidence_wanted"] = k["evidence_first"]
-
-
-@compiled
-def _clear_found(m: Any) -> None:
     m["missing_rms_Nm"][:] = 0.0
-    m["is_elastic"] = 0.0
+    m["evidence_wanted"] = k["evidence_first"]
 
 
 @compiled
@@ -156,7 +127,6 @@ def add(k: Any, m: Any, slot: int, joint: int) -> None:
     v[:] = 0.0
     v[:count] = m["ring_W"][slot, joint]
     v[count + PLACE_TERMS * joint : count + PLACE_TERMS * (joint + 1)] = m["ring_X"][slot, joint]
-    v[_first_elastic(m) :] = m["ring_E"][slot, joint]
     r = m["ring_tau"][slot, joint]
     for j in range(count):
         r -= v[j] * k["prior"][j]
@@ -184,19 +154,13 @@ def _rough_variance(k: Any, m: Any, joint: int) -> float:
 
 
 @compiled
-def _first_elastic(m: Any) -> int:
-    return int(m["evidence_row"].shape[0] - m["missing_rms_Nm"].shape[0])
-
-
-@compiled
 def is_found_in_time(k: Any, m: Any) -> bool:
     """Take in that a sample was learnt while the arm monitors; once in a while tell whether two stretches agree."""
     m["evidence_samples"] += 1.0
     if m["evidence_samples"] < m["evidence_wanted"]:
         return False
-    _clear_found(m)
-    is_said = _is_by_place(k, m, _weigh_rigid(k, m))
-    said = m["evidence_full"][m["belief"].shape[0] : _first_elastic(m)].copy()
+    is_said = is_found(k, m)
+    said = m["evidence_full"][m["belief"].shape[0] :].copy()
     is_agreed = _is_said_again(k, m)
     if is_said:
         m["evidence_said"][:] = said
@@ -207,51 +171,13 @@ def is_found_in_time(k: Any, m: Any) -> bool:
 
 @compiled
 def is_found(k: Any, m: Any) -> bool:
-    """Tell whether the model lacks a torque, by all samples there are; fill `missing_rms_Nm` (n,), `is_elastic`."""
-    _clear_found(m)
-    rigid = _weigh_rigid(k, m)
-    return _is_elastic(k, m, rigid) or _is_by_place(k, m, rigid)
-
-
-@compiled
-def _weigh_rigid(k: Any, m: Any) -> float:
-    """Fill `evidence_basic` (f,) with the model as it is, and return its log evidence."""
-    return float(_log_evidence(m, m["evidence_b"], _scale_of(k, m, 0, 0), m["evidence_basic"]))
-
-
-@compiled
-def _scale_of(k: Any, m: Any, first: int, last: int) -> Vector:
-    """Return the prior's deviations (f,) of the model and of columns first .. last - 1 beside it, 0 for the others."""
-    scale, count = m["evidence_scale"], m["belief"].shape[0]
-    scale[:] = 0.0
-    scale[:count] = k["evidence_std"][:count]
-    scale[first:last] = k["evidence_std"][first:last]
-    return scale  # type: ignore[no-any-return]
-
-
-@compiled
-def _is_elastic(k: Any, m: Any, rigid: float) -> bool:
-    """Tell whether an elastic joint explains what the model, of this log evidence, leaves; fill `missing_rms_Nm`."""
-    b, count, first, full = m["evidence_b"], m["belief"].shape[0], _first_elastic(m), m["evidence_full"]
-    if not _log_evidence(m, b, _scale_of(k, m, first, full.shape[0]), full) - rigid > ELASTIC_GAIN:
-        return False
-    by_place = _log_evidence(m, b, _scale_of(k, m, count, first), m["evidence_row"])
-    both = _log_evidence(m, b, _scale_of(k, m, count, full.shape[0]), m["evidence_row"])
-    if not both - by_place > ELASTIC_GAIN:
-        return False
-    _fill_missing(m)
-    m["is_elastic"] = 1.0
-    return True
-
-
-@compiled
-def _is_by_place(k: Any, m: Any, rigid: float) -> bool:
-    """Tell whether the place explains what the model, of this log evidence, leaves; fill `missing_rms_Nm` (n,)."""
+    """Tell whether the place explains what the model leaves of all samples; fill `missing_rms_Nm` (n,)."""
+    m["missing_rms_Nm"][:] = 0.0
     if k["position_torque_Nm"] != 0.0:
         return False
     basic, full = m["evidence_basic"], m["evidence_full"]
-    scale = _scale_of(k, m, m["belief"].shape[0], _first_elastic(m))
-    gain = _log_evidence(m, m["evidence_b"], scale, full) - rigid
+    without = _log_evidence(m, m["evidence_b"], _scale_of(k, m, False), basic)
+    gain = _log_evidence(m, m["evidence_b"], _scale_of(k, m, True), full) - without
     if not (gain > GAIN and _squares_left(m, full) < (1.0 - SHARE) * _squares_left(m, basic)):
         return False
     largest = 0.0
@@ -265,9 +191,19 @@ def _is_by_place(k: Any, m: Any, rigid: float) -> bool:
 
 
 @compiled
+def _scale_of(k: Any, m: Any, is_by_place: bool) -> Vector:
+    """Return the prior's deviations (f,) of the model, and of the columns by place or 0 for them."""
+    scale, count = m["evidence_scale"], m["belief"].shape[0]
+    scale[:] = k["evidence_std"]
+    if not is_by_place:
+        scale[count:] = 0.0
+    return scale  # type: ignore[no-any-return]
+
+
+@compiled
 def _is_said_again(k: Any, m: Any) -> bool:
     """Tell whether what an earlier stretch has said explains this one, of which `evidence_basic` is the model."""
-    _clear_found(m)
+    m["missing_rms_Nm"][:] = 0.0
     said, count, basic, full = m["evidence_said"], m["belief"].shape[0], m["evidence_basic"], m["evidence_full"]
     if k["position_torque_Nm"] != 0.0 or not np.any(said != 0.0):
         return False
@@ -277,7 +213,7 @@ def _is_said_again(k: Any, m: Any) -> bool:
         for j in range(count):
             for n in range(said.shape[0]):
                 b[j] -= m["evidence_L"][i, count + n, j] * said[n]
-    _log_evidence(m, b, _scale_of(k, m, 0, 0), full)
+    _log_evidence(m, b, _scale_of(k, m, False), full)
     full[count : count + said.shape[0]] = said
     left = _squares_left(m, basic)
     explained = left - _squares_left(m, full)
@@ -365,8 +301,6 @@ def describe(m: Any) -> list[str]:
     if not any(missing_Nm):
         return []
     torques = " and ".join(f"{rms:.3f} Nm rms in joint {i + 1}" for i, rms in enumerate(missing_Nm))
-    if m["is_elastic"]:
-        return [f"the torque of an elastic joint, {torques}, is missing in the model, which has rigid ones"]
     return [
         f"a torque that depends on where the arm is, {torques}, is missing in the model: a cable, a base that is not "
         "level, or a hand's spring"

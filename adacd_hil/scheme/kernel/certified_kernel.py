@@ -310,10 +310,7 @@ def improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     is_free = m["recovering_cycles"] == 0.0
     if is_touched and is_free_before and mode & (LEARN | TEST):
         sensitivity.strain(m, sensitivity.LARGEST_STRAIN)
-        if mode & LEARN:
-            earlier.keep(m)
-        else:
-            earlier.keep_refuted(m)
+        earlier.keep(k, m)
     if is_touched and mode & REFINE:
         doubt.begin(k, m)
     _follow_noise(k, m, is_free, mode)
@@ -356,19 +353,15 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     has_moved = True
     for i in range(dq.shape[0]):
         if not (abs(m["r"][filter_bank.SLOW, i]) <= m["test_limit_Nm"]):
-            earlier.keep_refuted(m)
-            m["withheld_by"] = certificate.missing_cause(k, m)
-            return REFUTED if m["withheld_by"] == certificate.NOTHING else REFUTED | WITHHELD
+            if m["is_payload"] == 0.0:  # of a new one hands have been on the arm, and friction may depend on it
+                earlier.keep(k, m)
+            is_by_place = missing_torque.is_found(k, m)
+            m["withheld_by"] = certificate.BY_PLACE if is_by_place else certificate.NOTHING
+            return REFUTED | WITHHELD if is_by_place else REFUTED
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
         has_moved = has_moved and fastest >= k["velocity_rad_s"]
     is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
-    if not (is_long and has_moved):
-        return 0
-    if anchor.is_within(k, m, m["theta"], m["P"]):
-        return CERTIFIED
-    m["withheld_by"] = certificate.ANCHOR
-    missing_torque.is_found(k, m)
-    return REFUTED | WITHHELD
+    return CERTIFIED if is_long and has_moved else 0
 
 
 @compiled

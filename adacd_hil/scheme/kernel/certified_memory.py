@@ -90,6 +90,8 @@ def constants_of(settings: Settings) -> Structured:
     theta_cad[: len(settings.arm.cad_theta)] = settings.arm.cad_theta
     inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
     correlated = 2.0 / (cutoff[filter_bank.LEARNT] * period_s * certified.learn_every)
+    prior_std = prior_std_of(settings)
+    kept = earlier.constants_of(settings, prior_std)
     values: dict[str, Any] = {
         "period_s": period_s,
         "cutoff": cutoff,
@@ -109,7 +111,7 @@ def constants_of(settings: Settings) -> Structured:
         "dahl_rad": certified.dahl_rad,
         "theta_cad": theta_cad,
         "prior": prior_of(settings),
-        "prior_std": prior_std_of(settings),
+        "prior_std": prior_std,
         "enough_std": _enough_std_of(settings),
         "drift_std": _drift_std_of(settings),
         "model_error": _by_kind(certified.model_error, names),
@@ -134,10 +136,10 @@ def constants_of(settings: Settings) -> Structured:
         **sensitivity.noise_constants(certified, period_s),
         **anchor.constants_of(settings),
         **doubt.constants_of(settings, len(names)),
-        **earlier.constants_of(settings, prior_std_of(settings)),
-        **certificate.constants_of(settings),
+        **kept,
+        **certificate.constants_of(settings, kept["compared"], prior_std),
         **margin.constants_of(settings),
-        **missing_torque.constants_of(settings, prior_std_of(settings)),
+        **missing_torque.constants_of(settings, prior_std),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
         "noise_sigmas": certified.noise_sigmas,

@@ -15,6 +15,9 @@ from adacd_hil.scheme.identify.doubt import CommonCause
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
 BY_WORD = "friction and inertia: by this run and the user's word, against "
+BY_FITS_THAT_AGREE = "friction and inertia: by fits of this run that agree, other than it had learnt before a touch"
+SAID_EACH = 5
+"""A cause that goes on is said of each so many refused fits, some 7 s."""
 _THE_RUN = "what the run had learnt before"
 _TAKEN_BACK = "the certificate that was taken back"
 _CHANGED = (
@@ -34,7 +37,6 @@ class _Cause(Enum):
     CHANGED = "touch", _BEGINS_ANEW, "nobody may touch an arm that learns"
     MORE = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"
     BY_PLACE = "position", _BEGINS_ANEW, _POSITION_REMEDY
-    ELASTIC = "elastic", _BEGINS_ANEW, "the model needs encoders on the links, or stiffer joints"
     TOO_MUCH_BY_PLACE = "position", _BEGINS_ANEW, "who holds the arm shall let go, or that bound is too small"
     MORE_THAN_LAST = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm, which has changed"
     BLIND = "sight", _BEGINS_ANEW, "`relearn` learns the arm anew"
@@ -46,7 +48,6 @@ _CAUSES = {
     certificate.MORE: _Cause.MORE,
     certificate.MORE_THAN_LAST: _Cause.MORE_THAN_LAST,
     certificate.BY_PLACE: _Cause.BY_PLACE,
-    certificate.ELASTIC: _Cause.ELASTIC,
     certificate.TOO_MUCH_BY_PLACE: _Cause.TOO_MUCH_BY_PLACE,
     certificate.BLIND: _Cause.BLIND,
 }
@@ -115,11 +116,13 @@ class CertificateWatch:
         joints = " and ".join(f"joint {i + 1}" for i in anchor.open_joints(self._constants, self._memory))
         if joints:
             told.insert(0, f"warning: who has leaned on {joints} since before the start is learnt as a torque offset")
-        return "; ".join([*told, *[known_by] * known_by.startswith(BY_WORD)])
+        return "; ".join([*told, *[known_by] * known_by.startswith((BY_WORD, BY_FITS_THAT_AGREE))])
 
     def _known_by(self) -> str:
         if self._vouched_against:
             return BY_WORD + self._vouched_against
+        if self._memory["has_lapsed"]:
+            return BY_FITS_THAT_AGREE
         is_compared = self._memory["is_last_believed"] and not self._memory["is_payload"]
         return f"friction and inertia: within what {self._last} allows" if is_compared else THIS_RUN_ONLY
 
@@ -135,10 +138,12 @@ class CertificateWatch:
             self._describe(cause),
             1 if before is None else before.times + 1,
         )
-        if before is not None and before.cause is cause:
+        is_said = before is not None and before.cause is cause
+        if is_said and (is_reading or self._refusal.times % SAID_EACH != 0):
             return None
         name, what, remedy = cause.value
-        return Event("warning", name, "; ".join((*self._refusal.lines, what, remedy)))
+        again = [f"the {self._refusal.times}th fit in a row that is refused"] * is_said
+        return Event("warning", name, "; ".join((*self._refusal.lines, *again, what, remedy)))
 
     def doubt(self, verdict: CommonCause) -> Event:
         """Say that contacts have taken the certificate back, and why."""
@@ -186,8 +191,8 @@ class CertificateWatch:
             case _Cause.CHANGED:
                 lines = [_CHANGED]
             case _Cause.MORE:
-                lines = [*earlier.describe_more(k, m), *missing_torque.describe(m)]
-            case _Cause.BY_PLACE | _Cause.ELASTIC:
+                lines = [*earlier.describe_more(m), *missing_torque.describe(m)]
+            case _Cause.BY_PLACE:
                 lines = missing_torque.describe(m)
             case _Cause.TOO_MUCH_BY_PLACE:
                 lines = anchor.describe_place_refused(k, m)

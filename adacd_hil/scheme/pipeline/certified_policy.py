@@ -25,6 +25,8 @@ from adacd_hil.scheme.supervisor.supervisor import LEARNING, REACTING, Superviso
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, WITHHELD, Calm, SchemeEvent
 from adacd_hil.settings.configuration import Settings
 
+FORGOTTEN_S = 1.0
+"""An arm at rest is asked so long after a stop whether something pushes it: the slowest filter has forgotten 40 Nm."""
 _WATCH = certified_kernel.WATCH
 _MODES = {
     SchemeState.COMMISSION: certified_kernel.MEASURE,
@@ -62,8 +64,10 @@ class CertifiedPolicy(SchemePolicy):
         self._refined = 0.0
         self._peak_share = m["peak_share"]
         self._margin = MarginWatch(self._peak_share.size)
-        self._second = round(1.0 / settings.bus.period_s)
+        self._period_s = settings.bus.period_s
+        self._second = round(1.0 / self._period_s)
         self._monitored = 0
+        self._until_push = 0
         self._warned: set[str] = set()
         self._events: list[Event] = []
         self._watch = CertificateWatch(self.numbers.constants, self.numbers.memory, settings.history.date_utc)
@@ -154,10 +158,10 @@ class CertifiedPolicy(SchemePolicy):
         return row
 
     def calm(self, calm: Calm) -> Calm:
-        """Narrow the bounds to the next judgement of the margin."""
-        if self.supervisor.state is not SchemeState.MONITOR:
-            return calm
-        return calm._replace(cycles=min(calm.cycles, self._second - self._monitored - 1))
+        """Narrow the bounds to the next judgement of the margin, or of a push at rest."""
+        if self.supervisor.state is SchemeState.MONITOR:
+            return calm._replace(cycles=min(calm.cycles, self._second - self._monitored - 1))
+        return calm._replace(cycles=min(calm.cycles, self._until_push - 1)) if self._until_push else calm
 
     @property
     def is_calm(self) -> bool:
@@ -165,9 +169,10 @@ class CertifiedPolicy(SchemePolicy):
         return bool(self._promotions[0] == self._refined)
 
     def pass_by(self, cycles: int) -> None:
-        """Count calm cycles, and those of monitoring."""
+        """Count calm cycles, those of monitoring, and those until a push at rest is judged."""
         super().pass_by(cycles)
         self._monitored += cycles if self.supervisor.state is SchemeState.MONITOR else 0
+        self._until_push = max(self._until_push - cycles, 0)
 
     def take(self, request: Request, observation: int) -> int:
         """Believe what was refused last if the user says so: then nothing is withheld in this cycle."""
@@ -204,6 +209,7 @@ class CertifiedPolicy(SchemePolicy):
         contact = super().report(cycle, observation)
         self._forget_if_disturbed(self.supervisor.state)
         self._watch_margin(self.supervisor.state)
+        self._watch_push(self.supervisor.state, observation >> CONTACT_SHIFT != 0)
         return contact
 
     def _say(self, event: Event | None) -> None:
@@ -224,6 +230,14 @@ class CertifiedPolicy(SchemePolicy):
                 self._events.append(Event("warning", name, warning))
             self._warned = self._warned | {name} if warning else self._warned - {name}
 
+    def _watch_push(self, state: SchemeState, is_touched: bool) -> None:
+        """Say what pushes the arm at rest, once the filters have forgotten a hand that has gone."""
+        if self._until_push == 0:
+            return
+        self._until_push = self._until_push - 1 if state is SchemeState.STOPPED else 0
+        if self._until_push == 0 and is_touched and state is SchemeState.STOPPED:
+            self._events.append(self._watch.push(self.numbers.memory[0]["y"][filter_bank.SLOW]))
+
     def _weigh(self, state: SchemeState, previous: SchemeState, cycle: int, is_touched: bool) -> SchemeState:
         """Take in how a contact of the certified model goes on; return where the arm goes, STOPPED if it is doubted."""
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
@@ -235,8 +249,10 @@ class CertifiedPolicy(SchemePolicy):
             if verdict is not None and not self.contacts.goes_on:
                 self._events.append(self._watch.doubt(verdict))
                 return self.supervisor.doubt()
+            again = self._doubt.describe_again()
+            self._say(Event("info", "touch", again) if again else None)
             if is_touched and state is SchemeState.STOPPED:
-                self._events.append(self._watch.push(self.numbers.memory[0]["y"][0]))
+                self._until_push = round(FORGOTTEN_S / self._period_s)
         if state is SchemeState.MONITOR:
             self._doubt.go_on(cycle)
         return state
