@@ -122,7 +122,7 @@ def test_a_time_that_somebody_changed_counts(tmp_path):
     message = TimedMessage(NOON_NS, arbitration_id=1, data=b"")
     message.timestamp = 12.5
     write(tmp_path / "x.mcap", [message, can.Message(timestamp=1790000000.1234567)])
-    assert read_frames(tmp_path / "x.mcap").frames["t_ns"].tolist() == [12_500_000_000, 1_790_000_000_123_456_717]
+    assert read_frames(tmp_path / "x.mcap").frames["t_ns"].tolist() == [12_500_000_000, 1_790_000_000_123_456_700]
 
 
 def test_logconvert_to_blf_and_back_keeps_all_but_the_direction_of_error_frames(messages, path, tools, tmp_path):

@@ -1,5 +1,8 @@
 """Recordings of every format, read to the same frames; times to the nanosecond where the format has them."""
 
+import struct
+import zlib
+
 import can
 import numpy as np
 import pytest
@@ -18,7 +21,7 @@ CANDUMP = [
     # line, t_ns, channel, can_id, is_tx, is_error, length, data, is_extended, is_remote, is_fd, BRS, ESI
     ("(1436509052.249713) vcan0 044#2A366C2BBA", 1436509052249713000, "vcan0", 0x44, 0, 0, 5, "2a366c2bba", 0, 0, 0, 0, 0),
     ("(0.000000001) can1 7FF#", 1, "can1", 0x7FF, 0, 0, 0, "", 0, 0, 0, 0, 0),
-    ("(1.5) can1 18DAF110#11.22 T", 1_500_000_000, "can1", 0x18DAF110, 1, 0, 2, "1122", 1, 0, 0, 0, 0),
+    ("(1.5) can1 18DAF110#1122 T", 1_500_000_000, "can1", 0x18DAF110, 1, 0, 2, "1122", 1, 0, 0, 0, 0),
     ("(2.000000) can0 00000123#01 R", 2_000_000_000, "can0", 0x123, 0, 0, 1, "01", 1, 0, 0, 0, 0),
     ("(2.000001) can0 123#R", 2_000_001_000, "can0", 0x123, 0, 0, 0, "", 0, 1, 0, 0, 0),
     ("(2.000002) can0 123#R7 T", 2_000_002_000, "can0", 0x123, 1, 0, 7, "", 0, 1, 0, 0, 0),
@@ -70,15 +73,19 @@ def test_a_candump_log_that_is_cut_says_where(tmp_path):
     path.write_text("(1.000000) can0 123#11\n(1.000001) can0 12")
     log = read_frames(path)
     assert len(log.frames) == 1
-    assert log.problem == "cut.log: 1 lines are no frames, the first is line 2: no frame: (1.000001) can0 12"
+    assert log.problem == "cut.log: line 2 is no frame: (1.000001) can0 12"
 
 
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("x.log", b"hello\n", "is not a candump log: line 1: no frame: hello"),
+        (
+            "x.log",
+            b"hello\n",
+            "is not a candump log, as `candump -l` records it and SavvyCAN saves it: line 1 is no frame: hello",
+        ),
         ("x.log", b"(1.0) can0 123#112233445566778899\n", "9 bytes of data"),
-        ("x.blf", b"hello", "can't be read as .blf: unpack requires"),
+        ("x.blf", b"hello", "is not a whole .blf: unpack requires"),
         ("x.mcap", b"hello", "is not an MCAP file"),
         ("x.pcap", b"", "did you mean .mcap; known: .mcap .log"),
         ("x", b"", "a file without suffix"),
@@ -141,3 +148,151 @@ def test_a_log_of_ours_gives_the_frames_that_its_reader_gives(tmp_path):
     assert np.array_equal(as_logged(log.frames), own.frames)
     assert (log.frames["is_fd"] == (log.frames["length"] > 8)).all()
     assert log.epoch_ns == NOON_NS
+
+
+FRAME = struct.Struct("<HBBL8s")
+BLF_FRAME, BLF_ERROR, BLF_MARKER = 86, 73, 96
+
+
+def blf_object(kind, body, version=1, flags=2, t_ns=0):
+    head = struct.pack("<LHHQ", flags, 0, 0, t_ns)
+    record = struct.pack("<4sHHLL", b"LOBJ", 32, version, 32 + len(body), kind) + head + body
+    return record + bytes(len(record) % 4)
+
+
+def write_blf(path, objects, cut=0):
+    """Write a BLF of one container by hand, `cut` bytes short."""
+    with can.BLFWriter(path):
+        pass
+    inner = b"".join(objects)
+    packed = struct.pack("<H6xI4x", 2, len(inner)) + zlib.compress(inner)
+    container = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(packed), 10) + packed
+    path.write_bytes((path.read_bytes()[:144] + container + bytes(len(container) % 4))[: -cut or None])
+    return path
+
+
+def data_frames(count):
+    return [blf_object(BLF_FRAME, FRAME.pack(1, 0, 8, 0x181, bytes([n % 256] * 8)), t_ns=n) for n in range(count)]
+
+
+def error_frame(dlc):
+    return blf_object(BLF_ERROR, struct.pack("<HHLBBBxLLH2x8s", 1, 0, 0, 0, 0, dlc, 0, 0x4, 0, b"12345678"))
+
+
+def test_an_error_frame_whose_length_code_no_frame_has_ends_nothing(tmp_path):
+    frames = data_frames(5)
+    log = read_frames(write_blf(tmp_path / "x.blf", [*frames[:2], error_frame(15), *frames[2:]]))
+    assert log.frames["data"][~log.frames["is_error"], 0].tolist() == [0, 1, 2, 3, 4]
+    assert log.frames["length"].tolist() == [8] * 6
+    assert log.problem == ""
+
+
+def test_an_object_of_a_version_to_come_is_counted_only_where_it_is_a_frame(tmp_path):
+    frames, marker = data_frames(4), blf_object(BLF_MARKER, bytes(40), version=3)
+    log = read_frames(write_blf(tmp_path / "x.blf", [*frames[:2], marker, *frames[2:]]))
+    assert (len(log.frames), log.problem) == (4, "")
+    frames[1] = frames[1].replace(b"\x20\0\x01\0", b"\x20\0\x03\0", 1)
+    log = read_frames(write_blf(tmp_path / "x.blf", [*frames[:2], marker, *frames[2:]]))
+    assert log.frames["data"][:, 0].tolist() == [0, 2, 3]
+    assert log.problem == "x.blf: a frame of header version 3 is not read"
+
+
+def test_a_blf_that_is_cut_says_so(tmp_path):
+    log = read_frames(write_blf(tmp_path / "x.blf", data_frames(500), cut=100))
+    assert 0 < len(log.frames) < 500
+    assert log.problem == f"x.blf: cut within an object, behind {len(log.frames)} frames"
+
+
+HEADS = {
+    "vector": "date Mon Mar 2 10:00:00.000 2026\nbase hex  timestamps {}\ninternal events logged\n",
+    "without a line on events": "date Mon Mar 2 10:00:00.000 2026\nbase hex  timestamps {}\n// version 8.2\n",
+    "with an empty line": "\nbase hex  timestamps {}\nno internal events logged\n",
+}
+
+
+@pytest.mark.parametrize("head", HEADS.values(), ids=HEADS)
+@pytest.mark.parametrize("kind", ["absolute", "relative"])
+def test_no_head_of_an_asc_costs_a_frame_and_stamps_count_from_the_beginning(head, kind, tmp_path):
+    path = tmp_path / "x.asc"
+    stamps = ["0.250000", "0.250100", "0.250150", "1.250150"]
+    if kind == "relative":
+        stamps = ["0.250000", "0.000100", "0.000050", "1.000000"]
+    lines = [
+        f"{stamps[0]} 1  181  Rx   d 2 00 01",
+        f"{stamps[1]} CAN 1 Status:chip status error active",
+        f"{stamps[2]} 1  18DAF110x  Tx   d 2 10 11",
+        f"{stamps[3]} 1  7FF  Rx   d 1 FF",
+    ]
+    path.write_text(head.format(kind) + "".join(f"   {line}\n" for line in lines))
+    log = read_frames(path)
+    assert log.frames["can_id"].tolist() == [0x181, 0x18DAF110, 0x7FF]
+    assert log.frames["t_ns"].tolist() == [250_000_000, 250_150_000, 1_250_150_000]
+    assert log.problem == ""
+
+
+def test_the_base_of_an_asc_counts_behind_an_empty_line(tmp_path):
+    path = tmp_path / "x.asc"
+    path.write_text("\nbase dec  timestamps absolute\n 0.1 1  385  Rx  d 2 16 255\n")
+    log = read_frames(path)
+    assert (hex(log.frames["can_id"][0]), log.frames["data"][0, :2].tolist()) == ("0x181", [16, 255])
+
+
+def test_an_asc_whose_frames_python_can_passes_over_says_so(tmp_path):
+    path = tmp_path / "x.asc"
+    lines = ["-0.5 1 181 Rx d 1 00", "0,1 1 181 Rx d 1 01", "0.2 1 181 TxRq d 1 02", "0.2 1 181 Tx d 1 03"]
+    path.write_text("base hex  timestamps absolute\n" + "\n".join(lines) + "\n")
+    log = read_frames(path)
+    assert log.frames["data"][:, 0].tolist() == [3]
+    assert log.problem == "x.asc: line 2 is not read: -0.5 1 181 Rx d 1 00, and 1 more records"
+
+
+def test_a_line_of_a_trc_that_tells_the_state_of_the_bus_is_no_frame(tmp_path):
+    path = tmp_path / "x.trc"
+    rows = [f"{n:6})   {n}.0  Rx     0181  2  00 {n:02X}" for n in range(1, 6)]
+    rows.insert(2, "     9)   2.5  Rx     FFFFFFFF  4  00 00 00 08  BUSHEAVY")
+    path.write_text(";$FILEVERSION=1.1\n;$STARTTIME=45000.0\n;\n" + "\n".join(rows) + "\n")
+    log = read_frames(path)
+    assert (log.frames["data"][:, 1].tolist(), log.problem) == ([1, 2, 3, 4, 5], "")
+
+
+def test_a_cut_line_of_a_trc_is_counted(tmp_path, capfd):
+    path = tmp_path / "x.trc"
+    path.write_text(
+        ";$FILEVERSION=1.1\n;$STARTTIME=45000.0\n     1)   1.0  Rx     0181  2  00 01\n     2)   2.0  Rx  01"
+    )
+    log = read_frames(path)
+    assert len(log.frames) == 1
+    assert "2.0 Rx 01" in log.problem
+    assert capfd.readouterr() == ("", "")
+
+
+def test_half_a_byte_at_the_end_of_a_candump_log_is_no_frame(tmp_path):
+    path = tmp_path / "x.log"
+    path.write_text("(1.000000) can0 123#1122\n(1.000001) can0 123#112")
+    log = read_frames(path)
+    assert (len(log.frames), log.problem) == (1, "x.log: line 2 is no frame: (1.000001) can0 123#112")
+
+
+SAVVYCAN = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("x.log", "  can0  181   [8]  00 01 02 03 04 05 06 07\n", "`candump -l`"),
+        ("x.log", " (000.001)  can0  181   [2]  00 01\n", "`candump -l`"),
+        ("x.log", "***BUSMASTER Ver 3.2.2***\n***HEX***\n", "`candump -l`"),
+        ("x.csv", SAVVYCAN + "1000,00000181,false,Rx,0,8,00,01,02,03,04,05,06,07,\n", "saves a candump log"),
+        ("x.log.gz", "", "unpack it with gunzip; known: .mcap .log"),
+        ("x.asc", "", "there is no frame in it"),
+    ],
+)
+def test_a_form_that_is_not_read_names_one_that_is(name, text, said, tmp_path):
+    path = tmp_path / name
+    path.write_text(text)
+    try:
+        words = read_frames(path).problem
+    except LogError as error:
+        words = str(error)
+    assert said in words
+    assert "\n" not in words

@@ -39,14 +39,13 @@ def item(version, size, body=bytes(32)):
 
 
 LIES = {
-    "an object of no size and unknown version": (item(512, 0), {}, "an object of 0 bytes and version 512"),
-    "an object of no size": (item(1, 0), {}, "an object of 0 bytes and version 1"),
+    "an object of no size and unknown version": (item(512, 0), {}, "an object of 0 bytes"),
+    "an object of no size": (item(1, 0), {}, "an object of 0 bytes"),
     "an object shorter than its head": (item(1, 15), {}, "an object of 15 bytes"),
-    "an object of 4 GB": (item(1, 2**32 - 1), {}, "an object of 4294967295 bytes"),
-    "a container of no size": (item(1, 48), {"size": 0}, "an object of 0 bytes"),
-    "a container of 4 GB": (item(1, 48), {"size": 2**32 - 1}, "an object of 4294967295 bytes"),
+    "an object of 4 GB": (item(1, 2**32 - 1), {}, "cut within an object"),
+    "a container of no size": (item(1, 48), {"size": 0}, "read length must be non-negative"),
     "a bomb": (bytes(MOST_BYTES + 1), {}, f"opens to {MOST_BYTES + 1} bytes"),
-    "a compression that nobody knows": (b"", {"method": 9}, "unknown compression 9"),
+    "a compression that nobody knows": (b"", {"method": 9}, r"compression method \(9\)"),
 }
 
 
@@ -69,8 +68,8 @@ def candump_line(time="1700000000.000000", channel="can0"):
     ("line", "reason"),
     [
         (candump_line(time="9" * 20 + ".0"), "is beyond the year 2116"),
-        (candump_line(time="9" * 5000 + ".0"), "no frame"),
-        (candump_line(channel="c" * 300), "no frame"),
+        (candump_line(time="9" * 5000 + ".0"), "is beyond the year 2116"),
+        (candump_line(time="nan"), "time nan s"),
         ("x" * 200_000 + "\n", "no frame"),
     ],
 )
@@ -88,21 +87,21 @@ def test_a_recording_has_256_channels_at_most(tmp_path):
     path.write_text("".join(candump_line(channel=f"can{number}") for number in range(300)))
     log = read_frames(path)
     assert len(log.channels) == len(log.frames) == 256
-    assert log.problem.startswith(
-        "x.log: 44 lines are no frames, the first is line 257: there are more than 256 channels"
-    )
+    assert log.problem == "x.log: there are more than 256 channels, and 43 more records"
 
 
-def test_a_time_beyond_64_bits_ends_an_asc_or_csv_file_with_one_line(tmp_path):
+def test_a_time_beyond_64_bits_is_left_out_and_named(tmp_path):
     path = tmp_path / "x.csv"
     message = can.Message(timestamp=1.0, arbitration_id=0x181, data=b"1", is_extended_id=False)
     with can.CSVWriter(path) as writer:
         writer(message)
         message.timestamp = 1e12
         writer(message)
+        message.timestamp = 2.0
+        writer(message)
     log = read_frames(path)
-    assert len(log.frames) == 1
-    assert log.problem == "x.csv is damaged after 1 frames: time 1e+12 s is beyond the year 2116"
+    assert log.frames["t_ns"].tolist() == [1_000_000_000, 2_000_000_000]
+    assert log.problem == "x.csv: time 1e+12 s is beyond the year 2116"
 
 
 def test_a_channel_that_is_a_number_of_5000_digits_is_a_name(tmp_path):

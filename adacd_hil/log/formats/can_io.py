@@ -9,33 +9,30 @@ A channel of digits is a number to python-can and a name here: "0" is its 0, "" 
 """
 
 import io
+import logging
 import os
-import zlib
-from collections.abc import Generator, Iterator
+import re
+from collections.abc import Generator, Iterable, Iterator
+from decimal import Decimal
 from pathlib import Path
 from typing import IO, Any, cast
 
 import can
 import numpy as np
-from can.io.blf import (
-    LOG_CONTAINER,
-    LOG_CONTAINER_STRUCT,
-    NO_COMPRESSION,
-    OBJ_HEADER_BASE_STRUCT,
-    ZLIB_DEFLATE,
-    BLFParseError,
-    BLFReader,
-)
+from can.io import blf
+from can.io.asc import ASC_MESSAGE_REGEX
 from can.io.generic import BinaryIOMessageReader, BinaryIOMessageWriter, TextIOMessageReader
 from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
+from adacd_hil.log.formats.frame_log import ERROR_FLAG
 from adacd_hil.log.formats.mcap_frames import FrameWriter, McapFrames, RecordedFrame
 from adacd_hil.log.log_files import LogError, failing_as
-from adacd_hil.log.mcap.chunks import MOST_BYTES, Opening
+from adacd_hil.log.mcap.chunks import MOST_BYTES
 from adacd_hil.log.types.message_types import MAX_DATA
 from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 
 class McapReader(BinaryIOMessageReader):
@@ -79,25 +76,8 @@ class McapWriter(BinaryIOMessageWriter):
         self._is_stopped = False
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Write a message."""
-        is_short = not (msg.is_remote_frame or msg.is_error_frame)
-        data = bytes(msg.data)
-        self._writer.write(
-            RecordedFrame(
-                t_ns=time_ns(msg),
-                can_id=msg.arbitration_id,
-                data=data,
-                length=len(data) if is_short else msg.dlc,
-                channel=channel_name(msg.channel),
-                is_tx=not msg.is_rx,
-                is_error=msg.is_error_frame,
-                is_extended=msg.is_extended_id,
-                is_remote=msg.is_remote_frame,
-                is_fd=msg.is_fd,
-                has_rate_switch=msg.is_fd and msg.bitrate_switch,
-                has_error_state=msg.is_fd and msg.error_state_indicator,
-            )
-        )
+        """Write a message. Raises ValueError for what no frame has."""
+        self._writer.write(to_frame(msg))
 
     def stop(self) -> None:
         """End the file; twice is once."""
@@ -125,8 +105,7 @@ def time_ns(message: can.Message) -> int:
     t_ns = getattr(message, "t_ns", None)
     if t_ns is not None and t_ns / 1_000_000_000 == seconds:
         return int(t_ns)
-    whole, rest = divmod(seconds, 1.0)
-    return int(whole) * 1_000_000_000 + round(rest * 1e9)
+    return round(Decimal(repr(seconds)) * 1_000_000_000)  # the digits that a text had
 
 
 def channel_name(channel: object) -> str:
@@ -134,34 +113,35 @@ def channel_name(channel: object) -> str:
     return "" if channel is None else str(channel)
 
 
-def to_row(message: can.Message, channel: int = 0, start_ns: int = 0) -> tuple[Any, ...]:
-    """Make a row of RECORDED_FRAME_DTYPE; `start_ns` is added to its time.
+def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
+    """Take a frame out of a message; `start_ns` is added to its time.
 
-    Raises LogError for data or an identifier that no frame has.
+    Raises ValueError for data, an identifier or a time that no frame has.
     """
+    most = MAX_DATA if message.is_fd else CLASSIC_BYTES
     data = bytes(message.data)
-    length = len(data) if not (message.is_remote_frame or message.is_error_frame) else message.dlc
-    if max(len(data), length) > (MAX_DATA if message.is_fd else 8):
-        raise LogError(f"frame 0x{message.arbitration_id:X} has {max(len(data), length)} bytes of data")
+    length = len(data)
+    if message.is_remote_frame or message.is_error_frame:  # their DLC goes up to 15
+        data, length = data[:most], min(message.dlc, most)
+    if length > most:
+        raise ValueError(f"frame 0x{message.arbitration_id:X} has {length} bytes of data")
     if not 0 <= message.arbitration_id < 1 << 29:
-        raise LogError(f"identifier 0x{message.arbitration_id:X} has more than 29 bits")
-    t_ns = time_ns(message) + start_ns
-    if abs(t_ns) > MOST_NS:
-        raise LogError(f"time {t_ns * 1e-9:g} s is beyond the year 2116")
-    return (
-        t_ns,
-        t_ns,
-        message.arbitration_id,
-        not message.is_rx,
-        message.is_error_frame,
-        length,
-        list(data.ljust(MAX_DATA, b"\0")),
-        channel,
-        message.is_extended_id,
-        message.is_remote_frame,
-        message.is_fd,
-        message.is_fd and message.bitrate_switch,
-        message.is_fd and message.error_state_indicator,
+        raise ValueError(f"identifier 0x{message.arbitration_id:X} has more than 29 bits")
+    if not abs(message.timestamp or 0.0) + start_ns * 1e-9 < MOST_NS * 1e-9:  # nor is NaN
+        raise ValueError(f"time {message.timestamp:g} s is beyond the year 2116")
+    return RecordedFrame(
+        t_ns=time_ns(message) + start_ns,
+        can_id=message.arbitration_id,
+        data=data,
+        length=length,
+        channel=channel_name(message.channel),
+        is_tx=not message.is_rx,
+        is_error=message.is_error_frame,
+        is_extended=message.is_extended_id,
+        is_remote=message.is_remote_frame,
+        is_fd=message.is_fd,
+        has_rate_switch=message.is_fd and message.bitrate_switch,
+        has_error_state=message.is_fd and message.error_state_indicator,
     )
 
 
@@ -188,93 +168,201 @@ def to_messages(frames: NDArray[Any], channels: list[str], epoch_ns: int = 0) ->
         )
 
 
-class _BlfReader(BLFReader):
-    """python-can's, but for sizes that lie: it would stay for ever at an object of size 0, and open any bomb."""
-
-    def __iter__(self) -> Generator[can.Message, None, None]:
-        opening = Opening()
-        while head := self.file.read(OBJ_HEADER_BASE_STRUCT.size):
-            signature, _, _, size, kind = OBJ_HEADER_BASE_STRUCT.unpack(head)
-            if signature != b"LOBJ" or not len(head) <= size <= MOST_BYTES:
-                raise BLFParseError(f"an object of {size} bytes")
-            body = self.file.read(size - len(head))
-            self.file.read(size % 4)  # padding
-            if kind == LOG_CONTAINER:
-                yield from self._parse_container(_open_container(body, opening))
+class _BlfReader(can.BLFReader):
+    """python-can's, but for an object of no size, at which it stays for ever, and frames that it passes over."""
 
     def _parse_container(self, data: bytes) -> Iterator[can.Message]:
-        _check_objects(self._tail + data)
+        if len(data) > MOST_BYTES:
+            raise blf.BLFParseError(f"a container opens to {len(data)} bytes, more than {MOST_BYTES}")
+        objects, position, head = self._tail + data, 0, blf.OBJ_HEADER_BASE_STRUCT
+        while 0 <= (position := objects.find(b"LOBJ", position, position + 8)) <= len(objects) - head.size:
+            _, _, version, size, kind = head.unpack_from(objects, position)
+            if size < head.size:
+                raise blf.BLFParseError(f"an object of {size} bytes")
+            position += size
+            if position <= len(objects) and kind in _BLF_FRAMES and version not in (1, 2):
+                _LOGGER.warning("a frame of header version %d is not read", version)
         yield from super()._parse_container(data)
 
 
-def _open_container(body: bytes, opening: Opening) -> bytes:
-    """Decompress the objects of a container. Raises BLFParseError, ChunkError, zlib.error, struct.error."""
-    method, _ = LOG_CONTAINER_STRUCT.unpack_from(body)
-    packed = body[LOG_CONTAINER_STRUCT.size :]
-    if method not in (NO_COMPRESSION, ZLIB_DEFLATE):
-        raise BLFParseError(f"unknown compression {method}")
-    data = packed if method == NO_COMPRESSION else zlib.decompressobj().decompress(packed, MOST_BYTES + 1)
-    opening.allow(len(body), len(data))
-    return data
+_BLF_FRAMES = (blf.CAN_MESSAGE, blf.CAN_MESSAGE2, blf.CAN_ERROR_EXT, blf.CAN_FD_MESSAGE, blf.CAN_FD_MESSAGE_64)
 
 
-def _check_objects(data: bytes) -> None:
-    """Raise BLFParseError for an object that can't be: shorter than its head, endless, of an unknown version."""
-    position = data.find(b"LOBJ", 0, 8)
-    while 0 <= position <= len(data) - OBJ_HEADER_BASE_STRUCT.size:
-        _, _, version, size, _ = OBJ_HEADER_BASE_STRUCT.unpack_from(data, position)
-        if version not in (1, 2) or not OBJ_HEADER_BASE_STRUCT.size <= size <= MOST_BYTES:
-            raise BLFParseError(f"an object of {size} bytes and version {version}")
-        position = data.find(b"LOBJ", position + size, position + size + 8)
+class _AscReader(can.ASCReader):
+    """python-can's, but for what it gets wrong without a word.
+
+    It loses a first frame that follows a head without `internal events logged`, as BUSMASTER writes it, takes stamps
+    that count from the line before for stamps from the beginning, requests to send (TxRq) for frames, and passes over
+    frames with a negative stamp or a decimal comma.
+    """
+
+    def _extract_header(self) -> None:
+        base = re.search(r"^\W*base\s+(hex|dec)(\s+timestamps\s+relative)?", self.file.read(_ASC_HEAD), _ASC_FLAGS)
+        if base:
+            self._converted_base = self._check_base(base[1].lower())
+        self.file.seek(0)
+        self.file = cast("Any", _asc_lines(self.file, is_relative=base is not None and base[2] is not None))
+
+
+_ASC_HEAD, _ASC_FLAGS = 4096, re.IGNORECASE | re.MULTILINE
+_ASC_FRAME = re.compile(r"-?\d+[.,]\d+\s+(CANFD\s+)?\d+\s+\S+\s+(Rx|Tx|TxRq)\s", re.IGNORECASE)
+
+
+def _asc_lines(lines: Iterable[str], is_relative: bool) -> Iterator[str]:
+    """Give the lines of an ASC, with stamps from the beginning; say which frames python-can will pass over."""
+    time_s = Decimal(0)
+    for number, text in enumerate(lines, 1):
+        line = text.strip()
+        if is_relative and (stamp := re.match(r"(\d+\.\d+)\s", line)):
+            time_s += Decimal(stamp[1])
+            line = f"{time_s} {line[stamp.end() :]}"
+        if frame := _ASC_FRAME.match(line):
+            if frame[2].lower() == "txrq":
+                continue
+            if not ASC_MESSAGE_REGEX.match(line):
+                _LOGGER.warning("line %d is not read: %s", number, line)
+        yield line
+
+
+class _CandumpReader(can.CanutilsLogReader):
+    """python-can's, but a line that is no frame ends nothing, and error frames keep their class.
+
+    Of an error frame python-can makes data of a 29-bit identifier, or drops all but the time.
+    """
+
+    _number = 0
+    _line = ""
+    _is_error = False
+
+    def __iter__(self) -> Generator[can.Message, None, None]:
+        file = self.file
+        while True:
+            self.file = cast("Any", self._lines(file))
+            try:
+                for message in super().__iter__():
+                    if message.dlc < len(message.data):
+                        raise ValueError("an odd number of digits")
+                    if self._is_error:
+                        message.is_error_frame, message.is_extended_id = True, False
+                    yield message
+            except (ValueError, IndexError):
+                _LOGGER.warning("line %d is no frame: %s", self._number, self._line.strip()[:60])
+            else:
+                return
+
+    def _lines(self, file: Iterable[str]) -> Iterator[str]:
+        for self._line in file:
+            self._number += 1
+            error = re.search(r" ([23][0-9A-Fa-f]{7})#", self._line)
+            self._is_error = error is not None
+            line = self._line.replace(error[0], f" {int(error[1], 16) & ~ERROR_FLAG:08X}#") if error else self._line
+            yield re.sub(r"(#[0-9A-Fa-f]{16})_[0-9A-Fa-f]", r"\1", line)  # a raw DLC, which means 8
+
+
+class _PassedOver(logging.Handler):
+    """Counts the records that are not read, and keeps what is said of the first; also what python-can says of it."""
+
+    first = ""
+    count = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        words = record.getMessage()
+        if not words.startswith(_HARMLESS) and not words.endswith(" ''"):  # an empty line
+            self.pass_over(words)
+
+    def pass_over(self, words: str) -> None:
+        """Count a record."""
+        self.count += 1
+        self.first = self.first or " ".join(words.split())[:_LONGEST]
+
+
+_LOGGER = logging.getLogger("can.io")
+_LOGGER.addHandler(logging.NullHandler())  # python-can's words go through `_PassedOver`, not to the terminal
+_HARMLESS = ("Unknown object header version", "DLC vs Data Length mismatch")
+"""Objects that are no frames, or that `_BlfReader` counts; frames that are read."""
+_READERS: dict[str, Any] = {".blf": _BlfReader, ".asc": _AscReader, ".log": _CandumpReader}
+_FLAGS = slice(RecordedFrame._fields.index("is_extended"), None)
+"""Those that a row of RECORDED_FRAME_DTYPE ends with, too."""
+_STATUS_ID = 0xFFFFFFFF
+"""Of the lines of a TRC that tell the state of the bus."""
+_FORMS = {
+    ".log": "a candump log, as `candump -l` records it and SavvyCAN saves it",
+    ".csv": "a CSV as python-can writes it; SavvyCAN saves a candump log, too",
+}
 
 
 class PythonCanFrames:
     """The frames of a file that python-can reads: iterate once; `channels` and `problem` grow meanwhile."""
 
     def __init__(self, path: Path) -> None:
-        """Open the file. Raises LogError when it can't be read or isn't of its format."""
+        """Look at the file. Raises LogError when it can't be read."""
         self.channels: list[str] = []
         self.epoch_ns = 0
         self.problem = ""
         self._path = path
-        kind: Any = _BlfReader if path.suffix.lower() == ".blf" else MESSAGE_READERS[path.suffix.lower()]
         with failing_as(f"{path} can't be read"):
-            binary = open_input(path)
-            # Vendors' tools write their texts in the Windows of the country; frames are ASCII.
-            file: Any = (
-                io.TextIOWrapper(binary, encoding="latin-1") if issubclass(kind, TextIOMessageReader) else binary
-            )
-        try:
-            self._reader = kind(file)
-            self._start_ns = _take_start(self._reader)
-        except Exception as error:  # each reader has failures of its own
-            file.close()
-            raise LogError(f"{path} can't be read as {path.suffix}: {_line(error)}") from None
+            open_input(path).close()
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Give the frames, (n,) of RECORDED_FRAME_DTYPE; what can't be read ends them and is the problem."""
+        """Give the frames, (n,) of RECORDED_FRAME_DTYPE; what is no frame is left out, and the problem."""
+        passed_over = _PassedOver()
         rows: list[tuple[Any, ...]] = []
         count = 0
-        with self._reader:
+        for message, start_ns in self._messages(passed_over):
             try:
-                for message in self._reader:
-                    rows.append(to_row(message, self._channel(message), self._start_ns))
-                    count += 1
-                    if len(rows) == PIECE_FRAMES:
-                        yield np.array(rows, RECORDED_FRAME_DTYPE)
-                        rows = []
-            except Exception as error:  # each reader has failures of its own
-                if not count:
-                    raise LogError(f"{self._path} can't be read as {self._path.suffix}: {_line(error)}") from None
-                self.problem = f"{self._path.name} is damaged after {count} frames: {_line(error)}"
+                frame = to_frame(message, start_ns)
+                data = list(frame.data.ljust(MAX_DATA, b"\0"))
+                head = (frame.t_ns, frame.t_ns, frame.can_id, frame.is_tx, frame.is_error, frame.length, data)
+                rows.append((*head, self._channel(frame.channel), *tuple(frame)[_FLAGS]))
+            except ValueError as error:
+                passed_over.pass_over(str(error))
+                continue
+            count += 1
+            if len(rows) == PIECE_FRAMES:
+                yield np.array(rows, RECORDED_FRAME_DTYPE)
+                rows = []
+        if passed_over.count and not count:
+            form = _FORMS.get(self._path.suffix.lower(), f"a whole {self._path.suffix}")
+            raise LogError(f"{self._path} is not {form}: {passed_over.first}")
+        if passed_over.count:
+            more = f", and {passed_over.count - 1} more records" if passed_over.count > 1 else ""
+            self.problem = f"{self._path.name}: {passed_over.first}{more}"
+        elif not count:
+            self.problem = f"{self._path.name}: there is no frame in it"
         if rows:
             yield np.array(rows, RECORDED_FRAME_DTYPE)
 
-    def _channel(self, message: can.Message) -> int:
-        name = channel_name(message.channel)
+    def _messages(self, passed_over: _PassedOver) -> Iterator[tuple[can.Message, int]]:
+        """Give what python-can reads, each message with the start to add, up to an error."""
+        suffix = self._path.suffix.lower()
+        kind = _READERS.get(suffix) or MESSAGE_READERS[suffix]
+        count = 0
+        _LOGGER.addHandler(passed_over)
+        try:
+            file: Any = open_input(self._path)
+            if issubclass(
+                kind, TextIOMessageReader
+            ):  # vendors' tools write in the code of the country; frames are ASCII
+                file = io.TextIOWrapper(file, encoding="latin-1")
+            with file:
+                reader = kind(file)
+                start_ns = _take_start(reader)
+                for message in reader:
+                    if message.arbitration_id != _STATUS_ID:
+                        count += 1
+                        yield message, start_ns
+                if getattr(reader, "_tail", b"").strip(b"\0"):
+                    passed_over.pass_over(f"cut within an object, behind {count} frames")
+        except Exception as error:  # each reader has failures of its own
+            reason = str(error) or type(error).__name__
+            passed_over.pass_over(f"behind {count} frames nothing can be read: {reason}" if count else reason)
+        finally:
+            _LOGGER.removeHandler(passed_over)
+
+    def _channel(self, name: str) -> int:
         if name not in self.channels:
             if len(self.channels) == MOST_CHANNELS:
-                raise LogError(f"there are more than {MOST_CHANNELS} channels")
+                raise ValueError(f"there are more than {MOST_CHANNELS} channels")
             self.channels.append(name)
         return self.channels.index(name)
 
@@ -288,5 +376,5 @@ def _take_start(reader: Any) -> int:
     return 0
 
 
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+_LONGEST = 120
+"""Letters of a reason, which may hold a line of the file."""
