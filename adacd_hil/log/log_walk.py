@@ -69,7 +69,7 @@ class _Extras:
         """Take in an attachment or metadata. Raises LogError for a damaged one."""
         if record.opcode == Opcode.ATTACHMENT:
             attachment: Attachment = parse(record.opcode, record.body)
-            if not attachment_crc_fits(record.body, is_vouched=False):
+            if not attachment_crc_fits(record):
                 raise LogError("attachment fails its CRC")
             self.attachments[attachment.name] = attachment.data
         elif record.opcode == Opcode.METADATA:

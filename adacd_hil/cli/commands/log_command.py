@@ -85,7 +85,8 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     """Save everything intact of a cut or damaged log, before and after the damage, to one whole file.
 
-    --out: default NAME.recovered.mcap. The log itself stays as it is. No message is saved that no CRC vouches for.
+    --out: default NAME.recovered.mcap. The log itself stays as it is. Of a log with CRCs no message is saved for which
+    none vouches; of one without all that can be read is, and counted.
     """
     from adacd_hil.log.editing.recover import recover as recover_log
 
@@ -160,10 +161,10 @@ def info_as_json(info: "LogInfo") -> dict[str, Any]:
 
 def info_as_text(info: "LogInfo") -> str:
     """Tell what a log holds, the gist first."""
-    ending = info.ending or "without an end"
+    ending = f", {info.ending}" if info.ending else ", without an end" if info.problems else ""
     parts = f"{info.files} parts, " if info.files > 1 else ""
     lines = [
-        f"{info.path}: {parts}{_size(info.size_bytes)}, {info.duration_s:.3f} s, {info.cycles} cycles, {ending}",
+        f"{info.path}: {parts}{_size(info.size_bytes)}, {info.duration_s:.3f} s, {info.cycles} cycles{ending}",
         f"{info.frames} frames, {info.messages} messages, {info.dropped} packets dropped",
         f"{info.contacts} contacts, {info.collisions} of them collisions; {len(info.faults)} errors, "
         f"{info.events['warning']} warnings",
@@ -227,6 +228,7 @@ def recovery_as_json(recovery: "LogRecovery") -> dict[str, Any]:
         "metadata": recovery.metadata,
         "is_lossy": recovery.is_lossy,
         "lost": recovery.describe_loss(),
+        "unvouched_messages": losses.unvouched,
         "lost_messages": losses.messages,
         "lost_chunks": losses.chunks,
         "lost_bytes": losses.bytes,
@@ -242,6 +244,8 @@ def recovery_as_text(recovery: "LogRecovery") -> str:
     saved = f"{recovery.messages} messages, {recovery.attachments} attachments"
     lost = recovery.describe_loss()
     lines = [f"{recovery.out}: {saved}", *(f"  {note}" for note in recovery.losses.notes)]
+    if recovery.losses.unvouched:
+        lines.append(f"nothing vouches for {recovery.losses.unvouched} messages: {recovery.path.name} has no checksums")
     lines.append(f"lost: {lost}" if lost else "nothing was lost")
     return "\n".join(in_line(line) for line in lines)
 

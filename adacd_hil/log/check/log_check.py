@@ -204,7 +204,7 @@ class _FileCheck:
         self._summary.attachment(record, attachment)
         if record.body[-4:] == bytes(4):
             self._findings.add("no-crc", f"the attachment {attachment.name} has no CRC", record.offset)
-        elif not attachment_crc_fits(record.body):
+        elif not attachment_crc_fits(record):
             self._findings.add("attachment-crc", f"the attachment {attachment.name} fails its CRC", record.offset)
 
     def _finish(self, end: int) -> None:

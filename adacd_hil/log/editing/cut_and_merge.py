@@ -102,7 +102,7 @@ class IntactLog:
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self.definitions.take((record,))
         elif opcode == Opcode.ATTACHMENT:
-            if not attachment_crc_fits(body):
+            if not attachment_crc_fits(record):
                 raise _damaged(path, record.offset)
             yield parse(opcode, body)
         elif opcode == Opcode.METADATA:

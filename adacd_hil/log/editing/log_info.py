@@ -16,7 +16,7 @@ from mcap.records import Attachment, Channel, Metadata, Statistics
 
 from adacd_hil.file_access import open_input
 from adacd_hil.log.check.content_checks import payload_size
-from adacd_hil.log.editing.salvage import Salvage
+from adacd_hil.log.editing.salvage import Losses, Salvage
 from adacd_hil.log.log_files import (
     CONTINUED,
     DROPPED_KEY,
@@ -142,16 +142,21 @@ class _InfoView:
         if end is not None:
             records = [record for record in end.summary if record.opcode == Opcode.STATISTICS]
             statistics = parse(Opcode.STATISTICS, records[0].body) if records else None
-        if end is None or statistics is None:
-            self._info.problems.append(f"{path.name} is cut or damaged: `adacd-hil log check` says how")
-            if self._is_brief:
-                self._info.metadata = self._info.metadata or run_metadata(path)
-            else:
-                self._take_damaged(path)
-        else:
+            channels = {parse(Opcode.CHANNEL, r.body).id for r in end.summary if r.opcode == Opcode.CHANNEL}
+            if statistics is not None and not statistics.channel_message_counts.keys() <= channels:
+                statistics = None  # the summary doesn't say whose messages it counts
+        is_damaged = end is None
+        if end is not None and statistics is not None:
             self._take_whole(file, end, statistics)
+        elif self._is_brief:
+            self._info.metadata = self._info.metadata or run_metadata(path)
+        else:
+            is_damaged |= self._take_each(path).is_any
+        if is_damaged:
+            self._info.problems.append(f"{path.name} is cut or damaged: `adacd-hil log check` says how")
 
-    def _take_damaged(self, path: Path) -> None:
+    def _take_each(self, path: Path) -> Losses:
+        """Read a file whole."""
         salvage = Salvage(path)
         for item in salvage:
             if isinstance(item, Attachment):
@@ -171,6 +176,7 @@ class _InfoView:
                 if len(item.log_times):
                     self._span(int(item.log_times.min()), int(item.log_times.max()))
                 self._read(item, salvage.definitions)
+        return salvage.losses
 
     def _take_whole(self, file: IO[bytes], end: FileEnd, statistics: Statistics) -> None:
         definitions = Definitions()

@@ -182,6 +182,8 @@ class _Work:
             "source": self._path.name,
             "source_ending": self._ending,
         }
+        if losses.unvouched:
+            summary["unvouched_messages"] = str(losses.unvouched)
         if recovery.is_lossy:
             summary |= {
                 LOST_KEY: recovery.describe_loss(),

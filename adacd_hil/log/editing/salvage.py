@@ -4,6 +4,9 @@ Salvage trusts a message when a CRC vouches for it: that of its chunk, or that o
 nothing from the beginning of a chunk that was cut or damaged: of 1000 decompressed so, two gave wrong messages.
 Metadata and message indexes have no CRC of their own; recovery makes indexes anew and takes metadata where their shape
 is right.
+
+Many recorders write no CRC. A file of which no chunk has one is read as a reader of streams reads it: whole chunks that
+open, and messages outside of chunks up to the first damage. `Losses.unvouched` counts these messages.
 """
 
 import contextlib
@@ -26,6 +29,7 @@ from adacd_hil.log.mcap.mcap_records import (
     FileGap,
     RawRecord,
     attachment_crc_fits,
+    chunk_crc,
     crc_of,
     parse,
     read_end,
@@ -55,6 +59,7 @@ class Losses:
     chunks: int = 0
     bytes: int = 0
     messages: int | None = 0
+    unvouched: int = 0  # messages that were saved though no CRC vouches for them
     attachments: int = 0
     metadata: int = 0
     is_cut: bool = False
@@ -79,6 +84,7 @@ class Losses:
         self.bytes += other.bytes
         is_known = self.messages is not None and other.messages is not None
         self.messages = (self.messages or 0) + (other.messages or 0) if is_known else None
+        self.unvouched += other.unvouched
         self.attachments += other.attachments
         self.metadata += other.metadata
         self.is_cut |= other.is_cut
@@ -97,6 +103,8 @@ class Salvage:
         self.definitions = Definitions()
         self.is_vouched = False
         """Whether the CRC of the data section fits: then everything is as it was written."""
+        self._is_unchecked = False
+        """Whether neither a chunk nor the data section has a CRC."""
         self._path = path
         self._opening = Opening()
         self._statistics: Statistics | None = None
@@ -114,6 +122,9 @@ class Salvage:
     def _look_at_end(self, file: IO[bytes]) -> None:
         """Take the summary where its CRC fits, and compare the CRC of the data section."""
         end = read_end(file)
+        has_data_crc = end is not None and end.data_crc != 0
+        chunks = (item for item in scan(file) if isinstance(item, RawRecord) and item.opcode == Opcode.CHUNK)
+        self._is_unchecked = not has_data_crc and not any(chunk_crc(chunk) for chunk in chunks)
         if end is None:
             return
         self.is_vouched = end.data_crc != 0 and end.data_crc == crc_of(file, 0, end.data_end)
@@ -139,17 +150,18 @@ class Salvage:
     def _take(self, record: RawRecord) -> Iterator[Attachment | Metadata | Contents]:
         """Give what is in a record and can be trusted."""
         opcode = record.opcode
+        is_trusted = self.is_vouched or (self._is_unchecked and not self.losses.bytes)
         try:
             if opcode == Opcode.CHUNK:
                 yield from self._take_chunk(record)
-            elif opcode == Opcode.MESSAGE and self.is_vouched:
-                yield from self._give(message_contents(record))
+            elif opcode == Opcode.MESSAGE and is_trusted:
+                yield from self._give(message_contents(record), self.is_vouched)
             elif opcode == Opcode.MESSAGE:
                 self._left_out += 1
-            elif opcode in DEFINITIONS and self.is_vouched:
+            elif opcode in DEFINITIONS and is_trusted:
                 self.definitions.take((record,))
             elif opcode == Opcode.ATTACHMENT:
-                if not attachment_crc_fits(record.body, self.is_vouched):
+                if not attachment_crc_fits(record, self.is_vouched or self._is_unchecked):
                     self._lose(record.offset, len(record.body), "attachment fails its CRC")
                     return
                 self._saved_attachments += 1
@@ -172,9 +184,12 @@ class Salvage:
     def _take_chunk(self, record: RawRecord) -> Iterator[Contents]:
         self._chunk = None
         chunk: Chunk = parse(record.opcode, record.body)
-        if not chunk.uncompressed_crc and not self.is_vouched:
+        is_vouched = self.is_vouched or chunk.uncompressed_crc != 0
+        if not is_vouched and not self._is_unchecked:
             raise ChunkError("has no CRC, and that of the whole doesn't fit")
         contents = read_contents(self._opening.open_checked(chunk))
+        if not is_vouched and (contents.breaks or contents.strangers):
+            raise ChunkError("has no CRC, and holds what is no message")
         self.definitions.take(contents.definitions)
         if not self.is_vouched:
             self._chunk = contents, contents.entries
@@ -182,12 +197,14 @@ class Salvage:
             times = int(contents.log_times.min()), int(contents.log_times.max())
             self._is_explained |= times != (chunk.message_start_time, chunk.message_end_time)
         self._is_explained |= len(contents.data) != chunk.uncompressed_size
-        yield from self._give(contents)
+        yield from self._give(contents, is_vouched)
 
-    def _give(self, contents: Contents) -> Iterator[Contents]:
+    def _give(self, contents: Contents, is_vouched: bool) -> Iterator[Contents]:
         known = np.isin(contents.channels, list(self.definitions.channels))
         self._left_out += int(np.count_nonzero(~known))
-        self._saved_messages += int(np.count_nonzero(known))
+        saved = int(np.count_nonzero(known))
+        self._saved_messages += saved
+        self.losses.unvouched += 0 if is_vouched else saved
         if len(contents.log_times):
             if self._is_hole:
                 self.losses.holes.append(Hole(self._latest_ns, int(contents.log_times.min())))

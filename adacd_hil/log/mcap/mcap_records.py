@@ -318,10 +318,15 @@ class _Scan:
         return self._size
 
 
-def attachment_crc_fits(body: bytes, is_vouched: bool = True) -> bool:
-    """Say whether the body of an attachment fits its CRC; 0, for none, does if something else vouches for it."""
-    stored = int.from_bytes(body[-4:], "little")
-    return stored == crc32(body[:-4]) or (stored == 0 and is_vouched)
+def chunk_crc(record: RawRecord) -> int:
+    """Return the CRC that a chunk brings of what it opens to; 0 where it has none."""
+    return int.from_bytes(record.body[24:28], "little")
+
+
+def attachment_crc_fits(record: RawRecord, can_lack: bool = True) -> bool:
+    """Say whether an attachment fits its CRC; can_lack: one of 0, for none, does."""
+    stored = int.from_bytes(record.body[-4:], "little")
+    return stored == crc32(record.body[:-4]) or (stored == 0 and can_lack)
 
 
 _FOOTER = HEAD.size + 20
@@ -333,7 +338,7 @@ class FileEnd(NamedTuple):
 
     data_end: int  # where the DataEnd begins
     data_crc: int  # stored there; 0: none
-    summary: list[RawRecord]  # empty where its CRC doesn't fit
+    summary: list[RawRecord]  # empty where its CRC doesn't fit, or where it has none and its records no shape
 
 
 def read_end(file: IO[bytes]) -> FileEnd | None:
@@ -346,14 +351,18 @@ def read_end(file: IO[bytes]) -> FileEnd | None:
     if data_end[0] != Opcode.DATA_END:
         return None
     data_crc = int.from_bytes(data_end[HEAD.size :], "little")
-    summary: list[RawRecord] = []
-    if (
-        footer.summary_crc
-        and place - end <= MOST_RECORD_BYTES
-        and footer.summary_crc == crc_of(file, end, place + _FOOTER - 4)
-    ):
-        summary = _split(_read(file, end, place - end), end)
-    return FileEnd(end - _DATA_END, data_crc, summary)
+    summary = summary_of(file)
+    if footer.summary_crc:
+        is_sound = footer.summary_crc == crc_of(file, end, place + _FOOTER - 4)
+    else:
+        is_sound = all(_has_shape(record) for record in summary)
+    return FileEnd(end - _DATA_END, data_crc, summary if is_sound else [])
+
+
+def _has_shape(record: RawRecord) -> bool:
+    """Say whether a record is one that repeats its length, and does so."""
+    body = record.body
+    return has_shape(record.opcode) and fits(record.opcode, len(body), lambda place, count: body[place : place + count])
 
 
 def summary_of(file: IO[bytes]) -> list[RawRecord]:
