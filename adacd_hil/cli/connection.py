@@ -18,6 +18,7 @@ from adacd_hil.terminal import hurry, in_line
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, open_bus
 from adacd_hil.wire.can_interface import can_interfaces, is_virtual
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.dbc_decoder import DbcDecoder, load_decoder
 
 MOST_BLIND_CYCLES = 5
 """Cycles without data that a real arm may go through: at 100 deg/s and 1 ms half a degree."""
@@ -129,6 +130,17 @@ class Connection:
         """Read configuration and contract. Raises ConfigError, CodecError."""
         settings = self.settings()
         return settings, load_contract(settings)
+
+    def load_decoder(self) -> Codec | DbcDecoder:
+        """Read what a listener decodes by: a DBC of --dbc may be any, the configuration's is a contract.
+
+        Raises ConfigError, CodecError.
+        """
+        if self.dbc is not None:
+            decoder = load_decoder(self.dbc)
+            if not decoder.is_contract:
+                return decoder
+        return self.load()[1]
 
     def open(self, clock: Clock, codec: Codec, settings: Settings) -> Bus:
         """Open the bus for a run: what the host receives in real time; all of it, with modelled time, in lockstep.

@@ -19,6 +19,7 @@ from adacd_hil.device.device_setup import Slave
 from adacd_hil.wire.bus import Bus, Frame, Tap
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID
+from adacd_hil.wire.dbc_decoder import DbcDecoder, MessageDecoder
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 from adacd_hil.wire.frame_time import LoadMeter
@@ -269,7 +270,7 @@ def _difference(node: Node, wanted: Expected) -> str:
     return ""
 
 
-def message_name(codec: Codec, can_id: int) -> str:
+def message_name(codec: Codec | DbcDecoder, can_id: int) -> str:
     """Name an identifier: the contract's message, else CiA 301's use of it in parentheses, else "unknown"."""
     message = codec.by_id.get(can_id)
     if message is not None:
@@ -331,9 +332,9 @@ class Snapshot:
 class _Entry:
     """One identifier's frames so far."""
 
-    def __init__(self, message: MessageCodec | None) -> None:
+    def __init__(self, message: MessageCodec | MessageDecoder | None) -> None:
         self.message = message
-        self.receiver = message.receiver() if message is not None and message.is_protected else None
+        self.receiver = message.receiver() if isinstance(message, MessageCodec) and message.is_protected else None
         self.count = 0
         self.last_ns = 0
         self.wrong_lengths = 0
@@ -346,7 +347,7 @@ class _Entry:
         self.data = frame.data
         if self.message is None:
             return
-        if len(frame.data) != self.message.length:
+        if not self.message.takes(len(frame.data)):
             self.wrong_lengths += 1
         elif self.receiver is None or self.receiver.check(frame.data).is_valid:
             self.valid = frame.data
@@ -366,7 +367,7 @@ class _Entry:
 class BusView:
     """Takes in every frame of a bus."""
 
-    def __init__(self, codec: Codec, bitrate: int, data_bitrate: int, t_ns: int) -> None:
+    def __init__(self, codec: Codec | DbcDecoder, bitrate: int, data_bitrate: int, t_ns: int) -> None:
         """Begin at `t_ns`; the bit rates in bit/s are for the load."""
         self.frames = 0
         self._codec = codec
@@ -437,10 +438,7 @@ class BusView:
         message = entry.message
         values: tuple[tuple[str, float, str], ...] = ()
         if message is not None and entry.valid is not None:
-            decoded = message.decode_values(entry.valid)
-            values = tuple(
-                (signal.name, value, signal.unit) for signal, value in zip(message.values, decoded, strict=True)
-            )
+            values = message.decode_named(entry.valid)
         return MessageView(
             can_id=can_id,
             name=message_name(self._codec, can_id),

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import cantools
 from cantools.database.can import Database, Message, Signal
-from cantools.database.errors import Error as DatabaseError
 
 from adacd_hil.file_access import read_input
 from adacd_hil.wire.codec_columns import MessageTable, SignalCodec
@@ -42,6 +41,8 @@ _FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h"} | 
 """Of a container, by its bytes and whether it is signed. Source: the module struct."""
 _MOST_MESSAGES = 1000
 """Of a contract: to judge their budget takes 3 s, and four times that for twice as many."""
+WIRE_VERSION = "WireVersion"
+"""The attribute by which a DBC says that it is a contract."""
 E2E_SIGNALS = ("e2e_crc", "e2e_counter", "e2e_status")
 _E2E_BITS = {
     Protection.PROFILE_2: ((0, 8), (8, 4), (12, 4)),
@@ -154,6 +155,17 @@ class MessageCodec(MessageTable):
             (scale1, offset1), (scale2, offset2) = self._scales
             return raw[0] * scale1 + offset1, raw[1] * scale2 + offset2
         return tuple([r * scale + offset for r, (scale, offset) in zip(raw, self._scales, strict=True)])
+
+    def takes(self, length: int) -> bool:
+        """Say whether a frame of so many bytes can be decoded."""
+        return length == self.length
+
+    def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
+        """Decode what follows the end-to-end header to (signal, value, unit)."""
+        return tuple(
+            (signal.name, value, signal.unit)
+            for signal, value in zip(self.values, self.decode_values(data), strict=True)
+        )
 
     def encode_raw(self, *raw: int) -> bytearray:
         """Encode raw integers in the order of `values`, each of which must fill its container; for the hot path."""
@@ -295,14 +307,15 @@ class Codec:
     def __init__(self, database: Database, path: Path, text: bytes) -> None:
         self.path = path
         self.text = text
+        self.database = database
         self.messages = {message.name: MessageCodec(message) for message in database.messages}
         self.by_id = {message.can_id: message for message in self.messages.values()}
         attributes = database.dbc.attributes if database.dbc else {}
-        if "WireVersion" not in attributes:
+        if WIRE_VERSION not in attributes:
             raise CodecError("the DBC has no WireVersion attribute")
         self.is_fd = any(message.is_fd for message in self.messages.values())
         """Whether any message needs CAN FD."""
-        self.wire_version = int(attributes["WireVersion"].value)
+        self.wire_version = int(attributes[WIRE_VERSION].value)
         self.layout_digest = zlib.crc32(_describe(self.messages).encode())
         """CRC-32 of every identifier, length, protection, signal place, scale and data id; nothing else counts."""
 
@@ -341,30 +354,48 @@ _MOST_BITS = "512"
 """Of a frame of 64 bytes."""
 
 
-def load_codec(path: Path | None = None) -> Codec:
-    """Generate the codec from a DBC (default: the one that comes with the package). Raises CodecError."""
+def read_dbc(path: Path | None = None) -> tuple[bytes, Path]:
+    """Read a DBC (default: the one that comes with the package), and return where it is. Raises CodecError."""
     path = path or contract_folder() / "arm.dbc"
     try:
-        text = read_input(path)
+        return read_input(path), path
     except OSError as error:
         raise CodecError(f"DBC {path}: {error.strerror}") from None
-    return parse_codec(text, path)
+
+
+def load_codec(path: Path | None = None) -> Codec:
+    """Generate the codec from a DBC (default: the one that comes with the package). Raises CodecError."""
+    return parse_codec(*read_dbc(path))
 
 
 def parse_codec(text: bytes, path: Path) -> Codec:
     """Generate the codec from the text of a DBC; `path` is where it is, or would be. Raises CodecError."""
-    for found in _SIGNAL_PLACE.finditer(text):  # cantools makes a character of each of its bits
-        if len(found["bits"]) > len(_MOST_BITS) or int(found["bits"]) > int(_MOST_BITS):
-            raise CodecError(f"DBC {path}: a signal has {found['bits'].decode()[:20]} bits, more than {_MOST_BITS}")
-    try:
-        database = cantools.database.load_string(text.decode("utf-8"), "dbc")
-    except (UnicodeDecodeError, DatabaseError) as error:
-        reason = " ".join(str(error).split())
-        raise CodecError(f"DBC {path} can't be read: {reason}") from None
-    if not isinstance(database, Database):
-        raise CodecError(f"DBC {path} holds no CAN messages")
+    database = parse_database(text, path)
     try:
         _check_messages(database)
         return Codec(database, path, text)
     except CodecError as error:
         raise CodecError(f"DBC {path}: {error}") from None
+
+
+def parse_database(text: bytes, path: Path) -> Database:
+    """Read the text of any DBC that cantools takes, in UTF-8 or in a code of Windows. Raises CodecError."""
+    for found in _SIGNAL_PLACE.finditer(text):  # cantools makes a character of each of its bits
+        if len(found["bits"]) > len(_MOST_BITS) or int(found["bits"]) > int(_MOST_BITS):
+            raise CodecError(f"DBC {path}: a signal has {found['bits'].decode()[:20]} bits, more than {_MOST_BITS}")
+    try:
+        database = cantools.database.load_string(decode_dbc(text), "dbc")
+    except Exception as error:  # cantools has no class for all that it meets
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise CodecError(f"DBC {path} can't be read: {reason}") from None
+    if not isinstance(database, Database):
+        raise CodecError(f"DBC {path} holds no CAN messages")
+    return database
+
+
+def decode_dbc(text: bytes) -> str:
+    """Decode the text of a DBC: UTF-8, else the code that vendors' tools write, as cantools assumes."""
+    try:
+        return text.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return text.decode("cp1252", "replace")

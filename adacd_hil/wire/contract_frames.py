@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
-import cantools
 from cantools.database.can import Database, Message
 
-from adacd_hil.wire.codec import Codec, CodecError, parse_codec
+from adacd_hil.wire.codec import Codec, CodecError, decode_dbc, parse_codec, parse_database
+from adacd_hil.wire.dbc_decoder import DbcDecoder
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 HOST_NODE = 127
@@ -63,7 +63,7 @@ def move_contract(codec: Codec, node_offset: int, host_node: int | None = None) 
     def move(found: re.Match[str]) -> str:
         return found["head"] + str(moved.get(int(found["id"]), found["id"]))
 
-    text = _STATEMENT.sub(move, codec.text.decode())
+    text = _STATEMENT.sub(move, decode_dbc(codec.text))
     return parse_codec(text.encode(), Path(codec.path.name))
 
 
@@ -81,12 +81,10 @@ def move_id(can_id: int, node_offset: int, host_node: int, name: str) -> int:
     return can_id + node_offset
 
 
-def read_bitrates(codec: Codec) -> tuple[int, int]:
+def read_bitrates(codec: Codec | DbcDecoder) -> tuple[int, int]:
     """Return the nominal and the data bit rate; the data bit rate of a classic bus is 0."""
-    database = cantools.database.load_string(codec.text.decode("utf-8"), "dbc")
-    if not isinstance(database, Database):
-        return DEFAULT_BITRATE, 0
-    return int(_attribute(database, "Baudrate")) or DEFAULT_BITRATE, int(_attribute(database, "BaudrateCANFD"))
+    nominal, data = (str(_attribute(codec.database, name)) for name in ("Baudrate", "BaudrateCANFD"))
+    return int(nominal) if nominal.strip("0").isdecimal() else DEFAULT_BITRATE, int(data) if data.isdecimal() else 0
 
 
 class Trigger(Enum):
@@ -166,9 +164,7 @@ class ContractTiming:
 
 def read_contract(text: bytes, name: str) -> ContractTiming:
     """Read the timing of a DBC that `load_codec` has accepted. Raises CodecError."""
-    database = cantools.database.load_string(text.decode("utf-8"), "dbc")
-    if not isinstance(database, Database):
-        raise CodecError(f"DBC {name} holds no CAN messages")
+    database = parse_database(text, Path(name))
     definitions = database.dbc.attribute_definitions if database.dbc else {}
     if "Trigger" not in definitions:
         raise CodecError(f"DBC {name} doesn't say when its messages are sent: it has no Trigger attribute")

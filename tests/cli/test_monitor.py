@@ -13,7 +13,8 @@ from adacd_hil.wire.bus import Frame
 
 
 def monitor(rig: Rig, node_id: int | None = None) -> Monitor:
-    return Monitor(Connection("embedded", "embedded", None, "paper", None, None), rig.bus, rig.clock, node_id)
+    connection = Connection("embedded", "embedded", None, "paper", None, None)
+    return Monitor(connection, connection.load_decoder(), rig.bus, rig.clock, node_id)
 
 
 def test_the_table_shows_nodes_messages_and_load() -> None:

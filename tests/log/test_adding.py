@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from recorded_run import CODEC
 
 from adacd_hil.log.check.log_check import check_log
 from adacd_hil.log.formats.signal_tables import export_tables
@@ -17,6 +16,7 @@ from adacd_hil.log.types import topics
 from adacd_hil.log.types.message_types import Member
 from adacd_hil.log.types.topics import SCHEME, OwnTopic
 from adacd_hil.records import Field, Layout, Request, SchemeState, scheme_layout
+from adacd_hil.wire.dbc_decoder import load_decoder
 
 CYCLES = 40
 PERIOD_NS = 1_000_000
@@ -101,7 +101,7 @@ def test_a_message_of_a_topic_that_was_added_is_as_long_as_it_says(path):
 
 def test_a_topic_that_was_added_is_exported(path, tmp_path):
     record(path, BATTERY, battery)
-    export_tables(path, tmp_path / "out", "csv", ("battery",), CODEC)
+    export_tables(path, tmp_path / "out", "csv", ("battery",), load_decoder())
     with (tmp_path / "out" / "battery.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["cell_V_1"] for row in rows] == [str(3.0 + number) for number in range(CYCLES)]

@@ -23,7 +23,7 @@ from adacd_hil.log.mcap.chunks import FREE_BYTES, MOST_BYTES, MOST_RATIO, ChunkE
 from adacd_hil.log.mcap.mcap_records import MOST_RECORD_BYTES
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import Event
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_decoder import load_decoder
 
 MOST_PEAK_BYTES = 400 << 20
 
@@ -147,7 +147,7 @@ def readers(path, folder):
     yield lambda: read_frames(path).problem
     yield lambda: [finding for finding in check_log(path).findings if finding.rule == "chunk-crc"]
     yield lambda: recover(path, folder / "recovered.mcap").losses.chunks
-    yield lambda: export_tables(path, folder / "tables", "csv", (), load_codec()).problem
+    yield lambda: export_tables(path, folder / "tables", "csv", (), load_decoder()).problem
 
 
 @pytest.mark.slow

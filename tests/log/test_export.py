@@ -22,6 +22,7 @@ from adacd_hil.log.formats.signal_tables import choose_topics, export_tables
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunked_file import MAGIC
 from adacd_hil.log.reader import read_log
+from adacd_hil.wire.dbc_decoder import load_decoder
 
 MILLISECOND_NS = 1_000_000
 
@@ -211,7 +212,7 @@ def columns_of(path):
 
 
 def test_parquet_holds_every_topic_bit_for_bit(log, tmp_path):
-    summary = export_tables(log, tmp_path, "parquet", (), CODEC)
+    summary = export_tables(log, tmp_path, "parquet", (), load_decoder())
     expected = read_log(log)
     table = columns_of(tmp_path / "scheme.parquet")
     assert summary.problem == ""
@@ -227,13 +228,13 @@ def test_parquet_holds_every_topic_bit_for_bit(log, tmp_path):
 
 
 def test_parquet_says_where_it_comes_from(log, tmp_path):
-    export_tables(log, tmp_path, "parquet", ("cycle",), CODEC)
+    export_tables(log, tmp_path, "parquet", ("cycle",), load_decoder())
     metadata = pyarrow.parquet.read_schema(tmp_path / "cycle.parquet").metadata
     assert metadata[b"epoch_ns"] == b"1790000000123456789"
 
 
 def test_csv_holds_numbers_that_read_back_to_the_same(log, tmp_path):
-    export_tables(log, tmp_path, "csv", ("control", "decoded/Sensor*"), CODEC)
+    export_tables(log, tmp_path, "csv", ("control", "decoded/Sensor*"), load_decoder())
     assert sorted(path.name for path in tmp_path.iterdir())[:2] == ["control.csv", "decoded_Sensor1Emcy.csv"]
     with (tmp_path / "control.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -244,7 +245,7 @@ def test_csv_holds_numbers_that_read_back_to_the_same(log, tmp_path):
 
 def test_frames_of_others_become_tables_by_the_contract(log, tmp_path):
     rewrite(log, tmp_path / "x.blf", "blf")
-    export_tables(tmp_path / "x.blf", tmp_path / "tables", "parquet", ("Drive1*",), CODEC)
+    export_tables(tmp_path / "x.blf", tmp_path / "tables", "parquet", ("Drive1*",), load_decoder())
     expected = read_log(log).decoded
     for name in ("Drive1Feedback", "Drive1Command"):
         table = columns_of(tmp_path / "tables" / f"decoded_{name}.parquet")
@@ -263,7 +264,7 @@ def test_a_topic_that_is_not_there_names_the_nearest():
 def test_without_pyarrow_one_line_says_what_to_install(log, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(LogError, match=r"pip install -e '.*\[tables\]', or choose csv"):
-        export_tables(log, tmp_path / "x", "parquet", (), CODEC)
+        export_tables(log, tmp_path / "x", "parquet", (), load_decoder())
     assert not (tmp_path / "x").exists()
 
 

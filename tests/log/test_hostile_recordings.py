@@ -17,7 +17,7 @@ from adacd_hil.log.log_files import LogError, find_parts
 from adacd_hil.log.mcap.chunks import MOST_BYTES
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.message_types import TIME_TEXT, payload_dtype
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_decoder import load_decoder
 
 HEAD = struct.Struct("<4sHHII")
 CONTAINER = 10
@@ -129,7 +129,7 @@ def test_a_schema_that_makes_no_payload_is_one_line_and_its_messages_are_kept_ap
     assert check_log(path).messages == 20
     told = ("", "a message is not as long as its schema says")  # by the names of fields in the channel, if not by it
     assert read_log(path).problem in told
-    assert export_tables(path, tmp_path / "tables", "csv", (), load_codec()).problem in told
+    assert export_tables(path, tmp_path / "tables", "csv", (), load_decoder()).problem in told
 
 
 def test_topics_of_strangers_become_files_of_their_own_in_the_folder(tmp_path):

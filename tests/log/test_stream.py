@@ -25,7 +25,7 @@ from adacd_hil.log.types.message_types import LOG, pack_log, unpack_log
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_decoder import load_decoder
 
 COUNT = 900
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -242,7 +242,7 @@ def test_an_event_that_is_none_is_left_out_and_said(payload, tmp_path):
     found = [logged.event.message for piece in stream for logged in stream.events(piece)]
     assert found == ["text", "text"]
     assert stream.problem == "a message is not as long as its schema says"
-    tables = export_tables(path, tmp_path / "tables", "csv", (), load_codec())
+    tables = export_tables(path, tmp_path / "tables", "csv", (), load_decoder())
     assert tables.rows[tmp_path / "tables" / "events.csv"] == 2
     assert tables.problem == stream.problem
 

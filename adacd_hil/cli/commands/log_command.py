@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from adacd_hil.log.editing.log_info import LogInfo
     from adacd_hil.log.editing.recover import LogRecovery
     from adacd_hil.log.log_files import TimeWindow
-    from adacd_hil.wire.codec import Codec
+    from adacd_hil.wire.dbc_decoder import DbcDecoder
 
 _TOLD_FAULTS = 5
 _log_argument = click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
@@ -282,7 +282,7 @@ only_option = click.option(
     help="Whose frames: by the contract, else by their direction.",
 )
 dbc_option = click.option(
-    "--dbc", type=GivenPath(dir_okay=False), help="The contract; default: the log's, else the arm's."
+    "--dbc", type=GivenPath(dir_okay=False), help="A DBC; default: the log's contract, else the arm's."
 )
 
 
@@ -324,41 +324,41 @@ def export(
     Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. What the target can't hold is counted on stderr. Tables
     replace tables; a file of frames replaces none but the same.
     """
+    from adacd_hil.wire.dbc_decoder import DbcDecoder
+
     if kind in TABLES and (can_ids or only != "both"):
         raise CommandError(f"--only and --id choose frames, {kind} holds tables; use --topic", ExitCode.USAGE)
     if kind in FRAMES and topics:
         raise CommandError(f"--topic chooses tables, {kind} holds frames; use --only or --id", ExitCode.USAGE)
     if has_direction and kind != "candump":
         raise CommandError(f"--direction is candump's; {kind} needs none", ExitCode.USAGE)
-    codec = contract_of(log, dbc)
+    decoder = DbcDecoder(*find_dbc(log, dbc))
     if kind in TABLES:
-        described, problem = _export_tables(log, out or log.with_name(f"{log.stem}-tables"), kind, topics, codec)
+        described, problem = _export_tables(log, out or log.with_name(f"{log.stem}-tables"), kind, topics, decoder)
     else:
         out = out or log.with_suffix(_SUFFIXES.get(kind, f".{kind}"))
-        described, problem = _export_frames(log, out, kind, only, can_ids, codec, has_direction)
+        described, problem = _export_frames(log, out, kind, only, can_ids, decoder, has_direction)
     if problem:
         print(in_line(f"warning: {problem}"), file=sys.stderr)
     answer(as_json, described | {"problem": problem}, described["text"])
     return ExitCode.PARTIAL if problem else ExitCode.OK
 
 
-def contract_of(log: Path, dbc: Path | None) -> "Codec":
-    """Load the contract: the given one, else the one that is attached to the log, else the arm's."""
+def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
+    """Read the DBC of a recording: the given one, else the one that is attached to the log, else the arm's."""
     from adacd_hil.log.editing.log_info import attachment
-    from adacd_hil.wire.codec import load_codec, parse_codec
+    from adacd_hil.wire.codec import read_dbc
 
-    if dbc is not None:
-        return load_codec(dbc)
-    text = attachment(log, "arm.dbc") if log.suffix.lower() == ".mcap" else None
-    return load_codec() if text is None else parse_codec(text, log / "arm.dbc")
+    text = attachment(log, "arm.dbc") if dbc is None and log.suffix.lower() == ".mcap" else None
+    return read_dbc(dbc) if text is None else (text, log / "arm.dbc")
 
 
 def _export_tables(
-    log: Path, out: Path, kind: str, topics: tuple[str, ...], codec: "Codec"
+    log: Path, out: Path, kind: str, topics: tuple[str, ...], decoder: "DbcDecoder"
 ) -> tuple[dict[str, Any], str]:
     from adacd_hil.log.formats.signal_tables import export_tables
 
-    summary = export_tables(log, out, kind, topics, codec, _Teller("rows"))
+    summary = export_tables(log, out, kind, topics, decoder, _Teller("rows"))
     lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
     described = {
         "files": {str(path): rows for path, rows in summary.rows.items()},
@@ -368,14 +368,14 @@ def _export_tables(
 
 
 def _export_frames(
-    log: Path, out: Path, kind: str, only: Any, can_ids: tuple[int, ...], codec: "Codec", has_direction: bool
+    log: Path, out: Path, kind: str, only: Any, can_ids: tuple[int, ...], decoder: "DbcDecoder", has_direction: bool
 ) -> tuple[dict[str, Any], str]:
     from adacd_hil.log.formats.frame_export import FrameChoice, export_frames, sides
     from adacd_hil.log.formats.frame_log import open_frames
 
     if out.exists() and log.exists() and out.samefile(log):
         raise CommandError(f"{out} is the recording itself; name another file with --out", ExitCode.USAGE)
-    host_ids, device_ids = sides(codec)
+    host_ids, device_ids = sides(decoder)
     choice = FrameChoice(only, host_ids, device_ids, frozenset(can_ids))
     source = open_frames(log)
     summary = export_frames(source, choice.pieces(source), out, kind, _Teller("frames"), has_direction)

@@ -14,7 +14,9 @@ from adacd_hil.device.survey import BusView, MessageView, Snapshot
 from adacd_hil.terminal import fold, moves_cursor, plain, terminal_columns, write_screen
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
+from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import read_bitrates
+from adacd_hil.wire.dbc_decoder import DbcDecoder
 from adacd_hil.wire.traffic import receive_until
 
 REDRAW_S = 0.2
@@ -62,8 +64,9 @@ class Screen:
 class Monitor:
     """Feeds a view from a bus and describes it."""
 
-    def __init__(self, connection: Connection, bus: Bus, clock: Clock, node_id: int | None) -> None:
-        _, codec = connection.load()
+    def __init__(
+        self, connection: Connection, codec: Codec | DbcDecoder, bus: Bus, clock: Clock, node_id: int | None
+    ) -> None:
         self._bus, self._clock, self._node_id = bus, clock, node_id
         self._link_name = connection.channel if connection.interface == "socketcan" else None
         self._carried = self._count_carried()
@@ -119,10 +122,10 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
     Raises ConfigError, CodecError, BusMissingError, CommandError.
     """
     clock = MonotonicClock()
-    _, codec = connection.load()  # what is wrong with the configuration comes before what is wrong with the bus
+    codec = connection.load_decoder()  # what is wrong with the configuration comes before what is wrong with the bus
     screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
     with connection.bus(clock, codec.is_fd) as bus:
-        monitor = Monitor(connection, bus, clock, node_id)
+        monitor = Monitor(connection, codec, bus, clock, node_id)
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
         with on_interrupt(monitor.stop):
             if not is_live:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.commands.log_command import contract_of, dbc_option, id_option, only_option
+from adacd_hil.cli.commands.log_command import dbc_option, find_dbc, id_option, only_option
 from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained
@@ -88,8 +88,9 @@ def play(
     """
     from adacd_hil.log.formats.frame_export import FrameChoice, sides
     from adacd_hil.log.formats.frame_log import open_frames
+    from adacd_hil.wire.codec import parse_codec
 
-    codec = contract_of(log, dbc)
+    codec = parse_codec(*find_dbc(log, dbc))
     choice = FrameChoice(
         only,
         *sides(codec),

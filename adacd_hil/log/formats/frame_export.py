@@ -21,6 +21,7 @@ from adacd_hil.log.formats.can_io import to_messages
 from adacd_hil.log.formats.frame_log import FrameSource, candump_channel, candump_line
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.dbc_decoder import DbcDecoder
 
 _MS_NS = 1_000_000
 _US_NS = 1_000
@@ -244,7 +245,7 @@ class FrameChoice:
         return np.asarray(is_host | (frames["is_tx"] & ~is_device))
 
 
-def sides(codec: Codec) -> tuple[frozenset[int], frozenset[int]]:
+def sides(codec: Codec | DbcDecoder) -> tuple[frozenset[int], frozenset[int]]:
     """List the identifiers that a contract's host and its devices send."""
     return (
         _ids(message.can_id for message in codec.messages.values() if HOST in message.senders),

@@ -10,6 +10,7 @@ import csv
 import errno
 import fnmatch
 import itertools
+import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing
@@ -30,8 +31,7 @@ from adacd_hil.log.reader import LoggedEvent, LogStream, Series
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import DECODED, EVENTS
 from adacd_hil.remedies import install_command, nearest_name
-from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.codec_columns import ColumnCodec
+from adacd_hil.wire.dbc_decoder import DbcDecoder
 
 _LONGEST_STEM = 60
 """Letters of the name of a file, so that it has room in 255 bytes."""
@@ -64,18 +64,27 @@ def event_columns(events: Iterable[LoggedEvent]) -> dict[str, Any]:
     return {name: [row[place] for row in rows] for place, name in enumerate(("t_ns", "level", "name", "message"))}
 
 
-def frame_columns(frames: NDArray[Any], codec: Codec) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Decode frames of RECORDED_FRAME_DTYPE by a contract: (message, columns) of each one that occurs."""
-    is_data = ~frames["is_error"] & ~frames["is_remote"]
-    for message in codec.messages.values():
-        found = frames[is_data & (frames["can_id"] == message.can_id) & (frames["length"] == message.length)]
+def frame_columns(frames: NDArray[Any], decoder: DbcDecoder) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Decode frames of RECORDED_FRAME_DTYPE by a DBC: (message, columns) of each one that occurs.
+
+    A signal that a frame lacks, because it is short or multiplexed, is NaN.
+    """
+    frames = frames[~frames["is_error"] & ~frames["is_remote"]]
+    there = set(frames["can_id"].tolist())
+    for message in decoder.messages.values():
+        if message.can_id not in there:
+            continue
+        is_own = (frames["can_id"] == message.can_id) & (frames["is_extended"] == message.is_extended)
+        found = frames[is_own]
+        found = found[np.array([message.takes(length) for length in found["length"].tolist()], np.bool_)]
         if not len(found):
             continue
-        decoder = ColumnCodec(message)
-        values = np.empty((len(found), decoder.count))
-        decoder.decode(np.ascontiguousarray(found["data"][:, : message.length]), values)
+        pairs = zip(found["data"], found["length"].tolist(), strict=True)
+        rows = [message.decode(data[:length].tobytes()) for data, length in pairs]
         columns: dict[str, Any] = {"t_ns": found["t_ns"], "cycle_t_ns": found["cycle_t_ns"]}
-        columns |= {signal.name: values[:, place] for place, signal in enumerate(message.signals)}
+        for name in message.units:
+            values = np.array([row.get(name, math.nan) for row in rows], np.float64)
+            columns[name if name not in columns else f"{name}_"] = values
         yield message.name, columns
 
 
@@ -205,12 +214,12 @@ def export_tables(
     out: Path,
     kind: str,
     wanted: Collection[str],
-    codec: Codec,
+    decoder: DbcDecoder,
     progress: Callable[[int], None] = lambda _: None,
 ) -> TableSummary:
     """Write the tables of a recording into the folder `out`.
 
-    wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty: all. codec:
+    wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty: all. decoder:
     decodes the frames of recordings that have no decoded topics. progress: is told the rows so far.
     Raises LogError when the recording can't be read, lacks a topic, or a table can't be written.
     """
@@ -222,7 +231,7 @@ def export_tables(
         return _export_topics(path, out, kind, choose_topics(topics, wanted, raw), progress)
     if is_mcap and wanted and not raw:
         raise LogError(f"{path} has no topic that can be read")
-    return _export_frames(path, out, kind, wanted, codec, progress)
+    return _export_frames(path, out, kind, wanted, decoder, progress)
 
 
 def choose_topics(
@@ -268,15 +277,15 @@ def _export_topics(
 
 
 def _export_frames(
-    path: Path, out: Path, kind: str, wanted: Collection[str], codec: Codec, progress: Callable[[int], None]
+    path: Path, out: Path, kind: str, wanted: Collection[str], decoder: DbcDecoder, progress: Callable[[int], None]
 ) -> TableSummary:
     source = open_frames(path)
-    owner = f"{path} has frames only, and their contract {codec.path.name}"
-    chosen = choose_topics([DECODED + name for name in codec.messages], wanted, owner=owner)
+    owner = f"{path} has frames only, and their contract {decoder.path.name}"
+    chosen = choose_topics([DECODED + name for name in decoder.messages], wanted, owner=owner)
     pieces = iter(source)
-    with Tables(out, kind, {"contract": codec.path.name}) as tables:
+    with Tables(out, kind, {"contract": decoder.path.name}) as tables:
         for frames in pieces:
-            for name, columns in frame_columns(frames, codec):
+            for name, columns in frame_columns(frames, decoder):
                 if DECODED + name in chosen:
                     tables.write(DECODED + name, columns)
             progress(sum(tables.rows.values()))
