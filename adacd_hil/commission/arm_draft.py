@@ -22,7 +22,9 @@ import numpy as np
 from adacd_hil.records import GRAVITY_M_S2, JOINTS, Vector
 from adacd_hil.scheme.model.chain import PER_LINK
 from adacd_hil.scheme.model.urdf import BASE, SerialArm, UrdfError, read_urdf
+from adacd_hil.settings.arm_settings import ArmSettings
 from adacd_hil.settings.configuration import known_keys, load_settings
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import toml_value
 from adacd_hil.terminal import one_line
 
@@ -125,9 +127,9 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
         (_short(l1), _short(l2)),
         _rounded(theta),
         is_upright,
-        _position_limits(arm),
-        _in_degrees(arm.velocity_limit),
-        (float(arm.torque_limit[0]), float(arm.torque_limit[1])) if np.all(np.isfinite(arm.torque_limit)) else None,
+        _plausible("position_limit_deg", _position_limits(arm), doubts),
+        _plausible("velocity_limit_deg_s", np.degrees(arm.velocity_limit).round(2), doubts),
+        _plausible("rated_torque_Nm", arm.torque_limit, doubts),
         tuple(doubts),
         is_tip_known,
         **body,
@@ -180,22 +182,26 @@ def _about(link: Vector, axis: Vector) -> float:
     return float(axis @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ axis)
 
 
-def _position_limits(arm: SerialArm) -> Pair | None:
-    """Return the largest |q| that is within the limits on both sides, deg; None where a joint has none."""
+def _position_limits(arm: SerialArm) -> Vector:
+    """Return the largest |q| that is within the limits on both sides, deg; infinite where a joint has none."""
     largest = np.minimum(-arm.position_low, arm.position_high)
-    if not np.all(np.isfinite(largest)):
-        return None
     if np.any(largest <= 0.0):
         joint = int(np.argmax(largest <= 0.0))
         raise UrdfError(f'joint "{arm.joint_names[joint]}": 0 is not within its limits; set the zero between them')
-    return _in_degrees(largest)
+    return np.asarray(np.degrees(largest).round(2))
 
 
-def _in_degrees(values: Vector) -> Pair | None:
+def _plausible(key: str, values: Vector, doubts: list[str]) -> Pair | None:
+    """Return limits; None where the URDF has none, and a doubt where it has one that `arm.KEY` can't have."""
     if not np.all(np.isfinite(values)):
         return None
-    first, second = np.degrees(values)
-    return round(float(first), 2), round(float(second), 2)
+    pair = float(values[0]), float(values[1])
+    try:
+        parse(ArmSettings, {key: list(pair)}, "arm.")
+    except ConfigError as error:
+        doubts.append(f"a limit of the URDF is not taken: {error}")
+        return None
+    return pair
 
 
 def _short(value: float) -> float:
@@ -422,10 +428,15 @@ def _scaled(by_kind: Sequence[float], scale: float) -> list[float]:
 
 
 def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) -> float:
-    """Return how much slower than on arm P the motion must be for speed and torque to suffice; 1 or more."""
+    """Return how much slower than on arm P the motion must be for speed and torque to suffice; 1 or more.
+
+    Raises ConfigError where a joint has no torque.
+    """
     limit_Nm, speed = facts.torque_limit_Nm.value, facts.velocity_limit_deg_s.value
     inertia, gravity, slower = _inertia(facts), _gravity(facts), 1.0
     for i in range(JOINTS):
+        if limit_Nm[i] <= 0.0:
+            raise ConfigError(f"`arm.torque_limit_Nm[{i}]` = 0 Nm: joint {i + 1} can't move without torque")
         share = amplitude[i] / _AMPLITUDE_DEG[i]
         slower = max(slower, share * _PEAK_DEG_S[i] / (_SPEED_SHARE * speed[i]))
         left_Nm = limit_Nm[i] - gravity[i]

@@ -68,7 +68,8 @@ def test_a_locked_joint_counts_as_fixed():
         (robot(""), "no <link>"),
         (robot("<link/>"), "a <link> has no name"),
         (robot('<link name="a"/><link name="a"/>'), 'link "a" is there twice'),
-        (robot(LINKS + TURN), 'more than one root link: "a", "c"'),
+        (robot(LINKS + TURN + joint("x", "fixed", "d", "c")), 'link "d", the parent of joint "x", does not exist'),
+        (robot(LINKS.replace('"c"/>', f'"c">{BODY}</link>') + TURN), 'more than one root link: "a", "c"'),
         (robot('<link name="a"/>'), "no joint moves"),
         (robot(LINKS + TURN + joint("x", "ball", "b", "c")), 'joint "x": type "ball" is not one of '),
         (robot(LINKS + TURN + joint("x", "fixed", "b", "d")), 'joint "x": child link "d" does not exist'),
@@ -82,7 +83,10 @@ def test_a_locked_joint_counts_as_fixed():
         (robot(LINKS + TURN + joint("x", "revolute", "a", "c")), 'the arm branches: joints "turn", "x" move'),
         (robot(LINKS + TURN + joint("x", "revolute", "b", "c", '<axis xyz="0 0 0"/>')), 'joint "x": the axis is zero'),
         (robot(LINKS + TURN + joint("x", "revolute", "b", "c", '<axis xyz="0 1"/>')), "has 2 numbers, not 3"),
-        (robot(LINKS + TURN + joint("x", "revolute", "b", "c", '<mimic joint="turn"/>')), "<mimic> is not supported"),
+        (
+            robot(LINKS + TURN + joint("x", "revolute", "b", "c", '<mimic joint="turn"/>')),
+            "<mimic> is not supported; lock",
+        ),
         (
             robot(LINKS + TURN + joint("x", "revolute", "b", "c", '<origin rpy="0 nan 0"/>')),
             'joint "x": <origin rpy="0 nan 0">: nan is not finite',
@@ -95,10 +99,6 @@ def test_a_locked_joint_counts_as_fixed():
             robot(LINKS + TURN + joint("x", "revolute", "b", "c", '<limit lower="2" upper="1"/>')),
             'joint "x": lower limit 2 is above the upper 1',
         ),
-        (SEVEN_JOINT_URDF.replace('value="3.6"', 'value="-3.6"'), 'link "link1": mass -3.6 kg is negative'),
-        (SEVEN_JOINT_URDF.replace('izz="0.0142"', ""), 'link "link4": <inertia> has no attribute "izz"'),
-        (SEVEN_JOINT_URDF.replace('izz="0.0142"', 'izz="-1"'), 'link "link4": the inertia is not positive'),
-        (SEVEN_JOINT_URDF.replace('<mass value="0.9"/>', ""), 'link "tool": <inertial> needs <mass> and <inertia>'),
     ],
 )
 def test_a_urdf_that_cannot_be_used_is_refused_in_one_line(text, message):
@@ -111,3 +111,56 @@ def test_a_urdf_that_cannot_be_used_is_refused_in_one_line(text, message):
 def test_a_locked_joint_that_is_not_there_is_named():
     with pytest.raises(UrdfError, match='no joint "thumb" to be locked'):
         read_urdf(robot(LINKS + TURN), locked=("thumb",))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (SEVEN_JOINT_URDF.replace('value="3.6"', 'value="-3.6"'), 'link "link1": mass -3.6 kg is negative'),
+        (SEVEN_JOINT_URDF.replace('izz="0.0142"', ""), 'link "link4": <inertia> has no attribute "izz"'),
+        (SEVEN_JOINT_URDF.replace('izz="0.0142"', 'izz="-1"'), 'link "link4": the inertia is not positive'),
+        (SEVEN_JOINT_URDF.replace('<mass value="0.9"/>', ""), 'link "tool": <inertial> needs <mass> and <inertia>'),
+    ],
+)
+def test_an_inertia_that_no_link_can_have_is_refused_where_it_is_asked_for(text, message):
+    arm = read_urdf(text)
+    with pytest.raises(UrdfError) as refused:
+        _ = arm.theta_full
+    assert message in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+ODD = f'<inertial><mass value="-1"/>{INERTIA.replace("3", "-3", 1)}</inertial>'
+ELSEWHERE = {
+    "an odd inertia of the base": (LINKS.replace('"a"/>', f'"a">{ODD}</link>') + TURN, ()),
+    "a mimic that is locked": (LINKS + TURN + joint("x", "prismatic", "b", "c", '<mimic joint="turn"/>'), ("x",)),
+    "a mimic of a locked joint, not locked itself": (
+        LINKS
+        + '<link name="d"/>'
+        + TURN
+        + joint("y", "prismatic", "b", "d", '<mimic joint="x"/>')
+        + joint("x", "prismatic", "b", "c"),
+        ("x",),
+    ),
+    "a locked joint of a kind of its own": (LINKS + TURN + joint("x", "floating", "b", "c"), ("x",)),
+    "a locked joint without sense": (LINKS + TURN + joint("x", "revolute", "b", "c", '<axis xyz="0 0 0"/>'), ("x",)),
+    "limits of a fixed joint": (LINKS + TURN + joint("x", "fixed", "b", "c", '<limit lower="2" upper="1"/>'), ()),
+    "a world without a link": (LINKS + TURN + joint("x", "fixed", "world", "a") + joint("y", "fixed", "b", "c"), ()),
+    "a world without a joint": (LINKS + '<link name="world"/>' + TURN + joint("y", "fixed", "b", "c"), ()),
+}
+
+
+@pytest.mark.parametrize(("inside", "locked"), ELSEWHERE.values(), ids=ELSEWHERE)
+def test_what_the_arm_does_not_need_is_not_judged(inside, locked):
+    arm = read_urdf(robot(inside), locked=locked)
+    assert arm.joint_names == ("turn",)
+    assert not arm.theta_full.any()
+
+
+def test_limits_that_are_all_zero_say_nothing():
+    zero = '<axis xyz="0 0 1"/><limit lower="0" upper="0" velocity="0" effort="0"/>'
+    arm = read_urdf(robot(LINKS + TURN + joint("x", "revolute", "b", "c", zero)))
+    assert (arm.position_low[1], arm.position_high[1]) == (-np.inf, np.inf)
+    assert (arm.velocity_limit[1], arm.torque_limit[1]) == (np.inf, np.inf)
+    one_side = read_urdf(robot(LINKS + TURN + joint("x", "revolute", "b", "c", zero.replace('upper="0"', 'upper="1"'))))
+    assert (one_side.position_low[1], one_side.position_high[1]) == (0.0, 1.0)

@@ -5,7 +5,8 @@ over. Links on fixed joints become part of the link that carries them, whose fra
 Angles are rad, rpy as in the URDF: R = Rz(yaw) Ry(pitch) Rx(roll). Source: http://wiki.ros.org/urdf/XML.
 
 The arm must be one chain of moving joints. A joint that is no part of it, as a finger of a gripper, is named in
-`locked`: it counts as fixed at its zero.
+`locked`: it counts as fixed at its zero. Only what the arm needs is judged: of a fixed or locked joint its place, of a
+link its inertia where `theta_full` is asked for and the link moves. A limit of 0, as exporters write it, says nothing.
 """
 
 import math
@@ -49,7 +50,6 @@ class SerialArm:
 
     name: str
     chain: Chain
-    theta_full: Vector  # (10 n,), of the links with all that is fixed to them
     joint_names: tuple[str, ...]  # (n,)
     link_names: tuple[str, ...]  # (n,), the link that each joint moves
     places: dict[
@@ -61,6 +61,16 @@ class SerialArm:
     torque_limit: Vector  # (n,), Nm or N
     damping: Vector  # (n,), Nm s/rad or N s/m; 0 where <dynamics> says nothing
     friction: Vector  # (n,), Nm or N
+    links: dict[str, Element]  # as the URDF has them
+
+    @property
+    def theta_full(self) -> Vector:
+        """Return the parameters (10 n,) of the links, with all that is fixed to them. Raises UrdfError."""
+        theta = np.zeros((len(self.joint_names), PER_LINK))
+        for name, (carrier, pose) in self.places.items():
+            if carrier != BASE and name in self.links:
+                theta[carrier] += _moved(_read_inertial(self.links[name], name), pose)
+        return theta.reshape(-1)
 
 
 @dataclass(frozen=True)
@@ -94,44 +104,52 @@ def read_urdf(
         raise UrdfError(f"not XML: {error}") from error
     if robot.tag != "robot":
         raise UrdfError(f"the outermost element is <{robot.tag}>, not <robot>")
-    links = {name: _read_inertial(element, name) for name, element in _named(robot, "link").items()}
-    joints = [_read_joint(element, name, links) for name, element in _named(robot, "joint").items()]
-    unknown = [name for name in locked if name not in {joint.name for joint in joints}]
+    links, named = _named(robot, "link"), _named(robot, "joint")
+    unknown = [name for name in locked if name not in named]
     if unknown:
         raise UrdfError(f'no joint "{unknown[0]}" to be locked')
-    return _assemble(robot.get("name", ""), links, joints, gravity_m_s2, locked)
+    held = _held(named, locked)
+    joints = [_read_joint(element, name, links, name in held) for name, element in named.items()]
+    return _assemble(robot.get("name", ""), links, joints, gravity_m_s2)
+
+
+def _held(joints: dict[str, Element], locked: Collection[str]) -> set[str]:
+    """Return the locked joints with those that mimic them."""
+    held = set(locked)
+    leaders = {name: mimic.get("joint") for name, joint in joints.items() if (mimic := joint.find("mimic")) is not None}
+    while following := {name for name, leader in leaders.items() if leader in held} - held:
+        held |= following
+    return held
 
 
 def _assemble(
-    name: str,
-    links: dict[str, Vector],
-    joints: list[_Joint],
-    gravity_m_s2: tuple[float, float, float],
-    locked: Collection[str],
+    name: str, links: dict[str, Element], joints: list[_Joint], gravity_m_s2: tuple[float, float, float]
 ) -> SerialArm:
     """Walk from the root outward and merge what is fixed."""
-    children: dict[str, list[_Joint]] = {link: [] for link in links}
+    children: dict[str, list[_Joint]] = {link: [] for link in (*links, *(joint.parent for joint in joints))}
     carried: set[str] = set()
     for joint in joints:
         if joint.child in carried:
             raise UrdfError(f'link "{joint.child}" is the child of more than one joint')
         carried.add(joint.child)
         children[joint.parent].append(joint)
-    roots = [link for link in links if link not in carried]
+    roots = [link for link in children if link not in carried]
+    for link in roots[:]:
+        if joints and not children[link] and _only(links[link], "inertial", f'link "{link}"') is None:
+            roots.remove(link)  # a frame without a body or a joint
+    unknown = [link for link in roots if link not in links]
+    if unknown and len(roots) > 1:
+        raise UrdfError(f'link "{unknown[0]}", the parent of joint "{children[unknown[0]][0].name}", does not exist')
     if len(roots) != 1:
         raise UrdfError("no root: the joints are a loop" if not roots else f"more than one root link: {_list(roots)}")
     moving: list[_Joint] = []
     placed: list[FramePose] = []
-    parameters: list[Vector] = []
     places: dict[str, tuple[int, FramePose]] = {}
     here = FramePose(np.eye(3), np.zeros(3))
     following: str | None = roots[0]
     while following is not None:
         index = len(moving) - 1
-        outward = _merge(following, index, children, places, locked)
-        if index != BASE:
-            seen_from_link = [_moved(links[link], pose) for link, (carrier, pose) in places.items() if carrier == index]
-            parameters.append(np.sum(seen_from_link, axis=0))
+        outward = _merge(following, index, children, places)
         if len(outward) > 1:
             raise UrdfError(
                 f"the arm branches: joints {_list([joint.name for joint in outward])} move on the same link; "
@@ -143,7 +161,7 @@ def _assemble(
             moving.append(outward[0])
             placed.append(here.then(outward[0].origin))
             following = outward[0].child
-    lost = [link for link in links if link not in places]
+    lost = [link for link in children if link in carried and link not in places]
     if lost:
         raise UrdfError(f'link "{lost[0]}" hangs on a loop, not on the root')
     if not moving:
@@ -158,7 +176,6 @@ def _assemble(
     return SerialArm(
         name,
         chain,
-        np.concatenate(parameters),
         tuple(joint.name for joint in moving),
         tuple(joint.child for joint in moving),
         places,
@@ -168,6 +185,7 @@ def _assemble(
         np.array([joint.effort for joint in moving]),
         np.array([joint.damping for joint in moving]),
         np.array([joint.friction for joint in moving]),
+        links,
     )
 
 
@@ -176,7 +194,6 @@ def _merge(
     index: int,
     children: dict[str, list[_Joint]],
     places: dict[str, tuple[int, FramePose]],
-    locked: Collection[str],
 ) -> list[_Joint]:
     """Place `link` and all that is fixed to it; return the joints that move on it."""
     outward = []
@@ -185,7 +202,7 @@ def _merge(
     while waiting:
         at = waiting.pop()
         for joint in children[at]:
-            if joint.kind == "fixed" or joint.name in locked:
+            if joint.kind == "fixed":
                 places[joint.child] = (index, places[at][1].then(joint.origin))
                 waiting.append(joint.child)
             else:
@@ -233,33 +250,40 @@ def _read_inertial(link: Element, name: str) -> Vector:
     return _moved(about_mass_centre, _read_origin(inertial, where))
 
 
-def _read_joint(joint: Element, name: str, links: Collection[str]) -> _Joint:
-    """Read one joint."""
+def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bool) -> _Joint:
+    """Read one joint, of one that is fixed or locked only where it is."""
     where = f'joint "{name}"'
-    kind = joint.get("type", "")
+    kind = "fixed" if is_locked else joint.get("type", "")
     if kind != "fixed" and kind not in MOVING:
-        raise UrdfError(f'{where}: type "{kind}" is not one of {_list([*MOVING, "fixed"])}')
+        raise UrdfError(f'{where}: type "{kind}" is not one of {_list([*MOVING, "fixed"])}, nor is it locked')
     ends = []
     for tag in ("parent", "child"):
         end = _only(joint, tag, where)
         link = end.get("link") if end is not None else None
         if link is None:
             raise UrdfError(f'{where}: no <{tag} link="...">')
-        if link not in links:
+        if tag == "child" and link not in links:  # a parent without <link> may be the world
             raise UrdfError(f'{where}: {tag} link "{link}" does not exist')
         ends.append(link)
+    origin = _read_origin(joint, where)
+    if kind == "fixed":
+        rest = np.zeros(3), -math.inf, math.inf, math.inf, math.inf, 0.0, 0.0
+        return _Joint(name, kind, ends[0], ends[1], origin, *rest)
     if _only(joint, "mimic", where) is not None:
-        raise UrdfError(f"{where}: <mimic> is not supported")
+        raise UrdfError(f"{where}: <mimic> is not supported; lock the joint if it is no part of the arm")
     axis_element, limit = _only(joint, "axis", where), _only(joint, "limit", where)
     axis = np.array([1.0, 0.0, 0.0]) if axis_element is None else _numbers(axis_element, "xyz", where)
     length = float(np.linalg.norm(axis))
-    if kind != "fixed" and length < 1e-6:
+    if length < 1e-6:
         raise UrdfError(f"{where}: the axis is zero")
     low, high, velocity, effort = -math.inf, math.inf, math.inf, math.inf
-    if limit is not None and kind != "fixed":
+    if limit is not None:
         if kind != "continuous":
             low, high = _number(limit, "lower", where, 0.0), _number(limit, "upper", where, 0.0)
-        velocity, effort = _number(limit, "velocity", where, math.inf), _number(limit, "effort", where, math.inf)
+            low, high = (low, high) if low or high else (-math.inf, math.inf)
+        velocity, effort = (_number(limit, key, where, 0.0) or math.inf for key in ("velocity", "effort"))
+    if min(velocity, effort) < 0.0:
+        raise UrdfError(f"{where}: <limit> velocity {velocity:g}, effort {effort:g}: neither may be negative")
     if low > high:
         raise UrdfError(f"{where}: lower limit {low:g} is above the upper {high:g}")
     dynamics = _only(joint, "dynamics", where)
@@ -268,10 +292,7 @@ def _read_joint(joint: Element, name: str, links: Collection[str]) -> _Joint:
     )
     if min(damping, friction) < 0.0:
         raise UrdfError(f"{where}: <dynamics> damping {damping:g}, friction {friction:g}: neither may be negative")
-    origin = _read_origin(joint, where)
-    return _Joint(
-        name, kind, ends[0], ends[1], origin, axis / max(length, 1e-6), low, high, velocity, effort, damping, friction
-    )
+    return _Joint(name, kind, ends[0], ends[1], origin, axis / length, low, high, velocity, effort, damping, friction)
 
 
 def _read_origin(element: Element, where: str) -> FramePose:
