@@ -82,10 +82,10 @@ def install_command(extra: str) -> str:
     """
     is_source = (_SOURCE_TREE / "pyproject.toml").is_file()
     source = "adacd-hil" if not is_source else "." if Path.cwd() == _SOURCE_TREE else str(_SOURCE_TREE)
-    return f"{_pip()} install {'-e ' if is_source else ''}'{source}[{extra}]'"
+    return f"{pip_command()} install {'-e ' if is_source else ''}'{source}[{extra}]'"
 
 
-def _pip() -> str:
+def pip_command() -> str:
     """Name pip of this interpreter, as short as it can be from here."""
     executable = Path(sys.executable)
     pip = executable.with_name("pip")

@@ -1,16 +1,30 @@
-"""Any interface that python-can offers, if it does not echo own frames."""
+"""Any interface that python-can offers, if it does not echo own frames.
+
+An interface of python-can fails in ways of its own: NameError without its maker's library, ImportError, TypeError for
+settings that it lacks, the maker's exceptions. Here each is one line with a remedy.
+"""
 
 import contextlib
+import logging
+import re
+import sys
+from importlib.metadata import metadata
 from typing import Any
 
 import can
 
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.remedies import nearest_name
+from adacd_hil.remedies import nearest_name, pip_command
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, Frame
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 
 _ECHOING_INTERFACES = ("udp_multicast",)
+_WITHOUT_HARDWARE = ("virtual", "udp_multicast", "socketcand")
+_EXTRAS = {"slcan": "serial", "robotell": "serial"}
+"""python-can's extra for an interface, where it isn't its name."""
+_MISSING = re.compile(r"missing \d+ required (?:positional|keyword-only) arguments?: (.+)")
+for _logger in ("can", "seeedbus"):  # they tell a terminal what is refused here in a line
+    logging.getLogger(_logger).addHandler(logging.NullHandler())
 
 
 def interface_names() -> list[str]:
@@ -45,8 +59,9 @@ class PythonCanBus(Bus):
     def _open(self) -> can.BusABC:
         try:
             return can.Bus(self.channel, interface=self._interface, receive_own_messages=False, **self._options)
-        except (OSError, can.CanError, ValueError) as error:
-            raise BusMissingError(f"interface {self._interface}, channel {self.channel}: {error}") from None
+        except Exception as error:
+            where = f"interface {self._interface}, channel {self.channel}"
+            raise BusMissingError(f"{where}: {_in_words(error)}{_remedy(self._interface, error)}") from None
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send a frame. Raises BusError."""
@@ -63,8 +78,8 @@ class PythonCanBus(Bus):
                     bitrate_switch=is_long,
                 )
             )
-        except (OSError, can.CanError, ValueError) as error:
-            raise BusError(f"sending on {self.channel}: {error}") from None
+        except Exception as error:
+            raise BusError(f"sending on {self.channel}: {_in_words(error)}") from None
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, or None after `timeout_s`. Raises BusError."""
@@ -72,8 +87,8 @@ class PythonCanBus(Bus):
         while True:
             try:
                 message = self._bus.recv(timeout_s)
-            except (OSError, can.CanError) as error:
-                raise BusError(f"receiving on {self.channel}: {error}") from None
+            except Exception as error:
+                raise BusError(f"receiving on {self.channel}: {_in_words(error)}") from None
             if message is None:
                 return None
             can_id = message.arbitration_id
@@ -85,11 +100,34 @@ class PythonCanBus(Bus):
     def recover(self) -> None:
         """Empty the transmit buffer where the interface can, and open it anew. Raises BusError."""
         # Few interfaces can empty a buffer, and a broken one fails: `_open` raises if the interface doesn't work.
-        with contextlib.suppress(NotImplementedError, OSError, can.CanError):
+        with contextlib.suppress(Exception):
             self._bus.flush_tx_buffer()
-        self._bus.shutdown()
+        self.close()
         self._bus = self._open()
 
     def close(self) -> None:
-        """Shut the interface down."""
-        self._bus.shutdown()
+        """Shut the interface down; one that fails at that is gone anyway."""
+        with contextlib.suppress(Exception):
+            self._bus.shutdown()
+
+
+def _in_words(error: Exception) -> str:
+    """Describe an error of an interface in one line."""
+    text = " ".join(str(error).split())
+    if missing := _MISSING.search(text):
+        return f"it needs {missing[1]} besides, which python-can takes from ~/.canrc"
+    if isinstance(error, NameError | AttributeError):  # of a function that the library would have
+        return f"its maker's library is not installed ({text})"
+    return text or type(error).__name__
+
+
+def _remedy(interface: str, error: Exception) -> str:
+    """Say how an interface that can't be opened is opened."""
+    remedies = []
+    extra = _EXTRAS.get(interface, interface.replace("_", "-"))
+    is_here = isinstance(error, ImportError | can.CanInterfaceNotImplementedError) and "Windows" not in str(error)
+    if is_here and extra in (metadata("python-can").get_all("Provides-Extra") or ()):
+        remedies.append(f"{pip_command()} install 'python-can[{extra}]'")
+    if sys.platform == "linux" and interface not in _WITHOUT_HARDWARE:
+        remedies.append("on Linux most adapters are -i socketcan -c can0, with the kernel's driver")
+    return "".join(f"; {remedy}" for remedy in remedies)
