@@ -48,6 +48,8 @@ class Writer:
         self.dropped = 0
         self.clock = HastyClock()
         self.sink = Sink(descriptor, path, waits=False, most_waiting=MOST_WAITING)
+        self.told = []
+        self.sink.say = self.told.append
         self._reader = RingReader(self.ring.descriptor)
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         setup = WriterSetup(
@@ -173,6 +175,8 @@ def test_a_full_disk_is_tried_again_with_another_part(tmp_path, monkeypatch):
     disk.room = 1000
     writer.feed(run.cycles[300:900])
     writer.wait_until_taken()
+    full = f"log {path} can't be written: No space left on device; packets are dropped until there is room"
+    assert writer.told == [full]
     disk.room = 2**40
     failed = writer.clock.now
     writer.wait(lambda: writer.clock.now > failed + 2 * RETRY_PERIOD_NS)
@@ -180,6 +184,8 @@ def test_a_full_disk_is_tried_again_with_another_part(tmp_path, monkeypatch):
     word = writer.end()
     assert re.fullmatch(r"No space left on device after \d+ bytes", word["error"])
     assert (word["lost"], word["parts"]) == (str(packets_of(run.cycles[300:900])), "2")
+    again = f"log {tmp_path / 'run_001.mcap'} is written again; packets are missing before it"
+    assert writer.told == [full, again]
     log = read_log(path)
     assert list(find_parts(path)) == [0, 1]
     assert re.fullmatch(r"run.mcap: cut after \d+ bytes", log.problem)
@@ -228,6 +234,7 @@ def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path,
     assert [file.name for file in tmp_path.iterdir()] == ["run.mcap"]
     assert len(read_log(path).scheme) == 200 * has_chunk
     assert word["error"].startswith("No space left on device")
+    assert len(writer.told) == 1
 
 
 def test_what_was_dropped_is_counted_in_one_part_only(tmp_path):

@@ -200,13 +200,19 @@ def test_a_disk_that_fails_at_the_very_end_is_reported(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("limit", "least"), [(30_000, 0), (200_000, 50), (400_000, 150)])
-def test_a_full_disk_is_reported_and_stops_nobody(limit, least, tmp_path):
+def test_a_full_disk_is_said_when_it_happens_and_stops_nobody(limit, least, tmp_path, capfd):
     run = make_run(2000)
     recorder = start(tmp_path / "run.mcap", run)
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (limit, limit))
     feed(recorder, run.cycles)
     assert recorder.dropped == 0
+    line = f"adacd-hil: log {recorder.path} can't be written: File too large; the log ends here\n"
+    said = ""
+    while not said:  # the test's time limit ends it
+        said = capfd.readouterr().err
+    assert said == line
     summary = recorder.close()
+    assert capfd.readouterr().err == ""
     assert re.fullmatch(r"File too large after \d+ bytes", summary.error)
     assert not summary.is_complete
     assert summary.dropped > 0

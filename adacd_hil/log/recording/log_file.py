@@ -57,6 +57,9 @@ class Sink:
         """Bytes of the file in progress that are on the disk."""
         self.path = path
         """The file in progress; None when it could not be created."""
+        self.say: Callable[[str], None] = lambda _: None
+        """Is told, by the thread, in a line each, when a file fails and when one is written again."""
+        self._has_told = False
         self._descriptor = descriptor
         self._name = ""  # of a later file
         self._waits = waits
@@ -145,6 +148,9 @@ class Sink:
                 _write_all(self._descriptor, task.data)
                 self.written += len(task.data)
                 self._on_written(task.packets)
+                if self._has_told and task.packets:
+                    self._has_told = False
+                    self.say(f"log {self.path} is written again; packets are missing before it")
             except OSError as error:
                 self._fail(error)
                 with contextlib.suppress(OSError):  # not everything that can be written can be cut
@@ -179,6 +185,10 @@ class Sink:
         self._descriptor = -1
 
     def _fail(self, error: OSError) -> None:
+        if not self._has_told:
+            self._has_told = True
+            what = "the log ends here" if self._waits else "packets are dropped until there is room"
+            self.say(f"log {self.path} can't be written: {error.strerror}; {what}")
         self.error = self.error or f"{self._name}{error.strerror} after {self.written} bytes"
         self.first_error = self.first_error or self.error
 

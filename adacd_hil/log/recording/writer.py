@@ -23,7 +23,7 @@ import sys
 import numpy as np
 
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.log.log_files import CONTINUED, ENDING_KEY, PART_KEY, LogError, part_path
+from adacd_hil.log.log_files import CONTINUED, ENDING_KEY, PART_KEY, PRODUCT, LogError, part_path
 from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS
 from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.log_file import McapFile, Sink
@@ -32,6 +32,7 @@ from adacd_hil.log.recording.processes import WriterSetup, read_setup
 from adacd_hil.log.recording.ring import RingReader, split
 from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.log.viewer.feed import LiveFeed
+from adacd_hil.terminal import in_line
 
 POLL_PERIOD_US = 25_000
 """How often the ring is looked into in real time. To be woken would cost the control process more than the packet does;
@@ -264,6 +265,13 @@ def _send(connection: socket.socket, word: bytes) -> None:
         connection.send(word)
 
 
+def _say(line: str) -> None:
+    """Tell the user of the run at once: a full disk leaves the control process in peace, who would learn at the end."""
+    with contextlib.suppress(OSError, ValueError):  # nobody is left to read it
+        sys.stderr.write(f"{PRODUCT}: {in_line(line)}\n")
+        sys.stderr.flush()
+
+
 def _schedule_plainly() -> None:
     """Leave the real-time class that the control process may have passed on."""
     with contextlib.suppress(OSError):
@@ -282,7 +290,8 @@ def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> 
         sink = Sink(file_descriptor, setup.path, waits=setup.is_blocking, on_written=ring.count_written)
         process = WriterProcess(connection, ring, sink, setup)
         sink.settle()
-        error = sink.error
+        error = sink.error  # the control process tells the first one
+        sink.say = _say
         url = process.live.url if process.live else ""
     except (LogError, OSError, ValueError) as reason:
         error = " ".join(str(reason).split())
