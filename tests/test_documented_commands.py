@@ -278,6 +278,7 @@ PLAYED = {
     r"can_(logger|logconvert|player) .*": ("log/test_can_io.py", "can_logconvert"),
     r"adacd-hil sweep .* --scheduler .*": ("analysis/test_sweep_cluster.py", "tls"),
     r"adacd-hil sweep .*": ("analysis/test_sweep.py", "sweep"),
+    r"pip install docs/examples/detector": ("test_packaging.py", "docs/examples/detector"),
     r"python tests/reference/renew.py": ("reference/test_reference_runs.py", "reference"),
     r"python tools/notebook.py .*": ("test_certified_experiment.py", "run_notebook"),
     r".*tools/(attack|doubt|error|property|timing|touch)_campaign.py .*": ("tools/test_tool_commands.py", "PROGRAMS"),
@@ -286,7 +287,6 @@ PLAYED = {
 """Commands that a test plays in its own way, in short or on a bus: the test's file, and what it must hold."""
 SHOWN = {
     r"make test": "it is what runs this test",
-    r"pip install docs/examples/detector": "changes the packages that the tests run with",
     r"(ip|groupadd|usermod|useradd|udevadm|systemctl|cp .* /etc/.*|echo 1)\b.*": "changes the computer, as root",
     r"(python3 -m venv /opt/|/opt/adacd-hil/bin/pip ).*": "changes the computer, as root",
     r"grep .* /proc/interrupts": "asks for the interrupts of a computer with an adapter",

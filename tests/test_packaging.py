@@ -119,3 +119,26 @@ def test_the_container_copies_what_the_wheel_is_built_from() -> None:
     copied = {word for line in lines if line.startswith("COPY ") for word in line.split()[1:-1]}
     assert {word for word in copied if not (ROOT / word).exists()} == set()
     assert {"pyproject.toml", "README.md", "LICENSE", "NOTICE", "dbc", "adacd_hil", "firmware_sim"} <= copied
+
+
+@pytest.mark.slow
+def test_pip_installs_the_example_of_a_detector_and_its_name_is_known(tmp_path: Path) -> None:
+    """As docs/api.md types it, but into a folder of its own, and without an index."""
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--quiet", "--no-index"]
+    subprocess.run(
+        [*pip, "--no-deps", "--no-build-isolation", "--target", str(tmp_path), "docs/examples/detector"],
+        cwd=ROOT,
+        check=True,
+        timeout=120,
+    )
+    code = (
+        "from adacd_hil.scheme.detect.detector_registry import check_contract; from lab_detectors import MeanOfTwenty;"
+        "from importlib.metadata import entry_points;"
+        "(point,) = entry_points(group='adacd_hil.detectors', name='mean of 20');"
+        "assert point.load() is MeanOfTwenty; print(check_contract('mean of 20', MeanOfTwenty))"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT)))}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, timeout=120
+    )
+    assert ran.stdout.strip() == "True"
