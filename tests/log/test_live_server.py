@@ -196,6 +196,45 @@ def test_a_name_that_is_not_ours_is_refused_on_the_wire(served):
     assert b"--live-name" in answer
 
 
+def page(url, *headers):
+    """What a browser gets that is pointed at the port: status line, headers, body."""
+    port = int(url.rsplit(":", 1)[1])
+    with socket.create_connection(("127.0.0.1", port)) as client:
+        client.sendall("\r\n".join(["GET / HTTP/1.1", *headers, "", ""]).encode())
+        head, _, body = client.makefile("rb").read().decode().partition("\r\n\r\n")
+    return head, body
+
+
+def test_a_browser_gets_a_page_that_says_what_connects(served):
+    host = served.removeprefix("ws://")
+    head, body = page(served, f"Host: {host}", "Accept: text/html")
+    assert head.startswith("HTTP/1.1 200")
+    assert head.count("Content-Type:") == 1
+    assert "Content-Type: text/html; charset=utf-8" in head
+    assert f"<code>adacd-hil monitor --url {served}</code>" in body
+    assert "Foxglove WebSocket" in body
+    assert "<script" not in body
+    assert "/scheme" not in body
+
+
+@pytest.mark.parametrize(
+    "headers", [["Host: stranger.example"], ["Host: 127.0.0.1", "Origin: https://stranger.example"], []]
+)
+def test_a_page_is_admitted_as_a_viewer_is(served, headers):
+    head, body = page(served, *headers)
+    assert head.startswith("HTTP/1.1 403")
+    assert "<html" not in body
+
+
+def test_a_page_leaves_the_place_of_a_viewer_free():
+    fed = Feed(live_setup(most_viewers=1))
+    host = f"Host: {fed.live.url.removeprefix('ws://')}"
+    assert all(page(fed.live.url, host)[0].startswith("HTTP/1.1 200") for _ in range(3))
+    with opened(fed.live.url):
+        assert page(fed.live.url, host)[0].startswith("HTTP/1.1 200")
+    fed.close()
+
+
 def raw_request(host, *more, key="AAAAAAAAAAAAAAAAAAAAAA==", protocol=SDK, path="/"):
     lines = [
         f"GET {path} HTTP/1.1",
@@ -367,6 +406,7 @@ def test_nothing_that_a_peer_sends_reaches_the_runs_terminal():
         raw_request(escape),
         raw_request("owned.example"),
         raw_request("127.0.0.1", protocol=escape),
+        raw_request("127.0.0.1", protocol="owned"),
         raw_request("127.0.0.1", key=escape),
         raw_request("127.0.0.1", path=f"/{escape}"),
         raw_request("127.0.0.1", f"X: {'y' * 100_000}"),

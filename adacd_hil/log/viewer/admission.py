@@ -78,12 +78,19 @@ class Admission:
         short = own.partition(".")[0]
         self._names = {*_OWN_NAMES, own, short, f"{short}.local", *(name.lower() for name in setup.names)}
 
-    def refuse(self, origins: Sequence[str], hosts: Sequence[str], subprotocols: Sequence[str]) -> ViewerRefusal | None:
-        """Judge a request by all values of its headers Origin, Host and Sec-WebSocket-Protocol; None: welcome."""
+    def refuse(
+        self, origins: Sequence[str], hosts: Sequence[str], subprotocols: Sequence[str] | None
+    ) -> ViewerRefusal | None:
+        """Judge a request by all values of its headers Origin, Host and Sec-WebSocket-Protocol; None: welcome.
+
+        subprotocols: None of a browser that asks for a page.
+        """
         if len(hosts) != 1 or not self._is_own_host(hosts[0]):
             return _HOST
         if len(origins) > 1 or not all(map(self._is_viewer, origins)):
             return _ORIGIN
+        if subprotocols is None:
+            return None
         offered = {name.strip() for line in subprotocols for name in line.split(",")}
         return None if offered.intersection(SUBPROTOCOLS) else _PROTOCOL
 

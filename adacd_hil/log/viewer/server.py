@@ -13,6 +13,7 @@ It runs with lower priority than the writer, and ends with it.
 
 import asyncio
 import contextlib
+import html
 import json
 import logging
 import os
@@ -22,6 +23,7 @@ import struct
 import sys
 from collections import defaultdict, deque
 from collections.abc import Mapping
+from http import HTTPStatus
 from typing import Any, cast
 
 from websockets.asyncio.connection import Connection
@@ -214,10 +216,13 @@ class LiveServer:
         )
 
     def _judge(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request that is refused, with the reason; None: it may go on."""
+        """Answer a request that is refused, with the reason, and a browser with a page; None: it may go on."""
         headers = request.headers
-        names = ("Origin", "Host", "Sec-WebSocket-Protocol")
-        refusal = self._admission.refuse(*(headers.get_all(name) for name in names))
+        origins, hosts, protocols = (headers.get_all(name) for name in ("Origin", "Host", "Sec-WebSocket-Protocol"))
+        is_page = not headers.get_all("Upgrade")
+        refusal = self._admission.refuse(origins, hosts, None if is_page else protocols)
+        if refusal is None and is_page:
+            return _page(connection, hosts[0])
         if refusal is None and len(self._admitted) >= self._setup.most_viewers:
             refusal = FULL
         if refusal is None:
@@ -344,6 +349,37 @@ def _message(subscription: int, shown: Shown) -> bytes:
 
 def _status(level: int, text: str) -> str:
     return json.dumps({"op": "status", "level": level, "message": text})
+
+
+def _page(connection: ServerConnection, host: str) -> Response:
+    """Tell a browser what connects here; `host` is what it asked for, and was admitted."""
+    url = f"ws://{html.escape(host)}"
+    response = connection.respond(HTTPStatus.OK, _PAGE.format(url=url))
+    del response.headers["Content-Type"]  # headers may be there twice
+    response.headers.update(_PAGE_HEADERS)
+    return response
+
+
+_PAGE_HEADERS = {
+    "Content-Type": "text/html; charset=utf-8",
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'",
+    "X-Content-Type-Options": "nosniff",
+}
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>adacd-hil: live view</title>
+<meta name="viewport" content="width=device-width">
+<style>body {{ font: 16px/1.5 sans-serif; max-width: 42em; margin: 2em auto; padding: 0 1em }}</style></head>
+<body><h1>A run of adacd-hil can be watched here</h1>
+<p>This port speaks the Foxglove WebSocket protocol. A browser alone shows nothing of the run; these connect:</p>
+<ul>
+<li><a href="https://github.com/lichtblick-suite/lichtblick">Lichtblick</a> or
+<a href="https://app.foxglove.dev">Foxglove</a>: <em>Open connection</em>, <em>Foxglove WebSocket</em>,
+<code>{url}</code>; then import the layout <code>viewer-layout.json</code> from the run's folder</li>
+<li>PlotJuggler from 3.16: <em>Streaming</em>, <em>Foxglove ROS2 Bridge</em>, <code>{url}</code></li>
+<li>a terminal: <code>adacd-hil monitor --url {url}</code></li>
+</ul>
+<p>Viewers only watch: nothing that they send changes the run.</p></body></html>
+"""
 
 
 def _no_logger() -> logging.Logger:
