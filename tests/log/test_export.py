@@ -370,3 +370,9 @@ def test_topics_of_frames_are_no_tables(log):
 
 def test_the_help_has_the_exit_statuses():
     assert "Exit status: 0 done; 1 " in " ".join(command("--help").stdout.split())
+
+
+def test_a_dbc_that_knows_no_frame_is_named(tmp_path):
+    (tmp_path / "x.log").write_text("(1.000000) can0 7A5#11\n")
+    done = command(tmp_path / "x.log", "--format", "csv")
+    assert (done.exit_code, done.stdout) == (0, "nothing to export: arm.dbc knows no frame of x.log\n")

@@ -362,7 +362,7 @@ def _export_tables(
     lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
     described = {
         "files": {str(path): rows for path, rows in summary.rows.items()},
-        "text": "\n".join(lines) or "nothing to export",
+        "text": "\n".join(lines) or in_line(f"nothing to export: {decoder.path.name} knows no frame of {log.name}"),
     }
     return described, summary.problem
 

@@ -288,6 +288,8 @@ _STATUS_ID = 0xFFFFFFFF
 _FORMS = {
     ".log": "a candump log, as `candump -l` records it and SavvyCAN saves it",
     ".csv": "a CSV as python-can writes it; SavvyCAN saves a candump log, too",
+    ".trc": "a TRC as PEAK's programs write it",
+    ".asc": "an ASC as Vector's programs write it",
 }
 
 
