@@ -24,6 +24,8 @@ import sys
 from collections import defaultdict, deque
 from collections.abc import Mapping
 from http import HTTPStatus
+from pathlib import Path
+from string import Template
 from typing import Any, cast
 
 from websockets.asyncio.connection import Connection
@@ -353,8 +355,8 @@ def _status(level: int, text: str) -> str:
 
 def _page(connection: ServerConnection, host: str) -> Response:
     """Tell a browser what connects here; `host` is what it asked for, and was admitted."""
-    url = f"ws://{html.escape(host)}"
-    response = connection.respond(HTTPStatus.OK, _PAGE.format(url=url))
+    page = Template(_PAGE.read_text(encoding="utf-8")).substitute(url=f"ws://{html.escape(host)}")
+    response = connection.respond(HTTPStatus.OK, page)
     del response.headers["Content-Type"]  # headers may be there twice
     response.headers.update(_PAGE_HEADERS)
     return response
@@ -365,21 +367,7 @@ _PAGE_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'",
     "X-Content-Type-Options": "nosniff",
 }
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>adacd-hil: live view</title>
-<meta name="viewport" content="width=device-width">
-<style>body {{ font: 16px/1.5 sans-serif; max-width: 42em; margin: 2em auto; padding: 0 1em }}</style></head>
-<body><h1>A run of adacd-hil can be watched here</h1>
-<p>This port speaks the Foxglove WebSocket protocol. A browser alone shows nothing of the run; these connect:</p>
-<ul>
-<li><a href="https://github.com/lichtblick-suite/lichtblick">Lichtblick</a> or
-<a href="https://app.foxglove.dev">Foxglove</a>: <em>Open connection</em>, <em>Foxglove WebSocket</em>,
-<code>{url}</code>; then import the layout <code>viewer-layout.json</code> from the run's folder</li>
-<li>PlotJuggler from 3.16: <em>Streaming</em>, <em>Foxglove ROS2 Bridge</em>, <code>{url}</code></li>
-<li>a terminal: <code>adacd-hil monitor --url {url}</code></li>
-</ul>
-<p>Viewers only watch: nothing that they send changes the run.</p></body></html>
-"""
+_PAGE = Path(__file__).with_name("live_page.html")
 
 
 def _no_logger() -> logging.Logger:
