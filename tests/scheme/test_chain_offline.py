@@ -11,7 +11,7 @@ from smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.scheme.identify import offline
 from adacd_hil.scheme.identify.offline import OfflineSettings, Record
-from adacd_hil.scheme.model.chain import mass_matrix
+from adacd_hil.scheme.model.chain import mass_matrix, regressor
 
 pinocchio = pytest.importorskip("pinocchio")
 
@@ -229,3 +229,97 @@ def test_a_record_of_another_arm_is_refused(case):
     short = Record(*(np.zeros((5, 2)),) * 3)
     with pytest.raises(ValueError, match="the arm has 7 joints, the record 2, noise_Nm 7 values"):
         case.detect(short)
+
+
+def plain_least_squares(columns, record, every=10):
+    """Return theta and its deviations by the textbook: W(q, dq, ddq) theta = tau_J, with ddq by differences of dq."""
+    ddq = np.gradient(record.dq, SETTINGS.period_s, axis=0)
+    rows = []
+    for k in range(every, len(record.q) - every, every):
+        W = regressor(columns.chain, record.q[k], record.dq[k], ddq[k])[:, columns.base.columns]
+        rows.append(np.hstack([W, np.diag(record.dq[k]), np.diag(np.sign(record.dq[k])), np.eye(W.shape[0])]))
+    W, tau = np.concatenate(rows), record.tau_J[every : len(record.q) - every : every].ravel()
+    theta = np.linalg.lstsq(W, tau, rcond=None)[0]
+    variance = np.sum((tau - W @ theta) ** 2) / (len(tau) - theta.size)
+    return theta, np.sqrt(variance * np.diag(np.linalg.inv(W.T @ W)))
+
+
+def test_a_plain_least_squares_finds_the_same_parameters_within_their_deviations(case):
+    theta, deviation = plain_least_squares(case.columns, case.fitted)
+    own = offline.parameter_deviation(case.columns, [case.fitted], case.before, case.estimate, SETTINGS)
+    apart = np.abs(case.estimate.theta - theta) / np.hypot(own, deviation)
+    assert np.sqrt(np.mean(apart**2)) < 1.3
+    assert apart.max() < 4.0
+
+
+def planar_record(rng, velocity_noise=0.0, torque_noise=1e-3, seconds=8.0, lacking=0.0):
+    """Return a record of the planar arm M without gravity; lacking: Nm of a torque that no model here has."""
+    t_s = np.arange(0.0, seconds, 1e-3)
+    q, dq, ddq = smooth_motion(t_s)
+    tau = torque_of(q, dq, ddq, THETA["M"]) + lacking * np.sin(3.0 * q) + torque_noise * rng.standard_normal(q.shape)
+    return Record(q, dq + velocity_noise * rng.standard_normal(q.shape), tau)
+
+
+def planar_truth(columns):
+    a1, a2, a3 = THETA["M"][:3]
+    theta_full = np.zeros(20)
+    theta_full[[9, 11, 19]] = a1 - a3, a2 / 0.35, a3  # Izz_1, mx_2, Izz_2
+    return np.concatenate([columns.base.map @ theta_full, THETA["M"][3:], [0.0, 0.0]])
+
+
+@pytest.mark.parametrize("noise_rad_s", [0.0, 0.02, 0.1])
+def test_an_arm_does_not_look_lighter_by_the_noise_of_its_velocities(noise_rad_s):
+    columns = offline.model_of(planar_chain((0.0, 0.0, 0.0)))
+    record = planar_record(np.random.default_rng(3), noise_rad_s, torque_noise=0.01)
+    settings = OfflineSettings(noise_Nm=(0.01, 0.01), velocity_noise_rad_s=noise_rad_s)
+    estimate = offline.identify(columns, record, offline.prior(columns), settings)
+    inertia = [columns.parameter_names.index(name) for name in ("Izz_1", "Izz_2")]
+    np.testing.assert_allclose(estimate.theta[inertia], planar_truth(columns)[inertia], rtol=0.02)
+
+
+def test_deviations_are_those_of_noise_where_the_model_is_right_and_larger_where_it_is_wrong():
+    columns = offline.model_of(planar_chain((0.0, 0.0, 0.0)))
+    settings, before = OfflineSettings(noise_Nm=(0.01, 0.01)), offline.prior(columns)
+    truth, ratios, errors = planar_truth(columns), [], []
+    for lacking in (0.0, 0.1):
+        record = planar_record(np.random.default_rng(4), torque_noise=0.01, lacking=lacking)
+        estimate = offline.identify(columns, record, before, settings)
+        deviation = offline.parameter_deviation(columns, [record], before, estimate, settings)
+        ratios.append(np.median(deviation / np.sqrt(np.diag(estimate.P))))
+        errors.append(np.sqrt(np.mean(((estimate.theta - truth) / deviation) ** 2)))
+    assert ratios[0] < 1.5
+    assert ratios[1] > 10.0
+    assert max(errors) < 3.0
+
+
+def test_a_record_in_two_parts_has_the_deviations_of_the_whole(case):
+    record = case.fitted
+    parts = [Record(record.q[part], record.dq[part], record.tau_J[part]) for part in (np.s_[:5000], np.s_[5000:])]
+    whole, split = (
+        offline.parameter_deviation(case.columns, records, case.before, case.estimate, SETTINGS)
+        for records in ([record], parts)
+    )
+    np.testing.assert_allclose(split, whole, rtol=0.5)
+
+
+def test_a_push_that_sways_around_its_threshold_is_one_contact():
+    tau_ext_hat = np.zeros((200, 2))
+    tau_ext_hat[20:160, 1] = 0.7
+    tau_ext_hat[20:60, 1] = tau_ext_hat[120:130, 1] = 1.5
+    contacts = offline._contacts(tau_ext_hat, np.ones((200, 2)), 30)
+    assert [contact.sample for contact in contacts] == [20]
+    tau_ext_hat[70:110, 1] = 0.4
+    assert [contact.sample for contact in offline._contacts(tau_ext_hat, np.ones((200, 2)), 30)] == [20, 120]
+
+
+def test_the_filters_leave_the_noise_that_is_reckoned_with():
+    settings = OfflineSettings(noise_Nm=(0.1, 0.1), velocity_noise_rad_s=0.0)
+    columns = offline.model_of(planar_chain((0.0, 0.0, 0.0)))
+    rng = np.random.default_rng(1)
+    still = np.zeros((60_000, 2))
+    record = Record(still, still, 0.1 * rng.standard_normal(still.shape))
+    zero = offline.ModelEstimate(np.zeros(len(columns.parameter_names)), np.zeros((len(columns.parameter_names),) * 2))
+    left = offline.filtered(columns, record, zero, settings)
+    np.testing.assert_allclose(left.torque.std(axis=0), offline.filtered_noise_Nm(settings), rtol=0.1)
+    np.testing.assert_array_equal(left.torque, left.residual)
+    assert left.unit[-1] == pytest.approx(1.0)

@@ -159,7 +159,7 @@ def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> Offlin
         residual_rms_Nm=np.sqrt(sum(w * part.residual_rms_Nm**2 for w, part in zip(weights, parts, strict=True))),
         residual_max_Nm=np.max([part.residual_max_Nm for part in parts], axis=0),
         lack_Nm=np.sqrt(sum(w * part.lack_Nm**2 for w, part in zip(weights, parts, strict=True))),
-        margin=min(part.margin for part in parts),
+        margins=np.min([part.margins for part in parts], axis=0),
     )
 
 
