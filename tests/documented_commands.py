@@ -21,7 +21,7 @@ import can
 import click
 from documents import ROOT
 
-from adacd_hil.analysis.foreign.recording_import import read_map
+from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli as host_cli
 from adacd_hil.control.arm_records import Tare, read_tare
 from adacd_hil.device.contract import find_contract, load_contract

@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose
 
 from adacd_hil.analysis.foreign import recording_import
 from adacd_hil.analysis.foreign.recording_identification import identify
-from adacd_hil.analysis.foreign.recording_import import read_map, read_recording
+from adacd_hil.analysis.foreign.recording_import import read_recording
+from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.scheme.identify.offline import model_of

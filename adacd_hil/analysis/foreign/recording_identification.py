@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.drawing import COLOURS, Drawing, note, plot, style
-from adacd_hil.analysis.foreign.recording_import import ForeignRecording, RecordingMap, RecordingStretch
+from adacd_hil.analysis.foreign.recording_import import ForeignRecording, RecordingStretch
+from adacd_hil.analysis.foreign.recording_map import RecordingMap
 from adacd_hil.analysis.score.judge import explained_until, owners
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector

@@ -14,18 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adacd_hil.analysis.foreign.recording_identification import Identified, identify, watch
-from adacd_hil.analysis.foreign.recording_import import (
-    LARGEST,
-    SHORTEST_SAMPLES,
+from adacd_hil.analysis.foreign.recording_import import LARGEST, SHORTEST_SAMPLES, ForeignRecording, recording_of
+from adacd_hil.analysis.foreign.recording_map import (
     ArmSection,
     ColumnsSection,
     CsvSection,
-    ForeignRecording,
     RecordingMap,
     SamplingSection,
     ScaleSection,
     UnitsSection,
-    recording_of,
 )
 from adacd_hil.file_access import read_input
 from adacd_hil.log.log_files import LogError

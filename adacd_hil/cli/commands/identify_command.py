@@ -48,7 +48,8 @@ def identify(
     contacts are looked for in the recordings of --watch.
     """
     from adacd_hil.analysis.foreign.recording_identification import identify as run
-    from adacd_hil.analysis.foreign.recording_import import read_map, read_recording
+    from adacd_hil.analysis.foreign.recording_import import read_recording
+    from adacd_hil.analysis.foreign.recording_map import read_map
     from adacd_hil.log.log_files import TimeWindow
 
     if not start_s < end_s:

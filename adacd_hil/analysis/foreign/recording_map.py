@@ -1,0 +1,184 @@
+"""The map of a recording: what each of its columns means and in which unit, and which arm it is of.
+
+One TOML file. Scales turn the recorded values, after their unit, into rad, rad/s and Nm, positive along the URDF's
+joint axes: -1.0 turns a sign, a drive's gain in Nm/A makes torques of currents.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from adacd_hil.file_access import read_input
+from adacd_hil.scheme.identify.offline import OfflineSettings
+from adacd_hil.scheme.model.urdf import STANDARD_GRAVITY_M_S2, SerialArm, UrdfError, read_urdf
+from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.toml_files import read_toml
+
+_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_ANGLE = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
+_SPEED = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}
+_TORQUE = {"Nm": 1.0, "mNm": 1e-3, "A": 1.0, "mA": 1e-3}
+
+
+@dataclass(frozen=True)
+class ArmSection:
+    """The arm that was recorded."""
+
+    urdf: str = setting(meaning="file, relative to the map")
+    gravity_m_s2: tuple[float, float, float] = setting(
+        STANDARD_GRAVITY_M_S2, unit="m/s²", low=-1e3, high=1e3, meaning="in the root's axes"
+    )
+    locked: tuple[str, ...] = setting((), meaning="joints that do not move")
+    has_rotors: bool = setting(False, meaning="torques are those of geared motors, which turn their rotors too")
+
+
+@dataclass(frozen=True)
+class ColumnsSection:
+    """Heads or numbers of the columns; of the joints from the base outward."""
+
+    time: str = setting(meaning="of the sample")
+    q: tuple[str, ...] = setting(meaning="joint positions")
+    tau_J: tuple[str, ...] = setting(meaning="joint torques, or currents")
+    dq: tuple[str, ...] = setting((), meaning="joint velocities; none: derived from the positions")
+    contact: str = setting("", meaning="not 0 while somebody touches the arm; none: not known")
+
+
+@dataclass(frozen=True)
+class UnitsSection:
+    """Units of the columns."""
+
+    time: str = setting("s", choices=tuple(_TIME), meaning="of the time")
+    q: str = setting("rad", choices=tuple(_ANGLE), meaning="of positions")
+    dq: str = setting("rad/s", choices=tuple(_SPEED), meaning="of velocities")
+    tau_J: str = setting("Nm", choices=tuple(_TORQUE), meaning="of torques; of currents, scale.tau_J has the gains")
+
+
+@dataclass(frozen=True)
+class ScaleSection:
+    """A factor per joint, after the unit; none: 1."""
+
+    q: tuple[float, ...] = setting((), low=-1e9, high=1e9, meaning="of positions and velocities")
+    tau_J: tuple[float, ...] = setting((), low=-1e9, high=1e9, meaning="of torques; Nm/A of currents")
+
+
+@dataclass(frozen=True)
+class CsvSection:
+    """The form of the file."""
+
+    delimiter: str = setting(",", choices=(",", ";", "\t", " "), meaning="between two columns")
+    has_header: bool = setting(True, meaning="whether the first row names the columns")
+    skip_rows: int = setting(0, low=0, high=10_000, meaning="rows before that")
+
+
+@dataclass(frozen=True)
+class SamplingSection:
+    """How the recording becomes samples at a fixed period."""
+
+    period_s: float = setting(0.0, unit="s", low=0.0, high=0.1, meaning="of the samples; 0: the recording's median")
+    longest_gap_s: float = setting(0.05, unit="s", low=1e-3, high=10.0, meaning="a longer one parts the recording")
+    smoothing_s: float = setting(
+        0.03, unit="s", low=1e-3, high=1.0, meaning="window of the derivative where velocities are derived"
+    )
+
+
+@dataclass(frozen=True)
+class RecordingMap:
+    """A map, and the arm that it names."""
+
+    arm: ArmSection
+    columns: ColumnsSection
+    units: UnitsSection
+    scale: ScaleSection
+    csv: CsvSection
+    sampling: SamplingSection
+    scheme: dict[str, Any]  # keys of OfflineSettings that outweigh its defaults and what the recording shows
+    urdf: SerialArm
+
+    @property
+    def joints(self) -> int:
+        """Number of joints, n."""
+        return len(self.urdf.joint_names)
+
+    @property
+    def time_s(self) -> float:
+        """One unit of the time, s."""
+        return _TIME[self.units.time]
+
+    @property
+    def q_rad(self) -> tuple[float, ...]:
+        """One unit of each position, rad."""
+        return tuple(_ANGLE[self.units.q] * factor for factor in self._factors(self.scale.q))
+
+    @property
+    def dq_rad_s(self) -> tuple[float, ...]:
+        """One unit of each velocity, rad/s."""
+        return tuple(_SPEED[self.units.dq] * factor for factor in self._factors(self.scale.q))
+
+    @property
+    def tau_J_Nm(self) -> tuple[float, ...]:
+        """One unit of each torque, Nm."""
+        return tuple(_TORQUE[self.units.tau_J] * factor for factor in self._factors(self.scale.tau_J))
+
+    def _factors(self, given: tuple[float, ...]) -> tuple[float, ...]:
+        return given or (1.0,) * self.joints
+
+    def settings(self, noise_Nm: tuple[float, ...], period_s: float, velocity_noise_rad_s: float) -> OfflineSettings:
+        """Join what the recording shows with what the map says of the scheme. Raises ConfigError."""
+        shown = {"noise_Nm": list(noise_Nm), "period_s": period_s, "velocity_noise_rad_s": velocity_noise_rad_s}
+        return parse(OfflineSettings, shown | self.scheme, "scheme.")
+
+
+_SECTIONS = {
+    "arm": ArmSection,
+    "columns": ColumnsSection,
+    "units": UnitsSection,
+    "scale": ScaleSection,
+    "csv": CsvSection,
+    "sampling": SamplingSection,
+}
+
+
+def read_map(path: Path) -> RecordingMap:
+    """Read a map and the URDF that it names. Raises ConfigError."""
+    table = read_toml(path, "map")
+    unknown = [key for key in table if key not in (*_SECTIONS, "scheme")]
+    if unknown:
+        raise ConfigError(f"{path}: unknown section `{unknown[0]}`; known: {', '.join((*_SECTIONS, 'scheme'))}")
+    try:
+        sections: dict[str, Any] = {
+            name: parse(section, table.get(name, {}), f"{name}.") for name, section in _SECTIONS.items()
+        }
+        scheme = dict(table.get("scheme", {}))
+        parse(OfflineSettings, {"noise_Nm": [1.0]} | scheme, "scheme.")
+        urdf = _read_arm(path.parent, sections["arm"])
+        found = RecordingMap(**sections, scheme=scheme, urdf=urdf)
+        _check_lengths(found)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return found
+
+
+def _read_arm(folder: Path, arm: ArmSection) -> SerialArm:
+    file = folder / arm.urdf
+    try:
+        return read_urdf(read_input(file), arm.gravity_m_s2, arm.locked)
+    except OSError as error:
+        raise ConfigError(f"`arm.urdf`: {file}: {error.strerror}") from None
+    except UrdfError as error:
+        raise ConfigError(f"`arm.urdf`: {file}: {error}") from None
+
+
+def _check_lengths(found: RecordingMap) -> None:
+    lists: dict[str, tuple[Any, ...]] = {
+        "columns.q": found.columns.q,
+        "columns.tau_J": found.columns.tau_J,
+        "columns.dq": found.columns.dq,
+        "scale.q": found.scale.q,
+        "scale.tau_J": found.scale.tau_J,
+        "scheme.noise_Nm": tuple(found.scheme.get("noise_Nm", ())),
+    }
+    for key, values in lists.items():
+        may_be_empty = key not in ("columns.q", "columns.tau_J")
+        if len(values) != found.joints and not (may_be_empty and not values):
+            raise ConfigError(f"`{key}` has {len(values)} values; the arm has {found.joints} moving joints")
