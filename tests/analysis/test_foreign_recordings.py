@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
-from adacd_hil.analysis.foreign import recording_import
+from adacd_hil.analysis.foreign import recorded_columns
 from adacd_hil.analysis.foreign.recording_identification import identify
 from adacd_hil.analysis.foreign.recording_import import read_recording
 from adacd_hil.analysis.foreign.recording_map import read_map
@@ -194,11 +194,17 @@ def rows(joints: str, count: int = 60) -> str:
     [
         ("", "has no column 'time_ms'"),
         (HEAD + "\n", "has 0 rows"),
-        (HEAD + "\n" + "1,2,3,4,5,0\n" * 60, "time does not increase after row 2"),
-        (HEAD + "\n" + "1,2,3,x,5,0\n" * 60, "could not convert"),
+        (
+            HEAD + "\n" + "1,2,3,4,5,0\n" * 60,
+            "has 1 row, 50 are the least; 59 rows with the time of the row before left out (row 3: 0 s once more)",
+        ),
+        (
+            HEAD + "\n" + "1,2,3,x,5,0\n" * 60,
+            "row 2: column 'j1_mNm' is 'x', no number; 60 rows that can't be read are too many",
+        ),
         (HEAD + "\n" + rows("1e300,3"), "column 'j1_deg' is 1e+300 at 0 s, more than 1e+06 rad"),
         (HEAD + "\n" + rows("1,3") + "100,1,-2e12,4,5,0\n", "column 'j2_deg' is -2e+12 at 0.099 s"),
-        (HEAD + "\n" + rows("inf,3"), "no 50 samples"),
+        (HEAD + "\n" + rows("inf,3"), "0 rows with all values, 50 needed"),
     ],
 )
 def test_a_wrong_recording_is_one_line(tmp_path: Path, example, text: str, line: str) -> None:
@@ -210,20 +216,19 @@ def test_a_wrong_recording_is_one_line(tmp_path: Path, example, text: str, line:
 
 
 def test_a_row_is_counted_over_all_blocks_that_are_read(tmp_path: Path, example, monkeypatch) -> None:
-    monkeypatch.setattr(recording_import, "_BLOCK_ROWS", 25)
-    for text, line in (
-        (rows("1,3") + "60,1,3,4,5,0\n", "time does not increase after row 61: 0.06 s"),
-        (rows("1,3") + "61,1,x,4,5,0\n", "at row 60,"),
+    monkeypatch.setattr(recorded_columns, "_BLOCK_ROWS", 25)
+    for text, note in (
+        ("60,1,3,4,5,0\n", "1 row with the time of the row before left out (row 62: 0.059 s once more)"),
+        ("61,1,x,4,5,0\n", "1 row that can't be read left out (row 62: column 'j2_deg' is 'x', no number)"),
+        ("59,1,3,4,5,0\n", "1 row out of order left out (row 62: time goes back to 0.058 s)"),
     ):
-        (tmp_path / "bad.csv").write_text(f"{HEAD}\n{text}")
-        with pytest.raises(LogError) as refusal:
-            read_recording(tmp_path / "bad.csv", example)
-        assert line in str(refusal.value)
+        (tmp_path / "some.csv").write_text(f"{HEAD}\n{rows('1,3')}{text}")
+        assert read_recording(tmp_path / "some.csv", example).notes == (note,)
 
 
 def test_blocks_are_the_recording(free: Path, example, monkeypatch) -> None:
     whole = read_recording(free, example)
-    monkeypatch.setattr(recording_import, "_BLOCK_ROWS", 701)
+    monkeypatch.setattr(recorded_columns, "_BLOCK_ROWS", 701)
     for mine, read in zip(read_recording(free, example).stretches, whole.stretches, strict=True):
         np.testing.assert_array_equal(mine.record.q, read.record.q)
         np.testing.assert_array_equal(mine.record.tau_J, read.record.tau_J)
@@ -231,8 +236,8 @@ def test_blocks_are_the_recording(free: Path, example, monkeypatch) -> None:
 
 def test_of_a_recording_that_is_too_long_only_a_span_is_kept(free: Path, example, monkeypatch) -> None:
     whole = read_recording(free, example).between(4.0, 7.0)
-    monkeypatch.setattr(recording_import, "_BLOCK_ROWS", 500)
-    monkeypatch.setattr(recording_import, "MOST_ROWS", 3000)
+    monkeypatch.setattr(recorded_columns, "_BLOCK_ROWS", 500)
+    monkeypatch.setattr(recorded_columns, "MOST_ROWS", 3000)
     with pytest.raises(LogError, match=r"more than 3000 rows: cut it$"):
         read_recording(free, example)
     with pytest.raises(LogError, match=r"more than 3000 rows: choose a part with --from and --until$"):

@@ -1,45 +1,31 @@
-"""A recording of an arm that others made: a CSV file and its map become samples at a fixed period, in SI units.
+"""A recording of an arm that others made: a file and its map become samples at a fixed period, in SI units.
 
 A gap in time, a value that is missing or not finite, and where a touch begins or ends, part a recording in stretches;
 the model is carried over, the filters begin anew. Values between two samples are interpolated.
-
-A recording is held in memory, at most `MOST_ROWS` rows of it: of a longer file only the span that is asked for.
 """
 
-import csv
-import io
-import math
-import re
-import warnings
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from adacd_hil.analysis.foreign.recording_map import RecordingMap
-from adacd_hil.file_access import open_input
+from adacd_hil.analysis.foreign.bag_recording import is_bag, read_bag
+from adacd_hil.analysis.foreign.csv_recording import read_csv
+from adacd_hil.analysis.foreign.recorded_columns import MOST_ROWS, SHORTEST_SAMPLES, RecordedColumns
+from adacd_hil.analysis.foreign.recording_map import RecordingMap, time_unit_of
+from adacd_hil.analysis.score.wording import number_of
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.records import Vector
-from adacd_hil.remedies import nearest_name
 from adacd_hil.scheme.identify.offline import Record
-from adacd_hil.settings.schema import ConfigError
 
-MOST_ROWS: Final = 4_000_000
-"""Rows of a file that are kept, and samples that they become: an hour at 1 kHz, with a little to spare."""
-_BLOCK_ROWS = 100_000
-_SPARE_S = 1.0
-"""Kept before and after the span that is asked for: what a derived velocity and the grid of samples reach over."""
-LARGEST = 1e6
-"""rad, rad/s or Nm: what is larger is no measurement, and its square would spoil all others."""
-SHORTEST_SAMPLES = 50
-"""A shorter stretch teaches nothing: the filters have not settled."""
+SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.1
 _LEAST_NOISE_NM = 1e-4
 _DEGREE = 3  # of the polynomial whose slope is a derived velocity
 _MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white noise
+_STEP_TO_SIGMA = 1.0 / np.sqrt(12.0)  # of the rounding to a step
 
 
 @dataclass(frozen=True)
@@ -55,7 +41,8 @@ class RecordingStretch:
 class ForeignRecording:
     """A recording, time-first. `noise_Nm` (n,), `velocity_noise_rad_s`: rms of what looks like white noise in it.
 
-    `blur_s`: how far a derived velocity looks ahead and back.
+    `blur_s`: how far a derived velocity looks ahead and back. `columns`: what the file had. `notes`: what was left out
+    or taken for granted, a few words each.
     """
 
     path: Path
@@ -64,6 +51,13 @@ class ForeignRecording:
     noise_Nm: tuple[float, ...]
     velocity_noise_rad_s: float
     blur_s: float
+    columns: RecordedColumns
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_velocities(self) -> bool:
+        """Whether velocities were measured, and not derived from the positions."""
+        return self.blur_s == 0.0
 
     @property
     def duration_s(self) -> float:
@@ -97,39 +91,39 @@ class ForeignRecording:
 def read_recording(
     path: Path, described: RecordingMap, period_s: float = 0.0, span: TimeWindow | None = None
 ) -> ForeignRecording:
-    """Read a CSV file. period_s: of the samples, where neither the map nor the recording is to say.
+    """Read a CSV file, an MCAP file or a rosbag. period_s: of the samples, where neither map nor recording is to say.
 
     span: what has to be read of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError when
     it can't be read or is too long, ConfigError when it lacks a column of the map.
     """
-    time_s, begin_s, values, touched = _read_columns(path, described, span)
-    return recording_of(path, described, time_s - begin_s, values, touched, period_s)
+    read = read_bag if is_bag(path) else read_csv
+    return recording_of(path, described, read(path, described, span), period_s)
 
 
 def recording_of(
-    path: Path,
-    described: RecordingMap,
-    time_s: Vector,
-    values: Vector,
-    touched: NDArray[np.bool_] | None,
-    period_s: float = 0.0,
+    path: Path, described: RecordingMap, given: RecordedColumns, period_s: float = 0.0
 ) -> ForeignRecording:
-    """Make a recording of columns: time (k,), values (k, 2 n or 3 n), touches (k,); path: its name, for errors.
-
-    values: positions, torques and velocities side by side, in SI units; what is missing is not finite. Raises LogError.
-    """
-    period_s = described.sampling.period_s or period_s or float(np.median(np.diff(time_s)))
-    is_whole = np.isfinite(values).all(axis=1)
-    time_s, values = time_s[is_whole], values[is_whole]
-    touched = None if touched is None else touched[is_whole]
+    """Make a recording of columns; path: its name, for errors. Raises LogError."""
     n = described.joints
+    is_whole = np.isfinite(given.values).all(axis=1)
+    time_s, values = given.time_s[is_whole] - given.begin_s, given.values[is_whole]
+    touched = None if given.touched is None else given.touched[is_whole]
+    notes = list(given.notes)
+    if missing := int(np.count_nonzero(~is_whole)):
+        notes.append(f"{number_of(missing, 'row')} without all values")
+    if len(time_s) < SHORTEST_SAMPLES:
+        raise LogError(f"recording {path}: {number_of(len(time_s), 'row')} with all values, {SHORTEST_SAMPLES} needed")
+    period_s = described.sampling.period_s or period_s or _period_s(path, time_s, described)
+    values, idle = _without_idle_velocities(values, described)
+    notes += idle
+    has_dq = values.shape[1] > 2 * n
     longest_s = max(described.sampling.longest_gap_s, 1.5 * period_s)
     window = max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
     shortest = max(SHORTEST_SAMPLES, window)
     edges = np.flatnonzero(np.diff(time_s) > longest_s) + 1
     stretches = []
     room = MOST_ROWS
-    for rows in np.split(np.arange(len(time_s)), edges) if len(time_s) else ():
+    for rows in np.split(np.arange(len(time_s)), edges):
         count = int((time_s[rows[-1]] - time_s[rows[0]]) / period_s + 1e-6) + 1
         if count < shortest:
             continue
@@ -139,136 +133,51 @@ def recording_of(
         grid_s = time_s[rows[0]] + period_s * np.arange(count)
         columns = [np.interp(grid_s, time_s[rows], values[rows, column]) for column in range(values.shape[1])]
         q, tau_J = np.column_stack(columns[:n]), np.column_stack(columns[n : 2 * n])
-        dq = np.column_stack(columns[2 * n :]) if described.columns.dq else _derive(q, period_s, window)
+        dq = np.column_stack(columns[2 * n :]) if has_dq else _derive(q, period_s, window)
         is_touched = None
         if touched is not None:
             is_touched = touched[rows][np.searchsorted(time_s[rows], grid_s, side="right") - 1]
         stretches.append(RecordingStretch(float(grid_s[0]), Record(q, dq, tau_J), is_touched))
     if not stretches:
         raise LogError(f"{path}: no {shortest} samples of {period_s:g} s without a gap")
-    noise_Nm = _noise([stretch.record.tau_J for stretch in stretches])
-    velocity = _noise([stretch.record.dq for stretch in stretches]) if described.columns.dq else np.zeros(n)
+    noise_Nm = _noise([stretch.record.tau_J for stretch in stretches], values[:, n : 2 * n])
+    velocity = _noise([stretch.record.dq for stretch in stretches], values[:, 2 * n :]) if has_dq else np.zeros(n)
     return ForeignRecording(
         path=path,
         period_s=period_s,
         stretches=tuple(stretches),
         noise_Nm=tuple(np.maximum(noise_Nm, _LEAST_NOISE_NM).tolist()),
         velocity_noise_rad_s=min(float(velocity.max()), 1.0),
-        blur_s=0.0 if described.columns.dq else 0.5 * window * period_s,
+        blur_s=0.0 if has_dq else 0.5 * window * period_s,
+        columns=given,
+        notes=tuple(notes),
     )
 
 
-def _read_columns(
-    path: Path, described: RecordingMap, span: TimeWindow | None
-) -> tuple[Vector, float, Vector, NDArray[np.bool_] | None]:
-    """Return time (k,) s and that of the file's first row, values (k, 2 n or 3 n) in SI units, touches (k,).
-
-    Values: positions, torques and velocities side by side; what is missing is not finite.
-    """
-    columns, form = described.columns, described.csv
-    try:
-        with _open(path, "") as file:
-            for _ in range(form.skip_rows):
-                next(file, "")
-            first = next(csv.reader(file, delimiter=form.delimiter), [])
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f"recording {path}: {getattr(error, 'strerror', None) or error}") from None
-    heads = [head.strip() for head in first] if form.has_header else []
-    wanted = (columns.time, *columns.q, *columns.tau_J, *columns.dq, *filter(None, (columns.contact,)))
-    places = [_place(name, heads, len(first), path) for name in wanted]
-    table, start = _read_table(path, described, places, span)
-    if len(table) < SHORTEST_SAMPLES:
-        where = "" if span is None or span.is_whole else f" {span.text}"
-        raise LogError(f"recording {path} has {len(table)} rows{where}, {SHORTEST_SAMPLES} are the least")
-    units = np.array((*described.q_rad, *described.tau_J_Nm, *(described.dq_rad_s if columns.dq else ())))
-    time_s, begin_s = table[:, 0] * described.time_s, start * described.time_s
-    with np.errstate(over="ignore"):
-        values = table[:, 1 : 1 + len(units)] * units
-    too_large = np.argwhere(np.isfinite(table[:, 1 : 1 + len(units)]) & ~(np.abs(values) <= LARGEST))
-    if len(too_large):
-        row, column = too_large[0].tolist()
-        raise LogError(
-            f"recording {path}: column {wanted[1 + column]!r} is {table[row, 1 + column]:g} at "
-            f"{time_s[row] - begin_s:.9g} s, more than {LARGEST:g} rad, rad/s or Nm"
-        )
-    return time_s, begin_s, values, table[:, -1] != 0.0 if columns.contact else None
+def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
+    """Return the recording's own period. Raises LogError where no arm is recorded like that, with the likely unit."""
+    period_s = float(np.median(np.diff(time_s)))
+    if SHORTEST_PERIOD_S <= period_s <= LONGEST_PERIOD_S:
+        return period_s
+    unit = time_unit_of(period_s / described.time_s)
+    remedy = f'; with `units.time` = "{unit}" they are {period_s / described.time_s:g} {unit}' if unit else ""
+    raise LogError(
+        f"recording {path}: rows are {period_s:g} s apart, {SHORTEST_PERIOD_S:g} to {LONGEST_PERIOD_S:g} s are "
+        f"expected{remedy}"
+    )
 
 
-def _read_table(
-    path: Path, described: RecordingMap, places: list[int], span: TimeWindow | None
-) -> tuple[Vector, float]:
-    """Return the columns at such places of all rows, or of those of a span; and the time in the first row."""
-    form = described.csv
-    head = form.skip_rows + form.has_header
-    kept: list[Vector] = []
-    rows = 0
-    start = last = math.nan
-    bounds = (-math.inf, math.inf) if span is None else (span.start_s - _SPARE_S, span.end_s + _SPARE_S)
-    try:
-        with warnings.catch_warnings(), _open(path) as file:
-            warnings.simplefilter("ignore", UserWarning)  # at the end of the file
-            while True:
-                block = np.loadtxt(
-                    file,
-                    delimiter=None if form.delimiter == " " else form.delimiter,
-                    skiprows=0 if rows else head,
-                    usecols=places,
-                    ndmin=2,
-                    converters=_number,
-                    max_rows=_BLOCK_ROWS,
-                )
-                if not len(block):
-                    break
-                start = float(block[0, 0]) if not rows else start
-                time_s = np.concatenate(([last] if rows else [], block[:, 0])) * described.time_s
-                _check_time(path, time_s, head + rows - bool(rows))
-                rows, last = rows + len(block), float(block[-1, 0])
-                kept.append(block)
-                if rows <= MOST_ROWS:
-                    continue
-                kept = [_within(part, start, described.time_s, bounds) for part in kept]
-                if sum(map(len, kept)) > MOST_ROWS:
-                    remedy = "cut it" if span is None else "choose a part with --from and --until"
-                    raise LogError(f"recording {path} has more than {MOST_ROWS} rows: {remedy}")
-                if (last - start) * described.time_s > bounds[1]:
-                    break
-    except (OSError, ValueError) as error:
-        line = re.sub(r"(?<=at row )\d+", lambda found: str(int(found[0]) + rows), str(error).splitlines()[0])
-        raise LogError(f"recording {path}: {line}") from None
-    return np.concatenate(kept) if kept else np.empty((0, len(places))), start
-
-
-def _within(table: Vector, start: float, unit_s: float, bounds_s: tuple[float, float]) -> Vector:
-    time_s = (table[:, 0] - start) * unit_s
-    return table[(time_s >= bounds_s[0]) & (time_s <= bounds_s[1])]
-
-
-def _check_time(path: Path, time_s: Vector, row: int) -> None:
-    """Raise LogError unless the time increases. row: the one in the file before the first."""
-    backward = np.flatnonzero(~(np.diff(time_s) > 0.0))
-    if len(backward):
-        place = int(backward[0])
-        raise LogError(f"recording {path}: time does not increase after row {row + 1 + place}: {time_s[place]:.9g} s")
-
-
-def _open(path: Path, newline: str | None = None) -> TextIO:
-    return io.TextIOWrapper(open_input(path), encoding="utf-8-sig", newline=newline)
-
-
-def _number(text: str) -> float:
-    """Read a number; a missing one is nan."""
-    return float(text) if text.strip() else float("nan")
-
-
-def _place(name: str, heads: list[str], count: int, path: Path) -> int:
-    """Find a column by its head or its number from 1. Raises ConfigError."""
-    if name in heads:
-        return heads.index(name)
-    if name.isdecimal() and 1 <= int(name) <= count:
-        return int(name) - 1
-    nearest = nearest_name(name, heads)
-    known = f"did you mean {nearest!r}?" if nearest else f"there are {', '.join(heads) or f'1 to {count}'}"
-    raise ConfigError(f"recording {path} has no column {name!r}; {known}")
+def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
+    """Drop velocities, as some drivers leave them empty, where one never changes though its joint moves."""
+    n = described.joints
+    idle = np.ptp(values[:, 2 * n :], axis=0) == 0.0
+    moved = np.ptp(values[:, :n], axis=0) > 0.0
+    if not len(idle) or not np.any(idle & moved):
+        return values, []
+    joint = int(np.flatnonzero(idle & moved)[0])
+    name, always = described.urdf.joint_names[joint], values[0, 2 * n + joint]
+    note = f"the velocity of {name} is always {always:g} rad/s: velocities are derived from the positions"
+    return values[:, : 2 * n], [note]
 
 
 def _derive(q: Vector, period_s: float, window: int) -> Vector:
@@ -276,10 +185,22 @@ def _derive(q: Vector, period_s: float, window: int) -> Vector:
     return np.asarray(savgol_filter(q, window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
 
 
-def _noise(parts: list[Vector]) -> Vector:
-    """Estimate the rms of white noise (n,) by the median of the second difference, which motion hardly shows in."""
+def _noise(parts: list[Vector], given: Vector) -> Vector:
+    """Estimate the rms of white noise (n,), by the median of the second difference, which motion hardly shows in.
+
+    given (k, n): the values as they were recorded; noise is at least that of their rounding.
+    """
     seconds = np.concatenate([np.abs(np.diff(part, 2, axis=0)) for part in parts])
-    return np.asarray(_MEDIAN_TO_SIGMA * np.median(seconds, axis=0))
+    rounding = _STEP_TO_SIGMA * np.array([_step(column) for column in given.T])
+    return np.asarray(np.maximum(_MEDIAN_TO_SIGMA * np.median(seconds, axis=0), rounding))
+
+
+def _step(column: Vector) -> float:
+    """Return the smallest difference of two recorded values."""
+    levels = np.unique(column)
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-9 * (levels[-1] - levels[0])]
+    return float(np.min(steps)) if steps.size else 0.0
 
 
 def _cut(stretch: RecordingStretch, period_s: float, start_s: float, end_s: float) -> RecordingStretch:

@@ -15,10 +15,29 @@ from adacd_hil.scheme.model.urdf import STANDARD_GRAVITY_M_S2, SerialArm, UrdfEr
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import read_toml
 
-_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+ISO = "iso"
+_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, ISO: 1.0}
 _ANGLE = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
 _SPEED = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3, "A": 1.0, "mA": 1e-3}
+_USUAL_PERIOD_S = (2e-4, 0.1)
+_SPELLINGS = {
+    **{unit.casefold(): unit for units in (_TIME, _ANGLE, _SPEED, _TORQUE) for unit in units},
+    **{"sec": "s", "seconds": "s", "msec": "ms", "\N{MICRO SIGN}s": "us", "\N{GREEK SMALL LETTER MU}s": "us"},
+    **{"°": "deg", "degree": "deg", "degrees": "deg", "°/s": "deg/s", "degs": "deg/s", "rads": "rad/s", "amp": "A"},
+    **{f"{milli}n{times}m": f"{milli}Nm" for milli in ("", "m") for times in ("*", "·", " ", ".", "-")},
+}
+
+
+def unit_of(text: str) -> str:
+    """Return the unit that a text names, as the map spells it; "" if it is none."""
+    return _SPELLINGS.get(text.strip(" []()").casefold(), "")
+
+
+def time_unit_of(step: float) -> str:
+    """Return the unit in which a time between two rows is one at which arms are recorded; "" if there is none."""
+    low_s, high_s = _USUAL_PERIOD_S
+    return next((unit for unit in ("s", "ms", "us", "ns") if low_s <= step * _TIME[unit] <= high_s), "")
 
 
 @dataclass(frozen=True)
@@ -35,11 +54,11 @@ class ArmSection:
 
 @dataclass(frozen=True)
 class ColumnsSection:
-    """Heads or numbers of the columns; of the joints from the base outward."""
+    """Heads or numbers of the columns, or a bag's names of the joints; of the joints from the base outward."""
 
-    time: str = setting(meaning="of the sample")
-    q: tuple[str, ...] = setting(meaning="joint positions")
-    tau_J: tuple[str, ...] = setting(meaning="joint torques, or currents")
+    time: str = setting("", meaning="of the sample; none: a row every sampling.period_s")
+    q: tuple[str, ...] = setting((), meaning="joint positions; of a bag names of its joints, else those of the URDF")
+    tau_J: tuple[str, ...] = setting((), meaning="joint torques, or currents; none of a bag, which has efforts")
     dq: tuple[str, ...] = setting((), meaning="joint velocities; none: derived from the positions")
     contact: str = setting("", meaning="not 0 while somebody touches the arm; none: not known")
 
@@ -48,7 +67,9 @@ class ColumnsSection:
 class UnitsSection:
     """Units of the columns."""
 
-    time: str = setting("s", choices=tuple(_TIME), meaning="of the time")
+    time: str = setting(
+        "s", choices=tuple(_TIME), meaning="of the time; iso: a date and time such as 2024-05-01T10:00:00.005"
+    )
     q: str = setting("rad", choices=tuple(_ANGLE), meaning="of positions")
     dq: str = setting("rad/s", choices=tuple(_SPEED), meaning="of velocities")
     tau_J: str = setting("Nm", choices=tuple(_TORQUE), meaning="of torques; of currents, scale.tau_J has the gains")
@@ -67,15 +88,32 @@ class CsvSection:
     """The form of the file."""
 
     delimiter: str = setting(",", choices=(",", ";", "\t", " "), meaning="between two columns")
+    decimal: str = setting(".", choices=(".", ","), meaning="sign before the decimals")
     has_header: bool = setting(True, meaning="whether the first row names the columns")
     skip_rows: int = setting(0, low=0, high=10_000, meaning="rows before that")
+
+
+@dataclass(frozen=True)
+class BagSection:
+    """Where an MCAP file or a rosbag has the joints' states."""
+
+    topic: str = setting("", meaning="of sensor_msgs/JointState; none: the only one, or /joint_states")
+    time: str = setting(
+        "header", choices=("header", "received"), meaning="stamp of the message, or when it was recorded"
+    )
 
 
 @dataclass(frozen=True)
 class SamplingSection:
     """How the recording becomes samples at a fixed period."""
 
-    period_s: float = setting(0.0, unit="s", low=0.0, high=0.1, meaning="of the samples; 0: the recording's median")
+    period_s: float = setting(
+        0.0,
+        unit="s",
+        low=0.0,
+        high=0.1,
+        meaning="of the samples, and of the rows without a time; 0: the recording's median",
+    )
     longest_gap_s: float = setting(0.05, unit="s", low=1e-3, high=10.0, meaning="a longer one parts the recording")
     smoothing_s: float = setting(
         0.03, unit="s", low=1e-3, high=1.0, meaning="window of the derivative where velocities are derived"
@@ -91,6 +129,7 @@ class RecordingMap:
     units: UnitsSection
     scale: ScaleSection
     csv: CsvSection
+    bag: BagSection
     sampling: SamplingSection
     scheme: dict[str, Any]  # keys of OfflineSettings that outweigh its defaults and what the recording shows
     urdf: SerialArm
@@ -135,6 +174,7 @@ _SECTIONS = {
     "units": UnitsSection,
     "scale": ScaleSection,
     "csv": CsvSection,
+    "bag": BagSection,
     "sampling": SamplingSection,
 }
 
@@ -179,6 +219,5 @@ def _check_lengths(found: RecordingMap) -> None:
         "scheme.noise_Nm": tuple(found.scheme.get("noise_Nm", ())),
     }
     for key, values in lists.items():
-        may_be_empty = key not in ("columns.q", "columns.tau_J")
-        if len(values) != found.joints and not (may_be_empty and not values):
+        if values and len(values) != found.joints:
             raise ConfigError(f"`{key}` has {len(values)} values; the arm has {found.joints} moving joints")

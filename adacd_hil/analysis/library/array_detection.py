@@ -13,10 +13,17 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from adacd_hil.analysis.foreign.recorded_columns import LARGEST, SHORTEST_SAMPLES, RecordedColumns
 from adacd_hil.analysis.foreign.recording_identification import Identified, identify, watch
-from adacd_hil.analysis.foreign.recording_import import LARGEST, SHORTEST_SAMPLES, ForeignRecording, recording_of
+from adacd_hil.analysis.foreign.recording_import import (
+    LONGEST_PERIOD_S,
+    SHORTEST_PERIOD_S,
+    ForeignRecording,
+    recording_of,
+)
 from adacd_hil.analysis.foreign.recording_map import (
     ArmSection,
+    BagSection,
     ColumnsSection,
     CsvSection,
     RecordingMap,
@@ -41,7 +48,6 @@ _OPTIONAL: Final = ("dq", "touched")
 _ALIASES: Final = {"t_s": "t", "time": "t", "qd": "dq", "tau": "tau_J"}
 _KNOWN: Final = (*_REQUIRED, *_OPTIONAL, *_ALIASES)
 _LONGEST_LAG_S: Final = 0.05
-_SHORTEST_PERIOD_S, _LONGEST_PERIOD_S = 1e-5, 0.1
 _UNITS: Final = {"t": "s", "q": "rad", "dq": "rad/s", "tau_J": "Nm"}
 
 
@@ -248,6 +254,10 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
     if backward.size:
         row = int(backward[0]) + 1
         raise ArrayError(f"t[{row}] = {t_s[row]:.9g} s is not after t[{row - 1}] = {t_s[row - 1]:.9g} s")
+    period_s = float(np.median(np.diff(t_s)))
+    if not SHORTEST_PERIOD_S <= period_s <= LONGEST_PERIOD_S:
+        bounds = f"{SHORTEST_PERIOD_S:g} to {LONGEST_PERIOD_S:g} s are expected"
+        raise ArrayError(f"t has a median period of {period_s:g} s, {bounds}")
     columns = []
     for name in ("q", "tau_J", *(("dq",) if "dq" in named else ())):
         values = _numbers(name, named[name])
@@ -266,14 +276,10 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
         touched = touched.astype(np.bool_)
     described = _described(arm, "dq" in named, {})
     try:
-        recording = recording_of(Path("arrays"), described, t_s - t_s[0], np.hstack(columns), touched)
+        given = RecordedColumns(t_s, float(t_s[0]), np.hstack(columns), touched, ())
+        recording = recording_of(Path("arrays"), described, given)
     except LogError as error:
         raise ArrayError(str(error)) from None
-    if not _SHORTEST_PERIOD_S <= recording.period_s <= _LONGEST_PERIOD_S:
-        raise ArrayError(
-            f"t has a median period of {recording.period_s:g} s, "
-            f"{_SHORTEST_PERIOD_S:g} to {_LONGEST_PERIOD_S:g} s are expected"
-        )
     return _GivenArrays(recording, float(t_s[0]), "dq" in named)
 
 
@@ -325,6 +331,7 @@ def _described(arm: OfflineArm, has_dq: bool, scheme: Mapping[str, Any]) -> Reco
         units=UnitsSection(),
         scale=ScaleSection(),
         csv=CsvSection(),
+        bag=BagSection(),
         sampling=SamplingSection(),
         scheme=plain,
         urdf=arm.serial,

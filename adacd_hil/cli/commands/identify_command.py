@@ -10,7 +10,7 @@ import click
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show
 from adacd_hil.file_access import replace_file
-from adacd_hil.given_path import GIVEN_FILE, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.progress_lines import Progress
 from adacd_hil.terminal import in_line
 
@@ -19,14 +19,18 @@ if TYPE_CHECKING:
     from adacd_hil.analysis.foreign.recording_import import ForeignRecording
 
 
+_RECORDING = GivenPath()
+"""A file, or the folder of a rosbag."""
+
+
 @click.command(
     epilog="Exit status: 0 done; 1 a recording can't be read; 2 wrong usage or map; 3 the model doesn't explain the "
     "test: a residual reached its threshold."
 )
-@click.argument("recordings", nargs=-1, required=True, type=GIVEN_FILE)
+@click.argument("recordings", nargs=-1, required=True, type=_RECORDING)
 @click.option("--map", "map_path", required=True, type=GIVEN_FILE, help="TOML: what the columns are, and of which arm.")
-@click.option("--test", type=GIVEN_FILE, help="Recording to test on; default: the last part of the last one fitted.")
-@click.option("--watch", multiple=True, type=GIVEN_FILE, help="Recording in which to look for contacts; repeatable.")
+@click.option("--test", type=_RECORDING, help="Recording to test on; default: the last part of the last one fitted.")
+@click.option("--watch", multiple=True, type=_RECORDING, help="Recording in which to look for contacts; repeatable.")
 @click.option("--from", "start_s", type=float, default=0.0, show_default=True, help="Fit from this time on, s.")
 @click.option("--until", "end_s", type=float, default=float("inf"), help="Fit until this time, s; default: the end.")
 @click.option("--out", type=WrittenPath(file_okay=False), help="Folder for pictures and identify.json.")
