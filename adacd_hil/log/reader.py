@@ -229,11 +229,13 @@ def topic_bytes(path: str | Path, topic: str) -> bytes:
 
 def open_log(path: str | Path, topics: Collection[str] | None) -> tuple[LogWalk, int]:
     """Begin to read a log; return the walk over it and what was added to t_ns for its times. Raises LogError."""
-    walk = LogWalk(log_in(path), _payload_layout, topics)
+    walk = LogWalk(log_in(path), lambda channel, schema: _payload_layout(channel, schema, bool(walk.metadata)), topics)
     return walk, _number(walk.metadata, EPOCH_KEY, 0)
 
 
-def _payload_layout(channel: Channel, schema: Schema) -> Payload | None:
+def _payload_layout(channel: Channel, schema: Schema, is_of_run: bool) -> Payload | None:
+    if schema.name == JOINT_STATE.name and not is_of_run:
+        return None  # others have any number of joints
     try:
         text = schema.data.decode("utf-8")
     except UnicodeDecodeError:
@@ -397,6 +399,11 @@ class LogStream:
     def parts(self) -> int:
         """How many files have been read."""
         return self._walk.parts
+
+    def joint_states(self, piece: Piece) -> dict[str, list[bytes]]:
+        """Give the payloads of joint states of others, by topic."""
+        found = self._walk.topics
+        return {name: each for name, each in piece.payloads.items() if found[name].type_name == JOINT_STATE.name}
 
     def _own_topics(self) -> dict[str, Topic]:
         """List those of our topics that pieces have series of."""

@@ -1,8 +1,7 @@
 """A recording in an MCAP file or a rosbag: sensor_msgs/JointState of any number of joints, found by their names.
 
-`mcap` reads MCAP files, `rosbags` the bags of ROS 1 and ROS 2; both decode with the types that `rosbags` has, so a bag
-needs neither ROS nor definitions inside. Messages of other joints, as of a gripper that publishes on the same topic,
-are passed over.
+`mcap` reads MCAP files, `rosbags` the bags of ROS 1 and ROS 2; neither needs ROS. Messages of other joints, as of a
+gripper that publishes on the same topic, are passed over.
 """
 
 import math
@@ -15,30 +14,21 @@ from adacd_hil.analysis.foreign.recorded_columns import RecordedColumns, Recorde
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
 from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.types.joint_states import TYPE, JointStateMessage, decode_joint_state
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.schema import ConfigError
 
 JOINT_STATES: Final = "/joint_states"
-_TYPE: Final = "sensor_msgs/msg/JointState"
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _BAG_MAGIC: Final = b"#ROSBAG V"
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
-
-
-class JointStateMessage(NamedTuple):
-    """A message: when it was recorded, its own stamp, names, and arrays that may be empty."""
-
-    received_ns: int
-    stamp_ns: int
-    names: tuple[str, ...]
-    values: tuple[list[float], list[float], list[float]]  # position, velocity, effort
 
 
 class _Bag(NamedTuple):
     """What is in a bag: the type of each topic, and how messages of one are read."""
 
     topics: Mapping[str, str]
-    messages: Callable[[str], Iterator[JointStateMessage]]
+    messages: Callable[[str], Iterator[tuple[int, JointStateMessage]]]  # with when they were recorded, ns
 
 
 def is_bag(path: Path) -> bool:
@@ -64,9 +54,9 @@ def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
         read = RecordedRows(path, 1 + 3 * len(wanted), 1.0, span)
         is_stamped = described.bag.time == "header"
         first_ns: int | None = None
-        for number, message in enumerate(bag.messages(topic), start=1):
+        for number, (received_ns, message) in enumerate(bag.messages(topic), start=1):
             if row := states.read(number, message, read):
-                time_ns = message.stamp_ns if is_stamped else message.received_ns
+                time_ns = message.stamp_ns if is_stamped else received_ns
                 first_ns = time_ns if first_ns is None else first_ns
                 read.append(number, [(time_ns - first_ns) * 1e-9, *row])
             if read.is_past_span:
@@ -103,9 +93,7 @@ def opened_bag(path: Path) -> Iterator[_Bag]:
 @contextmanager
 def _opened_mcap(path: Path) -> Iterator[_Bag]:
     from mcap.reader import make_reader
-    from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.LATEST)
     with open_input(path) as file:
         topics: dict[str, str] = {}
         summary = make_reader(file).get_summary()
@@ -118,9 +106,9 @@ def _opened_mcap(path: Path) -> Iterator[_Bag]:
                 is_cdr = channel.message_encoding == "cdr"
                 topics[channel.topic] = known.name if known and is_cdr else channel.message_encoding
 
-        def messages(topic: str) -> Iterator[JointStateMessage]:
+        def messages(topic: str) -> Iterator[tuple[int, JointStateMessage]]:
             for _, _, message in make_reader(file).iter_messages(topics=[topic], log_time_order=False):
-                yield _joint_state(store.deserialize_cdr(message.data, _TYPE), message.log_time)
+                yield message.log_time, decode_joint_state(message.data)
 
         yield _Bag(topics, messages)
 
@@ -129,31 +117,22 @@ def _opened_mcap(path: Path) -> Iterator[_Bag]:
 def _opened_rosbag(path: Path, is_ros1: bool) -> Iterator[_Bag]:
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
-    from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
-    decode: Callable[[bytes, str], Any] = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     reader: Any = Reader1(path) if is_ros1 else Reader2(path)
     reader.open()
     with closing(reader):
 
-        def messages(topic: str) -> Iterator[JointStateMessage]:
+        def messages(topic: str) -> Iterator[tuple[int, JointStateMessage]]:
             connections = [each for each in reader.connections if each.topic == topic]
             for _, received_ns, data in reader.messages(connections=connections):
-                yield _joint_state(decode(data, _TYPE), received_ns)
+                yield received_ns, decode_joint_state(data, is_ros1)
 
         yield _Bag({each.topic: each.msgtype for each in reader.connections}, messages)
 
 
-def _joint_state(message: Any, received_ns: int) -> JointStateMessage:
-    stamp = message.header.stamp
-    values = (message.position.tolist(), message.velocity.tolist(), message.effort.tolist())
-    return JointStateMessage(received_ns, stamp.sec * 1_000_000_000 + stamp.nanosec, tuple(message.name), values)
-
-
 def joint_state_topics(topics: Mapping[str, str]) -> list[str]:
     """List the topics of joint states."""
-    return [topic for topic, kind in topics.items() if kind.replace("/msg/", "/") == _TYPE.replace("/msg/", "/")]
+    return [topic for topic, kind in topics.items() if kind.replace("/msg/", "/") == TYPE.replace("/msg/", "/")]
 
 
 def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
@@ -164,10 +143,10 @@ def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
             return wanted
         near = nearest_name(wanted, found)
         known = f"did you mean {near}?" if near else f"there are {', '.join(found) or 'none'}"
-        raise ConfigError(f"recording {path} has no topic {wanted} of {_TYPE}; {known}")
+        raise ConfigError(f"recording {path} has no topic {wanted} of {TYPE}; {known}")
     if not found:
         there = ", ".join(f"{topic} ({kind})" for topic, kind in list(topics.items())[:6]) or "no topic at all"
-        raise ConfigError(f"recording {path} has no topic of {_TYPE}; it has {there}")
+        raise ConfigError(f"recording {path} has no topic of {TYPE}; it has {there}")
     if len(found) > 1 and JOINT_STATES not in found:
         raise ConfigError(f"recording {path} has joint states on {', '.join(found)}: `bag.topic` says which")
     return JOINT_STATES if JOINT_STATES in found else found[0]
@@ -192,19 +171,22 @@ class _States:
         if places is None:
             return None
         count = len(message.names)
-        sizes = [len(values) for values in message.values]
+        arrays = (message.position, message.effort, message.velocity)
+        sizes = [len(values) for values in arrays]
         if sizes[0] != count or any(size not in (0, count) for size in sizes[1:]):
-            named = f"{count} names, {sizes[0]} positions, {sizes[1]} velocities, {sizes[2]} efforts"
+            named = f"{count} names, {sizes[0]} positions, {sizes[2]} velocities, {sizes[1]} efforts"
             into.drop("that can't be read", f"row {number}: the message has {named}")
             return None
         self._taken += 1
         self._has_stamps |= message.stamp_ns != 0
-        self.has_velocities &= sizes[1] == count
-        none = [math.nan] * count
-        position, velocity, effort = (list(values) or none for values in message.values)
+        self.has_velocities &= sizes[2] == count
+        row = [float(values[p]) if len(values) else math.nan for values in arrays for p in places]
         if self._lacks_effort:
-            self._lacks_effort -= {name for name, p in zip(self._wanted, places, strict=True) if effort[p] == effort[p]}
-        return [values[place] for values in (position, effort, velocity) for place in places]
+            efforts = row[len(places) : 2 * len(places)]
+            self._lacks_effort -= {
+                name for name, effort in zip(self._wanted, efforts, strict=True) if not math.isnan(effort)
+            }
+        return row
 
     def check(self, is_stamped: bool) -> None:
         """Refuse a topic without the joints, without efforts, or without stamps. Raises LogError, ConfigError."""

@@ -10,6 +10,7 @@ from adacd_hil.log.check.findings import Findings
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, MESSAGE_HEAD
+from adacd_hil.log.types.joint_states import is_joint_state
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,
@@ -118,6 +119,7 @@ class ContentCheck:
         self._is_cdr = np.zeros(CHANNEL_NUMBERS, np.bool_)
         self._fd_frames: set[int] = set()
         self._logs: set[int] = set()
+        self._joint_states: set[int] = set()
 
     def schema(self, schema: Schema, offset: int) -> None:
         """Read the text of a schema."""
@@ -144,6 +146,9 @@ class ContentCheck:
             self._fd_frames.add(channel.id)
         elif schema is not None and _is_own(channel, schema, LOG):
             self._logs.add(channel.id)
+        elif schema is not None and _is_own(channel, schema, JOINT_STATE):
+            self._joint_states.add(channel.id)
+            self._sizes[channel.id] = _ANY_SIZE  # others have the same text, and other joints
 
     def _check_order(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
         order = np.argsort(contents.channels, kind="stable")
@@ -176,6 +181,9 @@ class ContentCheck:
             payload = contents.payload(place)
             is_fd = int(contents.channels[place]) in self._fd_frames
             is_wrong[place] = not (_is_fd_frame(payload) if is_fd else is_log(payload))
+        is_others = np.isin(contents.channels, [*self._joint_states]) & (sizes != JOINT_STATE_DTYPE.itemsize)
+        for place in np.flatnonzero(is_others & ~is_wrong).tolist():
+            is_wrong[place] = not is_joint_state(contents.payload(place))
         for place in np.flatnonzero(is_wrong)[:1].tolist():
             channel = definitions.channels[int(contents.channels[place])]
             count = np.count_nonzero(is_wrong)

@@ -28,6 +28,7 @@ from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import ChunkError, Opening, read_contents
 from adacd_hil.log.mcap.mcap_records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
+from adacd_hil.log.types.joint_states import joint_state_columns
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import DECODED, EVENTS
 from adacd_hil.remedies import install_command, nearest_name
@@ -265,11 +266,18 @@ def _export_topics(
     path: Path, out: Path, kind: str, topics: list[str], progress: Callable[[int], None]
 ) -> TableSummary:
     stream = LogStream(path, topics)
+    keys: dict[tuple[str, tuple[str, ...]], str] = {}  # tables of joint states: a choice of joints has its own
     with Tables(out, kind, stream.metadata) as tables:
         for piece in stream:
+            others = stream.joint_states(piece)
             for topic, series in piece.series.items():
-                if topic in topics:
+                if topic in topics and topic not in others:
                     tables.write(topic, series_columns(series, stream.epoch_ns))
+            for topic, payloads in others.items():
+                for names, columns in joint_state_columns(payloads):
+                    is_first = all(other != topic for other, _ in keys)
+                    key = keys.setdefault((topic, names), topic if is_first else f"{topic}_{names[0]}_{len(keys)}")
+                    tables.write(key, columns)
             if events := stream.events(piece):
                 tables.write(EVENTS.name, event_columns(events))
             progress(sum(tables.rows.values()))

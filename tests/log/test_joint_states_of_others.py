@@ -1,0 +1,75 @@
+"""Joint states that others recorded: of any number of joints, under the text that our own two-joint ones have."""
+
+import csv
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from joint_state_bags import State, write_mcap
+
+from adacd_hil.cli.main import cli
+
+NAMES = ("lift", "pan", "elbow")
+
+
+def states(effort=(5.0, 6.0, 7.0)) -> list[State]:
+    return [State(0.01 * k, NAMES, (k, k + 1.0, k + 2.0), (), effort) for k in range(60)]
+
+
+def command(*arguments: str) -> tuple[int, str]:
+    played = CliRunner().invoke(cli, arguments)
+    return played.exit_code, played.stdout + played.stderr
+
+
+def tables(path: Path, out: Path) -> dict[str, list[dict[str, str]]]:
+    status, said = command("log", "export", str(path), "--format", "csv", "--out", str(out))
+    assert status == 0, said
+    return {each.stem: list(csv.DictReader(each.read_text().splitlines())) for each in sorted(out.glob("*.csv"))}
+
+
+def test_the_check_takes_them_for_what_they_are(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "r.mcap", states())
+    status, said = command("log", "check", str(path))
+    assert status in (0, 3)  # 3: only warnings, as this file has no CRC of its data section
+    assert "0 errors" in said
+    assert "60 messages" in said
+
+
+def test_the_check_finds_one_that_is_none(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "r.mcap", states(), has_index=False)
+    data = path.read_bytes()
+    place = data.index(b"lift\0") - 4
+    path.write_bytes(data[:place] + b"\xff\xff\xff\x00" + data[place + 4 :])
+    status, said = command("log", "check", str(path))
+    assert status == 1
+    assert "1 messages" in said
+    assert "/joint_states (cdr)" in said
+
+
+def test_a_table_of_them_has_the_joints_names(tmp_path: Path) -> None:
+    (table,) = tables(write_mcap(tmp_path / "r.mcap", states()), tmp_path / "out").values()
+    assert len(table) == 60
+    assert (table[2]["position_lift"], table[2]["position_elbow"], table[2]["effort_pan"]) == ("2.0", "4.0", "6.0")
+    assert table[2]["velocity_pan"] == "nan"
+    assert int(table[1]["t_ns"]) - int(table[0]["t_ns"]) == 10_000_000
+
+
+@pytest.mark.parametrize("is_gripper_first", [False, True])
+def test_each_choice_of_joints_has_a_table(tmp_path: Path, is_gripper_first: bool) -> None:
+    gripper = [State(state.t_s + 1e-3, ("finger",), (0.5,), (), (9.0,)) for state in states()]
+    pairs = zip(states(), gripper, strict=True)
+    messages = [message for pair in pairs for message in (reversed(pair) if is_gripper_first else pair)]
+    found = tables(write_mcap(tmp_path / "r.mcap", messages), tmp_path / "out")
+    assert sorted(len(table[0]) for table in found.values()) == [4, 10]
+    assert all(len(table) == 60 for table in found.values())
+    first, second = ("finger", "lift") if is_gripper_first else ("lift", "finger")
+    assert f"effort_{first}" in found["joint_states"][0]
+    assert f"effort_{second}" in found[f"joint_states_{second}_1"][0]
+
+
+def test_a_topic_is_chosen_by_its_name(tmp_path: Path) -> None:
+    left, right = (State(0.0, NAMES, (1.0, 2.0, 3.0), topic=topic) for topic in ("/left", "/right"))
+    path = write_mcap(tmp_path / "r.mcap", [left, right])
+    out = tmp_path / "out"
+    assert command("log", "export", str(path), "--format", "csv", "--topic", "right", "--out", str(out))[0] == 0
+    assert [each.name for each in out.iterdir()] == ["right.csv"]
