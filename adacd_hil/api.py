@@ -5,7 +5,7 @@ Everything else may move; these names stay. docs/api.md has examples.
 | name | is |
 |---|---|
 | `load`, `LoadedRun` | a run's log as named arrays, events, contacts, certificates |
-| `detect`, `fit`, `Arm`, `Detection`, `Model`, `ArrayError` | the scheme over arrays of any serial arm |
+| `detect`, `fit`, `Arm`, `Detection`, `Model`, `Verdict`, `ArrayError` | the scheme over arrays of any serial arm |
 | `Detector`, `register_detector` | a detector of your own |
 | `Bus`, `Frame` | another CAN interface |
 | `SchemeState`, `ContactReport`, `Certificate`, `LogError` | what the results are made of |
@@ -14,6 +14,7 @@ Everything else may move; these names stay. docs/api.md has examples.
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from adacd_hil.analysis.foreign.recording_verdict import Verdict
     from adacd_hil.analysis.library.array_detection import ArrayContact, ArrayError, detect, fit
     from adacd_hil.analysis.library.array_detection import ArrayDetection as Detection
     from adacd_hil.analysis.library.array_detection import FittedModel as Model
@@ -42,6 +43,7 @@ __all__ = [
     "RunContact",
     "RunEvent",
     "SchemeState",
+    "Verdict",
     "detect",
     "fit",
     "load",
@@ -65,6 +67,7 @@ _PLACES = {
     "RunContact": (f"{_LIBRARY}.loaded_run", "RunContact"),
     "RunEvent": (f"{_LIBRARY}.loaded_run", "RunEvent"),
     "SchemeState": ("adacd_hil.records", "SchemeState"),
+    "Verdict": ("adacd_hil.analysis.foreign.recording_verdict", "Verdict"),
     "detect": (f"{_LIBRARY}.array_detection", "detect"),
     "fit": (f"{_LIBRARY}.array_detection", "fit"),
     "load": (f"{_LIBRARY}.loaded_run", "load"),

@@ -67,6 +67,34 @@ def test_a_model_of_one_recording_watches_another_and_names_of_others_are_taken(
     assert detect(renamed, arm, model=model).contacts == detect(arrays, arm, fit_s=(100.0, 105.0)).contacts
 
 
+def test_a_recording_without_torque_is_not_explained(arm: OfflineArm, arrays: dict[str, Any]) -> None:
+    noise = 0.01 * np.random.default_rng(2).standard_normal((6000, 1))
+    for tau_J, cause in ((np.zeros((6000, 1)), "is always 0 Nm"), (noise, "is noise: nothing of the motion is in it")):
+        model = detect({**arrays, "tau_J": tau_J}, arm).model
+        assert not model.verdict.is_explained
+        assert cause in model.verdict.reasons[0]
+        assert not model.explained.max() > 0.1
+    assert fit(arrays, arm).verdict.is_explained
+    assert fit(arrays, arm).explained.min() > 0.99
+
+
+def test_results_are_shown_in_a_line(arm: OfflineArm, arrays: dict[str, Any]) -> None:
+    found = detect(arrays, arm)
+    assert repr(arm) == "<Arm one: 1 joint, shoulder>"
+    assert repr(found.model) == f"<Model of 1 joint: explained; margin {found.model.margin:.2f}>"
+    assert repr(found).startswith("<Detection: 1 contact in 12.0 s; model explained; margin ")
+    assert repr(found.model.verdict) == f"<Verdict: explained; margin {found.model.margin:.2f}>"
+
+
+def test_a_run_and_its_contacts_are_shown_in_a_line(log: Path) -> None:
+    run = load(log.parent)
+    assert re.fullmatch(r"<LoadedRun .*run\.mcap: \d+ cycles, [\d.]+ s, \d+ contacts?, \d+ certificates?>", repr(run))
+    for contact in run.contacts:
+        assert re.fullmatch(r"<RunContact at [\d.]+ s: \w+ on link [12], \w+>", repr(contact))
+    for certificate in run.certificates:
+        assert re.fullmatch(r"<Certificate: a1, a2, a3 = [\d., -]+ kg m²>", repr(certificate))
+
+
 def test_touches_that_are_known_are_left_out_of_the_fit(arm: OfflineArm, arrays: dict[str, Any]) -> None:
     touched = (arrays["t"] >= 100.0 + PUSH_S[0]) & (arrays["t"] < 100.0 + PUSH_S[1])
     blind = fit(arrays, arm, fit_s=(106.0, 112.0))

@@ -1,12 +1,15 @@
 """A foreign recording through the scheme: parameters from free motion, their test on other motion, contacts in a third.
 
 The fit learns whatever is in its recording, a touch too; where the map names a column of touches, those are left out.
-The figure shows the external torque of each joint against its threshold, and the contacts.
+The figure shows the external torque of each joint against its threshold, and the contacts. The thresholds of the test
+are those of its margin: noise and what is known of the parameters. Those of other recordings are wider by what the
+test shows as lacking.
 """
 
-import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +19,7 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.drawing import COLOURS, Drawing, note, plot, style
 from adacd_hil.analysis.foreign.recording_import import ForeignRecording, RecordingStretch
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
+from adacd_hil.analysis.foreign.recording_verdict import Fitted, Verdict, judge_fit
 from adacd_hil.analysis.score.judge import explained_until, owners
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
@@ -55,31 +59,37 @@ class Watched:
 
 @dataclass(frozen=True)
 class Identified:
-    """Parameters (p,), and how much of the torque (n,) they explain on motion that was not fitted."""
+    """Parameters (p,) and their deviations, and how much of the torque they explain on motion that was not fitted."""
 
     model: offline.ArmModel
     settings: OfflineSettings
     joint_names: tuple[str, ...]
     estimate: ModelEstimate
+    deviation: Vector
     certificate: OfflineCertificate
-    explained: Vector
+    verdict: Verdict
     fit_s: float
     test: Watched
     watched: tuple[Watched, ...]
+    notes: dict[Path, tuple[str, ...]]  # what was left out of the recordings, or taken for granted
 
     @property
     def is_explained(self) -> bool:
-        """Whether no residual of the test reached its threshold."""
-        return self.certificate.margin > 1.0
+        """Whether the torque of the test is explained; see `recording_verdict`."""
+        return self.verdict.is_explained
+
+    @property
+    def explained(self) -> Vector:
+        """The share (n,) of each joint's torque that the model explains in the test; nan where there is none."""
+        return np.array([joint.share for joint in self.verdict.joints])
 
     def as_json(self) -> dict[str, Any]:
         """Describe it for machines."""
-        deviation = np.sqrt(np.diag(self.estimate.P)).tolist()
         names, certificate = self.model.parameter_names, self.certificate
         return {
             "parameters": {
                 name: {"value": value, "std": std}
-                for name, value, std in zip(names, self.estimate.theta.tolist(), deviation, strict=True)
+                for name, value, std in zip(names, self.estimate.theta.tolist(), self.deviation.tolist(), strict=True)
             },
             "fit_s": self.fit_s,
             "period_s": self.settings.period_s,
@@ -87,12 +97,15 @@ class Identified:
             "velocity_noise_rad_s": self.settings.velocity_noise_rad_s,
             "test": {
                 "seconds": self.test.recording.duration_s,
-                "margin": certificate.margin,
-                "explained": dict(zip(self.joint_names, self.explained.tolist(), strict=True)),
+                "verdict": self.verdict.as_json(),
+                "margin": _finite(certificate.margin),
+                "margins": dict(zip(self.joint_names, map(_finite, certificate.margins.tolist()), strict=True)),
+                "explained": dict(zip(self.joint_names, map(_finite, self.explained.tolist()), strict=True)),
                 "residual_rms_Nm": certificate.residual_rms_Nm.tolist(),
                 "residual_max_Nm": certificate.residual_max_Nm.tolist(),
                 "lack_Nm": certificate.lack_Nm.tolist(),
             },
+            "left_out": {str(path): list(notes) for path, notes in self.notes.items()},
             "watched": [
                 {
                     "recording": str(watched.recording.path),
@@ -132,24 +145,33 @@ def identify(
     source = recordings[-1]
     settings = described.settings(source.noise_Nm, source.period_s, source.velocity_noise_rad_s)
     model = offline.model_of(described.urdf.chain, described.arm.has_rotors)
-    estimate = offline.prior(model)
-    for stretch in itertools.chain.from_iterable(recording.stretches for recording in recordings):
-        estimate = offline.identify(model, stretch.record, estimate, settings)
+    before = estimate = offline.prior(model)
+    records = [stretch.record for recording in recordings for stretch in recording.stretches]
+    for record in records:
+        estimate = offline.identify(model, record, estimate, settings)
+    deviation = offline.parameter_deviation(model, records, before, estimate, settings)
     certificate = _joined(
         [offline.certify(model, part.record, estimate, settings) for part in tested.stretches], tested
     )
-    test = watch(model, settings, estimate, certificate.lack_Nm, tested)
+    fit = Fitted(described, model, settings, before, estimate, deviation, certificate, tuple(recordings), tested)
     return Identified(
         model=model,
         settings=settings,
         joint_names=described.urdf.joint_names,
         estimate=estimate,
+        deviation=deviation,
         certificate=certificate,
-        explained=_explained(test),
+        verdict=judge_fit(fit),
         fit_s=sum(recording.duration_s for recording in recordings),
-        test=test,
+        test=watch(model, settings, estimate, np.zeros(model.joints), tested),
         watched=tuple(watch(model, settings, estimate, certificate.lack_Nm, recording) for recording in watched),
+        notes={recording.path: recording.notes for recording in (*recordings, tested)},
     )
+
+
+def _finite(value: float) -> float | None:
+    """Return a number as JSON can hold it."""
+    return value if math.isfinite(value) else None
 
 
 def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:
@@ -160,15 +182,9 @@ def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> Offlin
         residual_rms_Nm=np.sqrt(sum(w * part.residual_rms_Nm**2 for w, part in zip(weights, parts, strict=True))),
         residual_max_Nm=np.max([part.residual_max_Nm for part in parts], axis=0),
         lack_Nm=np.sqrt(sum(w * part.lack_Nm**2 for w, part in zip(weights, parts, strict=True))),
+        threshold_Nm=sum(w * part.threshold_Nm for w, part in zip(weights, parts, strict=True)),
         margins=np.min([part.margins for part in parts], axis=0),
     )
-
-
-def _explained(test: Watched) -> Vector:
-    """Return the share of each torque's variance (n,) that the model predicts."""
-    tau_J = np.concatenate([stretch.record.tau_J for stretch in test.recording.stretches])
-    residual = np.concatenate(test.tau_ext_hat)
-    return np.asarray(1.0 - np.mean(residual**2, axis=0) / np.maximum(np.var(tau_J, axis=0), 1e-12))
 
 
 def watch(

@@ -118,7 +118,7 @@ def recording_of(
     notes += idle
     has_dq = values.shape[1] > 2 * n
     longest_s = max(described.sampling.longest_gap_s, 1.5 * period_s)
-    window = max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
+    window = derivative_window(described, period_s)
     shortest = max(SHORTEST_SAMPLES, window)
     edges = np.flatnonzero(np.diff(time_s) > longest_s) + 1
     stretches = []
@@ -133,7 +133,7 @@ def recording_of(
         grid_s = time_s[rows[0]] + period_s * np.arange(count)
         columns = [np.interp(grid_s, time_s[rows], values[rows, column]) for column in range(values.shape[1])]
         q, tau_J = np.column_stack(columns[:n]), np.column_stack(columns[n : 2 * n])
-        dq = np.column_stack(columns[2 * n :]) if has_dq else _derive(q, period_s, window)
+        dq = np.column_stack(columns[2 * n :]) if has_dq else derive(q, period_s, window)
         is_touched = None
         if touched is not None:
             is_touched = touched[rows][np.searchsorted(time_s[rows], grid_s, side="right") - 1]
@@ -180,7 +180,12 @@ def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[V
     return values[:, : 2 * n], [note]
 
 
-def _derive(q: Vector, period_s: float, window: int) -> Vector:
+def derivative_window(described: RecordingMap, period_s: float) -> int:
+    """Return over how many samples velocities are derived."""
+    return max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
+
+
+def derive(q: Vector, period_s: float, window: int) -> Vector:
     """Derive velocities (k, n) from positions, without delay: the slope of a cubic over a window of samples."""
     return np.asarray(savgol_filter(q, window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
 

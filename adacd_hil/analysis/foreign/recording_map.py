@@ -120,6 +120,17 @@ class SamplingSection:
     )
 
 
+def units_by_slope(units: UnitsSection, factor: float) -> list[tuple[str, str]]:
+    """List keys and units with which velocities, so many times the slope of the positions, would be that slope."""
+    found = [("dq", unit) for unit, value in _SPEED.items() if _is_near(factor * value / _SPEED[units.dq], 1.0)]
+    found += [("q", unit) for unit, value in _ANGLE.items() if _is_near(factor * _ANGLE[units.q] / value, 1.0)]
+    return [(key, unit) for key, unit in found if getattr(units, key) != unit]
+
+
+def _is_near(value: float, wanted: float) -> bool:
+    return abs(value / wanted - 1.0) < 0.1
+
+
 @dataclass(frozen=True)
 class RecordingMap:
     """A map, and the arm that it names."""

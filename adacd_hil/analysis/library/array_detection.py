@@ -31,6 +31,8 @@ from adacd_hil.analysis.foreign.recording_map import (
     ScaleSection,
     UnitsSection,
 )
+from adacd_hil.analysis.foreign.recording_verdict import Verdict
+from adacd_hil.analysis.score.wording import number_of
 from adacd_hil.file_access import read_input
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.viewer.robot_description import robot_description
@@ -84,6 +86,10 @@ class OfflineArm:
         """Take the two-joint arm of a configuration, a name or a TOML file. Raises ConfigError, a ValueError."""
         return cls(read_urdf(robot_description(load_settings(str(config), profile))))
 
+    def __repr__(self) -> str:
+        name = self.serial.name or "without a name"
+        return f"<Arm {name}: {number_of(self.joints, 'joint')}, {' '.join(self.joint_names)}>"
+
     @property
     def joints(self) -> int:
         """Number of joints, n."""
@@ -115,8 +121,9 @@ class ArrayContact(NamedTuple):
 class FittedModel:
     """A model that was fitted to free motion, and tested on motion that it was not fitted to.
 
-    names, theta, std: parameters (p,) and their deviations. margin: smallest threshold over residual in the test; below
-    1 the model lacks something. explained: share of each torque's variance in the test (n,).
+    names, theta, std: parameters (p,), and how far they may be off. margin: smallest threshold over residual in the
+    test; below 1 the model lacks more than noise. explained: share (n,) of each joint's torque that it explains in the
+    test, nan where there is none. verdict: whether all of it is, why not, and what to do next.
     """
 
     arm: OfflineArm
@@ -126,6 +133,14 @@ class FittedModel:
     margin: float
     explained: Vector
     identified: Identified
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the torque is explained, with reasons, remarks and the next thing to do."""
+        return self.identified.verdict
+
+    def __repr__(self) -> str:
+        return f"<Model of {number_of(self.arm.joints, 'joint')}: {self.verdict.headline}>"
 
 
 @dataclass(frozen=True)
@@ -141,6 +156,11 @@ class ArrayDetection:
     threshold: Vector
     contacts: tuple[ArrayContact, ...]
 
+    def __repr__(self) -> str:
+        seconds = self.t_s.size * self.model.identified.settings.period_s
+        found = f"{number_of(len(self.contacts), 'contact')} in {seconds:.1f} s"
+        return f"<Detection: {found}; model {self.model.verdict.headline}>"
+
 
 def fit(
     arrays: Mapping[str, ArrayLike],
@@ -150,7 +170,10 @@ def fit(
     velocity_lag_s: float = 0.0,
     **scheme: Any,
 ) -> FittedModel:
-    """Fit a model to the free motion in arrays and test it on the last 40 % of that; see `detect`."""
+    """Fit a model to the free motion in arrays and test it on the last 40 % of that; see `detect`.
+
+    `verdict` of the model says whether it explains the torque: look at it before anything else.
+    """
     return _fitted(_taken(arrays, arm, velocity_lag_s), arm, fit_s, scheme)
 
 
@@ -170,7 +193,7 @@ def _fitted(
         arm=arm,
         names=found.model.parameter_names,
         theta=found.estimate.theta,
-        std=np.sqrt(np.diag(found.estimate.P)),
+        std=found.deviation,
         margin=found.certificate.margin,
         explained=found.explained,
         identified=found,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import settings_of
 from adacd_hil.analysis.score.metrics import certificates_in
+from adacd_hil.analysis.score.wording import number_of
 from adacd_hil.log.log_files import LogError, log_in
 from adacd_hil.log.reader import LoggedContact, LoggedEvent, RunLog, read_log
 from adacd_hil.records import ContactReport, SchemeState, Vector
@@ -43,6 +44,11 @@ class RunContact(NamedTuple):
     t_s: float
     report: ContactReport
 
+    def __repr__(self) -> str:
+        report = self.report
+        what = f"{report.kind.name.lower()} on link {report.link}, {report.level.name.lower()}"
+        return f"<RunContact at {self.t_s:.3f} s: {what}>"
+
 
 @dataclass(frozen=True)
 class LoadedRun:
@@ -61,6 +67,12 @@ class LoadedRun:
     metadata: Mapping[str, str]
     attachments: Mapping[str, bytes]
     problem: str
+
+    def __repr__(self) -> str:
+        seconds = float(self.t_s[-1] - self.t_s[0]) if len(self) else 0.0
+        found = (number_of(len(self), "cycle"), f"{seconds:.1f} s", number_of(len(self.contacts), "contact"))
+        certified = number_of(len(self.certificates), "certificate")
+        return f"<LoadedRun {self.path}: {', '.join(found)}, {certified}{'; ' + self.problem if self.problem else ''}>"
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Give an array by its name. Raises KeyError that names the nearest."""

@@ -25,7 +25,7 @@ _RECORDING = GivenPath()
 
 @click.command(
     epilog="Exit status: 0 done; 1 a recording can't be read; 2 wrong usage or map; 3 the model doesn't explain the "
-    "test: a residual reached its threshold."
+    "test; the verdict says why."
 )
 @click.argument("recordings", nargs=-1, required=True, type=_RECORDING)
 @click.option("--map", "map_path", required=True, type=GIVEN_FILE, help="TOML: what the columns are, and of which arm.")
@@ -76,12 +76,14 @@ def identify(
     if as_json:
         print(json.dumps(found.as_json(), indent=2))
     else:
-        show(_as_text(found), *_next(map_path, recordings[0], has_watched=bool(watch)))
+        show(_as_text(found), *_next(found, map_path, recordings[0]))
     return ExitCode.OK if found.is_explained else ExitCode.PARTIAL
 
 
-def _next(map_path: Path, recording: Path, has_watched: bool) -> tuple[str, ...]:
-    if has_watched:
+def _next(found: "Identified", map_path: Path, recording: Path) -> tuple[str, ...]:
+    if found.verdict.remedy:
+        return (f"{found.verdict.remedy}; then identify again",)
+    if found.watched:
         return ()
     again = f"adacd-hil identify {quoted(recording)} --map {quoted(map_path)}"
     return (f"{again} --watch TOUCHED.csv   # contacts in a recording of a touched arm",)
@@ -98,32 +100,38 @@ def _write(found: "Identified", out: Path) -> None:
 
 
 def _as_text(found: "Identified") -> str:
-    certificate = found.certificate
-    deviation = found.estimate.P.diagonal() ** 0.5
+    from adacd_hil.analysis.foreign.recording_verdict import percent
+
+    certificate, verdict = found.certificate, found.verdict
     parameters = [
         (name, f"{value:.5g}", f"± {std:.2g}")
-        for name, value, std in zip(found.model.parameter_names, found.estimate.theta, deviation, strict=True)
+        for name, value, std in zip(found.model.parameter_names, found.estimate.theta, found.deviation, strict=True)
     ]
     joints = [
-        (name, *(f"{value:.3g}" for value in (noise, rms, largest)), f"{100.0 * share:.1f} %")
-        for name, noise, rms, largest, share in zip(
-            found.joint_names,
+        (
+            joint.name,
+            *(f"{value:.3g}" for value in (noise, rms, largest)),
+            f"{joint.margin:.2f}" if math.isfinite(joint.margin) else "-",
+            percent(joint.share),
+        )
+        for joint, noise, rms, largest in zip(
+            verdict.joints,
             found.settings.noise_Nm,
             certificate.residual_rms_Nm,
             certificate.residual_max_Nm,
-            found.explained,
             strict=True,
         )
     ]
-    verdict = "explained" if found.is_explained else "NOT explained: a residual reached its threshold"
+    columns = ("joint", "noise, Nm", "residual rms, Nm", "largest, Nm", "margin", "torque explained")
     lines = [
+        *(in_line(f"{path.name}: {note}") for path, notes in found.notes.items() for note in notes),
         f"fitted {found.fit_s:.1f} s at {found.settings.period_s * 1e3:g} ms",
         format_table(("parameter", "value", "std"), parameters, right=(1,)),
         "",
-        f"tested on {found.test.recording.duration_s:.1f} s: {verdict}; margin {certificate.margin:.2f}",
-        format_table(
-            ("joint", "noise, Nm", "residual rms, Nm", "largest, Nm", "torque explained"), joints, right=(1, 2, 3, 4)
-        ),
+        f"tested on {found.test.recording.duration_s:.1f} s: {verdict.headline}",
+        *(f"  because {reason}" for reason in map(in_line, verdict.reasons)),
+        *(f"  note: {remark}" for remark in map(in_line, verdict.remarks)),
+        format_table(columns, joints, right=(1, 2, 3, 4, 5)),
     ]
     return "\n".join([*lines, *(_describe(watched) for watched in found.watched)])
 

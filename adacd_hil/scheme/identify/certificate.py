@@ -49,6 +49,10 @@ class Certificate(NamedTuple):
     is_payload: bool
     text: str
 
+    def __repr__(self) -> str:
+        inertia = ", ".join(f"{value:.3g}" for value in self.inertia_kgm2)
+        return f"<Certificate{' with a payload' if self.is_payload else ''}: a1, a2, a3 = {inertia} kg m²>"
+
 
 def constants_of(settings: Settings, compared: Vector, prior_std: Vector) -> dict[str, Vector]:
     """Return `last_compared` (q, p), `last_prior` (q,), `last_certified`, `_std`, `_floor`; nan of no last certificate.

@@ -184,6 +184,7 @@ class OfflineCertificate:
     residual_rms_Nm: Vector  # (n,)
     residual_max_Nm: Vector  # (n,)
     lack_Nm: Vector  # (n,), standard deviation of what neither noise nor P explains
+    threshold_Nm: Vector  # (n,), median over all samples, of noise and P
     margins: Vector  # (n,), smallest ratio of threshold to residual over all samples; below 1 is a false alarm
 
     @property
@@ -278,6 +279,25 @@ def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings:
     return FilteredTorque(trace.tau_f, -trace.tau_ext_hat, trace.unit)
 
 
+def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tuple[Vector, Vector]:
+    """Return the samples of a fit: regressor (m, n, p) and torque (m, n), filtered. Raises as `identify`."""
+    count = len(record.q) // settings.fit_every
+    shape = (count, model.joints, len(model.parameter_names))
+    rows = _Rows(np.zeros(shape), np.zeros(shape[:2]))
+    zero = ModelEstimate(np.zeros(shape[2]), np.zeros((shape[2],) * 2))
+    _fit_trace(model, record, zero, settings, zero.theta, rows=rows)
+    return rows.W, rows.tau
+
+
+def mass_terms(model: ArmModel, q: Vector, dq: Vector) -> Vector:
+    """Return the row (p,) whose product with theta is dq' M(q) dq, twice the kinetic energy."""
+    n, p = model.joints, len(model.parameter_names)
+    Y_p, Y_h = np.zeros((n, p)), np.zeros((n, p))
+    chain.fill(model.chain, model.base.place, q, dq, chain.new_scratch(model.chain), Y_p, Y_h)
+    _fill_rotors(dq, model.place_of("rotor").start if model.has_rotors else chain.NOT_USED, Y_p)
+    return np.asarray(dq @ Y_p)
+
+
 def filtered_noise_Nm(settings: OfflineSettings) -> Vector:
     """Return what the filter of the fit leaves of each torque sensor's noise (n,)."""
     gains = _noise_gains(settings.fit_cutoff_rad_s, settings, is_smoothed=True)
@@ -290,9 +310,11 @@ def certify(model: ArmModel, record: Record, estimate: ModelEstimate, settings: 
     residual = np.abs(trace.tau_ext_hat)
     mean_square = np.mean(residual**2, axis=0)
     lack = np.sqrt(np.maximum(mean_square - np.mean(trace.deviation**2, axis=0), 0.0))
+    threshold = _threshold(trace, settings, np.zeros(model.joints))
     with np.errstate(divide="ignore"):
-        margins = np.min(_threshold(trace, settings, np.zeros(model.joints)) / residual, axis=0)
-    return OfflineCertificate(np.sqrt(mean_square), np.max(residual, axis=0), lack, margins)
+        margins = np.min(threshold / residual, axis=0)
+    largest = np.max(residual, axis=0)
+    return OfflineCertificate(np.sqrt(mean_square), largest, lack, np.median(threshold, axis=0), margins)
 
 
 def detect(
@@ -381,6 +403,13 @@ def _new_memory(joints: int, count: int) -> _Memory:
     return _Memory(*(np.zeros(shape) for shape in (*(columns,) * 8, *(joint,) * 9, *(columns,) * 2, *(parameter,) * 2)))
 
 
+class _Rows(NamedTuple):
+    """The samples of a fit, if they are asked for: (m, n, p) and (m, n), m = 0 if not."""
+
+    W: Vector
+    tau: Vector
+
+
 class _NoiseGains(NamedTuple):
     """What the filters make of white noise of 1: its standard deviation, and what correlation costs a fit."""
 
@@ -443,11 +472,13 @@ def _trace(
     scores: Vector | None = None,
     at: int = 0,
     length: int = 1,
+    rows: _Rows | None = None,
 ) -> _Trace:
     """Run a record through the filter; theta and P, contiguous then, are corrected in place if it learns.
 
     theta_M (p,): of the mass matrix that carries the velocity's noise. scores (B, p): gets the sums of
     `parameter_deviation`, `length` samples a part; at: samples that were before this record.
+    rows: gets the samples of the fit.
     """
     n = model.joints
     if record.q.shape[1] != n or len(settings.noise_Nm) != n:
@@ -486,6 +517,7 @@ def _trace(
         np.zeros((0, 0)) if scores is None else scores,
         at,
         length,
+        _Rows(np.zeros((0, 0, 0)), np.zeros((0, 0))) if rows is None else rows,
     )
     return trace
 
@@ -517,6 +549,7 @@ def _run(
     scores: Vector,
     at: int,
     length: int,
+    rows: _Rows,
 ) -> None:
     """Filter a record, estimate the external torque of each sample, and correct theta and P if it learns.
 
@@ -552,6 +585,9 @@ def _run(
             trace.tau_f[k, i] = m.tau[i]
         if k % fit_every == fit_every - 1:
             _weigh(noise_Nm, R, passed_rad_s2, m)
+            if rows.W.shape[0] > 0:
+                rows.W[k // fit_every] = m.W
+                rows.tau[k // fit_every] = m.tau
             if scores.shape[0] > 0:
                 _add_score(theta, m, scores[(at + k) // length])
             if is_learning:

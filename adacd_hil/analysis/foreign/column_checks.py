@@ -1,0 +1,240 @@
+"""What the columns of a recording show before anything is fitted: constant, stuck, clipped, in another unit.
+
+A sensor that is dead, or a column that was never filled in, reads always the same. One that is stuck reads the same for
+a while in which its joint moves. One that is clipped stays at its largest reading far longer than just below it.
+Velocities are compared with the slope of the positions, positions and torques with the limits of the URDF.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.foreign.recording_import import ForeignRecording, derivative_window, derive
+from adacd_hil.analysis.foreign.recording_map import RecordingMap, units_by_slope
+from adacd_hil.records import Vector
+
+_STUCK_S: Final = 0.5
+_STUCK_TRAVEL: Final = 0.2
+"""Of its whole travel, that a joint makes while a torque that is stuck reads the same."""
+_STUCK_TIMES: Final = 5.0
+"""Longer than 99 % of the other runs of equal readings: coarse sensors have long ones."""
+_CLIPPED_SHARE, _CLIPPED_ROWS, _CLIPPED_RUN = 0.005, 10, 5
+_CLIPPED_BAND: Final = 0.05
+"""Of the span below the largest reading, which a clipped sensor passes in less time than it stays at the bound."""
+_FEWEST_LEVELS: Final = 50
+"""Of a sensor whose largest reading says anything."""
+STILL_RAD: Final = 0.01
+"""A joint that travels less is at rest."""
+_WELL_CORRELATED: Final = 0.8
+_SAME_SLOPE: Final = (0.8, 1.25)
+_BEYOND_LIMITS: Final = 3.0
+"""Times the limits of a joint: no arm goes there, but degrees taken for radians are 57 times."""
+_BEYOND_EFFORT: Final = 30.0
+"""Times the effort of the URDF: mNm taken for Nm are 1000 times."""
+
+
+class ColumnFinding(NamedTuple):
+    """What is wrong with columns, and the next thing to do.
+
+    is_dead: no model can be made of it. is_wrong: no model of it is worth anything, if no other reading is found. What
+    is neither may be why nothing fits.
+    """
+
+    text: str
+    remedy: str
+    is_dead: bool = False
+    is_wrong: bool = False
+
+
+class _Columns(NamedTuple):
+    """All samples of some recordings, (k, n), their times in the recording (k,), and the period."""
+
+    time_s: Vector
+    q: Vector
+    dq: Vector
+    tau_J: Vector
+    period_s: float
+
+
+def find_faults(described: RecordingMap, recordings: list[ForeignRecording]) -> tuple[ColumnFinding, ...]:
+    """List what the columns show. recordings: what is fitted and tested."""
+    stretches = [stretch for recording in recordings for stretch in recording.stretches]
+    period_s = recordings[0].period_s
+    times = [stretch.start_s + period_s * np.arange(len(stretch.record.q)) for stretch in stretches]
+    q, dq, tau_J = (
+        np.concatenate([getattr(stretch.record, name) for stretch in stretches]) for name in ("q", "dq", "tau_J")
+    )
+    columns = _Columns(np.concatenate(times), q, dq, tau_J, period_s)
+    found = [*_of_torques(described, columns), *_of_positions(described, columns)]
+    if all(recording.has_velocities for recording in recordings):
+        found += _of_velocities(described, recordings)
+    return tuple(found)
+
+
+def joined_names(names: list[str], count: int) -> str:
+    """Join the names of some of so many joints."""
+    if len(names) == count > 2:
+        return "all joints"
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def column_name(described: RecordingMap, key: str, joint: int) -> str:
+    """Name a joint with its column."""
+    name, columns = described.urdf.joint_names[joint], getattr(described.columns, key)
+    return f"{name} ({columns[joint]})" if columns and columns[joint] != name else name
+
+
+def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+    n = described.joints
+    constant = [joint for joint in range(n) if np.ptp(columns.tau_J[:, joint]) == 0.0]
+    if constant:
+        names = joined_names([column_name(described, "tau_J", joint) for joint in constant], n)
+        always = ", ".join(dict.fromkeys(f"{columns.tau_J[0, joint] + 0.0:g}" for joint in constant))
+        yield ColumnFinding(
+            f"the torque of {names} is always {always} Nm: a dead sensor, or a column that nobody filled in",
+            "check that sensor, and `columns.tau_J`",
+            is_dead=True,
+        )
+    for joint in (joint for joint in range(n) if joint not in constant):
+        torque, name = columns.tau_J[:, joint], column_name(described, "tau_J", joint)
+        run = _stuck_run(torque, columns.q, columns.period_s)
+        if run is not None:
+            seconds, start_s = (run[1] - run[0]) * columns.period_s, columns.time_s[run[0]]
+            yield ColumnFinding(
+                f"the torque of {name} is stuck at {torque[run[0]]:g} Nm for {seconds:.2g} s, from {start_s:.4g} s on, "
+                "while the arm moves",
+                "leave that time out with --from and --until, and check the sensor",
+            )
+        if bounds := list(_clipped_at(torque)):
+            yield ColumnFinding(
+                f"the torque of {name} is clipped at {' and '.join(f'{bound:g}' for bound in bounds)} Nm",
+                "move slower, or raise the range of that sensor",
+            )
+    yield from _against_effort(described, columns)
+
+
+def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+    effort = described.urdf.torque_limit
+    known = np.isfinite(effort) & (effort > 0.0)
+    if not known.any() or "A" in described.units.tau_J:
+        return
+    largest = np.quantile(np.abs(columns.tau_J), 0.99, axis=0)
+    over = np.where(known, largest / np.where(known, effort, 1.0), 0.0)
+    joint = int(np.argmax(over))
+    if over[joint] > _BEYOND_EFFORT:
+        yield ColumnFinding(
+            f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest[joint]:.3g} Nm, the URDF allows "
+            f"{effort[joint]:g} Nm",
+            f'if the torques are mNm: `units.tau_J` = "mNm", which the map has as "{described.units.tau_J}"',
+            is_dead=not np.any(described.urdf.theta_full),  # else its masses say more
+        )
+
+
+def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+    n, urdf = described.joints, described.urdf
+    travel = np.ptp(columns.q, axis=0)
+    still = [joint for joint in range(n) if travel[joint] < STILL_RAD]
+    if len(still) == n:
+        yield ColumnFinding("the arm does not move", "record motion of every joint, fast and slow", is_dead=True)
+    for joint in still if len(still) < n else ():
+        name, always = column_name(described, "q", joint), columns.q[0, joint]
+        how = f"is always {always:g} rad" if travel[joint] == 0.0 else f"changes by less than {STILL_RAD:g} rad"
+        yield ColumnFinding(
+            f"the position of {name} {how}: a dead encoder, or a joint at rest, of which neither friction nor inertia "
+            "can be learnt",
+            "move every joint, name one that never moves in `arm.locked`, and check `columns.q`",
+        )
+    for joint in range(n):
+        low, high = urdf.position_low[joint], urdf.position_high[joint]
+        bound = max(abs(low), abs(high)) if np.isfinite(low + high) and high > low else math.pi * 4.0
+        reach, speed = np.abs(columns.q[:, joint]).max(), np.quantile(np.abs(columns.dq[:, joint]), 0.99)
+        limit = urdf.velocity_limit[joint]
+        is_fast = np.isfinite(limit) and limit > 0.0 and speed > _BEYOND_LIMITS * limit
+        if described.urdf.chain.is_prismatic[joint] == 0.0 and (reach > _BEYOND_LIMITS * bound or is_fast):
+            much = f"goes to {reach:.3g} rad" if reach > _BEYOND_LIMITS * bound else f"turns at {speed:.3g} rad/s"
+            most = f"{bound:.3g} rad" if reach > _BEYOND_LIMITS * bound else f"{limit:g} rad/s"
+            yield ColumnFinding(
+                f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
+                f'if the positions are degrees: `units.q` = "deg", which the map has as "{described.units.q}"',
+            )
+            return
+
+
+def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) -> Iterator[ColumnFinding]:
+    """Compare measured velocities with the slope of the positions."""
+    n = described.joints
+    products = np.zeros((n, n))
+    window = derivative_window(described, recordings[0].period_s)
+    squares, own = np.zeros(n), np.zeros(n)
+    for stretch in (stretch for recording in recordings for stretch in recording.stretches):
+        if len(stretch.record.q) < window:
+            continue
+        slope = derive(stretch.record.q, recordings[0].period_s, window)
+        products += slope.T @ stretch.record.dq
+        squares += np.sum(slope**2, axis=0)
+        own += np.sum(stretch.record.dq**2, axis=0)
+    slopes = np.diag(products) / np.maximum(squares, 1e-12)
+    alike = products / np.sqrt(np.maximum(np.outer(squares, own), 1e-24))
+    moving = [joint for joint in range(n) if squares[joint] > 0.0]
+    strangers = [joint for joint in moving if abs(alike[joint, joint]) < 0.5]
+    for joint in strangers:
+        other = int(np.argmax(np.abs(alike[joint])))
+        if other != joint and alike[joint, other] > _WELL_CORRELATED:
+            yield ColumnFinding(
+                f"the velocity of {column_name(described, 'dq', joint)} is in the column of "
+                f"{column_name(described, 'dq', other)}",
+                "in the map: exchange them in `columns.dq`, or leave that key out: velocities are derived then",
+                is_wrong=True,
+            )
+            return
+    for joint in moving:
+        if abs(alike[joint, joint]) < _WELL_CORRELATED or _SAME_SLOPE[0] < slopes[joint] < _SAME_SLOPE[1]:
+            continue
+        name, factor = column_name(described, "dq", joint), float(slopes[joint])
+        how = "has the other sign than" if factor < 0.0 else f"is {factor:.3g} times"
+        keys = [f'`units.{key}` = "{unit}"' for key, unit in units_by_slope(described.units, abs(factor))]
+        yield ColumnFinding(
+            f"the velocity of {name} {how} its position's slope",
+            f"in the map: {' or '.join([*keys, 'leave `columns.dq` out'])}: velocities are derived then",
+            is_wrong=True,
+        )
+        return
+
+
+def _runs(column: Vector) -> NDArray[np.int64]:
+    """List the runs of equal readings: first row, and the one after the last (r, 2)."""
+    edges = np.flatnonzero(np.diff(column) != 0.0) + 1
+    bounds = np.concatenate(([0], edges, [len(column)]))
+    return np.column_stack([bounds[:-1], bounds[1:]])
+
+
+def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | None:
+    """Find the longest run of equal torques in which a joint moves, if it is too long for a coarse sensor. q (k, n)."""
+    runs = _runs(torque)
+    lengths = runs[:, 1] - runs[:, 0]
+    lengths[np.isin(torque[runs[:, 0]], (torque.min(), torque.max()))] = 1  # of a sensor that is clipped
+    place = int(np.argmax(lengths))
+    first, last = runs[place].tolist()
+    usual = float(np.quantile(np.delete(lengths, place), 0.99)) if len(lengths) > 1 else 0.0
+    is_long = (last - first) * period_s >= _STUCK_S and last - first >= 20 and last - first > _STUCK_TIMES * usual
+    is_moving = np.any(np.ptp(q[first:last], axis=0) > _STUCK_TRAVEL * np.ptp(q, axis=0))
+    return (first, last) if is_long and is_moving else None
+
+
+def _clipped_at(torque: Vector) -> Iterator[float]:
+    """List the bounds at which readings are cut off."""
+    levels = np.unique(torque)
+    if len(levels) < _FEWEST_LEVELS:
+        return
+    span = levels[-1] - levels[0]
+    runs = _runs(torque)
+    for bound in (levels[0], levels[-1]):
+        is_at = torque == bound
+        at = int(np.count_nonzero(is_at))
+        beside = int(np.count_nonzero(np.abs(torque - bound) <= _CLIPPED_BAND * span)) - at
+        longest = max((last - first for first, last in runs.tolist() if is_at[first]), default=0)
+        if at > max(_CLIPPED_SHARE * len(torque), _CLIPPED_ROWS, beside) and longest >= _CLIPPED_RUN:
+            yield float(bound)

@@ -1,0 +1,466 @@
+"""The verdict on a recording: whether there is a torque to explain, whether it is explained, which mistake it was."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from foreign_arms import AXES, Motion, record, urdf_text, write_recording
+
+from adacd_hil.analysis.foreign.other_readings import is_possible
+from adacd_hil.analysis.foreign.recording_identification import Identified, identify
+from adacd_hil.analysis.foreign.recording_import import read_recording
+from adacd_hil.analysis.foreign.recording_map import read_map
+from adacd_hil.cli.main import cli
+from adacd_hil.scheme.identify.offline import model_of
+from adacd_hil.scheme.model.urdf import read_urdf
+
+LEVEL, UPRIGHT = ("0 0 1",) * 7, ("0 1 0",) * 7
+"""Axes of an arm that gravity doesn't reach, and of one that it does."""
+
+pytestmark = pytest.mark.slow  # for the first fit, which compiles
+
+
+@pytest.fixture(scope="module")
+def upright() -> Motion:
+    return record(urdf_text(2, UPRIGHT))
+
+
+@pytest.fixture(scope="module")
+def level() -> Motion:
+    return record(urdf_text(2, LEVEL))
+
+
+def judged(folder: Path, motion: Motion, axes=UPRIGHT, has_dq: bool = False, more: str = "", **urdf) -> Identified:
+    text = urdf_text(motion.q.shape[1], axes, **urdf)
+    recording, described = write_recording(folder, text, motion, has_dq, more)
+    return identify(read_map(described), [read_recording(recording, read_map(described))], None)
+
+
+def column(n: int, joint: int, value: float) -> np.ndarray:
+    return np.where(np.arange(n) == joint, value, 1.0)
+
+
+def noise(shape, seed: int = 3) -> np.ndarray:
+    return 0.02 * np.random.default_rng(seed).standard_normal(shape)
+
+
+# What has to be explained, and is.
+
+
+GOOD = {
+    "one joint": (1, UPRIGHT, {}),
+    "two level ones": (2, LEVEL, {}),
+    "two upright ones": (2, UPRIGHT, {}),
+    "three": (3, AXES, {}),
+    "much noise": (2, UPRIGHT, {"noise_Nm": 0.1}),
+    "slow and small motion": (2, UPRIGHT, {"amplitude_rad": 0.25}),
+    "six seconds": (2, UPRIGHT, {"seconds": 6.0}),
+    "1 kHz": (2, UPRIGHT, {"period_s": 1e-3}),
+    "seven": (7, AXES, {}),
+}
+
+
+@pytest.mark.parametrize("kind", GOOD)
+@pytest.mark.parametrize("has_dq", [False, True])
+def test_a_good_recording_is_explained(tmp_path: Path, kind: str, has_dq: bool) -> None:
+    joints, axes, options = GOOD[kind]
+    found = judged(tmp_path, record(urdf_text(joints, axes), **options), axes, has_dq)
+    assert found.verdict.is_explained, found.verdict
+    assert found.verdict.headline == f"explained; margin {found.certificate.margin:.2f}"
+    assert (found.verdict.reasons, found.verdict.remedy) == ((), "")
+    assert not any("times" in remark or "drives" in remark or "stuck" in remark for remark in found.verdict.remarks)
+
+
+def test_friction_and_inertia_of_a_good_recording_are_within_their_deviations(tmp_path: Path) -> None:
+    text = urdf_text(7, AXES)
+    motion = record(text, seconds=20.0)
+    found = judged(tmp_path, motion, AXES, has_dq=True)
+    base = found.model.base.map @ read_urdf(text).theta_full
+    truth = np.concatenate([base, *(motion.truth[key] for key in ("F_v", "F_c", "offset"))])
+    apart = (found.estimate.theta - truth) / found.deviation
+    assert np.abs(apart).max() < 5.0
+    assert np.sqrt(np.mean(apart**2)) < 1.5
+
+
+def test_seven_joints_are_explained_though_their_sensors_have_no_noise_and_the_margin_is_small(tmp_path: Path) -> None:
+    """Whatever a model lacks is more than no noise; 99 % of the torque is explained all the same."""
+    motion = record(urdf_text(7, AXES), noise_Nm=0.0)
+    stribeck = 0.3 * motion.truth["F_c"] * np.sign(motion.dq) * np.exp(-np.abs(motion.dq) / 0.1)
+    found = judged(tmp_path, replace(motion, tau=motion.tau + stribeck), AXES, has_dq=True)
+    assert found.verdict.is_explained
+    assert found.certificate.margin < 1.0
+    assert found.explained.min() > 0.99
+    assert "of the torque at the worst joint; margin" in found.verdict.headline
+    (remark,) = found.verdict.remarks
+    assert "what the model lacks is more than noise: contacts show from about joint" in remark
+
+
+# What can't be explained.
+
+
+def still(motion: Motion, joint: int) -> Motion:
+    q = motion.q.copy()
+    q[:, joint] = q[0, joint]
+    return replace(motion, q=q)
+
+
+def stuck(motion: Motion) -> Motion:
+    tau = motion.tau.copy()
+    tau[900:1100, 0] = tau[900, 0]
+    return replace(motion, tau=tau)
+
+
+def clipped(motion: Motion) -> Motion:
+    limit = np.quantile(np.abs(motion.tau[:, 0]), 0.7)
+    return replace(motion, tau=np.column_stack([np.clip(motion.tau[:, 0], -limit, limit), motion.tau[:, 1]]))
+
+
+def short(motion: Motion) -> Motion:
+    return Motion(*(values[:300] for values in (motion.t, motion.q, motion.dq, motion.tau)))
+
+
+def drift(motion: Motion) -> Motion:
+    return replace(motion, tau=np.cumsum(noise(motion.tau.shape), axis=0))
+
+
+def noisy_last(motion: Motion) -> Motion:
+    return replace(motion, tau=np.column_stack([motion.tau[:, 0], noise(len(motion.t))]))
+
+
+UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], tuple[str, ...], str]] = {
+    "no torque at all": (
+        lambda m: replace(m, tau=0.0 * m.tau),
+        ("the torque of joint1 (tau1) and joint2 (tau2) is always 0 Nm",),
+        "`columns.tau_J`",
+    ),
+    "a dead sensor": (
+        lambda m: replace(m, tau=m.tau * [1.0, 0.0] + [0.0, 0.31]),
+        ("the torque of joint2 (tau2) is always 0.31 Nm",),
+        "`columns.tau_J`",
+    ),
+    "noise": (
+        lambda m: replace(m, tau=noise(m.tau.shape)),
+        ("the torque of joint1 and joint2 is noise: nothing of the motion is in it",),
+        "`columns.tau_J` (tau1, tau2)",
+    ),
+    "noise of one sensor": (noisy_last, ("the torque of joint2 is noise",), "`columns.tau_J` (tau2)"),
+    "a sensor that drifts": (drift, ("is not the arm's: nothing of the motion is in it",), "`columns.tau_J`"),
+    "a stuck sensor": (stuck, ("the torque of joint1 (tau1) is stuck at", "for 0.99 s, from 4.5"), "--from"),
+    "a clipped sensor": (clipped, ("the torque of joint1 (tau1) is clipped at -",), "range"),
+    "a dead encoder": (lambda m: still(m, 1), ("the position of joint2 (q2) is always",), "`columns.q`"),
+    "an arm at rest": (lambda m: still(still(m, 0), 1), ("the arm does not move",), "motion of every joint"),
+    "too short": (short, ("too short: 0.9 s fitted and 0.6 s tested",), "record more"),
+}
+
+
+@pytest.mark.parametrize("kind", UNEXPLAINED)
+def test_what_can_not_be_explained_is_named_with_the_next_thing_to_do(
+    tmp_path: Path, upright: Motion, kind: str
+) -> None:
+    spoil, causes, remedy = UNEXPLAINED[kind]
+    verdict = judged(tmp_path, spoil(upright)).verdict
+    assert not verdict.is_explained
+    assert verdict.headline.startswith("NOT explained")
+    for cause in causes:
+        assert cause in verdict.reasons[0]
+    assert len(verdict.reasons) == 1
+    assert remedy in verdict.remedy
+
+
+def test_the_share_is_that_of_what_the_same_filter_leaves_of_the_torque(tmp_path: Path, upright: Motion) -> None:
+    """Noise that the filter takes away is no merit of the model's: of noise alone nothing is explained, at any rate."""
+    for period_s in (5e-3, 2e-3, 1e-3):
+        motion = record(urdf_text(2, UPRIGHT), period_s=period_s)
+        found = judged(tmp_path, replace(motion, tau=noise(motion.tau.shape)))
+        assert np.all(found.explained < 0.1)
+        assert not found.verdict.is_explained
+    half = replace(upright, tau=upright.tau + 1.5 * np.std(upright.tau, axis=0) * np.sin(40.0 * upright.t)[:, None])
+    assert np.all(judged(tmp_path, half).explained > 0.95)  # 40 rad/s hardly pass 10 rad/s twice
+
+
+def test_a_passive_joint_is_named_and_the_driven_one_explained(tmp_path: Path) -> None:
+    """The forearm swings freely: nothing but noise is at its sensor, and its friction is none."""
+    text = urdf_text(2, UPRIGHT)
+    motion = record(text)
+    free = replace(motion, tau=np.column_stack([motion.tau[:, 0], noise(len(motion.t))]))
+    (reason,) = judged(tmp_path, free).verdict.reasons
+    assert "the torque of joint2 is noise" in reason
+    assert "nothing drives the joint" in reason
+
+
+def test_a_wrong_model_says_how_far_it_is_off(tmp_path: Path, upright: Motion) -> None:
+    spring = replace(upright, tau=upright.tau + [0.0, 1.5] * np.sin(3.0 * upright.q))
+    verdict = judged(tmp_path, spring).verdict
+    assert any(reason.startswith("joint2: ") and "99 % are needed" in reason for reason in verdict.reasons)
+    assert "--out" in verdict.remedy
+    motors = judged(tmp_path, spring, more='[units]\ntau_J = "A"\n').verdict
+    assert "`arm.has_rotors` = true" in motors.remedy
+
+
+def test_friction_that_drives_and_a_negative_term_of_it_are_said(tmp_path: Path, upright: Motion) -> None:
+    compensated = replace(upright, tau=upright.tau - 2.0 * upright.truth["F_c"] * np.sign(upright.dq))
+    verdict = judged(tmp_path, compensated, has_dq=True).verdict
+    assert any(remark.startswith("friction drives joint1 on: F_v ") for remark in verdict.remarks)
+    curved = replace(upright, tau=upright.tau - 0.5 * upright.truth["F_v"] * upright.dq * 3.0)
+    verdict = judged(tmp_path, curved, has_dq=True).verdict
+    assert any(remark.startswith("F_v1 of joint1 is negative, -0.1") for remark in verdict.remarks)
+
+
+def test_an_inertia_that_no_masses_make_is_said(tmp_path: Path, level: Motion) -> None:
+    ddq = np.gradient(level.dq, level.t, axis=0)
+    odd = replace(level, tau=level.tau - np.array([3.0, 0.0]) * ddq)
+    verdict = judged(tmp_path, odd, LEVEL, has_dq=True).verdict
+    assert any("the inertia about joint1 is negative, -" in reason and "kg m²" in reason for reason in verdict.reasons)
+
+
+def test_motion_that_tells_nothing_of_a_parameter_is_too_little_excitation(tmp_path: Path) -> None:
+    text = urdf_text(2, UPRIGHT)
+    motion = record(text)
+    held = replace(motion, q=motion.q * [1.0, 0.0] + [0.0, 0.3], dq=motion.dq * [1.0, 0.0])
+    arm = read_urdf(text)
+    from foreign_arms import rigid_torque
+
+    ddq = np.gradient(held.dq, held.t, axis=0)
+    tau = rigid_torque(arm, np.array([held.q, held.dq, ddq])) + 0.3 * np.sign(held.dq) + noise(held.q.shape)
+    verdict = judged(tmp_path, replace(held, tau=tau), has_dq=True).verdict
+    assert any("too little excitation: the motion tells next to nothing of" in text for text in verdict.remarks)
+    assert any("joint2 (q2) is always 0.3 rad" in text for text in (*verdict.remarks, *verdict.reasons))
+
+
+# Common mistakes.
+
+TURNED = np.array([1.0, -1.0])
+SUMS = np.array([[1.0, 0.0], [1.0, 1.0]])
+"""Columns that count from the base: q1, q1 + q2."""
+DEGREE = math.pi / 180.0
+
+MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str, str]] = {
+    "mNm": (lambda m: replace(m, tau=1e3 * m.tau), "", "they are mNm", '`units.tau_J` = "mNm"'),
+    "mNm that are none": (lambda m: m, '[units]\ntau_J = "mNm"\n', "they are Nm", '`units.tau_J` = "Nm"'),
+    "degrees": (
+        lambda m: replace(m, q=m.q / DEGREE, dq=m.dq / DEGREE),
+        "",
+        "the positions are degrees",
+        '`units.q` = "deg"',
+    ),
+    "degrees that are none": (lambda m: m, '[units]\nq = "deg"\n', "the positions are radians", '`units.q` = "rad"'),
+    "a torque that is turned": (
+        lambda m: replace(m, tau=m.tau * TURNED),
+        "",
+        "the torque of joint2 has the other sign",
+        "`scale.tau_J` = [1, -1]",
+    ),
+    "a torque that the map turns": (
+        lambda m: m,
+        "[scale]\ntau_J = [1.0, -1.0]\n",
+        "the torque of joint2 has the other sign",
+        "`scale.tau_J` = [1, 1]",
+    ),
+    "all torques turned": (
+        lambda m: replace(m, tau=-m.tau),
+        "",
+        "all torques have the other sign",
+        "`scale.tau_J` = [-1, -1]",
+    ),
+    "a position that is turned": (
+        lambda m: replace(m, q=m.q * TURNED, dq=m.dq * TURNED),
+        "",
+        "the position of joint2 counts the other way round",
+        "`scale.q` = [1, -1]",
+    ),
+    "a joint that is turned": (
+        lambda m: replace(m, q=m.q * TURNED, dq=m.dq * TURNED, tau=m.tau * TURNED),
+        "",
+        "joint2 counts the other way round, position and torque",
+        "`scale.q` = [1, -1], `scale.tau_J` = [1, -1]",
+    ),
+    "torques exchanged": (
+        lambda m: replace(m, tau=m.tau[:, ::-1]),
+        "",
+        "the torques of joint1 and joint2 are exchanged",
+        "`columns.tau_J`",
+    ),
+    "positions exchanged": (
+        lambda m: replace(m, q=m.q[:, ::-1], dq=m.dq[:, ::-1]),
+        "",
+        "the positions of joint1 and joint2 are exchanged",
+        "`columns.q`",
+    ),
+    "joints exchanged": (
+        lambda m: replace(m, q=m.q[:, ::-1], dq=m.dq[:, ::-1], tau=m.tau[:, ::-1]),
+        "",
+        "joint1 and joint2 are exchanged, positions and torques",
+        "`columns.q`, `columns.tau_J`",
+    ),
+    "positions that count from the base": (
+        lambda m: replace(m, q=m.q @ SUMS.T, dq=m.dq @ SUMS.T),
+        "",
+        "the column of joint2 has the sum of joint1 and joint2:",
+        "own positions",
+    ),
+    "coupled joints": (
+        lambda m: replace(m, q=m.q @ SUMS.T, dq=m.dq @ SUMS.T, tau=m.tau @ np.linalg.inv(SUMS)),
+        "",
+        "the column of joint2 has the sum of joint1 and joint2, and so do the torques:",
+        "own positions",
+    ),
+    "rotors": (
+        lambda m: replace(m, tau=m.tau + np.array([0.9, 0.5]) * np.gradient(m.dq, m.t, axis=0)),
+        "",
+        "geared motors, which turn their rotors too",
+        "`arm.has_rotors` = true",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.parametrize("has_dq", [False, True])
+def test_a_common_mistake_is_named_with_its_key(tmp_path: Path, upright: Motion, mistake: str, has_dq: bool) -> None:
+    spoil, keys, said, remedy = MISTAKES[mistake]
+    verdict = judged(tmp_path, spoil(upright), has_dq=has_dq, more=keys).verdict
+    assert not verdict.is_explained
+    assert said in verdict.reasons[0]
+    assert verdict.remedy.startswith("in the map: ")
+    assert remedy in verdict.remedy
+
+
+def test_what_is_named_makes_the_recording_explained(tmp_path: Path, upright: Motion) -> None:
+    turned = replace(upright, q=upright.q * TURNED, dq=upright.dq * TURNED, tau=1e3 * upright.tau * TURNED)
+    keys = '[units]\ntau_J = "mNm"\n[scale]\nq = [1, -1]\ntau_J = [1, -1]\n'
+    assert not judged(tmp_path, turned).verdict.is_explained
+    assert judged(tmp_path, turned, more=keys).verdict.is_explained
+
+
+@pytest.mark.parametrize("mistake", ["a torque that is turned", "joints exchanged", "coupled joints", "degrees"])
+def test_a_mistake_with_three_joints_is_named(tmp_path: Path, mistake: str) -> None:
+    motion = record(urdf_text(3, AXES))
+    spoilt = {
+        "a torque that is turned": replace(motion, tau=motion.tau * column(3, 2, -1.0)),
+        "joints exchanged": replace(
+            motion, q=motion.q[:, [1, 0, 2]], dq=motion.dq[:, [1, 0, 2]], tau=motion.tau[:, [1, 0, 2]]
+        ),
+        "coupled joints": replace(
+            motion, q=np.cumsum(motion.q, axis=1), tau=motion.tau @ np.linalg.inv(np.tril(np.ones((3, 3))))
+        ),
+        "degrees": replace(motion, q=np.degrees(motion.q)),
+    }
+    said = {
+        "a torque that is turned": "the torque of joint3 has the other sign",
+        "joints exchanged": "joint1 and joint2 are exchanged, positions and torques",
+        "coupled joints": "each position counts from the base, not from the link before, and so do the torques",
+        "degrees": "the positions are degrees",
+    }
+    assert said[mistake] in judged(tmp_path, spoilt[mistake], AXES).verdict.reasons[0]
+
+
+def test_which_joint_of_an_arm_without_gravity_is_turned_nobody_can_say(tmp_path: Path, level: Motion) -> None:
+    turned = replace(level, q=level.q * TURNED, tau=level.tau * TURNED)
+    (reason,) = judged(tmp_path, turned, LEVEL).verdict.reasons
+    assert "joint1 counts the other way round, position and torque, or joint2 counts" in reason or (
+        "joint2 counts the other way round, position and torque, or joint1 counts" in reason
+    )
+
+
+def test_an_arm_without_masses_in_its_urdf_is_judged_by_its_effort_and_by_its_reach(
+    tmp_path: Path, upright: Motion
+) -> None:
+    milli = replace(upright, tau=1e3 * upright.tau)
+    (reason,) = judged(tmp_path, milli, has_masses=False).verdict.reasons
+    assert "Nm, the URDF allows 60 Nm" in reason
+    (reason,) = judged(tmp_path, milli, has_masses=False, effort=1e6).verdict.reasons
+    assert "kg at the arm's reach" in reason
+    assert judged(tmp_path, upright, has_masses=False).verdict.is_explained
+
+
+def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path: Path, upright: Motion) -> None:
+    """Some have a thousandth of a kilogram to please a simulator."""
+    verdict = judged(tmp_path, upright, density=1e-3).verdict
+    assert verdict.is_explained
+    assert any("times those that the masses of the URDF need: a unit" in remark for remark in verdict.remarks)
+
+
+VELOCITIES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str, str]] = {
+    "deg/s": (lambda dq: dq / DEGREE, "the velocity of joint1 (dq1) is 57.3 times", '`units.dq` = "deg/s"'),
+    "rpm": (lambda dq: dq * 30.0 / math.pi, "the velocity of joint1 (dq1) is 9.55 times", '`units.dq` = "rpm"'),
+    "another sign": (lambda dq: dq * TURNED, "the velocity of joint2 (dq2) has the other sign", "`columns.dq`"),
+    "exchanged": (lambda dq: dq[:, ::-1], "the velocity of joint1 (dq1) is in the column of joint2", "`columns.dq`"),
+}
+
+
+@pytest.mark.parametrize("kind", VELOCITIES)
+def test_velocities_that_are_not_the_slope_of_the_positions_are_named(
+    tmp_path: Path, upright: Motion, kind: str
+) -> None:
+    spoil, said, remedy = VELOCITIES[kind]
+    verdict = judged(tmp_path, replace(upright, dq=spoil(upright.dq)), has_dq=True).verdict
+    assert not verdict.is_explained
+    assert said in verdict.reasons[0]
+    assert remedy in verdict.remedy
+
+
+def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path: Path, upright: Motion) -> None:
+    noisy = replace(upright, dq=upright.dq + 1.0 * np.random.default_rng(5).standard_normal(upright.dq.shape))
+    verdict = judged(tmp_path, noisy, has_dq=True).verdict
+    assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in verdict.remarks)
+
+
+# The command.
+
+
+def test_the_command_says_verdict_reasons_and_the_next_thing_to_do(tmp_path: Path, upright: Motion) -> None:
+    recording, described = write_recording(tmp_path, urdf_text(2, UPRIGHT), replace(upright, tau=upright.tau * TURNED))
+    arguments = ["identify", str(recording), "--map", str(described)]
+    played = CliRunner().invoke(cli, arguments)
+    assert played.exit_code == 3
+    assert "s: NOT explained" in played.stdout
+    assert "because the torque of joint2 has the other sign" in played.stdout
+    assert "next: in the map: `scale.tau_J` = [1, -1]; then identify again" in played.stderr
+    verdict = json.loads(CliRunner().invoke(cli, [*arguments, "--json"]).stdout)["test"]["verdict"]
+    assert not verdict["is_explained"]
+    assert verdict["next"] == "in the map: `scale.tau_J` = [1, -1]"
+
+
+def test_json_of_a_recording_without_torque_is_json(tmp_path: Path, upright: Motion) -> None:
+    recording, described = write_recording(tmp_path, urdf_text(2, UPRIGHT), replace(upright, tau=0.0 * upright.tau))
+    played = CliRunner().invoke(cli, ["identify", str(recording), "--map", str(described), "--json"])
+    test = json.loads(played.stdout, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))["test"]
+    assert played.exit_code == 3
+    assert (test["margin"], test["explained"]) == (None, {"joint1": None, "joint2": None})
+
+
+def test_what_was_left_out_of_a_recording_is_told(tmp_path: Path, upright: Motion) -> None:
+    recording, described = write_recording(tmp_path, urdf_text(2, UPRIGHT), upright)
+    rows = recording.read_text().splitlines(keepends=True)
+    recording.write_text("".join([*rows[:901], *rows[900:]]))
+    played = CliRunner().invoke(cli, ["identify", str(recording), "--map", str(described)])
+    assert played.exit_code == 0
+    assert "r.csv: 1 row with the time of the row before left out (row 902: 4.495 s once more)" in played.stdout
+
+
+def test_the_picture_of_the_test_has_the_thresholds_of_its_margin(tmp_path: Path, upright: Motion) -> None:
+    spring = replace(upright, tau=upright.tau + [0.0, 1.5] * np.sin(3.0 * upright.q))
+    found = judged(tmp_path, spring)
+    ratios = [
+        threshold[1:] / np.abs(residual[1:])
+        for residual, threshold in zip(found.test.tau_ext_hat, found.test.threshold, strict=True)
+    ]
+    assert np.concatenate(ratios).min() == pytest.approx(found.certificate.margin)
+    assert found.test.contacts
+
+
+def test_an_arm_has_an_inertia_about_every_joint_and_friction_that_takes_power(upright: Motion) -> None:
+    arm = read_urdf(urdf_text(2, UPRIGHT))
+    model = model_of(arm.chain)
+    theta = np.concatenate([model.base.map @ arm.theta_full, [0.1, 0.1, 0.2, 0.2, 0.0, 0.0]])
+    assert is_possible(model, theta, upright.q, upright.dq)
+    light = theta.copy()
+    light[model.parameter_names.index("Iyy_2")] = -0.01
+    driven = theta.copy()
+    driven[model.place_of("F_c")] = [0.2, -0.2]
+    assert not is_possible(model, light, upright.q, upright.dq)
+    assert not is_possible(model, driven, upright.q, upright.dq)
