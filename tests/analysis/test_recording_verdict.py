@@ -149,7 +149,11 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], tuple[str, ...], str]] 
         "`columns.tau_J` (tau1, tau2)",
     ),
     "noise of one sensor": (noisy_last, ("the torque of joint2 is noise",), "`columns.tau_J` (tau2)"),
-    "a sensor that drifts": (drift, ("is not the arm's: nothing of the motion is in it",), "`columns.tau_J`"),
+    "a sensor that drifts": (
+        drift,
+        ("nothing of the torque of joint1 and joint2 is explained: the sensor is dead",),
+        "`columns.tau_J`",
+    ),
     "a stuck sensor": (stuck, ("the torque of joint1 (tau1) is stuck at", "for 0.99 s, from 4.5"), "--from"),
     "a clipped sensor": (clipped, ("the torque of joint1 (tau1) is clipped at -",), "range"),
     "a dead encoder": (lambda m: still(m, 1), ("the position of joint2 (q2) is always",), "`columns.q`"),
@@ -401,6 +405,12 @@ def test_velocities_that_are_not_the_slope_of_the_positions_are_named(
     assert not verdict.is_explained
     assert said in verdict.reasons[0]
     assert remedy in verdict.remedy
+
+
+def test_a_position_that_stays_while_its_velocity_does_not_is_a_dead_encoder(tmp_path: Path, level: Motion) -> None:
+    verdict = judged(tmp_path, still(level, 1), LEVEL, has_dq=True).verdict
+    assert "though by its velocity it turns: a dead encoder" in verdict.reasons[0]
+    assert not verdict.is_explained
 
 
 def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path: Path, upright: Motion) -> None:

@@ -24,10 +24,12 @@ _STUCK_TIMES: Final = 5.0
 _CLIPPED_SHARE, _CLIPPED_ROWS, _CLIPPED_RUN = 0.005, 10, 5
 _CLIPPED_BAND: Final = 0.05
 """Of the span below the largest reading, which a clipped sensor passes in less time than it stays at the bound."""
-_FEWEST_LEVELS: Final = 50
-"""Of a sensor whose largest reading says anything."""
+_FEWEST_LEVELS, _FINE_LEVELS = 50, 200
+"""Of a sensor whose largest reading says anything, and of one that a sine leaves sooner, to half the time."""
 STILL_RAD: Final = 0.01
 """A joint that travels less is at rest."""
+_TURNS_THOUGH_STILL_RAD: Final = 0.3
+"""Travel by the velocities, of a joint at rest, that neither their noise nor their offset makes."""
 _WELL_CORRELATED: Final = 0.8
 _SAME_SLOPE: Final = (0.8, 1.25)
 _BEYOND_LIMITS: Final = 3.0
@@ -142,6 +144,14 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
     for joint in still if len(still) < n else ():
         name, always = column_name(described, "q", joint), columns.q[0, joint]
         how = f"is always {always:g} rad" if travel[joint] == 0.0 else f"changes by less than {STILL_RAD:g} rad"
+        turned = float(np.ptp(np.cumsum(columns.dq[:, joint]))) * columns.period_s
+        if turned > _TURNS_THOUGH_STILL_RAD:
+            yield ColumnFinding(
+                f"the position of {name} {how}, though by its velocity it turns: a dead encoder",
+                "check that encoder, and `columns.q`",
+                is_wrong=True,
+            )
+            continue
         yield ColumnFinding(
             f"the position of {name} {how}: a dead encoder, or a joint at rest, of which neither friction nor inertia "
             "can be learnt",
@@ -229,12 +239,12 @@ def _clipped_at(torque: Vector) -> Iterator[float]:
     levels = np.unique(torque)
     if len(levels) < _FEWEST_LEVELS:
         return
-    span = levels[-1] - levels[0]
     runs = _runs(torque)
+    lengths, at_run = runs[:, 1] - runs[:, 0], torque[runs[:, 0]]
+    times = 1.0 if len(levels) < _FINE_LEVELS else 0.5
     for bound in (levels[0], levels[-1]):
-        is_at = torque == bound
-        at = int(np.count_nonzero(is_at))
-        beside = int(np.count_nonzero(np.abs(torque - bound) <= _CLIPPED_BAND * span)) - at
-        longest = max((last - first for first, last in runs.tolist() if is_at[first]), default=0)
-        if at > max(_CLIPPED_SHARE * len(torque), _CLIPPED_ROWS, beside) and longest >= _CLIPPED_RUN:
+        at = int(lengths[at_run == bound].sum())
+        beside = int(np.count_nonzero(np.abs(torque - bound) <= _CLIPPED_BAND * (levels[-1] - levels[0]))) - at
+        is_long = lengths[at_run == bound].max() >= _CLIPPED_RUN
+        if at > max(_CLIPPED_SHARE * len(torque), _CLIPPED_ROWS, times * beside) and is_long:
             yield float(bound)

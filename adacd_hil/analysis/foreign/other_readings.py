@@ -22,9 +22,9 @@ from adacd_hil.records import Vector
 from adacd_hil.scheme.identify import offline
 from adacd_hil.scheme.identify.offline import ArmModel, OfflineSettings, Record
 
-_MOST_S: Final = 15.0
+_MOST_S: Final = 10.0
 """Of fit and of test that is looked at."""
-_PERIOD_S: Final = 5e-3
+_PERIOD_S: Final = 1e-2
 """Samples closer than this are left out: the filter of the fit is slower by far."""
 _MOST_SIGNS: Final = 7
 """Joints of which all choices of signs are tried."""

@@ -235,18 +235,22 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
     related = _related_to_motion(fit)
     is_noise = [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
     empty = [i for i, joint in enumerate(joints) if joint.share < NOTHING and (is_noise[i] or related[i] < NOTHING)]
-    for kind, chosen in (
-        ("noise", [i for i in empty if is_noise[i]]),
-        ("not the arm's", [i for i in empty if not is_noise[i]]),
+    for chosen, text in (
+        (
+            [i for i in empty if is_noise[i]],
+            "the torque of {names} is noise: nothing of the motion is in it. The sensor is dead, the column is another "
+            "one's, or nothing drives the joint",
+        ),
+        (
+            [i for i in empty if not is_noise[i]],
+            "nothing of the torque of {names} is explained: the sensor is dead, the column is another one's, nothing "
+            "drives the joint, or it moves in the test as it never did in the fit",
+        ),
     ):
         if chosen:
             names = joined_names([joints[i].name for i in chosen], len(joints))
-            yield _Finding(
-                f"the torque of {names} is {kind}: nothing of the motion is in it. The sensor is dead, the column is "
-                "another one's, or nothing drives the joint",
-                f"check the sensor of {names}, and {_column(fit.described, 'tau_J', chosen)}",
-                is_against=True,
-            )
+            remedy = f"check the sensor of {names}, and {_column(fit.described, 'tau_J', chosen)}"
+            yield _Finding(text.format(names=names), remedy, is_against=True)
     weak = [
         joint.name
         for i, joint in enumerate(joints)

@@ -284,7 +284,7 @@ def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tupl
     count = len(record.q) // settings.fit_every
     shape = (count, model.joints, len(model.parameter_names))
     rows = _Rows(np.zeros(shape), np.zeros(shape[:2]))
-    zero = ModelEstimate(np.zeros(shape[2]), np.zeros((shape[2],) * 2))
+    zero = ModelEstimate(np.zeros(shape[2]), np.zeros((0, 0)))
     _fit_trace(model, record, zero, settings, zero.theta, rows=rows)
     return rows.W, rows.tau
 
@@ -578,7 +578,8 @@ def _run(
             _fill_mass(arm, place, rotor_column, q[k], theta_M, scratch, m.unit, m.Y_unit, m.Y_rest, m.through)
         for i in range(n):
             m.noise[i] = np.sqrt(noise_Nm[i] ** 2 + passed_rad_s2**2 * m.through[i])
-        fill_deviation(m.W, P, m.noise, m.WP, trace.deviation[k])
+        if P.shape[0] > 0:
+            fill_deviation(m.W, P, m.noise, m.WP, trace.deviation[k])
         trace.unit[k] = m.W[0, offset_column]
         for i in range(n):
             trace.friction[k, i] = m.standstill[i] * max(F_c[i], 0.0)
