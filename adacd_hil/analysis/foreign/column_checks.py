@@ -159,7 +159,8 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
         )
     for joint in range(n):
         low, high = urdf.position_low[joint], urdf.position_high[joint]
-        bound = max(abs(low), abs(high)) if np.isfinite(low + high) and high > low else math.pi * 4.0
+        is_known = np.isfinite(low) and np.isfinite(high) and high > low
+        bound = max(abs(low), abs(high)) if is_known else math.pi * 4.0
         reach, speed = np.abs(columns.q[:, joint]).max(), np.quantile(np.abs(columns.dq[:, joint]), 0.99)
         limit = urdf.velocity_limit[joint]
         is_fast = np.isfinite(limit) and limit > 0.0 and speed > _BEYOND_LIMITS * limit

@@ -96,7 +96,7 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
     form = described.csv
     number = 0
     try:
-        with _open(path) as file:
+        with open_text(path) as file:
             for _ in range(form.skip_rows):
                 next(file, "")
             lines: Iterator[list[str]]
@@ -116,7 +116,7 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
         raise LogError(f"recording {path}: {error.strerror or error}") from None
 
 
-def _open(path: Path) -> TextIO:
+def open_text(path: Path) -> TextIO:
     """Open a file of text. Raises LogError for what is of another kind, OSError."""
     file = open_input(path)
     begin = file.peek(16)
@@ -231,7 +231,7 @@ class _RowReader:
         """Name the key of the map with which a cell could be read."""
         if self._described.csv.decimal == "." and text.count(",") == 1 and _is_number(text.replace(",", ".")):
             return ', no number: `csv.decimal` = "," reads it'
-        if column is self._columns[0] and _is_iso(text):
+        if column is self._columns[0] and is_iso_time(text):
             return f', no number: `units.time` = "{ISO}" reads it'
         return ", no number"
 
@@ -272,7 +272,8 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _is_iso(text: str) -> bool:
+def is_iso_time(text: str) -> bool:
+    """Tell whether a text is a date and time of ISO 8601."""
     try:
         _iso_seconds(text)
     except ValueError:

@@ -9,9 +9,10 @@ import click
 
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show
-from adacd_hil.file_access import replace_file
-from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
+from adacd_hil.file_access import place_file, replace_file
+from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.progress_lines import Progress
+from adacd_hil.settings.toml_files import toml_value
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -28,7 +29,10 @@ _RECORDING = GivenPath()
     "test; the verdict says why."
 )
 @click.argument("recordings", nargs=-1, required=True, type=_RECORDING)
-@click.option("--map", "map_path", required=True, type=GIVEN_FILE, help="TOML: what the columns are, and of which arm.")
+@click.option(
+    "--map", "map_path", type=WrittenPath(dir_okay=False), help="TOML: what the columns are, and of which arm."
+)
+@click.option("--init", "is_init", is_flag=True, help="Write that map: --init RECORDING URDF.")
 @click.option("--test", type=_RECORDING, help="Recording to test on; default: the last part of the last one fitted.")
 @click.option("--watch", multiple=True, type=_RECORDING, help="Recording in which to look for contacts; repeatable.")
 @click.option("--from", "start_s", type=float, default=0.0, show_default=True, help="Fit from this time on, s.")
@@ -38,7 +42,8 @@ _RECORDING = GivenPath()
 @explained
 def identify(
     recordings: tuple[Path, ...],
-    map_path: Path,
+    map_path: Path | None,
+    is_init: bool,
     test: Path | None,
     watch: tuple[Path, ...],
     start_s: float,
@@ -46,16 +51,21 @@ def identify(
     out: Path | None,
     as_json: bool,
 ) -> ExitCode:
-    """Identify an arm from RECORDINGS, CSV files with positions, torques and, if there are some, velocities.
+    """Identify an arm from RECORDINGS of positions, torques and, if there are some, velocities: CSV, MCAP, rosbags.
 
-    RECORDINGS are of free motion. What they don't explain of the test is told per joint; with the model frozen,
-    contacts are looked for in the recordings of --watch.
+    RECORDINGS are of free motion. The verdict says whether their torque is explained, why not, and what to do next.
+    With the model frozen, contacts are looked for in the recordings of --watch. With --init a recording and a URDF make
+    a map, whose guesses are told.
     """
     from adacd_hil.analysis.foreign.recording_identification import identify as run
     from adacd_hil.analysis.foreign.recording_import import read_recording
     from adacd_hil.analysis.foreign.recording_map import read_map
     from adacd_hil.log.log_files import TimeWindow
 
+    if is_init:
+        return _init(recordings, map_path)
+    if map_path is None:
+        raise CommandError("--map is missing; `adacd-hil identify --init RECORDING URDF` writes one", ExitCode.USAGE)
     if not start_s < end_s:
         raise CommandError(f"--from {start_s:g} s is not before --until {end_s:g} s", ExitCode.USAGE)
     described = read_map(map_path)
@@ -78,6 +88,31 @@ def identify(
     else:
         show(_as_text(found), *_next(found, map_path, recordings[0]))
     return ExitCode.OK if found.is_explained else ExitCode.PARTIAL
+
+
+def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
+    """Write the map of a recording, and tell what is guessed."""
+    from adacd_hil.analysis.foreign.map_draft import draft_map
+    from adacd_hil.analysis.foreign.recording_map import read_map
+
+    urdfs = [path for path in given if path.suffix.lower() in (".urdf", ".xml")]
+    others = [path for path in given if path not in urdfs]
+    if len(urdfs) != 1 or len(others) != 1:
+        raise CommandError("--init takes one recording and one URDF, a file that ends in .urdf", ExitCode.USAGE)
+    recording = others[0]
+    target = map_path or recording.parent / "map.toml"
+    draft = draft_map(recording, urdfs[0], target)
+    try:
+        place_file(target, draft.text().encode())
+    except FileExistsError:
+        line = f"{target} is another map already; --map names a file for this one"
+        raise CommandError(line, ExitCode.USAGE) from None
+    read_map(target)
+    rows = [(f"{key.section}.{key.key}", toml_value(key.value), key.reason) for key in draft.keys]
+    table = format_table(("key", "value", "a guess, because"), [row for row in rows if row[2]])
+    told = f"{target} written" + (f"; look at these:\n{table}" if draft.guesses else ", nothing in it is a guess")
+    show(told, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
+    return ExitCode.OK
 
 
 def _next(found: "Identified", map_path: Path, recording: Path) -> tuple[str, ...]:

@@ -1,0 +1,240 @@
+"""`identify --init`: the map of a recording, drafted from its heads and values and the URDF."""
+
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from foreign_arms import AXES, Motion, record, urdf_text
+from joint_state_bags import State, write_mcap
+
+from adacd_hil.analysis.foreign.map_draft import MapDraft, draft_map
+from adacd_hil.analysis.foreign.recording_map import read_map
+from adacd_hil.cli.main import cli
+from adacd_hil.log.log_files import LogError
+from adacd_hil.settings.schema import ConfigError
+
+URDF = urdf_text(2, ("0 1 0",) * 2, effort=20.0)
+Q, DQ, TAU = ("q1", "q2"), ("dq1", "dq2"), ("tau1", "tau2")
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    return record(URDF, seconds=3.0)
+
+
+def table(heads: str, *columns, delimiter: str = ",", form: Callable[[float], str] = "{:.6g}".format) -> str:
+    values = np.column_stack(columns)
+    rows = [delimiter.join(form(value) for value in row) for row in values.tolist()]
+    return "\n".join([*([heads] if heads else []), *rows]) + "\n"
+
+
+def draft(folder: Path, text: str, urdf: str = URDF) -> tuple[MapDraft, dict]:
+    """Draft a map, write and read it, and return it with its tables."""
+    (folder / "arm.urdf").write_text(urdf)
+    (folder / "r.csv").write_text(text)
+    found = draft_map(folder / "r.csv", folder / "arm.urdf", folder / "map.toml")
+    (folder / "map.toml").write_text(found.text())
+    read_map(folder / "map.toml")
+    return found, tomllib.loads(found.text())
+
+
+HEADS = {
+    "plain": ("t,q1,q2,dq1,dq2,tau1,tau2", ("t", Q, DQ, TAU), {}),
+    "counted from zero": (
+        "time,pos_0,pos_1,vel_0,vel_1,effort_0,effort_1",
+        ("time", ("pos_0", "pos_1"), ("vel_0", "vel_1"), ("effort_0", "effort_1")),
+        {},
+    ),
+    "units behind": (
+        "time_ms,j1_deg,j2_deg,v1_rpm,v2_rpm,j1_mNm,j2_mNm",
+        ("time_ms", ("j1_deg", "j2_deg"), ("v1_rpm", "v2_rpm"), ("j1_mNm", "j2_mNm")),
+        {"time": "ms", "q": "deg", "dq": "rpm", "tau_J": "mNm"},
+    ),
+    "units in brackets": (
+        "Time [s],q1 [rad],q2 [rad],qd1 [rad/s],qd2 [rad/s],tau1 (N m),tau2 (N m)",
+        ("Time [s]", ("q1 [rad]", "q2 [rad]"), ("qd1 [rad/s]", "qd2 [rad/s]"), ("tau1 (N m)", "tau2 (N m)")),
+        {"q": "rad"},
+    ),
+    "of a controller": (
+        "timestamp,actual_q_0,actual_q_1,actual_qd_0,actual_qd_1,actual_current_0,actual_current_1",
+        (
+            "timestamp",
+            ("actual_q_0", "actual_q_1"),
+            ("actual_qd_0", "actual_qd_1"),
+            ("actual_current_0", "actual_current_1"),
+        ),
+        {"tau_J": "A"},
+    ),
+    "by the joints' names": (
+        "stamp,joint1/position,joint2/position,joint1/velocity,joint2/velocity,joint1/effort,joint2/effort",
+        (
+            "stamp",
+            ("joint1/position", "joint2/position"),
+            ("joint1/velocity", "joint2/velocity"),
+            ("joint1/effort", "joint2/effort"),
+        ),
+        {},
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", HEADS)
+def test_columns_and_units_are_found_by_their_heads(tmp_path: Path, motion: Motion, kind: str) -> None:
+    heads, (time, q, dq, tau), units = HEADS[kind]
+    _, keys = draft(tmp_path, table(heads, motion.t, motion.q, motion.dq, motion.tau))
+    assert keys["columns"] == {"time": time, "q": list(q), "dq": list(dq), "tau_J": list(tau)}
+    assert keys.get("units", {}) == units
+
+
+def test_joints_in_another_order_are_put_in_the_urdfs(tmp_path: Path, motion: Motion) -> None:
+    heads = "t,joint2_pos,joint1_pos,joint2_effort,joint1_effort"
+    _, keys = draft(tmp_path, table(heads, motion.t, motion.q[:, ::-1], motion.tau[:, ::-1]))
+    assert keys["columns"]["q"] == ["joint1_pos", "joint2_pos"]
+    assert keys["columns"]["tau_J"] == ["joint1_effort", "joint2_effort"]
+
+
+def test_measured_columns_go_before_desired_and_filtered_ones(tmp_path: Path, motion: Motion) -> None:
+    heads = "t,q_des1,q_des2,q_filt1,q_filt2,q_meas1,q_meas2,tau_cmd1,tau_cmd2,tau_meas1,tau_meas2,qdd1,qdd2"
+    text = table(heads, motion.t, motion.q, motion.q, motion.q, motion.tau, motion.tau, motion.q)
+    found, keys = draft(tmp_path, text)
+    assert keys["columns"] == {"time": "t", "q": ["q_meas1", "q_meas2"], "tau_J": ["tau_meas1", "tau_meas2"]}
+    reasons = {key.key: key.reason for key in found.guesses}
+    assert reasons["q"] == "one of q_des1, q_filt1, q_meas1"
+
+
+def test_what_heads_leave_open_is_guessed_from_spans_against_the_urdf(tmp_path: Path, motion: Motion) -> None:
+    heads = "t,q1,q2,dq1,dq2,tau1,tau2"
+    columns = (5.0 * np.arange(len(motion.t)), np.degrees(motion.q), np.degrees(motion.dq), 1e3 * motion.tau)
+    found, keys = draft(tmp_path, table(heads, *columns))
+    assert keys["units"] == {"time": "ms", "q": "deg", "dq": "deg/s", "tau_J": "mNm"}
+    reasons = {key.key: key.reason for key in found.guesses}
+    assert reasons["time"] == "rows are 5 ms apart"
+    assert "the URDF to 2 rad" in reasons["q"]
+    assert "the effort of the URDF is 20 Nm" in reasons["tau_J"]
+    _, keys = draft(tmp_path, table(heads, motion.t, motion.q, motion.dq, motion.tau))
+    assert "units" not in keys
+
+
+def test_columns_without_heads_are_found_by_their_slopes(tmp_path: Path, motion: Motion) -> None:
+    _, keys = draft(tmp_path, table("", motion.t, motion.q, motion.dq, motion.tau, motion.tau))
+    assert keys["csv"] == {"has_header": False}
+    assert keys["columns"] == {"time": "1", "q": ["2", "3"], "dq": ["4", "5"], "tau_J": ["6", "7"]}
+
+
+def test_semicolons_decimal_commas_and_lines_above_the_head_are_found(tmp_path: Path, motion: Motion) -> None:
+    text = table(
+        "t;q1;q2;tau1;tau2",
+        motion.t,
+        motion.q,
+        motion.tau,
+        delimiter=";",
+        form=lambda value: f"{value:.5f}".replace(".", ","),
+    )
+    head, _, rows = text.partition("\n")
+    _, keys = draft(tmp_path, f"Recorder 3.1\nArm;left\n{head}\ns;deg;deg;Nm;Nm\n{rows}")
+    assert keys["csv"] == {"delimiter": ";", "decimal": ",", "skip_rows": 2}
+    assert keys["units"] == {"q": "deg"}
+
+
+def test_dates_are_found(tmp_path: Path, motion: Motion) -> None:
+    rows = table("", motion.q, motion.tau).splitlines()
+    dated = [f"2024-05-01T10:00:{0.005 * k:09.6f}Z,{row}" for k, row in enumerate(rows)]
+    _, keys = draft(tmp_path, "\n".join(["stamp,q1,q2,tau1,tau2", *dated]))
+    assert keys["units"] == {"time": "iso"}
+
+
+def test_a_period_that_nobody_says_is_left_to_be_written(tmp_path: Path, motion: Motion) -> None:
+    _, keys = draft(tmp_path, table("q1,q2,tau1,tau2", motion.q, motion.tau))
+    assert keys["sampling"] == {"period_s": 0.0}
+    played = CliRunner().invoke(cli, ["identify", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml")])
+    assert played.exit_code == 2
+    assert "`sampling.period_s`" in played.stderr
+
+
+def test_a_gripper_that_makes_the_arm_branch_is_locked(tmp_path: Path, motion: Motion) -> None:
+    fingers = "".join(
+        f'<link name="{side}"/><joint name="{side}_finger" type="prismatic"><parent link="link2"/>'
+        f'<child link="{side}"/><axis xyz="0 1 0"/><limit lower="0" upper="0.04" velocity="1" effort="10"/></joint>'
+        for side in ("left", "right")
+    )
+    urdf = URDF.replace("</robot>", fingers + "</robot>")
+    _, keys = draft(tmp_path, table("t,q1,q2,tau1,tau2", motion.t, motion.q, motion.tau), urdf)
+    assert keys["arm"]["locked"] == ["left_finger", "right_finger"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("t,a1,b1\n" + "0,1,2\n" * 9, "no 2 columns look like positions of joint1, joint2; there are t, a1, b1"),
+        ("t,q1,q2,x1\n" + "0,1,2,3\n" * 9, "no 2 columns look like torques or currents"),
+        ("nothing\n" * 9, "no rows of numbers in its first 60 lines"),
+        ("", "no rows of numbers"),
+    ],
+)
+def test_a_table_that_nothing_can_be_made_of_is_one_line(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises((LogError, ConfigError)) as refusal:
+        draft(tmp_path, text)
+    assert said in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def bag(folder: Path, names: tuple[str, ...], motion: Motion, **more) -> dict:
+    (folder / "arm.urdf").write_text(URDF)
+    states = [
+        State(t, names, q, (), tau, **more)
+        for t, q, tau in zip(motion.t.tolist(), motion.q.tolist(), motion.tau.tolist(), strict=True)
+    ]
+    path = write_mcap(folder / "r.mcap", states)
+    return tomllib.loads(draft_map(path, folder / "arm.urdf", folder / "map.toml").text())
+
+
+def test_a_bag_needs_its_urdf_alone_where_it_has_the_urdfs_names(tmp_path: Path, motion: Motion) -> None:
+    assert bag(tmp_path, ("joint1", "joint2"), motion) == {"arm": {"urdf": "arm.urdf"}}
+    assert bag(tmp_path, ("left_joint1", "left_joint2"), motion, is_stamped=False) == {
+        "arm": {"urdf": "arm.urdf"},
+        "bag": {"time": "received"},
+        "columns": {"q": ["left_joint1", "left_joint2"]},
+    }
+    wide = Motion(motion.t, motion.q[:, [0, 1, 1]], motion.dq, motion.tau[:, [0, 1, 1]])
+    with pytest.raises(ConfigError, match="has the joints a, b, c, the URDF joint1, joint2"):
+        bag(tmp_path, ("a", "b", "c"), wide)
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_map_that_identifies_the_arm_and_replaces_none(tmp_path: Path) -> None:
+    urdf = urdf_text(3, AXES)
+    motion = record(urdf)
+    (tmp_path / "arm.urdf").write_text(urdf)
+    recording = tmp_path / "r.csv"
+    recording.write_text(
+        table("t_ms,p1,p2,p3,m1,m2,m3", 1e3 * motion.t, np.degrees(motion.q), motion.tau)
+        .replace("p1,p2,p3", "angle1,angle2,angle3")
+        .replace("m1,m2,m3", "torque1,torque2,torque3")
+    )
+    played = CliRunner().invoke(cli, ["identify", "--init", str(recording), str(tmp_path / "arm.urdf")])
+    assert played.exit_code == 0, played.stderr
+    assert "units.q" in played.stdout
+    assert "identify" in played.stderr
+    identified = CliRunner().invoke(cli, ["identify", str(recording), "--map", str(tmp_path / "map.toml")])
+    assert identified.exit_code == 0, identified.stdout
+    again = CliRunner().invoke(cli, ["identify", "--init", str(recording), str(tmp_path / "arm.urdf")])
+    assert again.exit_code == 0  # the same map
+    (tmp_path / "map.toml").write_text("# my own\n")
+    refused = CliRunner().invoke(cli, ["identify", "--init", str(recording), str(tmp_path / "arm.urdf")])
+    assert refused.exit_code == 2
+    assert "--map names a file for this one" in refused.stderr
+    assert (tmp_path / "map.toml").read_text() == "# my own\n"
+
+
+def test_init_takes_a_recording_and_a_urdf_and_identify_a_map(tmp_path: Path) -> None:
+    (tmp_path / "r.csv").write_text("")
+    for arguments, said in (
+        (["--init", str(tmp_path / "r.csv")], "--init takes one recording and one URDF"),
+        ([str(tmp_path / "r.csv")], "--map is missing"),
+    ):
+        played = CliRunner().invoke(cli, ["identify", *arguments])
+        assert played.exit_code == 2
+        assert said in played.stderr
