@@ -233,6 +233,10 @@ def test_other_settings_decide_otherwise_about_the_same_motion(log: Path) -> Non
     assert delays == sorted(delays)
     assert len(set(delays)) == 3
     assert never.score.contacts[0].detected_ns is None
+    (row,) = (row for row in side_by_side([mine, later]) if row[0] == "threshold, Nm")
+    assert [float(value) for value in row[2].split(" / ")] == pytest.approx([0.6, 0.6], abs=0.01)
+    assert row[1] != row[2]
+    assert not any(row[0].startswith("smallest push") for row in side_by_side([mine, later]))  # of the certified scheme
     assert never.score.missed == 1
     assert contacts_beside(log) is not None
 

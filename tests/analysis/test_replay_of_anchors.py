@@ -5,13 +5,15 @@ from pathlib import Path
 import pytest
 
 from adacd_hil.analysis.replay.log_source import LogSource
-from adacd_hil.analysis.replay.replay import replay
+from adacd_hil.analysis.replay.replay import replay, replay_many
+from adacd_hil.analysis.replay.replayed_outcome import side_by_side
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import CERTIFICATE_EVENTS
 from adacd_hil.scheme.identify import anchor
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
+from adacd_hil.settings.configuration import apply_settings
 from adacd_hil.settings.toml_files import to_toml
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
@@ -89,3 +91,13 @@ def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(
     monkeypatch.setattr("adacd_hil.log.reader.LogStream.attachments", attachments, raising=False)
     (then,) = {part.said for part in LogSource(leant_on)}
     assert then == {"margin"}
+
+
+def test_threshold_and_smallest_push_are_rows_that_follow_the_settings(leant_on: Path) -> None:
+    own = replay(leant_on, script_of=ScriptedOperator).settings
+    louder = apply_settings(own, {"certified.noise_sigmas": "12"})
+    rows = {row[0]: row[1:] for row in side_by_side(replay_many(leant_on, [own, louder]))}
+    for name in ("threshold, Nm", "smallest push in 100 ms, Nm"):
+        mine, other = ([float(value) for value in cell.split(" / ")] for cell in rows[name])
+        assert len(mine) == 2
+        assert all(more > less > 0.0 for less, more in zip(mine, other, strict=True))

@@ -374,5 +374,6 @@ def _result(player: _Player, source: ReplaySource, tolerance: float, first_ns: i
         tolerance=tolerance,
         zero_ns=next((each.t_ns for each in gatherer.transitions if each.state is SchemeState.ADAPT), 0),
         ending=gatherer.transitions[-1] if gatherer.transitions else None,
+        sight=gatherer.sight,
         notes=tuple(notes),
     )

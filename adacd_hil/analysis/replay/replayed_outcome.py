@@ -13,14 +13,17 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import Mismatch, enters_react, host_span
+from adacd_hil.analysis.score.distribution import Distribution
 from adacd_hil.analysis.score.emulator_truth import HostCycles, TrueContact, TrueContacts, windows_of
 from adacd_hil.analysis.score.judge import Alarm, Score, TouchWindow, judge
+from adacd_hil.analysis.score.margins import PushGatherer
 from adacd_hil.analysis.score.wording import NONE, found_text, why_not_found
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
-from adacd_hil.records import PARAMETER_UNITS, FaultReason, SchemeState, Vector
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, FaultReason, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.settings.configuration import Settings
@@ -44,6 +47,17 @@ class Adaptation(NamedTuple):
     theta_hat: tuple[float, ...]
 
 
+class Sight(NamedTuple):
+    """What detection sees in MONITOR from the beginning of the log: medians of each joint, Nm.
+
+    threshold: the lowest of all channels, nan where it never monitored. push: the smallest that is found within 100 ms,
+    an estimate; () of the paper's scheme.
+    """
+
+    threshold_Nm: tuple[float, ...]
+    push_Nm: tuple[float, ...]
+
+
 class OutcomeGatherer:
     """Takes in the decisions of one replay. `truth`: the true contacts, None where nobody knows them."""
 
@@ -60,8 +74,12 @@ class OutcomeGatherer:
         self._touches: list[TouchWindow] = []
         self._alarms: list[tuple[int, Alarm]] = []  # with the cycle of each
         self._begins: list[int] = []  # first cycle of each attempt
-        self._theta = layout_of(settings).slices["theta_hat"]
-        self._threshold = layout_of(settings).slices["threshold"]
+        slices = layout_of(settings).slices
+        self._theta = slices["theta_hat"]
+        self._threshold = slices["threshold"]
+        self._bank = (slices["tau_ext_bank"], slices["threshold_bank"]) if "threshold_bank" in slices else None
+        self._push = PushGatherer(settings) if self._bank else None
+        self._thresholds = tuple(Distribution() for _ in range(JOINTS))
         self._began: tuple[int, int] | None = None  # cycle and time of the adaptation in progress
         self._crossings: list[int] = []  # times at which some joint crosses its threshold
         self._was_over = False
@@ -73,6 +91,7 @@ class OutcomeGatherer:
             return
         over = batch.contact_joints != 0
         self._keep(ticks, batch)
+        self._watch(batch, ~over)
         rises = np.flatnonzero(over & ~np.concatenate(([self._was_over], over[:-1])))
         self._was_over = bool(over[-1])
         self._crossings += ticks.t_ns[rises].tolist()
@@ -105,6 +124,27 @@ class OutcomeGatherer:
         rows = np.unique(np.clip(np.concatenate((after - 1, after, [0, len(ticks.cycle)])), 0, len(ticks.cycle) - 1))
         threshold = batch.block[rows, self._threshold]
         self._kept.append(HostCycles(ticks.cycle[rows], ticks.t_ns[rows], batch.previous_state[rows], threshold))
+
+    def _watch(self, batch: SchemeBatch, is_quiet: NDArray[np.bool_]) -> None:
+        """Take in the thresholds of the cycles of MONITOR in which no joint is over its own."""
+        monitors = (batch.state == SchemeState.MONITOR) & (batch.previous_state == SchemeState.MONITOR)
+        block = batch.block[monitors & is_quiet]
+        if not len(block):
+            return
+        if self._push is not None and self._bank is not None:
+            self._push.add(*(block[:, place].reshape(len(block), -1, JOINTS) for place in self._bank))
+        for joint, kept in enumerate(self._thresholds):
+            kept.add(block[:, self._threshold][:, joint])
+
+    @property
+    def sight(self) -> Sight:
+        """What was seen in MONITOR."""
+        pushes = None if self._push is None else self._push.smallest_push()
+        seen = tuple(kept.percentiles().get("p50", math.nan) for kept in self._thresholds)
+        if pushes is None:
+            return Sight(seen, ())
+        threshold, push = (tuple(joint["p50"] for joint in each) for each in (pushes.threshold_Nm, pushes.push_Nm))
+        return Sight(threshold, push)
 
     def _enter(self, transition: StateChange, theta_hat: Vector) -> None:
         self.transitions.append(transition)
@@ -164,7 +204,7 @@ class Replay:
     are not the log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
     `mismatched_fields`. parameters: of the end. score: of contacts and alarms that begin in the stretch, None where the
     truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one.
-    ending: the last change of state, which may be before the stretch. attempts: from the beginning of the log.
+    ending: the last change of state, which may be before the stretch. attempts, sight: from the beginning of the log.
     """
 
     settings: Settings
@@ -184,6 +224,7 @@ class Replay:
     tolerance: float
     zero_ns: int
     ending: StateChange | None
+    sight: Sight
     notes: tuple[str, ...] = ()
     """What of the log could not be compared or judged, a line each."""
 
@@ -226,6 +267,9 @@ def side_by_side(replays: Sequence[Replay]) -> list[Row]:
         ("false alarms", *map(_false_alarms, replays)),
         ("median delay, ms", *map(_median_delay, replays)),
     ]
+    rows.append(("threshold, Nm", *(_by_joint(each.sight.threshold_Nm) for each in replays)))
+    if any(each.sight.push_Nm for each in replays):
+        rows.append(("smallest push in 100 ms, Nm", *(_by_joint(each.sight.push_Nm) for each in replays)))
     for index in range(max(len(each.adaptation_s) for each in replays)):
         rows.append((f"adaptation {index + 1}, s", *(_adaptation(each, index) for each in replays)))
     for name in dict.fromkeys(itertools.chain.from_iterable(each.parameters for each in replays)):
@@ -284,6 +328,11 @@ def _adaptation(found: Replay, index: int) -> str:
     return "not finished" if took_s is None else f"{took_s:.3f}"
 
 
+def _by_joint(values_Nm: Sequence[float]) -> str:
+    known = [value for value in values_Nm if math.isfinite(value)]
+    return " / ".join(f"{value:.3f}" for value in known) or NONE
+
+
 def _number(value: float | None) -> str:
     return NONE if value is None else f"{value:.6g}"
 
@@ -320,6 +369,8 @@ def as_json(found: Replay) -> dict[str, Any]:
         else [found.time_s(alarm.t_ns) for alarm in found.score.false_alarms],
         "missed": None if found.score is None else found.score.missed,
         "adaptation_s": list(found.adaptation_s),
+        "threshold_Nm": [value for value in found.sight.threshold_Nm if math.isfinite(value)],
+        "smallest_push_Nm": list(found.sight.push_Nm),
         "parameters": {name: value if math.isfinite(value) else None for name, value in found.parameters.items()},
         "states": [
             {
