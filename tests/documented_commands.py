@@ -268,7 +268,7 @@ RESOLVED: dict[str, Callable[[Any, dict[str, Any]], object]] = {
     "scenarios": _resolve_scenarios,
     "dbc": _resolve_contract,
     "interface": _resolve_interface,
-    "map_path": lambda value, values: read_map(value),
+    "map_path": lambda value, values: None if values.get("is_init") else read_map(value),
     "url": _resolve_address,
     "scheduler": _resolve_address,
     "files": _resolve_files,

@@ -64,6 +64,7 @@ BROUGHT = {
     "mine.csv": "recording.csv",
     "my-map.toml": "docs/examples/foreign/map.toml",
     "planar-arm.urdf": "docs/examples/foreign/planar-arm.urdf",
+    "panda.urdf": "docs/examples/foreign/planar-arm.urdf",
 }
 """Files that a newcomer comes with, and those that stand for them here, up to so many lines:"""
 MOST_LINES = 4500
