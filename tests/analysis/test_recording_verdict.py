@@ -236,6 +236,36 @@ def test_motion_that_tells_nothing_of_a_parameter_is_too_little_excitation(tmp_p
     assert any("joint2 (q2) is always 0.3 rad" in text for text in (*verdict.remarks, *verdict.reasons))
 
 
+def rests(motion: Motion, first: int, last: int, joints: list[int]) -> Motion:
+    """Hold joints where they are at a row, until another one; the torque there is noise about what it is then."""
+    q, tau = motion.q.copy(), motion.tau.copy()
+    q[first:last, joints] = q[first, joints]
+    tau[first:last, joints] = tau[first, joints] + noise((last - first, len(joints)))
+    return replace(motion, q=q, tau=tau)
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ((0, 1440), "the arm does not move in the part that is fitted"),
+        ((1440, 2400), "the arm does not move in the part that is tested"),
+    ],
+)
+def test_an_arm_that_rests_in_the_fit_or_in_the_test_is_said_to(
+    tmp_path: Path, upright: Motion, part: tuple[int, int], said: str
+) -> None:
+    verdict = judged(tmp_path, rests(upright, *part, [0, 1])).verdict
+    assert verdict.reasons == (said,)
+    assert "--test" in verdict.remedy
+
+
+def test_a_joint_that_rests_in_the_fit_alone_is_why_its_torque_is_not_explained(
+    tmp_path: Path, upright: Motion
+) -> None:
+    verdict = judged(tmp_path, rests(upright, 0, 1440, [1])).verdict
+    assert "joint2 does not move in the part that is fitted" in verdict.reasons
+
+
 # Common mistakes.
 
 TURNED = np.array([1.0, -1.0])

@@ -6,7 +6,7 @@ Velocities are compared with the slope of the positions, positions and torques w
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -61,8 +61,11 @@ class _Columns(NamedTuple):
     period_s: float
 
 
-def find_faults(described: RecordingMap, recordings: list[ForeignRecording]) -> tuple[ColumnFinding, ...]:
-    """List what the columns show. recordings: what is fitted and tested."""
+def find_faults(
+    described: RecordingMap, fitted: Sequence[ForeignRecording], tested: ForeignRecording
+) -> tuple[ColumnFinding, ...]:
+    """List what the columns of what is fitted and tested show."""
+    recordings = [*fitted, tested]
     stretches = [stretch for recording in recordings for stretch in recording.stretches]
     period_s = recordings[0].period_s
     times = [stretch.start_s + period_s * np.arange(len(stretch.record.q)) for stretch in stretches]
@@ -71,6 +74,9 @@ def find_faults(described: RecordingMap, recordings: list[ForeignRecording]) -> 
     )
     columns = _Columns(np.concatenate(times), q, dq, tau_J, period_s)
     found = [*_of_torques(described, columns), *_of_positions(described, columns)]
+    still = np.ptp(q, axis=0) < STILL_RAD
+    for part, records in (("fit", fitted), ("test", [tested])):
+        found += _of_rest(described, part, records, still)
     if all(recording.has_velocities for recording in recordings):
         found += _of_velocities(described, recordings)
     return tuple(found)
@@ -172,6 +178,22 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
                 f'if the positions are degrees: `units.q` = "deg", which the map has as "{described.units.q}"',
             )
             return
+
+
+def _of_rest(
+    described: RecordingMap, part: str, recordings: Sequence[ForeignRecording], still: NDArray[np.bool_]
+) -> Iterator[ColumnFinding]:
+    """Say which joints rest in the part that is fitted, or tested, though they move in the other one. still (n,)."""
+    q = np.concatenate([stretch.record.q for recording in recordings for stretch in recording.stretches])
+    rests = np.ptp(q, axis=0) < STILL_RAD
+    joints = np.flatnonzero(rests & ~still).tolist()
+    if joints:
+        names = "the arm" if rests.all() else joined_names([described.urdf.joint_names[i] for i in joints], len(rests))
+        yield ColumnFinding(
+            f"{names} does not move in the part that is {'fitted' if part == 'fit' else 'tested'}",
+            "choose what is fitted with --from and --until, and other motion for --test",
+            is_dead=bool(rests.all()),
+        )
 
 
 def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) -> Iterator[ColumnFinding]:

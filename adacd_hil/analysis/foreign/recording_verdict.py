@@ -111,7 +111,7 @@ class _Finding(NamedTuple):
 def judge_fit(fit: Fitted) -> Verdict:
     """Judge a fit by its test."""
     joints = _shares(fit)
-    columns = find_faults(fit.described, [*fit.fitted, fit.tested])
+    columns = find_faults(fit.described, fit.fitted, fit.tested)
     plain = [_against(found) for found in columns if found.is_dead] or list(_of_length(fit))
     findings = plain or _of_model(fit, joints, columns)
     findings += [] if plain else _of_friction(fit)
