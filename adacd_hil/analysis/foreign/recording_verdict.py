@@ -235,14 +235,25 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
     related = _related_to_motion(fit)
     is_noise = [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
     empty = [i for i, joint in enumerate(joints) if joint.share < NOTHING and (is_noise[i] or related[i] < NOTHING)]
+    has_others = any(joint.is_explained for joint in joints)
+    passive = [
+        i
+        for i, joint in enumerate(joints)
+        if is_noise[i] and has_others and joint.margin >= 1.0 and not joint.is_explained
+    ]
     for chosen, text in (
         (
-            [i for i in empty if is_noise[i]],
+            passive,
+            "the torque of {names} is noise, and by the model of the others there is hardly any: a passive joint, or "
+            "what drives it is less than the noise",
+        ),
+        (
+            [i for i in empty if is_noise[i] and i not in passive],
             "the torque of {names} is noise: nothing of the motion is in it. The sensor is dead, the column is another "
             "one's, or nothing drives the joint",
         ),
         (
-            [i for i in empty if not is_noise[i]],
+            [i for i in empty if not is_noise[i] and i not in passive],
             "nothing of the torque of {names} is explained: the sensor is dead, the column is another one's, nothing "
             "drives the joint, or it moves in the test as it never did in the fit",
         ),
@@ -254,7 +265,7 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
     weak = [
         joint.name
         for i, joint in enumerate(joints)
-        if i not in empty and not joint.is_explained and joint.margin >= 1.0
+        if i not in (*empty, *passive) and not joint.is_explained and joint.margin >= 1.0
     ]
     if weak:
         yield _Finding(
