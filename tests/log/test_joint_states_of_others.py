@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from joint_state_bags import State, write_mcap
+from mcap.writer import Writer
 
 from adacd_hil.cli.main import cli
 
@@ -73,3 +74,17 @@ def test_a_topic_is_chosen_by_its_name(tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert command("log", "export", str(path), "--format", "csv", "--topic", "right", "--out", str(out))[0] == 0
     assert [each.name for each in out.iterdir()] == ["right.csv"]
+
+
+def test_topics_that_make_no_table_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="a test")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
+        channel = writer.register_channel("/words", "cdr", schema)
+        writer.add_message(channel, 1, b"\0\1\0\0\3\0\0\0ab\0", 1)
+        writer.finish()
+    status, said = command("log", "export", str(path), "--format", "csv", "--out", str(tmp_path / "out"))
+    assert status == 3
+    assert "messages of varying size are not exported: /words" in said

@@ -1,45 +1,19 @@
 """A recording in an MCAP file or a rosbag: sensor_msgs/JointState of any number of joints, found by their names.
 
-`mcap` reads MCAP files, `rosbags` the bags of ROS 1 and ROS 2; neither needs ROS. Messages of other joints, as of a
-gripper that publishes on the same topic, are passed over.
+Messages of other joints, as of a gripper that publishes on the same topic, are passed over.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
 
 from adacd_hil.analysis.foreign.recorded_columns import RecordedColumns, RecordedRows
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
-from adacd_hil.file_access import open_input
+from adacd_hil.log.formats.joint_state_bags import JOINT_STATES, joint_state_topics, opened_bag
 from adacd_hil.log.log_files import LogError, TimeWindow
-from adacd_hil.log.types.joint_states import TYPE, JointStateMessage, decode_joint_state
+from adacd_hil.log.types.joint_states import TYPE, JointStateMessage
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.schema import ConfigError
-
-JOINT_STATES: Final = "/joint_states"
-_MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
-_BAG_MAGIC: Final = b"#ROSBAG V"
-_SQLITE_MAGIC: Final = b"SQLite format 3\0"
-
-
-class _Bag(NamedTuple):
-    """What is in a bag: the type of each topic, and how messages of one are read."""
-
-    topics: Mapping[str, str]
-    messages: Callable[[str], Iterator[tuple[int, JointStateMessage]]]  # with when they were recorded, ns
-
-
-def is_bag(path: Path) -> bool:
-    """Tell whether a path is a bag: a folder, an MCAP file, one of ROS 1, or the database of ROS 2."""
-    if path.is_dir():
-        return True
-    try:
-        with open_input(path) as file:
-            return file.peek(16).startswith((_MCAP_MAGIC, _BAG_MAGIC, _SQLITE_MAGIC))
-    except OSError:
-        return False  # who reads it says why it can't be
 
 
 def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
@@ -64,75 +38,6 @@ def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
     states.check(is_stamped)
     names = [*wanted] * (3 if states.has_velocities else 2)
     return read.columns(described, names)
-
-
-@contextmanager
-def opened_bag(path: Path) -> Iterator[_Bag]:
-    """Open a bag. Raises LogError for whatever its reader raises."""
-    try:
-        if not path.is_dir():
-            with open_input(path) as file:
-                is_mcap, is_ros1 = (file.peek(16).startswith(magic) for magic in (_MCAP_MAGIC, _BAG_MAGIC))
-            with _opened_mcap(path) if is_mcap else _opened_rosbag(path, is_ros1) as bag:
-                yield bag
-        else:
-            if not (path / "metadata.yaml").is_file():
-                raise LogError(f"folder {path} is no rosbag: it has no metadata.yaml")
-            with _opened_rosbag(path, is_ros1=False) as bag:
-                yield bag
-    except (LogError, ConfigError):
-        raise
-    except OSError as error:
-        raise LogError(f"recording {path}: {error.strerror or error}") from None
-    except Exception as error:  # whatever a reader makes of damaged bytes
-        remedy = "; `adacd-hil log recover` saves what is left of a cut MCAP file" if path.suffix == ".mcap" else ""
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise LogError(f"recording {path} can't be read: {reason}{remedy}") from None
-
-
-@contextmanager
-def _opened_mcap(path: Path) -> Iterator[_Bag]:
-    from mcap.reader import make_reader
-
-    with open_input(path) as file:
-        topics: dict[str, str] = {}
-        summary = make_reader(file).get_summary()
-        if summary is None or not summary.channels:
-            for schema, channel, _ in make_reader(file).iter_messages(log_time_order=False):
-                topics.setdefault(channel.topic, schema.name if schema else "")
-        else:
-            for channel in summary.channels.values():
-                known = summary.schemas.get(channel.schema_id)
-                is_cdr = channel.message_encoding == "cdr"
-                topics[channel.topic] = known.name if known and is_cdr else channel.message_encoding
-
-        def messages(topic: str) -> Iterator[tuple[int, JointStateMessage]]:
-            for _, _, message in make_reader(file).iter_messages(topics=[topic], log_time_order=False):
-                yield message.log_time, decode_joint_state(message.data)
-
-        yield _Bag(topics, messages)
-
-
-@contextmanager
-def _opened_rosbag(path: Path, is_ros1: bool) -> Iterator[_Bag]:
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
-
-    reader: Any = Reader1(path) if is_ros1 else Reader2(path)
-    reader.open()
-    with closing(reader):
-
-        def messages(topic: str) -> Iterator[tuple[int, JointStateMessage]]:
-            connections = [each for each in reader.connections if each.topic == topic]
-            for _, received_ns, data in reader.messages(connections=connections):
-                yield received_ns, decode_joint_state(data, is_ros1)
-
-        yield _Bag({each.topic: each.msgtype for each in reader.connections}, messages)
-
-
-def joint_state_topics(topics: Mapping[str, str]) -> list[str]:
-    """List the topics of joint states."""
-    return [topic for topic, kind in topics.items() if kind.replace("/msg/", "/") == TYPE.replace("/msg/", "/")]
 
 
 def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:

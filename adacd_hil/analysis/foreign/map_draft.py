@@ -11,10 +11,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.foreign.bag_recording import JOINT_STATES, is_bag, joint_state_topics, opened_bag
 from adacd_hil.analysis.foreign.recording_map import ISO, UnitsSection, time_unit_of, units_by_slope
 from adacd_hil.analysis.foreign.table_guess import TableGuess, guess_table
 from adacd_hil.file_access import read_input
+from adacd_hil.log.formats.joint_state_bags import JOINT_STATES, is_bag, joint_state_topics, opened_bag
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 from adacd_hil.scheme.model.urdf import SerialArm, UrdfError, read_urdf

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from adacd_hil.analysis.foreign.bag_recording import is_bag, read_bag
+from adacd_hil.analysis.foreign.bag_recording import read_bag
 from adacd_hil.analysis.foreign.csv_recording import read_csv
 from adacd_hil.analysis.foreign.recorded_columns import MOST_ROWS, SHORTEST_SAMPLES, RecordedColumns
 from adacd_hil.analysis.foreign.recording_map import RecordingMap, time_unit_of
 from adacd_hil.analysis.score.wording import number_of
+from adacd_hil.log.formats.joint_state_bags import is_bag
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.records import Vector
 from adacd_hil.scheme.identify.offline import Record

@@ -281,7 +281,8 @@ def _export_topics(
             if events := stream.events(piece):
                 tables.write(EVENTS.name, event_columns(events))
             progress(sum(tables.rows.values()))
-    return TableSummary(tables.rows, stream.problem)
+    varying = "" if tables.rows else f"messages of varying size are not exported: {', '.join(topics)}"
+    return TableSummary(tables.rows, stream.problem or varying)
 
 
 def _export_frames(
