@@ -73,6 +73,9 @@ class Identified:
     watched: tuple[Watched, ...]
     notes: dict[Path, tuple[str, ...]]  # what was left out of the recordings, or taken for granted
 
+    def __repr__(self) -> str:
+        return f"<Identified: {self.verdict.headline}>"
+
     @property
     def is_explained(self) -> bool:
         """Whether the torque of the test is explained; see `recording_verdict`."""

@@ -147,11 +147,21 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Colum
     is_good = not inertia and not wrong and all(joint.is_explained for joint in joints)
     if is_good and fit.certificate.margin >= 1.0:
         return [*scale, *remarks]
-    if readings := list(_of_readings(fit, joints, WHOLE if wrong else 0.0)):
+    if not all(_is_noise(fit, joints)) and (readings := list(_of_readings(fit, joints, WHOLE if wrong else 0.0))):
         return [*readings, *remarks]
     if is_good:
         return [*scale, *remarks]
-    return wrong or [*map(_against, columns)] or list(_of_noise(fit, joints)) or inertia or list(_of_lack(fit, joints))
+    lack = list(_of_lack(fit, joints))
+    causes = wrong or [*map(_against, columns)]
+    if causes:
+        return [*causes, *(found._replace(is_against=False) for found in lack)]
+    return list(_of_noise(fit, joints)) or inertia or lack
+
+
+def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
+    """Tell of each torque whether it is no more than the sensor's noise behind the filter of the fit."""
+    noise = offline.filtered_noise_Nm(fit.settings)
+    return [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
 
 
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
@@ -231,10 +241,10 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
 
 def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
     """Name torques in which nothing of the motion is, or little."""
-    noise = offline.filtered_noise_Nm(fit.settings)
-    related = _related_to_motion(fit)
-    is_noise = [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
-    empty = [i for i, joint in enumerate(joints) if joint.share < NOTHING and (is_noise[i] or related[i] < NOTHING)]
+    related, is_noise = _related_to_motion(fit), _is_noise(fit, joints)
+    empty = [
+        i for i, joint in enumerate(joints) if not joint.share >= NOTHING and (is_noise[i] or related[i] < NOTHING)
+    ]
     has_others = any(joint.is_explained for joint in joints)
     passive = [
         i
