@@ -220,7 +220,8 @@ class Bench:
         """Place a SYNC among those before and count the cycles; tell whether devices take it."""
         order = self._order
         last = order.counter
-        order.judge(data[0] if data else 0, self._nodes.listeners.overflow if data else 0, t_ns, self._nodes.period_ns)
+        overflow = self._nodes.listeners.overflow if data else 0
+        order.judge(data[0] if data else 0, overflow, t_ns, self._nodes.told_period_ns)
         if not order.is_taken:
             return False
         self._lost_syncs = order.periods - 1

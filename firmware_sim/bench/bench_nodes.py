@@ -28,6 +28,8 @@ Movable: TypeAlias = "Body | RecordedBody"
 TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
+_UNTOLD_PERIOD_NS = 1_000_000
+"""What a SYNC is worth while 0x1006 is 0, as in a drive that nobody has set up."""
 
 
 class BenchNodes:
@@ -93,7 +95,11 @@ class BenchNodes:
                     device.serve(*alias, device.reader(*place))
                     device.pdos.accept(*alias, device.pdos.writer(*place))
         injector.attach(self.devices, self.drives, self.sensors)
-        self.period_ns = self.devices[0].value(0x1006) * 1000
+        self.period_ns = _UNTOLD_PERIOD_NS
+        """How far one SYNC takes the arm, where time goes by SYNC."""
+        self.told_period_ns = 0
+        """0x1006 of drive 1; 0: nobody has told it the period."""
+        self._set_period(self.devices[0].value(0x1006))
         for device in self.devices:
             device.watch(0x1006, 0, check=_check_period)
         self.devices[0].watch(0x1006, 0, self._set_period)
@@ -163,8 +169,9 @@ class BenchNodes:
         )
 
     def _set_period(self, period_us: int) -> None:
-        if period_us:  # 0 is written to change 0x1019; the period stays
-            self.period_ns = period_us * 1000
+        self.told_period_ns = period_us * 1000
+        if period_us:  # 0 is written to change 0x1019; what a SYNC is worth stays
+            self.period_ns = self.told_period_ns
 
 
 def _scale_of(own: OwnArmSettings | None, place: int) -> DriveScale:

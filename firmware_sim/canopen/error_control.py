@@ -298,7 +298,10 @@ class SyncOrder:
         self.counter = 0
 
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:
-        """Judge a SYNC of the right length. `counter`: 0 where it has none. `overflow`: 0x1019."""
+        """Judge a SYNC of the right length.
+
+        `counter`: 0 where it has none. `overflow`: 0x1019. `period_ns`: 0x1006; 0: not told, so no SYNC is early.
+        """
         last = self.counter
         self.kind, self.is_taken, self.periods = SyncKind.RIGHT, True, 1
         if overflow == 0:
@@ -322,7 +325,7 @@ class SyncOrder:
     def _judge_time(self, t_ns: int, period_ns: int, is_first: bool) -> None:
         ahead_ns = self.periods * period_ns - (t_ns - self._last_ns)
         self._last_ns = t_ns
-        if is_first:
+        if is_first or period_ns == 0:
             self._lateness_ns = period_ns  # nobody knows
             return
         if ahead_ns - self._lateness_ns > _AHEAD * period_ns:

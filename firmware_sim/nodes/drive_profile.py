@@ -18,6 +18,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S, DriveMode
 from firmware_sim.canopen.object_dictionary import ObjectDictionary
 from firmware_sim.canopen.pdo import Pdos
@@ -263,7 +264,7 @@ class Patience:
         self.sync_ns = 0
         """When the last SYNC came, by the device's clock."""
         self._syncs = dictionary.value_or(_NO_PATIENCE, 0x2200)
-        self._period_us = dictionary.value(0x1006)
+        self._factory_period_us = self._period_us = dictionary.value(0x1006)
         self._tenth_periods = dictionary.value_or(_TENTH_PERIODS, 0x2201)
         dictionary.watch(0x1006, 0, self._set_period)
         dictionary.watch(0x2200, 0, self._set_syncs)
@@ -276,7 +277,9 @@ class Patience:
 
     @property
     def sync_due_ns(self) -> int:
-        """When SYNC is missing, by the device's clock."""
+        """When SYNC is missing, by the device's clock; never while nobody has told its period."""
+        if not self._period_us:
+            return NEVER_NS
         return self.sync_ns + self._period_us * self._tenth_periods * 100
 
     def restart(self) -> None:
@@ -287,7 +290,8 @@ class Patience:
         self._syncs = syncs
 
     def _set_period(self, period_us: int) -> None:
-        if period_us:  # 0 is written to change 0x1019; SYNC is watched all the same
+        # 0 is written to change 0x1019; a drive that has a period from its factory watches SYNC all the same.
+        if period_us or not self._factory_period_us:
             self._period_us = period_us
 
     def _set_tolerance(self, tenth_periods: int) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cantools
 import pytest
-from bench_host import ENABLE, SHUTDOWN, START, SWITCH_ON, BenchHost, quiet_scenario
+from bench_host import ENABLE, PERIOD_NS, SHUTDOWN, START, SWITCH_ON, BenchHost, quiet_scenario
 
 from adacd_hil.device.contract import load_contract
 from adacd_hil.settings.configuration import load_settings
@@ -138,6 +138,9 @@ def test_the_contract_is_found_by_its_dbc(name):
 
 def stock_host(**scenario) -> BenchHost:
     host = BenchHost(quiet_scenario(**scenario), contract="arm_stock")
+    for node in (*DRIVE_NODES, *SENSOR_NODES):
+        host.write(node, 0x1019, 0, 240)
+        host.write(node, 0x1006, 0, 1000)
     for node in DRIVE_NODES:
         for record, (base, kind, entries) in STOCK.items():
             host.write(node, record, 1, 1 << 31 | base + node)
@@ -198,6 +201,55 @@ def test_a_stock_sensor_sends_its_torque_and_nothing_else():
     assert len(torques) == 200
     assert struct.unpack("<i", torques[0])[0] == round(round(1.0 / TORQUE_LSB_NM) * TORQUE_LSB_NM * 1e5)
     assert {can_id for can_id, _ in frames if can_id & 0x7F in SENSOR_NODES} == {0x183, 0x184}
+
+
+def test_stock_devices_come_without_a_sync_counter_and_without_a_period():
+    host = BenchHost(contract="arm_stock")
+    for node in (*DRIVE_NODES, *SENSOR_NODES):
+        assert (host.read(node, 0x1019), host.read(node, 0x1006)) == (0, 0)
+
+
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_a_stock_drive_that_nobody_has_set_up_answers_a_sync_without_a_counter(clock_mode):
+    host = BenchHost(contract="arm_stock", clock_mode=clock_mode)
+    host.write(1, 0x1800, 2, 1)
+    host.nmt(START)
+    host.take()
+    for _ in range(5):
+        host.t_ns += 10 * PERIOD_NS
+        host.put(0x080, b"")
+    assert [can_id for can_id, _ in host.take()].count(0x181) == 5
+
+
+def test_a_stock_drive_says_by_emcy_that_it_expects_no_sync_counter():
+    host = BenchHost(contract="arm_stock")
+    host.nmt(START)
+    host.take()
+    host.put(0x080, b"\x01")
+    assert [data[:2] for can_id, data in host.take() if can_id == 0x081] == [struct.pack("<H", 0x8240)]
+
+
+def test_a_stock_drive_sends_its_statusword_when_it_changes():
+    host = BenchHost(contract="arm_stock")
+    host.nmt(START)
+    host.take()
+    for _ in range(3):
+        host.put(0x080, b"")
+    assert host.taken(0x181) == []
+    host.put(0x201, struct.pack("<H", SHUTDOWN))
+    host.put(0x080, b"")
+    assert host.taken(0x181) == [struct.pack("<H", 0x0231)]
+
+
+def test_a_drive_that_was_never_told_a_period_does_not_watch_sync():
+    host = BenchHost(contract="arm_stock", clock_mode="wall")
+    host.nmt(START)
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        host.t_ns += PERIOD_NS
+        host.put(0x201, struct.pack("<H", word))
+        host.put(0x080, b"")
+    host.bench.advance_to(host.t_ns + 1000 * PERIOD_NS)
+    assert host.state_bits(1) == 0x27
 
 
 @pytest.mark.parametrize("sub", [0, 1])

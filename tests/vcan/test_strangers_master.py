@@ -138,13 +138,17 @@ class Stranger:
     def start(self) -> None:
         for node in self.drives:
             self.remap(node)
+            node.sdo[0x1006].raw = 0
+            node.sdo[0x1019].raw = 240
             node.sdo[0x1006].raw = round(PERIOD_S * 1e6)
             if 0x2200 in node.object_dictionary:
                 node.sdo[0x2200].raw = 200
             node.setup_402_state_machine(read_pdos=False)
             node.op_mode = "CYCLIC SYNCHRONOUS TORQUE"  # by SDO; waits for 0x6061
         for sensor in (3, 4):
-            self.network.add_node(sensor, None).sdo.download(0x1006, 0, round(PERIOD_S * 1e6).to_bytes(4, "little"))
+            sdo = self.network.add_node(sensor, None).sdo
+            for index, value, size in ((0x1006, 0, 4), (0x1019, 240, 1), (0x1006, round(PERIOD_S * 1e6), 4)):
+                sdo.download(index, 0, value.to_bytes(size, "little"))
         self.rhythm.begin(self.drives)
         self.network.nmt.state = "OPERATIONAL"
 
