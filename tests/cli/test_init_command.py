@@ -15,8 +15,8 @@ from rig import Rig, SessionRig
 from adacd_hil.cli.main import cli
 from adacd_hil.commission.arm_draft import planar_from_urdf, uniform_rods
 from adacd_hil.commission.configuration_check import configuration_checks, examine_configuration
-from adacd_hil.commission.device_recognition import DeviceRatings, draft_profile
 from adacd_hil.commission.host_checks import Status, diagnose
+from adacd_hil.commission.profile_draft import DeviceRatings, draft_profile
 from adacd_hil.device.contract import load_contract
 from adacd_hil.scheme.model.urdf import UrdfError
 from adacd_hil.settings.configuration import Settings, load_settings

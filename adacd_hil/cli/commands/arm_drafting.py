@@ -21,18 +21,9 @@ from adacd_hil.commission.arm_draft import (
     write_draft,
 )
 from adacd_hil.commission.configuration_check import ConfigurationFindings, examine_configuration
-from adacd_hil.commission.device_recognition import (
-    DRIVE,
-    SENSOR,
-    DeviceRatings,
-    RecognisedDevice,
-    choose_family,
-    draft_profile,
-    identity_of,
-    kind_of,
-    recognise,
-)
+from adacd_hil.commission.device_recognition import RecognisedDevice, choose_family, recognise
 from adacd_hil.commission.host_checks import Status, look_for_socketcan
+from adacd_hil.commission.profile_draft import DRIVE, SENSOR, DeviceRatings, draft_profile, identity_of, kind_of
 from adacd_hil.device.profile import load_profile, profile_names
 from adacd_hil.device.survey import survey
 from adacd_hil.file_access import read_input, replace_file
