@@ -222,7 +222,8 @@ class DeviceReadings:
         if reading.kind == "scale":
             return (
                 f"joint {joint + 1} turns about {reading.position[joint]:g} times as far as position and velocity say: "
-                f"correct its gear in scale.increments_per_joint_rev and scale.velocity_rad_s of devices.drive[{joint}]"
+                "correct its gear: scale.gear_ratio, scale.increments_per_joint_rev and scale.velocity_rad_s of "
+                f"devices.drive[{joint}]"
             )
         return (
             f"the torque sensor of joint 2 measures about {1.0 / reading.torque[1]:+.2g} times what that of joint 1 "

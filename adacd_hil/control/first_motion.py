@@ -253,8 +253,8 @@ class FirstMotion:
     def _scales(self, joint: int) -> str:
         rated_Nm = self._settings.arm.rated_torque_Nm[joint]
         return (
-            f"scale.torque_Nm of devices.sensor[{joint}], arm.rated_torque_Nm[{joint}] = {rated_Nm:g} Nm and the "
-            "motor's torque constant"
+            f"scale.torque_Nm of devices.sensor[{joint}], arm.rated_torque_Nm[{joint}] = {rated_Nm:g} Nm, "
+            f"scale.gear_ratio and scale.gear_efficiency of devices.drive[{joint}], and the motor's torque constant"
         )
 
     def _describe(self, joint: int, ratio: "TorqueRatio") -> str:

@@ -20,6 +20,7 @@ from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
+from adacd_hil.device.profile import enable_timeout_s
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import place_file
 from adacd_hil.log.log_files import LOG_NAME, MOST_VIEWERS, arithmetic
@@ -135,6 +136,8 @@ class Session:
         if self.is_lockstep:  # a simulated arm moves by whole periods, however late the modelled host sends SYNC
             realtime = replace(self.settings.realtime, sample_period="nominal")
             self.settings = replace(self.settings, realtime=realtime)
+        safety = replace(self.settings.safety, enable_timeout_s=enable_timeout_s(self.settings))
+        self.settings = replace(self.settings, safety=safety)  # with the log, which replays without the profiles
         tap = Tap(self.bus, self.clock)
         pacer = make_pacer(self.settings, self.clock, tap, self.codec.message("Sync").can_id)
         with compiling_cycle(self.settings):
@@ -209,7 +212,8 @@ class Session:
             self.progress("running")
             ending = Ending(self._run(cycle, master, recorder, tap), "", is_bus_failed=False)
         except (BusError, DeviceError) as reason:
-            ending = Ending(None, str(reason), isinstance(reason, BusError))
+            line = reason.line if isinstance(reason, DeviceError) else str(reason)
+            ending = Ending(None, line, isinstance(reason, BusError))
             recorder.cycle(self.clock.now_ns(), [], tap.take())
             recorder.event(self.clock.now_ns(), Event("error", "run", ending.error))
             self.progress(ending.error)

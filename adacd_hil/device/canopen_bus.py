@@ -62,11 +62,37 @@ logging.getLogger("canopen").propagate = False
 
 
 class DeviceError(RuntimeError):
-    """A device is missing, not the expected one, or refuses its set-up; one line."""
+    """A device is missing, not the expected one, or refuses its set-up; one line. `remedy`: what to do; "": unknown."""
+
+    def __init__(self, text: str, remedy: str = "") -> None:
+        super().__init__(text)
+        self.remedy = remedy
+
+    @property
+    def line(self) -> str:
+        """What is wrong, and what to do about it."""
+        return f"{self}; {self.remedy}" if self.remedy else str(self)
+
+
+class RefusedError(DeviceError):
+    """A device has answered a request with an abort."""
+
+
+_REFUSED = (
+    "the device takes no such value, or not in this state: see the object in its manual; `setup` of its profile writes "
+    "what it wants first"
+)
+_SILENT = (
+    "see that it has power and that nobody else asks it; a slow device needs `patience.answer_s` or "
+    "`patience.pause_ms` in its profile"
+)
 
 
 class EdsVariable(NamedTuple):
-    """One object of an EDS. bits: its size in a PDO, 0 for what has no fixed size. is_writable: over SDO."""
+    """One object of an EDS. bits: its size in a PDO, 0 for what has no fixed size. is_writable: over SDO.
+
+    is_mappable: whether a PDO may carry it.
+    """
 
     name: str
     bits: int
@@ -74,6 +100,7 @@ class EdsVariable(NamedTuple):
     default: int | None
     is_writable: bool
     is_float: bool = False
+    is_mappable: bool = True
 
 
 def read_eds(path: Path, node_id: int) -> Any:
@@ -133,7 +160,8 @@ def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
     is_signed = entry.data_type in canopen.objectdictionary.SIGNED_TYPES
     bits, number = len(entry) if is_number else 0, default if isinstance(default, int) else None
     is_float = entry.data_type in canopen.objectdictionary.FLOAT_TYPES
-    return EdsVariable(name, bits, is_signed, number, "w" in entry.access_type, is_float)
+    is_mappable = bool(entry.pdo_mappable)
+    return EdsVariable(name, bits, is_signed, number, "w" in entry.access_type, is_float, is_mappable)
 
 
 class _BusNetwork(canopen.Network):
@@ -156,16 +184,27 @@ class CanopenBus:
         """Gets every frame that arrives while an answer is awaited, besides canopen."""
         self._bus = bus
         self._network = _BusNetwork(self._send)
+        self._patience: dict[int, tuple[float, float]] = {}
+        self._has_answered: set[int] = set()
         self.malformed_frames = 0
         """Frames so far whose length or content doesn't fit what their identifier says they are."""
 
-    def add_node(self, node_id: int, objects: Any, on_emergency: Callable[[EmcyError], None] | None = None) -> Any:
+    def add_node(
+        self,
+        node_id: int,
+        objects: Any,
+        on_emergency: Callable[[EmcyError], None] | None = None,
+        answer_s: float = ANSWER_TIMEOUT_S,
+        pause_s: float = 0.0,
+    ) -> Any:
         """Return canopen's node with the objects of `read_eds`.
 
-        With None it has no objects, and SDO goes by index through `node.sdo.upload`.
+        With None it has no objects, and SDO goes by index through `node.sdo.upload`. `answer_s`: longest wait for an
+        answer. `pause_s`: between an answer and the next request, for a device that loses what comes sooner.
         """
         node = canopen.RemoteNode(node_id, canopen.ObjectDictionary() if objects is None else objects)  # type: ignore[no-untyped-call]
         self._network.add_node(node)
+        self._patience[node_id] = answer_s, pause_s
         node.sdo.RESPONSE_TIMEOUT = 0.0005  # the answer is in the queue when `_send` returns, or never comes
         if on_emergency is not None:
             node.emcy.add_callback(on_emergency)
@@ -176,10 +215,14 @@ class CanopenBus:
         self._bus.send(NMT_ID, bytes((nmt_command, node_id)))
 
     def _send(self, can_id: int, data: bytes) -> None:
-        self._bus.send(can_id, data)
         is_request = can_id & 0x780 == SDO_REQUEST_ID and data[0] != SDO_ABORT
-        if is_request:
-            self.pump(lambda frame: frame.can_id == can_id - 0x80, ANSWER_TIMEOUT_S)
+        node_id = can_id & 0x7F
+        answer_s, pause_s = self._patience.get(node_id, (ANSWER_TIMEOUT_S, 0.0))
+        if is_request and pause_s and node_id in self._has_answered:
+            self.pump(lambda _: False, pause_s)
+        self._bus.send(can_id, data)
+        if is_request and self.pump(lambda frame: frame.can_id == can_id - 0x80, answer_s):
+            self._has_answered.add(node_id)
 
     def pump(self, is_answer: Callable[[Frame], bool], timeout_s: float) -> bool:
         """Read the bus until an answer is in; False after a silence of `timeout_s`, or as much of other traffic."""
@@ -210,16 +253,16 @@ class CanopenBus:
 
 
 @contextmanager
-def explained(name: str, node_id: int, what: str) -> Iterator[None]:
+def explained(name: str, node_id: int, what: str, answer_s: float = ANSWER_TIMEOUT_S) -> Iterator[None]:
     """Turn whatever canopen raises into a DeviceError of one line; a BusError passes."""
     try:
         yield
     except (BusError, DeviceError):
         raise
     except SdoAbortedError as error:
-        raise DeviceError(f"{name} (node {node_id}): {what} refused: {error}") from None
+        raise RefusedError(f"{name} (node {node_id}): {what} refused: {error}", _REFUSED) from None
     except SdoCommunicationError:
-        raise DeviceError(f"{name} (node {node_id}): no SDO answer within {ANSWER_TIMEOUT_S:g} s ({what})") from None
+        raise DeviceError(f"{name} (node {node_id}): no SDO answer within {answer_s:g} s ({what})", _SILENT) from None
     except (SdoError, *_UNFORESEEN) as error:
         raise DeviceError(f"{name} (node {node_id}): {what}: {' '.join(str(error).split()) or repr(error)}") from None
 

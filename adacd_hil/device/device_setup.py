@@ -9,12 +9,20 @@ valid last. PDOs that the contract doesn't know are switched off: a stock device
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 from adacd_hil.device.arm_watch import RateLimitedEvents, Recurrence
-from adacd_hil.device.canopen_bus import SDO_ABORT, DeviceError, explained, find_variable, read_object
-from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, torque_limit_permille
+from adacd_hil.device.canopen_bus import (
+    SDO_ABORT,
+    DeviceError,
+    RefusedError,
+    explained,
+    find_variable,
+    read_object,
+)
+from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
+from adacd_hil.device.drive_units import name_velocity_unit, read_drive_units
 from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
@@ -27,31 +35,40 @@ from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 class Slave:
     """A device of the arm on the bus, as its master sees it."""
 
-    def __init__(self, device: PlacedDevice, node: Any) -> None:
+    def __init__(self, device: PlacedDevice, node: Any, wait: Callable[[float], object] = lambda _: None) -> None:
+        """`wait`: lets so many seconds pass on the bus."""
+        self.wait = wait
         self.device = device
         self.name = device.name
         self.node_id = device.node_id
         self.known: dict[tuple[int, int], int] = {}
         """What the set-up has written or compared, by index and sub-index."""
         self._node = node
+        self._answer_s = device.settings.patience.answer_s
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Whether the EDS lists an object."""
         return find_variable(self._node.object_dictionary, index, sub) is not None
 
-    def default(self, index: int, sub: int = 0) -> int:
-        """Return the value that the EDS gives, 0 when it gives none."""
+    def can_write(self, index: int, sub: int = 0) -> bool:
+        """Whether the EDS lists an object that SDO may write."""
         variable = find_variable(self._node.object_dictionary, index, sub)
-        return 0 if variable is None or variable.default is None else variable.default
+        return variable is not None and variable.is_writable
+
+    def default(self, index: int, sub: int = 0) -> int | None:
+        """Return the value that the EDS gives, None when it gives none."""
+        variable = find_variable(self._node.object_dictionary, index, sub)
+        return None if variable is None else variable.default
 
     def read(self, index: int, sub: int = 0) -> int:
         """Read a number. Raises DeviceError."""
-        with explained(self.name, self.node_id, f"reading {self.describe(index, sub)}"):
+        with explained(self.name, self.node_id, f"reading {self.describe(index, sub)}", self._answer_s):
             return int(self._entry(index, sub).raw)
 
     def write(self, index: int, sub: int, value: int) -> None:
         """Write a number. Raises DeviceError."""
-        with explained(self.name, self.node_id, f"writing {self.describe(index, sub)} = {_number(value)}"):
+        what = f"writing {self.describe(index, sub)} = {_number(value)}"
+        with explained(self.name, self.node_id, what, self._answer_s):
             self._entry(index, sub).raw = value
         self.known[index, sub] = value
 
@@ -60,24 +77,35 @@ class Slave:
         self.write(index, sub, value)
         found = self.read(index, sub)
         if found != value:
-            self.fail(f"{self.describe(index, sub)} reads back {_with(found, unit)}, {_with(value, unit)} written")
+            self.fail(
+                f"{self.describe(index, sub)} reads back {_with(found, unit)}, {_with(value, unit)} written",
+                f"the device limits or rounds it: see {ObjectName(index, sub)} in its manual",
+            )
 
-    def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False) -> None:
-        """Compare an object with what it must be. Raises DeviceError."""
+    def difference(
+        self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False
+    ) -> str:
+        """Say how an object differs from what it must be, "" where it doesn't. Raises DeviceError."""
         found = self.read(index, sub)
         self.known[index, sub] = expected
-        if found != expected:
-            values = [f"0x{value:08X}" if is_hex else _with(value, unit) for value in (found, expected)]
-            self.fail(f"{quantity} {ObjectName(index, sub)} = {values[0]}, {values[1]} expected")
+        if found == expected:
+            return ""
+        values = [f"0x{value:08X}" if is_hex else _with(value, unit) for value in (found, expected)]
+        return f"{quantity} {ObjectName(index, sub)} = {values[0]}, {values[1]} expected"
+
+    def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", remedy: str = "") -> None:
+        """Compare an object with what it must be. Raises DeviceError."""
+        if text := self.difference(index, sub, expected, quantity, unit):
+            self.fail(text, remedy)
 
     def describe(self, index: int, sub: int) -> str:
         """Name an object as the EDS does."""
         variable = find_variable(self._node.object_dictionary, index, sub)
         return str(ObjectName(index, sub)) + ("" if variable is None else f" {variable.name}")
 
-    def fail(self, text: str) -> NoReturn:
-        """Raise DeviceError with the device's name."""
-        raise DeviceError(f"{self.name} (node {self.node_id}): {text}")
+    def fail(self, text: str, remedy: str = "") -> NoReturn:
+        """Raise DeviceError with the device's name. `remedy`: what to do about it."""
+        raise DeviceError(f"{self.name} (node {self.node_id}): {text}", remedy)
 
     def _entry(self, index: int, sub: int) -> Any:
         entry = self._node.sdo.get_variable(index, sub)
@@ -104,54 +132,158 @@ def command_deadline_ms(settings: Settings) -> int:
     return max(1, math.ceil(settings.bus.command_patience_cycles * settings.bus.period_us / 1000))
 
 
-def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> None:
-    """Check what the drive is, write limits, option codes and mode. Raises DeviceError."""
+_ROUNDED_SHARE = 0.005
+"""Part by which a rated torque may be off because it was rounded to two or three digits."""
+_TORQUE_UNITS = {1.0: "Nm", 1e-3: "mNm", 1e-6: "µNm"}
+
+
+def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> list[str]:
+    """Check what the drive is, write limits, option codes and mode; return what could not be checked, a line each.
+
+    Raises DeviceError.
+    """
     arm, joint, profile = settings.arm, slave.device.joint, slave.device.settings
     if slave.has(0x6502):
         modes = slave.read(0x6502)
         if not modes & _CST_SUPPORTED:
-            slave.fail(f"supported modes 0x6502 = 0x{modes:08X}, bit 9 (cyclic synchronous torque) expected")
+            slave.fail(
+                f"supported modes 0x6502 = 0x{modes:08X}, bit 9 (cyclic synchronous torque) expected",
+                "this drive can't be commanded by torque; a newer firmware may",
+            )
     if slave.has(0x6076):
-        slave.expect(0x6076, 0, round(arm.rated_torque_Nm[joint] * 1000), "rated torque", "mNm")
-    _check_resolution(slave, codec)
+        _check_rated_torque(slave, arm.rated_torque_Nm)
+    remarks = _check_units(slave, codec)
     if slave.device.can("option_codes"):
         quick_stop, fault_reaction = option_codes(settings, profile)
         for index, value in ((0x605A, quick_stop), (0x605E, fault_reaction)):
-            if value is not None and slave.has(index):
+            if value is not None and slave.can_write(index):
                 slave.write_checked(index, 0, value)
     if slave.device.can("torque_limits"):
         for index in (0x6072, 0x60E0, 0x60E1):
-            if slave.has(index):
+            if slave.can_write(index):
                 slave.write_checked(index, 0, torque_limit_permille(settings, joint), "per mille")
     if profile.command_watchdog == "0x2200":
         slave.write_checked(0x2200, 0, settings.bus.command_patience_cycles, "SYNCs")
     if slave.device.can("sync_tolerance"):
         slave.write_checked(0x2201, 0, round(10 * settings.bus.sync_patience_periods), "tenths of a period")
-    _enter_mode(slave)
+    _enter_mode(slave, codec)
+    return remarks
 
 
-def _check_resolution(slave: Slave, codec: Codec) -> None:
-    """Compare encoder and gear, where the EDS has both, with what the contract makes of an increment."""
-    if not all(slave.has(index, sub) for index in (0x608F, 0x6091) for sub in (1, 2)):
+def _check_rated_torque(slave: Slave, rated_Nm: Sequence[float]) -> None:
+    """Compare the motor's rated torque, behind its gear, with that of the joint, Nm (n,)."""
+    found = slave.read(0x6076)
+    slave.known[0x6076, 0] = found
+    scale, joint = slave.device.settings.scale, slave.device.joint
+    expected = [one_Nm / scale.joint_torque_Nm for one_Nm in rated_Nm]
+    alike = [other for other, counts in enumerate(expected) if abs(found - counts) <= _ROUNDED_SHARE * counts]
+    if joint in alike:
         return
-    increments, motor_revs = slave.read(0x608F, 1), slave.read(0x608F, 2)
-    gear_in, gear_out = slave.read(0x6091, 1), slave.read(0x6091, 2)
-    feedback = codec.message(f"{slave.name}Feedback")
-    position = feedback.values[feedback.place("position")]
-    expected = round(2.0 * math.pi / position.scale)
-    if motor_revs * gear_out == 0 or increments * gear_in != expected * motor_revs * gear_out:
+    later = [other for other in alike if other > joint]  # the drives of the joints before are where they should be
+    if not found:
         slave.fail(
-            f"increments per joint revolution 0x608F x 0x6091 = {increments}/{motor_revs} x {gear_in}/{gear_out}, "
-            f"{expected} expected"
+            "rated torque 0x6076 = 0: the drive does not know its motor",
+            "enter the motor with the maker's tool, and store it",
         )
+    unit = _TORQUE_UNITS.get(scale.rated_torque_count_Nm, f"x {scale.rated_torque_count_Nm:g} Nm")
+    text = f"rated torque 0x6076 = {found} {unit}, {round(expected[joint])} {unit} expected"
+    if scale.joint_torque_Nm != scale.rated_torque_count_Nm:
+        text += (
+            f" of a motor behind a gear of {scale.gear_ratio:g}: {found * scale.joint_torque_Nm:.4g} Nm at the joint, "
+            f"{rated_Nm[joint]:.4g} Nm told"
+        )
+    if later:
+        slave.fail(
+            f"{text}; it is that of joint {later[0] + 1}: the drives are exchanged",
+            "exchange `devices.drive_node`, or the drives' cables",
+        )
+    place = f"devices.drive[{joint}]"
+    slave.fail(
+        text,
+        f"correct `arm.rated_torque_Nm[{joint}]`, the torque at the joint; or `scale.gear_ratio`, "
+        f"`scale.gear_efficiency`, `scale.rated_torque_count_Nm` of {place}",
+    )
 
 
-def _enter_mode(slave: Slave) -> None:
-    slave.write(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+def _check_units(slave: Slave, codec: Codec) -> list[str]:
+    """Compare the worth of the drive's counts, as far as its EDS lists what says it, with the contract's.
+
+    Return what could not be compared, a line each. Raises DeviceError.
+    """
+
+    def number(index: int, sub: int) -> int | None:
+        return slave.read(index, sub) if slave.has(index, sub) else None
+
+    scale, remarks = slave.device.settings.scale, []
+    place = f"devices.drive[{slave.device.joint}]"
+    found = read_drive_units(number, scale.gear_ratio)
+    feedback = codec.message(f"{slave.name}Feedback")
+    position, velocity = (feedback.values[feedback.place(name)].scale for name in ("position", "velocity"))
+    increments = math.tau / position
+    if found.has_increments and not _is_alike(found.increments_per_joint_rev, increments):
+        slave.fail(
+            f"increments per joint revolution {found.increments_text}, {increments:.10g} expected",
+            f"correct `scale.increments_per_joint_rev` and `scale.gear_ratio` of {place}, or encoder and gear in the "
+            "drive",
+        )
+    if found.increments_text and not found.has_increments:
+        remarks.append(f"{found.increments_text} is a factory value: nothing confirms {increments:.10g} increments")
+    if found.velocity_rad_s is not None and not _is_alike(found.velocity_rad_s, velocity):
+        slave.fail(
+            f"a count of velocity by 0x60A9 = {name_velocity_unit(found.velocity_unit)} is "
+            f"{found.velocity_rad_s:.6g} rad/s at the joint, {velocity:.6g} rad/s expected",
+            f"correct `scale.velocity_rad_s` of {place}, or set 0x60A9 in the drive",
+        )
+    # A gear of 1 is that of a drive that rates its joint; 1 : 1 in the drive, that it was never told.
+    if found.gear_ratio not in (None, 1.0) and scale.gear_ratio not in (1.0, found.gear_ratio):
+        slave.fail(
+            f"gear ratio 0x6091 = {found.gear_ratio:g}, {scale.gear_ratio:g} expected",
+            f"correct `scale.gear_ratio` of {place}, or the gear in the drive",
+        )
+    return remarks
+
+
+def _is_alike(found: float | None, expected: float) -> bool:
+    return found is not None and abs(found - expected) <= 1e-6 * abs(expected)
+
+
+_HALT = 1 << 8  # of the controlword
+_MODE_POLL_S = 0.02
+
+
+def _enter_mode(slave: Slave, codec: Codec) -> None:
+    """Ask for cyclic synchronous torque. 0x6061 may show it later, once the drive is enabled: the cycle compares it.
+
+    Where no frame shows the mode, 0x6061 must show it now. Raises DeviceError.
+    """
+    if not slave.can_write(0x6060):
+        return
+    try:
+        slave.write(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+    except RefusedError:
+        if not (slave.can_write(0x6040) and slave.read(0x6040) & _HALT):
+            raise
+        slave.write(0x6040, 0, 0)  # drives that refuse another mode under halt
+        slave.known.pop((0x6040, 0))
+        slave.write(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+    if not slave.has(0x6061):
+        return
     for _ in range(_MODE_READS):
         if slave.read(0x6061) == MODE_CYCLIC_SYNCHRONOUS_TORQUE:
             return
-    slave.expect(0x6061, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE, "mode of operation")
+    if shows_mode(codec, slave.name):
+        return
+    for _ in range(round(slave.device.settings.patience.mode_s / _MODE_POLL_S)):
+        slave.wait(_MODE_POLL_S)
+        if slave.read(0x6061) == MODE_CYCLIC_SYNCHRONOUS_TORQUE:
+            return
+    slave.expect(
+        0x6061,
+        0,
+        MODE_CYCLIC_SYNCHRONOUS_TORQUE,
+        "mode of operation",
+        remedy="no frame shows the mode, so it is compared before the drive is enabled: map 0x6061 as `mode_display`",
+    )
 
 
 NEWTON_METRE = 0x00560100
@@ -167,18 +299,22 @@ def set_up_sensor(slave: Slave, codec: Codec) -> str:
     torque = codec.message(f"{slave.name}Torque")
     scale = torque.values[torque.place("torque")].scale
     channel = _channel(slave)
+    remedy = f"correct `scale.torque_Nm` of devices.sensor[{slave.device.joint}], or unit and digits in the sensor"
     prefix = 0
     if slave.has(0x6131, channel):
         unit = slave.read(0x6131, channel)
         if unit & 0x00FFFFFF != NEWTON_METRE:
-            slave.fail(f"unit 0x6131:{channel} = 0x{unit:08X}, 0x{NEWTON_METRE:08X} (Nm) expected")
+            slave.fail(
+                f"unit 0x6131:{channel} = 0x{unit:08X}, 0x{NEWTON_METRE:08X} (Nm) expected",
+                f"set 0x6131:{channel} of the sensor to newton metres with the maker's tool",
+            )
         prefix = unit >> PREFIX_SHIFT
         prefix -= 256 if prefix > 127 else 0
     if slave.has(0x6132, channel):
         digits = prefix - math.log10(scale)
         if abs(digits - round(digits)) > 1e-9:
-            slave.fail(f"a count of {scale:g} Nm can't be said in decimal digits 0x6132:{channel}")
-        slave.expect(0x6132, channel, round(digits), "decimal digits")
+            slave.fail(f"a count of {scale:g} Nm can't be said in decimal digits 0x6132:{channel}", remedy)
+        slave.expect(0x6132, channel, round(digits), "decimal digits", remedy=remedy)
     if slave.has(0x6150, channel):
         status = slave.read(0x6150, channel)
         if status:
@@ -222,6 +358,10 @@ class ParameterWatch(RateLimitedEvents):
         self._next = 0
         self._asked: _KnownObject | None = None
         self._asked_cycle = 0
+        self._pause_cycles: dict[int, int] = {}
+        self._last_cycle: dict[int, int] = {}
+        """By node id: how long it wants to be left alone, and when it was asked last."""
+        self._period_s = settings.bus.period_s
         self._answer_cycles = round(_ANSWER_S / settings.bus.period_s)
         self._due = Recurrence(settings.devices.reread_ms * 1e-3, settings.bus.period_s)
         self._is_on = settings.devices.reread_ms > 0
@@ -234,6 +374,10 @@ class ParameterWatch(RateLimitedEvents):
         # By turns, so that no device waits for all objects of another.
         longest = max(map(len, found), default=0)
         self._objects = tuple(objects[k] for k in range(longest) for objects in found if k < len(objects))
+        self._pause_cycles = {
+            one.slave.node_id: math.ceil(one.slave.device.settings.patience.pause_ms * 1e-3 / self._period_s)
+            for one in self._objects
+        }
 
     def step(self, cycle: int, t_ns: int) -> None:
         """Ask for the next object when it is due. Raises BusError."""
@@ -244,8 +388,12 @@ class ParameterWatch(RateLimitedEvents):
             self._asked = asked = None
         if asked is not None or not (self._is_on and self._objects and self._due.is_due(cycle)):
             return
-        self._asked = chosen = self._objects[self._next]
-        self._asked_cycle = cycle
+        chosen = self._objects[self._next]
+        node_id = chosen.slave.node_id
+        if cycle - self._last_cycle.get(node_id, -math.inf) <= self._pause_cycles[node_id]:
+            return
+        self._asked = chosen
+        self._asked_cycle = self._last_cycle[node_id] = cycle
         self._next = (self._next + 1) % len(self._objects)
         index, sub = chosen.place
         request = bytes((_UPLOAD, index & 0xFF, index >> 8, sub, 0, 0, 0, 0))
@@ -282,7 +430,7 @@ _RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 
 
 def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
-    """Bring all PDOs of a device into the form of its profile; a fixed mapping is only compared. Raises DeviceError.
+    """Bring all PDOs of a device into the form of its profile; what is so already is compared only. Raises DeviceError.
 
     `command_deadline_ms`: event timer of the command PDO where the profile has the deadline there.
     """
@@ -290,14 +438,25 @@ def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
     for pdo in profile.pdo:
         if not slave.has(pdo.communication_index, _COB_ID) or not slave.has(pdo.mapping_index, 0):
             slave.fail(
-                f"{pdo.message}: 0x{pdo.communication_index:04X} and 0x{pdo.mapping_index:04X} are not in the EDS"
+                f"{pdo.message}: 0x{pdo.communication_index:04X} and 0x{pdo.mapping_index:04X} are not in the EDS",
+                f"correct `number` of [[pdo]] {pdo.message} in {slave.device.profile.name}",
             )
-    if profile.mapping == "writable":
+    timers = {pdo.message: _event_timer(slave, pdo, command_deadline_ms) for pdo in profile.pdo}
+    compared = set()
+    if profile.mapping != "fixed":
         _switch_off_others(slave)
         for pdo in profile.pdo:
-            _write_pdo(slave, pdo, _event_timer(slave, pdo, command_deadline_ms))
+            if profile.mapping == "rewritten" or _difference(slave, pdo, timers[pdo.message]):
+                _write_pdo(slave, pdo, timers[pdo.message])
+            else:
+                compared.add(pdo.message)
     for pdo in profile.pdo:
-        _compare_pdo(slave, pdo, _event_timer(slave, pdo, command_deadline_ms))
+        if pdo.message not in compared and (text := _difference(slave, pdo, timers[pdo.message])):
+            slave.fail(
+                text,
+                f"[[pdo]] {pdo.message} of {slave.device.profile.name} must say what the device can map: see 0x1A00 "
+                "and PDOMapping in its EDS; `adacd-hil init --eds` drafts a profile",
+            )
 
 
 def _event_timer(slave: Slave, pdo: PdoSettings, command_deadline_ms: int) -> int:
@@ -308,7 +467,7 @@ def _event_timer(slave: Slave, pdo: PdoSettings, command_deadline_ms: int) -> in
 def _switch_off_others(slave: Slave) -> None:
     used = {pdo.communication_index for pdo in slave.device.settings.pdo}
     for index in _RECORDS:
-        if index in used or not slave.has(index, _COB_ID):
+        if index in used or not slave.can_write(index, _COB_ID):
             continue
         cob_id = slave.read(index, _COB_ID)
         if not cob_id & NOT_VALID:
@@ -316,42 +475,66 @@ def _switch_off_others(slave: Slave) -> None:
 
 
 def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
+    """Write what differs, or all: invalid first, the mapping emptied, valid last."""
     index, mapping_index = pdo.communication_index, pdo.mapping_index
     kept = slave.read(index, _COB_ID) & RTR_NOT_ALLOWED
     cob_id = slave.device.can_id(pdo) | kept
-    slave.write(index, _COB_ID, cob_id | NOT_VALID)
-    slave.write(mapping_index, 0, 0)
     entries = slave.device.mapping(pdo)
-    for sub, entry in enumerate(entries, 1):
-        slave.write(mapping_index, sub, entry)
-    slave.write(mapping_index, 0, len(entries))
-    slave.write(index, _TYPE, pdo.transmission)
+    is_all = slave.device.settings.mapping == "rewritten"
+    if slave.can_write(index, _COB_ID):
+        slave.write(index, _COB_ID, cob_id | NOT_VALID)
+    if is_all or _mapping_difference(slave, pdo):
+        if not slave.has(mapping_index, len(entries)):
+            slave.fail(
+                f"{pdo.message}: {len(entries)} objects are to be mapped, 0x{mapping_index:04X} has no sub-index "
+                f"{len(entries)}",
+                f"map fewer objects in [[pdo]] {pdo.message} of {slave.device.profile.name}",
+            )
+        slave.write(mapping_index, 0, 0)
+        for sub, entry in enumerate(entries, 1):
+            slave.write(mapping_index, sub, entry)
+        slave.write(mapping_index, 0, len(entries))
+    if is_all or slave.can_write(index, _TYPE):
+        slave.write(index, _TYPE, pdo.transmission)
     for sub, value in ((_INHIBIT, pdo.inhibit_100us), (_EVENT_TIMER, event_timer_ms)):
-        if slave.has(index, sub):
+        if slave.can_write(index, sub):
             slave.write(index, sub, value)
-        elif value:
-            slave.fail(f"{ObjectName(index, sub)} is not in the EDS, {value} wanted")
-    slave.write(index, _COB_ID, cob_id)
+        elif value and not slave.has(index, sub):
+            slave.fail(
+                f"{ObjectName(index, sub)} is not in the EDS, {value} wanted",
+                f"leave it out of [[pdo]] {pdo.message} in {slave.device.profile.name}",
+            )
+    if slave.can_write(index, _COB_ID):
+        slave.write(index, _COB_ID, cob_id)
 
 
-def _compare_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
-    index, mapping_index = pdo.communication_index, pdo.mapping_index
-    found = slave.read(index, _COB_ID) & ~RTR_NOT_ALLOWED
-    expected = slave.device.can_id(pdo)
+def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
+    """Say where a PDO of the device is not as its profile has it; empty where it is so."""
+    index = pdo.communication_index
+    identifier = slave.read(index, _COB_ID)
+    found, expected = identifier & ~RTR_NOT_ALLOWED, slave.device.can_id(pdo)
+    slave.known[index, _COB_ID] = expected | identifier & RTR_NOT_ALLOWED
     if found != expected:
-        slave.fail(f"identifier {ObjectName(index, _COB_ID)} = 0x{found:X}, 0x{expected:X} expected")
-    slave.expect(index, _TYPE, pdo.transmission, "transmission type")
-    if slave.device.settings.mapping == "writable":
-        for sub, value, quantity, unit in (
+        return f"identifier {ObjectName(index, _COB_ID)} = 0x{found:X}, 0x{expected:X} expected"
+    parameters = [(_TYPE, pdo.transmission, "transmission type", "")]
+    if slave.device.settings.mapping != "fixed":
+        parameters += [
             (_INHIBIT, pdo.inhibit_100us, "inhibit time", "x 100 µs"),
             (_EVENT_TIMER, event_timer_ms, "event timer", "ms"),
-        ):
-            if slave.has(index, sub):
-                slave.expect(index, sub, value, quantity, unit)
-    entries = slave.device.mapping(pdo)
-    slave.expect(mapping_index, 0, len(entries), "number of mapped objects")
+        ]
+    for sub, value, quantity, unit in parameters:
+        if slave.has(index, sub) and (text := slave.difference(index, sub, value, quantity, unit)):
+            return text
+    return _mapping_difference(slave, pdo)
+
+
+def _mapping_difference(slave: Slave, pdo: PdoSettings) -> str:
+    """Say where the mapping of a PDO is not as its profile has it; empty where it is so."""
+    mapping_index, entries = pdo.mapping_index, slave.device.mapping(pdo)
+    text = slave.difference(mapping_index, 0, len(entries), "number of mapped objects")
     for sub, entry in enumerate(entries, 1):
-        slave.expect(mapping_index, sub, entry, "mapped object", is_hex=True)
+        text = text or slave.difference(mapping_index, sub, entry, "mapped object", is_hex=True)
+    return text
 
 
 _RECEIVED, _SENT = 0x1400, 0x1800
@@ -371,6 +554,7 @@ SIGNAL_OBJECTS = {
     "target_torque": 0x6071,
     "torque_offset": 0x60B2,
     "max_torque": 0x6072,
+    "mode": 0x6060,
     "torque": 0x9130,
     "status": 0x6150,
 }

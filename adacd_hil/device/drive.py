@@ -169,6 +169,12 @@ def torque_limit_permille(settings: Settings, joint: int) -> int:
     return min(0xFFFF, round(1000 * arm.torque_limit_Nm[joint] / arm.rated_torque_Nm[joint]))
 
 
+def shows_mode(codec: Codec, name: str) -> bool:
+    """Whether some frame of a drive carries the mode, 0x6061."""
+    frames = (codec.messages.get(f"{name}{message}") for message in ("Feedback", "Status"))
+    return any(signal.name == "mode_display" for frame in frames if frame is not None for signal in frame.values)
+
+
 def decode_statusword(statusword: int) -> Cia402State:
     """Read the state from 0x6041; a pattern the standard doesn't list counts as not ready."""
     for mask, value, state in _STATUSWORD:
@@ -222,8 +228,7 @@ class Drive(CyclicDevice):
         self.state = Cia402State.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
         # Where no frame shows the mode, the master has compared 0x6061 before the start.
-        is_mode_shown = max(self._feedback_status.mode_display, self._status_places.mode_display) >= 0
-        self.mode = 0 if is_mode_shown else MODE_CYCLIC_SYNCHRONOUS_TORQUE
+        self.mode = 0 if shows_mode(codec, name) else MODE_CYCLIC_SYNCHRONOUS_TORQUE
         self.is_enabled = False
         """Whether the drive produces the commanded torque."""
         self.torque_actual_permille = 0
@@ -341,7 +346,13 @@ def _status_places(message: MessageCodec) -> _StatusPlaces:
 
 def _command_template(message: MessageCodec, max_torque_permille: int) -> tuple[list[int], int, int]:
     """Return the raw values of a command with the constant ones filled in, and where controlword and torque are."""
-    constants = {"controlword": 0, "target_torque": 0, "torque_offset": 0, "max_torque": max_torque_permille}
+    constants = {
+        "controlword": 0,
+        "target_torque": 0,
+        "torque_offset": 0,
+        "max_torque": max_torque_permille,
+        "mode": MODE_CYCLIC_SYNCHRONOUS_TORQUE,
+    }
     template = []
     for signal in message.values:
         if signal.name not in constants:

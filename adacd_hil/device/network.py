@@ -28,6 +28,8 @@ from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 START, ENTER_PRE_OPERATIONAL, RESET_COMMUNICATION = 0x01, 0x80, 0x82
 """NMT commands."""
 _PROFILE_NUMBER_MASK = 0xFFFF  # of 0x1000
+_SAME_DBC = "give host and devices the same DBC file: `devices.contract`, and the node ids that it has"
+_UNPOWERED = "check the device's power, wiring and node id; `adacd-hil scan` lists who is there"
 _MOST_OLD_FRAMES = 10_000  # more than any queue holds; a bus that somebody floods is never empty
 
 
@@ -64,9 +66,12 @@ class Master:
         devices = place_devices(settings)
         for device in devices:
             listener = functools.partial(self._on_emergency, device.name)
-            node = self._canopen.add_node(device.node_id, device.objects, listener)
+            patience = device.settings.patience
+            node = self._canopen.add_node(
+                device.node_id, device.objects, listener, patience.answer_s, patience.pause_ms * 1e-3
+            )
             self.nodes[device.name] = node
-            self.slaves.append(Slave(device, node))
+            self.slaves.append(Slave(device, node, self._let_pass))
         self._heartbeats = follow_devices(devices, settings.bus.heartbeat_ms, self._events.append)
         self.parameters = ParameterWatch(settings, bus)
         self._canopen.bystander = self._heartbeats.accept
@@ -86,6 +91,9 @@ class Master:
             return
         self._heartbeats.accept(frame)
         self._canopen.accept(frame)
+
+    def _let_pass(self, duration_s: float) -> None:
+        self._canopen.pump(lambda _: False, duration_s)
 
     def take_events(self) -> list[Event]:
         """Return what the devices reported since the last call."""
@@ -120,7 +128,7 @@ class Master:
 
         if not self._canopen.pump(is_last_boot, timeout_s):
             missing = ", ".join(f"{name} (node {node_id})" for node_id, name in waiting.items())
-            raise DeviceError(f"no boot-up from {missing} on {self._bus.channel} within {timeout_s:g} s")
+            raise DeviceError(f"no boot-up from {missing} on {self._bus.channel} within {timeout_s:g} s", _UNPOWERED)
 
     def identify(self) -> list[Identity]:
         """Read who is there and compare it with EDS, profile and DBC. Raises DeviceError, BusError."""
@@ -130,38 +138,56 @@ class Master:
         profile = slave.device.settings
         by_contract = self._codec.node_id(f"{slave.name}Heartbeat")
         if slave.node_id != by_contract:
-            slave.fail(f"node id {by_contract} by the DBC, {slave.node_id} by the configuration")
+            slave.fail(
+                f"node id {by_contract} by the DBC, {slave.node_id} by the configuration",
+                f'correct `devices.{profile.kind}_node`, or `devices.contract` = "" composes the frames',
+            )
         device_type = slave.read(0x1000)
         read = {sub: slave.read(0x1018, sub) if slave.has(0x1018, sub) else 0 for sub in (1, 2, 3, 4)}
         if profile.identity == "eds":
             self._check_identity(slave, device_type, read)
         if profile.serial and read[4] != profile.serial[slave.device.joint]:
-            slave.fail(f"serial number 0x1018:4 = {read[4]}, {profile.serial[slave.device.joint]} expected")
+            slave.fail(
+                f"serial number 0x1018:4 = {read[4]}, {profile.serial[slave.device.joint]} expected",
+                f"the device was changed, or moved to another joint: correct `serial` of {slave.device.profile.name}",
+            )
         if profile.contract_object:
             self._check_contract(slave)
         return Identity(slave.name, slave.node_id, *read.values())
 
     @staticmethod
     def _check_identity(slave: Slave, device_type: int, read: dict[int, int]) -> None:
+        """Compare what the EDS gives; what it leaves open may be anything."""
+        kind, name = slave.device.settings.kind, slave.device.profile.name
+        another = (
+            f"another device has this node id, or profile {name} is of another: `adacd-hil scan` lists the nodes; "
+            f"correct `devices.{kind}_node` or `devices.{kind}`"
+        )
         expected_type = slave.default(0x1000)
-        if device_type & _PROFILE_NUMBER_MASK != expected_type & _PROFILE_NUMBER_MASK:
-            slave.fail(f"device type 0x1000 = 0x{device_type:08X}, 0x{expected_type:08X} expected")
+        if expected_type is not None and (device_type ^ expected_type) & _PROFILE_NUMBER_MASK:
+            slave.fail(f"device type 0x1000 = 0x{device_type:08X}, 0x{expected_type:08X} expected", another)
         for sub, what in ((1, "vendor"), (2, "product code")):
-            if read[sub] != slave.default(0x1018, sub):
-                slave.fail(f"{what} 0x{read[sub]:X} is not the EDS's 0x{slave.default(0x1018, sub):X}")
+            expected = slave.default(0x1018, sub)
+            if expected is not None and read[sub] != expected:
+                slave.fail(f"{what} 0x{read[sub]:X} is not the EDS's 0x{expected:X}", another)
         # CiA 301, 7.5.2.19: the high word stands for a behaviour on the bus, the low word for versions of it.
-        major, minor = divmod(slave.default(0x1018, 3), 1 << 16)
-        if (major or minor) and (read[3] >> 16 != major or read[3] & 0xFFFF < minor):
-            slave.fail(f"revision 0x{read[3]:X} is not of the EDS's 0x{slave.default(0x1018, 3):X}")
+        revision = slave.default(0x1018, 3) or 0
+        major, minor = divmod(revision, 1 << 16)
+        if revision and (read[3] >> 16 != major or read[3] & 0xFFFF < minor):
+            slave.fail(
+                f"revision 0x{read[3]:X} is not of the EDS's 0x{revision:X}",
+                f'get the EDS of this firmware from the maker; `identity = "any"` in {name} takes every revision',
+            )
 
     def _check_contract(self, slave: Slave) -> None:
         version, digest = slave.read(0x2000, 1), slave.read(0x2000, 2)
         if version != self._codec.wire_version:
-            slave.fail(f"wire version {version} is not the DBC's {self._codec.wire_version}")
+            slave.fail(f"wire version {version} is not the DBC's {self._codec.wire_version}", _SAME_DBC)
         if digest != self._codec.layout_digest:
             slave.fail(
                 f"layout digest 0x{digest:08X} is not the DBC's 0x{self._codec.layout_digest:08X}; "
-                "host and device use different DBC files"
+                "host and device use different DBC files",
+                _SAME_DBC,
             )
 
     def configure(self) -> None:
@@ -172,7 +198,8 @@ class Master:
             self._set_up_emergencies(slave)
             set_up_pdos(slave, command_deadline_ms(self._settings) if self._watch_host else 0)
             if slave.device.settings.kind == "drive":
-                set_up_drive(slave, self._settings, self._codec)
+                for remark in set_up_drive(slave, self._settings, self._codec):
+                    self._events.append(Event("warning", slave.name, remark))
             else:
                 status = set_up_sensor(slave, self._codec)
                 if status:
@@ -185,28 +212,39 @@ class Master:
         if slave.has(0x1005):
             identifier = slave.read(0x1005) & MAX_STANDARD_ID
             if identifier != SYNC_ID:
-                slave.fail(f"SYNC identifier 0x1005 = 0x{identifier:X}, 0x{SYNC_ID:X} expected")
-        counts = slave.has(0x1019) and slave.device.can("sync_counter")
+                slave.fail(
+                    f"SYNC identifier 0x1005 = 0x{identifier:X}, 0x{SYNC_ID:X} expected",
+                    "set 0x1005 with the maker's tool, and store it",
+                )
+        counts = slave.can_write(0x1019) and slave.device.can("sync_counter")
+        has_period = slave.can_write(0x1006)
         if counts and slave.read(0x1019) != SYNC_OVERFLOW:
-            if slave.has(0x1006):
+            if has_period:
                 slave.write(0x1006, 0, 0)  # CiA 301, 7.5.2.22: the overflow value can be changed at period 0 only
             slave.write_checked(0x1019, 0, SYNC_OVERFLOW)
-        if slave.has(0x1006):
+        if has_period:
             slave.write(0x1006, 0, self._settings.bus.period_us)
-            slave.expect(0x1006, 0, self._settings.bus.period_us, "SYNC period", "µs")
+            slave.expect(
+                0x1006,
+                0,
+                self._settings.bus.period_us,
+                "SYNC period",
+                "µs",
+                remedy="the device takes other periods: choose a `bus.period_us` of its manual",
+            )
 
     @staticmethod
     def _set_up_emergencies(slave: Slave) -> None:
-        if slave.has(0x1015):
+        if slave.can_write(0x1015):
             slave.write_checked(0x1015, 0, EMCY_INHIBIT_100US, "x 100 µs")
 
     def _set_up_heartbeats(self, slave: Slave) -> None:
         period_ms = self._settings.bus.heartbeat_ms
-        if slave.has(0x1017):
+        if slave.can_write(0x1017):
             slave.write_checked(0x1017, 0, period_ms, "ms")
         else:
             self._events.append(Event("warning", slave.name, "sends no heartbeat (0x1017 is not in its EDS)"))
-        if slave.has(0x1016, 1) and slave.device.can("heartbeat_consumer"):
+        if slave.can_write(0x1016, 1) and slave.device.can("heartbeat_consumer"):
             host = self._heartbeat_id & 0x7F
             entry = host << 16 | round(PATIENCE_PERIODS * period_ms)
             slave.write_checked(0x1016, 1, entry if self._watch_host else 0)

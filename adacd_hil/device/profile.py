@@ -7,6 +7,7 @@ frame under which signal name, what one count is worth, how frames are protected
 Source: CiA 306 (EDS), CiA 301 clause 7.5.2 (PDO parameters), CiA 402-2, CiA 404.
 """
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -16,7 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adacd_hil.device.canopen_bus import EdsVariable, find_variable, read_eds
+from adacd_hil.device.drive_units import LEAST_INCREMENTS
 from adacd_hil.records import JOINTS
+from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
@@ -69,6 +72,8 @@ def parse_object(text: str) -> ObjectName:
     return name
 
 
+_MERGED = ("scale", "plausibility", "patience")
+"""Sections of a profile that one which extends it need not repeat."""
 _TOGETHER = {
     "Feedback": ("position", "velocity"),
     "Command": ("controlword", "target_torque"),
@@ -135,11 +140,31 @@ class PdoSettings:
 class ScaleSettings:
     """What one count of the device is worth."""
 
-    increments_per_joint_rev: int = setting(
-        0, low=0, high=2**40, meaning="position increments per revolution of the joint; checked with 0x608F, 0x6091"
+    increments_per_joint_rev: float = setting(
+        0.0,
+        low=0.0,
+        high=2.0**40,
+        meaning="position increments per revolution of the joint; checked with 0x608F, 0x6091",
     )
-    velocity_rad_s: float = setting(0.0, unit="rad/s", low=0.0, high=100.0, meaning="one count of velocity")
+    velocity_rad_s: float = setting(
+        0.0, unit="rad/s", low=0.0, high=100.0, meaning="one count of velocity, at the joint; checked with 0x60A9"
+    )
+    gear_ratio: float = setting(
+        1.0,
+        low=1e-3,
+        high=1e5,
+        meaning="motor revolutions per revolution of the joint: 0x6076 is the motor's; 1: a drive that rates its joint",
+    )
+    gear_efficiency: float = setting(1.0, low=0.05, high=1.0, meaning="part of the motor's torque that leaves the gear")
+    rated_torque_count_Nm: float = setting(
+        1e-3, unit="Nm", low=1e-12, high=1.0, meaning="one count of 0x6076: 1e-3 by CiA 402-2, 1e-6 in an EPOS4"
+    )
     torque_Nm: float = setting(0.0, unit="Nm", low=0.0, high=100.0, meaning="one count of the sensor's torque")
+
+    @property
+    def joint_torque_Nm(self) -> float:
+        """One count of 0x6076 at the joint, Nm: per mille of 0x6076 are per mille of this much of it."""
+        return self.rated_torque_count_Nm * self.gear_ratio * self.gear_efficiency
 
 
 @dataclass(frozen=True)
@@ -152,6 +177,22 @@ class PlausibilitySettings:
     torque_rate_Nm_s: float = setting(20_000.0, unit="Nm/s", low=1.0, high=1e7, meaning="largest change of torque")
     torque_range_Nm: float = setting(
         0.0, unit="Nm", low=0.0, high=1e6, meaning="end of the sensor's range, there it is overloaded; 0: unknown"
+    )
+
+
+@dataclass(frozen=True)
+class PatienceSettings:
+    """How long the host waits for a device, and how soon it asks again."""
+
+    answer_s: float = setting(0.5, unit="s", low=0.01, high=60.0, meaning="longest wait for an SDO answer")
+    pause_ms: float = setting(
+        0.0, unit="ms", low=0.0, high=1000.0, meaning="from an SDO answer to the next request, 15 for an EPOS"
+    )
+    enable_s: float = setting(
+        5.0, unit="s", low=0.1, high=300.0, meaning="longest way to Operation enabled, as of a brake that opens"
+    )
+    mode_s: float = setting(
+        10.0, unit="s", low=0.0, high=300.0, meaning="how much later 0x6061 may show cyclic synchronous torque"
     )
 
 
@@ -185,7 +226,11 @@ class ProfileSettings:
     contract_object: bool = setting(False, meaning="the device carries wire version and layout digest in 0x2000")
     protection: str = setting("none", choices=("none", "P02", "P05"), meaning="AUTOSAR end-to-end profile")
     header: tuple[str, ...] = setting((), meaning="objects of the end-to-end header, in order")
-    mapping: str = setting("writable", choices=("writable", "fixed"), meaning="whether PDO parameters are written")
+    mapping: str = setting(
+        "writable",
+        choices=("writable", "rewritten", "fixed"),
+        meaning="PDO parameters are written where they differ; always; or only compared",
+    )
     command_watchdog: str = setting(
         "none", choices=("none", "0x2200", "0x1400:5"), meaning="where the deadline of commands is set: SYNCs, or ms"
     )
@@ -194,6 +239,8 @@ class ProfileSettings:
     fault_reaction_option: int | None = setting(None, low=0, high=4, meaning="0x605E that is written, or fixed")
     scale: ScaleSettings = setting(ScaleSettings, meaning="worth of a count")
     plausibility: PlausibilitySettings = setting(PlausibilitySettings, meaning="bounds for unprotected frames")
+    patience: PatienceSettings = setting(PatienceSettings, meaning="how long the host waits for it")
+    assumed: tuple[str, ...] = setting((), meaning="keys of this profile whose values are guesses")
     setup: tuple[WriteSettings, ...] = setting((), meaning="extra SDO writes, last")
 
     def __post_init__(self) -> None:
@@ -202,6 +249,7 @@ class ProfileSettings:
         self._check_frames()
         self._check_protection()
         self._check_scale()
+        self._check_assumed()
 
     def _check_frames(self) -> None:
         wanted = {"drive": ("Feedback", "Command"), "sensor": ("Torque",)}[self.kind]
@@ -249,10 +297,24 @@ class ProfileSettings:
     def _check_scale(self) -> None:
         if self.kind == "drive" and not (self.scale.increments_per_joint_rev and self.scale.velocity_rad_s):
             raise ValueError("scale: a drive needs increments_per_joint_rev and velocity_rad_s")
+        if self.kind == "drive" and self.scale.increments_per_joint_rev < LEAST_INCREMENTS:
+            raise ValueError(
+                f"scale: increments_per_joint_rev = {self.scale.increments_per_joint_rev:g} is below "
+                f"{LEAST_INCREMENTS}: "
+                "a factory value of 0x608F? It is increments per motor revolution times the gear"
+            )
         if self.kind == "sensor" and not self.scale.torque_Nm:
             raise ValueError("scale: a sensor needs torque_Nm")
         if self.serial and len(self.serial) != 2:
             raise ValueError(f"serial has {len(self.serial)} numbers, 2 expected")
+
+    def _check_assumed(self) -> None:
+        known = [f"{name}.{field.name}" for name in _MERGED for field in dataclasses.fields(type(getattr(self, name)))]
+        for key in self.assumed:
+            if key not in known:
+                nearest = nearest_name(key, known)
+                hint = f"; did you mean {nearest!r}?" if nearest else f"; known: {', '.join(known)}"
+                raise ValueError(f"assumed: {key!r} is no key of a profile{hint}")
 
     def unit_of(self, signal: SignalSettings) -> tuple[float, str]:
         """Return the worth of one count and the unit of a signal."""
@@ -292,18 +354,43 @@ def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
     Raises ConfigError for an unknown name or key, a value outside its bounds, an EDS that isn't there, another kind.
     """
     path = find_toml("device profile", name_or_file, _builtin_folder())
-    table = read_toml(path, "device profile")
     try:
+        table, folders = _read_profile(path)
         settings = parse(ProfileSettings, table)
     except ConfigError as error:
-        raise ConfigError(f"device profile {name_or_file}: {error}") from None
+        place = "" if str(error).startswith("device profile") else f"device profile {name_or_file}: "
+        raise ConfigError(f"{place}{error}") from None
     if settings.kind != kind:
         raise ConfigError(f"device profile {name_or_file} is a {settings.kind}, a {kind} is needed")
-    beside = path.parent / settings.eds
-    eds = beside if beside.is_file() else contract_folder() / settings.eds
-    if not eds.is_file():
+    places = (folder / settings.eds for folder in (*folders, contract_folder()))
+    eds = next((place for place in places if place.is_file()), None)
+    if eds is None:
         raise ConfigError(f"device profile {name_or_file}: eds = {settings.eds!r} is neither beside it nor in dbc/")
     return DeviceProfile(path.stem, eds, settings)
+
+
+_MOST_EXTENDED = 8
+
+
+def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path]]:
+    """Read a profile over the one that it extends; return it with the folders of both, its own first."""
+    table = read_toml(path, "device profile")
+    extended = table.pop("extends", None)
+    if extended is None:
+        return table, [path.parent]
+    if not isinstance(extended, str) or depth >= _MOST_EXTENDED:
+        raise ConfigError(f"`extends` = {extended!r} must be the name of a profile, at most {_MOST_EXTENDED} in a row")
+    beside = path.parent / extended
+    base = beside if beside.is_file() else find_toml("device profile", extended, _builtin_folder())
+    below, folders = _read_profile(base, depth + 1)
+    merged = below | table
+    for key in _MERGED:
+        if isinstance(below.get(key), dict) and isinstance(table.get(key), dict):
+            merged[key] = below[key] | table[key]
+    if "assumed" not in table:
+        stated = {f"{key}.{name}" for key in _MERGED if isinstance(table.get(key), dict) for name in table[key]}
+        merged["assumed"] = [key for key in below.get("assumed", []) if key not in stated]
+    return merged, [path.parent, *folders]
 
 
 @dataclass(frozen=True)
@@ -384,3 +471,14 @@ def place_devices(settings: Settings) -> list[PlacedDevice]:
             profile = load_profile(names[joint], kind)
             devices.append(PlacedDevice(f"{kind.capitalize()}{joint + 1}", joint, nodes[joint], profile))
     return devices
+
+
+def enable_timeout_s(settings: Settings) -> float:
+    """Return how long ENABLE may take: as the configuration says, else as long as the most patient profile wants.
+
+    Raises ConfigError.
+    """
+    if settings.safety.enable_timeout_s is not None:
+        return settings.safety.enable_timeout_s
+    patience = [device.settings.patience for device in place_devices(settings) if device.settings.kind == "drive"]
+    return max(settings.safety.phase_timeout_s, *(one.enable_s + one.mode_s for one in patience))

@@ -18,7 +18,11 @@ class ArmSettings:
     profile: str = setting("P", choices=("P", "S", "M"), meaning="emulated arm that this configuration is for")
     link_length_m: tuple[float, float] = setting((0.35, 0.30), unit="m", low=0.01, high=5.0, meaning="joint to joint")
     rated_torque_Nm: tuple[float, float] = setting(
-        (12.0, 6.0), unit="Nm", low=0.1, high=1000.0, meaning="rated torque of each drive, 0x6076"
+        (12.0, 6.0),
+        unit="Nm",
+        low=0.1,
+        high=1000.0,
+        meaning="rated torque of each drive at its joint: 0x6076, by gear and unit",
     )
     sign: tuple[int, int] = setting((1, 1), low=-1, high=1, meaning="+1 or -1: device direction to joint direction")
     torque_offset_Nm: tuple[float, float] = setting(

@@ -228,6 +228,13 @@ class SafetySettings:
         "the run faults; 0: not compared",
     )
     phase_timeout_s: float = setting(5.0, unit="s", low=0.1, high=600.0, meaning="longest COMMISSION and ENABLE")
+    enable_timeout_s: float | None = setting(
+        None,
+        unit="s",
+        low=0.1,
+        high=600.0,
+        meaning="longest ENABLE; absent: phase_timeout_s, or what the drives' profiles ask for if that is more",
+    )
     tolerated_emergencies: tuple[int, ...] = setting(
         (0x8200, 0x8210, 0x8240),
         low=0x0100,

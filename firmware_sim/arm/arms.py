@@ -132,7 +132,7 @@ class OwnArmSettings:
     viscous_Nm_s: Pair = setting(unit="Nm s/rad", low=0.0, high=1e4, meaning="viscous friction behind the sensor")
     coulomb_Nm: Pair = setting(unit="Nm", low=0.0, high=1e3, meaning="Coulomb friction behind the sensor")
     rated_torque_Nm: Pair = setting(
-        unit="Nm", low=0.1, high=1000.0, meaning="rated torque of each joint's drive, 0x6076, and the most it gives"
+        unit="Nm", low=1e-3, high=1e5, meaning="rated torque of each joint's drive, 0x6076, and the most it gives"
     )
     brake_damping_Nm_s: Pair = setting(
         unit="Nm s/rad", low=0.0, high=1e4, meaning="quick stop and fault: braking torque per rad/s"
@@ -148,6 +148,9 @@ class OwnArmSettings:
     )
     velocity_factor: Pair = setting(
         (1.0, 1.0), low=1e-3, high=1e3, meaning="counts of velocity, in those that the contract says"
+    )
+    rated_count_Nm: Pair = setting(
+        (1e-3, 1e-3), unit="Nm", low=1e-12, high=1e6, meaning="one count of 0x6076 of each drive, behind its gear"
     )
     torque_factor: Pair = setting(
         (1.0, 1.0), low=1e-3, high=1e3, meaning="counts of torque, in those that the contract says"

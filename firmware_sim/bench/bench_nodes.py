@@ -178,7 +178,7 @@ def _scale_of(own: OwnArmSettings | None, place: int) -> DriveScale:
     if own is None:
         return DriveScale()
     increments = own.increments_per_joint_rev[place] or ENCODER_COUNTS
-    return DriveScale(increments / ENCODER_COUNTS, own.velocity_factor[place])
+    return DriveScale(increments / ENCODER_COUNTS, own.velocity_factor[place], own.rated_count_Nm[place])
 
 
 def _check_period(period_us: int) -> None:

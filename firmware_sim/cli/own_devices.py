@@ -6,10 +6,11 @@ describe a device, and the contract that follows from them, which is the definit
 
 import math
 from collections.abc import Sequence
+from fractions import Fraction
 from typing import NamedTuple
 
 from adacd_hil.device.contract import load_contract
-from adacd_hil.device.profile import PlacedDevice, place_devices
+from adacd_hil.device.profile import ObjectName, PlacedDevice, place_devices
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
 from adacd_hil.settings.schema import ConfigError, parse
@@ -102,12 +103,35 @@ def _counts(codec: Codec, devices: list[PlacedDevice]) -> DeviceCounts:
         message = codec.message(f"{sensor.name}Torque")
         signal = message.values[message.place("torque")]
         ranges.append(sensor.settings.plausibility.torque_range_Nm or signal.raw_high * signal.scale)
-    return DeviceCounts((first, second), (ranges[0], ranges[1]))
+    count_Nm = [drive.settings.scale.joint_torque_Nm for drive in drives]
+    rated_Nm = [_default(drive, 0x6076, 0) * worth for drive, worth in zip(drives, count_Nm, strict=True)]
+    return DeviceCounts((first, second), (ranges[0], ranges[1]), (count_Nm[0], count_Nm[1]), (rated_Nm[0], rated_Nm[1]))
+
+
+def _default(device: PlacedDevice, index: int, sub: int) -> int:
+    """Return what an EDS gives of an object, 0 where it gives nothing."""
+    variable = device.variable(ObjectName(index, sub)) if device.has(index, sub) else None
+    return 0 if variable is None or variable.default is None else variable.default
 
 
 def describe_devices(codec: Codec, devices: list[PlacedDevice]) -> EmulatedContract:
     """Describe the four devices by their own EDS. Raises ConfigError when one lacks an object that no drive lacks."""
     return EmulatedContract(codec.path.name, "", "", tuple(_describe(device) for device in devices))
+
+
+def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
+    """Give encoder, gear and feed constant the values that come to the profile's increments."""
+    scale = device.settings.scale
+    told_in, told_out = _default(device, 0x6091, 1), _default(device, 0x6091, 2)
+    gear = Fraction(told_in, told_out) if told_in and told_out else Fraction(scale.gear_ratio).limit_denominator(1000)
+    return {
+        (0x608F, 1): round(scale.increments_per_joint_rev / gear),
+        (0x608F, 2): 1,
+        (0x6091, 1): gear.numerator,
+        (0x6091, 2): gear.denominator,
+        (0x6092, 1): round(scale.increments_per_joint_rev),
+        (0x6092, 2): 1,
+    }
 
 
 def _describe(device: PlacedDevice) -> DeviceDescription:
@@ -133,7 +157,7 @@ def _describe(device: PlacedDevice) -> DeviceDescription:
         fallbacks[pdo.communication_index, 1] = device.can_id(pdo)
         fallbacks[pdo.communication_index, 2] = pdo.transmission
     if kind == "drive":
-        fallbacks |= {(0x608F, 1): scale.increments_per_joint_rev, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
+        fallbacks |= _counts_of_position(device)
         fallbacks[0x6502, 0] = _CYCLIC_SYNCHRONOUS_TORQUE
     else:
         fallbacks |= {(0x6131, sub): _NEWTON_METRE for sub in range(1, 255)}

@@ -5,7 +5,7 @@ SYNC. The motor has torque only in Operation enabled with mode 10; Quick stop ac
 brake, and so do shutdown and disable operation where 0x605B and 0x605C say so; everywhere else the arm coasts.
 
 Units on the wire: position in encoder counts, velocity in the LSB of the contract, torque in per mille of rated torque
-0x6076, rated torque in mNm.
+0x6076, rated torque in mNm of the joint, or in what one count of an arm of one's own is worth behind the gear.
 
 While the motor is powered, SDO writes nothing but the controlword and clears the error history. While an RPDO brings
 the controlword, SDO writes only those that take the power away: Disable voltage and Quick stop.
@@ -81,7 +81,9 @@ class DriveNode(Application):
         self._motor = motor
         self.is_free_running = is_free_running
         """Whether time passes without SYNC, so that SYNC is watched."""
-        self._rated_mNm = round(rated_torque_Nm * 1000)
+        self._rated_counts = round(rated_torque_Nm / scale.rated_count_Nm)
+        is_plain = scale.rated_count_Nm == 1e-3
+        self._rated_mNm = self._rated_counts if is_plain else self._rated_counts * scale.rated_count_Nm * 1e3
         self._position_scale = scale.position
         self._velocity_lsb_rad_s = velocity_lsb(codec, number, scale.velocity)
         self._position = self._velocity = 0
@@ -120,7 +122,7 @@ class DriveNode(Application):
         serve(0x6064, 0, lambda: self._position)
         serve(0x606C, 0, lambda: self._velocity)
         serve(0x6074, 0, lambda: self._demand)
-        serve(0x6076, 0, lambda: self._rated_mNm)
+        serve(0x6076, 0, lambda: self._rated_counts)
         serve(0x6077, 0, lambda: self._torque_permille)
 
     def _configure(self) -> None:

@@ -249,10 +249,14 @@ class Motor(NamedTuple):
 
 
 class DriveScale(NamedTuple):
-    """How a drive counts: position in the body's counts, velocity in those that the contract says."""
+    """How a drive counts: position in the body's counts, velocity in those that the contract says.
+
+    rated_count_Nm: one count of 0x6076, behind the gear.
+    """
 
     position: float = 1.0
     velocity: float = 1.0
+    rated_count_Nm: float = 1e-3
 
 
 class Patience:

@@ -60,11 +60,14 @@ class DeviceCounts(NamedTuple):
     """What a profile says that the emulated devices count in; pairs are by place.
 
     increments_per_joint_rev: of position. torque_range_Nm: the most that the sensors' signals can carry, or that the
-    profile says.
+    profile says. rated_count_Nm: one count of 0x6076 behind the gear. rated_torque_Nm: what the EDS gives of 0x6076,
+    behind the gear; 0: nothing.
     """
 
     increments_per_joint_rev: Pair
     torque_range_Nm: Pair
+    rated_count_Nm: Pair = (1e-3, 1e-3)
+    rated_torque_Nm: Pair = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,10 @@ def compose_scenario(
     settings, arm = told.settings, told.settings.arm
     assumed: list[str] = []
     links = _place_links(told, truth, assumed)
-    rated = truth.arm.rated_torque_Nm or _times(arm.rated_torque_Nm, truth.factor.rated_torque)
+    factor = truth.factor
+    first, second = (by_eds or told for by_eds, told in zip(counts.rated_torque_Nm, arm.rated_torque_Nm, strict=True))
+    rated = truth.arm.rated_torque_Nm or _times((first, second), factor.rated_torque)
+    rated = _times(rated, factor.gear)
     viscous, coulomb = _friction(told, truth, rated, assumed)
     inertia = _joint_inertia(links)
     braking = truth.arm.brake_damping_Nm_s or _times(inertia, (1.0 / _BRAKING_S, 1.0 / _BRAKING_S))
@@ -131,8 +137,8 @@ def compose_scenario(
             f"joint stops at ±{first:g} and ±{second:g} deg, since the file has none: {_STOP_MARGIN_DEG:g} deg beyond "
             "arm.position_limit_deg"
         )
-    factor = truth.factor
-    increments = _by_place(truth, "drives", counts.increments_per_joint_rev)
+    gear = _by_place(truth, "drives", factor.gear)
+    increments = _times(gear, _by_place(truth, "drives", counts.increments_per_joint_rev))
     own: dict[str, Any] = {
         "name": settings.name or "own",
         "link_length_m": links.length_m,
@@ -146,7 +152,8 @@ def compose_scenario(
         "stop_deg": stops,
         **_wire(arm.sign, truth),
         "increments_per_joint_rev": _times(increments, _by_place(truth, "drives", factor.position_counts)),
-        "velocity_factor": _by_place(truth, "drives", factor.velocity_counts),
+        "velocity_factor": _times(gear, _by_place(truth, "drives", factor.velocity_counts)),
+        "rated_count_Nm": _times(gear, _by_place(truth, "drives", counts.rated_count_Nm)),
         "torque_factor": _by_place(truth, "sensors", factor.torque_counts),
     }
     own = {key: list(value) if isinstance(value, tuple) else value for key, value in own.items()}

@@ -370,6 +370,9 @@ class FactorSettings:
     link_length: Pair = setting((1.0, 1.0), low=0.1, high=10.0, meaning="of the lengths; masses keep their shares")
     mass: Pair = setting((1.0, 1.0), low=0.01, high=100.0, meaning="of the masses, and with them the inertia")
     rated_torque: Pair = setting((1.0, 1.0), low=0.01, high=100.0, meaning="of the rated torque of each joint's drive")
+    gear: Pair = setting(
+        (1.0, 1.0), low=1e-3, high=1e3, meaning="of the gear ratio of each joint's drive: its torque and its counts"
+    )
     torque_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the torque sensors' counts")
     position_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the drives' counts of position")
     velocity_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the drives' counts of velocity")

@@ -221,3 +221,26 @@ def test_a_float_is_not_read_as_an_integer(tmp_path: Path) -> None:
         ConfigError, match=r"0x9130:1 \(AI input PV 32 bit, AI input PV 1\) is a float, REAL32; .* integers"
     ):
         load_contract(dataclasses.replace(load_settings("certified"), devices=devices))
+
+
+def test_a_profile_extends_another_section_by_section(tmp_path: Path) -> None:
+    (tmp_path / "base.toml").write_text(
+        DRIVE.read_text().replace("[scale]", 'assumed = ["scale.gear_ratio", "scale.velocity_rad_s"]\n\n[scale]')
+    )
+    mine = profile_file(tmp_path, 'extends = "base.toml"\n[scale]\ngear_ratio = 26\n')
+    settings = load_profile(mine, "drive").settings
+    assert (settings.scale.gear_ratio, settings.scale.increments_per_joint_rev) == (26.0, 1048576)
+    assert settings.assumed == ("scale.velocity_rad_s",)
+    assert [pdo.message for pdo in settings.pdo] == ["Feedback", "Status", "Command"]
+
+
+def test_a_profile_extends_a_built_in_one_by_its_name(tmp_path: Path) -> None:
+    mine = profile_file(tmp_path, 'extends = "stock-drive"\n[patience]\npause_ms = 15\n')
+    profile = load_profile(mine, "drive")
+    assert (profile.eds.name, profile.settings.patience.pause_ms) == ("stock_drive.eds", 15.0)
+
+
+def test_profiles_that_extend_each_other_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "other.toml").write_text('extends = "mine.toml"\n')
+    with pytest.raises(ConfigError, match="at most 8 in a row"):
+        load_profile(profile_file(tmp_path, 'extends = "other.toml"\n'), "drive")

@@ -1,6 +1,7 @@
 """The state machine: its table against one written by hand, and the conditions that raise its events."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,8 +102,8 @@ DISABLED = GOOD._replace(is_enabled=False)
 class Run:
     """A supervisor driven cycle by cycle."""
 
-    def __init__(self):
-        self.supervisor = Supervisor(SETTINGS)
+    def __init__(self, settings=SETTINGS):
+        self.supervisor = Supervisor(settings)
 
     @property
     def state(self):
@@ -331,6 +332,15 @@ def test_a_phase_that_takes_too_long_faults(state, cycles, reason):
     assert run.step(arm, observation=observation, cycles=cycles - 1) is state
     assert run.step(arm, observation=observation) is SchemeState.FAULT
     assert run.supervisor.fault is reason
+
+
+def test_drives_may_be_given_longer_to_be_enabled_than_the_other_phases():
+    patient = replace(SETTINGS, safety=replace(SETTINGS.safety, enable_timeout_s=0.3))
+    run = Run(patient).to(SchemeState.ENABLE)
+    assert run.step(DISABLED, observation=RESTING, cycles=299) is SchemeState.ENABLE
+    assert run.step(DISABLED, observation=RESTING) is SchemeState.FAULT
+    run = Run(patient).to(SchemeState.COMMISSION)
+    assert run.step(DISABLED, cycles=100) is SchemeState.FAULT
 
 
 def test_an_arm_that_never_completes_a_cycle_faults_in_time():

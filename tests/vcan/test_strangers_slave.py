@@ -361,7 +361,7 @@ def test_a_fixed_mapping_is_not_written() -> None:
     rig = Rig()
     rig.boot()
     indexes = {int.from_bytes(f.data[1:3], "little") for f in rig.wire.sent if f.can_id == 0x603 and f.data[0] < 0x40}
-    assert indexes == {0x1006, 0x1015, 0x1016, 0x1017}
+    assert indexes == {0x1006, 0x1015, 0x1016, 0x1017, 0x1019}
 
 
 def test_communication_and_application_are_set_up() -> None:
@@ -547,9 +547,14 @@ BAD_DEVICES: dict[str, tuple[Callable[[Rig], None], str]] = {
         lambda rig: rig.drives[0].lies.update({(0x6502, 0): 0x1A5}),
         "Drive1 (node 1): supported modes 0x6502 = 0x000001A5, bit 9 (cyclic synchronous torque) expected",
     ),
-    "mode not taken": (
-        lambda rig: rig.drives[0].lies.update({(0x6061, 0): 8}),
-        "Drive1 (node 1): mode of operation 0x6061 = 8, 10 expected",
+    "exchanged drives": (
+        lambda rig: (rig.drives[0].lies.update({(0x6076, 0): 6000}), rig.drives[1].lies.update({(0x6076, 0): 12_000})),
+        "Drive1 (node 1): rated torque 0x6076 = 6000 mNm, 12000 mNm expected; it is that of joint 2: the drives are "
+        "exchanged",
+    ),
+    "a motor that was never entered": (
+        lambda rig: rig.drives[0].lies.update({(0x6076, 0): 0}),
+        "Drive1 (node 1): rated torque 0x6076 = 0: the drive does not know its motor",
     ),
     "wrong encoder": (
         lambda rig: rig.drives[0].lies.update({(0x608F, 1): 4096}),
@@ -591,6 +596,84 @@ def test_a_bad_device_is_one_line_that_names_device_object_value_and_expectation
     with pytest.raises(DeviceError) as raised:
         rig.boot()
     assert str(raised.value) == line
+    assert raised.value.remedy
+
+
+def test_each_difference_has_a_remedy_of_its_own() -> None:
+    remedies = {}
+    for name, (spoil, _) in BAD_DEVICES.items():
+        rig = Rig()
+        spoil(rig)
+        with pytest.raises(DeviceError) as raised:
+            rig.boot()
+        remedies[name] = raised.value.remedy
+    wiring = [name for name, remedy in remedies.items() if "wiring" in remedy]
+    assert wiring == ["no boot-up"]
+    assert "`devices.drive_node`" in remedies["exchanged drives"]
+    assert "`arm.rated_torque_Nm[1]`" in remedies["wrong rated torque"]
+    assert "`scale.increments_per_joint_rev`" in remedies["wrong encoder"]
+
+
+def is_write(frame: Frame, can_id: int, index: int) -> bool:
+    return frame.can_id == can_id and frame.data[0] & 0xE0 == 0x20 and frame.data[1:3] == index.to_bytes(2, "little")
+
+
+def test_what_the_device_maps_already_is_compared_and_not_written() -> None:
+    rig = Rig()
+    rig.boot()
+    rig.wire.sent.clear()
+    rig.master.configure()
+    written = {index for index in range(0x1400, 0x1C00) if any(is_write(f, 0x601, index) for f in rig.wire.sent)}
+    assert written == set()
+
+
+def test_an_identifier_that_cant_be_written_is_compared() -> None:
+    rig = Rig()
+    drive = rig.drives[0]
+    for index in (0x1400, 0x1800):
+        drive.refusals[index, 1] = 0x06010002
+    with pytest.raises(DeviceError, match=r"writing 0x1800:1 .* refused"):
+        rig.boot()
+    rig = Rig()
+    rig.boot()
+    for index in (0x1400, 0x1800):
+        rig.drives[0].refusals[index, 1] = 0x06010002
+    rig.master.configure()
+
+
+@pytest.mark.parametrize("shown", [0, 8, -1])
+def test_a_mode_that_is_shown_only_once_the_drive_is_enabled_is_compared_then(shown: int) -> None:
+    rig = Rig()
+    drive = rig.drives[0]
+    drive.on_write = lambda index, data: None  # type: ignore[method-assign]
+    drive.node.sdo[0x6061].raw = shown
+    rig.start()
+    for _ in range(20):
+        assert not rig.step(1.0, 1.0).is_enabled
+    assert drive.state == "operation enabled"
+    assert {frame.data[2:] for frame in rig.wire.sent if frame.can_id == 0x201} == {bytes(2)}
+    drive.node.sdo[0x6061].raw = 10
+    drive._told = None
+    for _ in range(5):
+        state = rig.step(1.0, 1.0)
+    assert state.is_enabled
+    assert rig.wire.sent[-1].data[2:] != bytes(2)
+
+
+def test_a_drive_that_refuses_another_mode_under_halt_is_taken_out_of_it_first() -> None:
+    rig = Rig()
+    drive = rig.drives[0]
+    drive.node.sdo[0x6040].raw = 0x0100
+    drive.refusals[0x6060, 0] = 0x08000022
+    told = drive.on_write
+
+    def on_write(index: int, data: bytes) -> None:
+        told(index, data)
+        if index == 0x6040 and not data[1] & 1:
+            drive.refusals.pop((0x6060, 0), None)
+
+    drive.on_write = on_write  # type: ignore[method-assign]
+    rig.enable()
 
 
 DIGITS_PROFILE = """
@@ -643,6 +726,7 @@ def test_wrong_units_of_a_sensor_are_one_line(tmp_path: Path, lies: dict[tuple[i
     with pytest.raises(DeviceError) as raised:
         rig.boot()
     assert str(raised.value) == line
+    assert raised.value.remedy
 
 
 def rig_with_profile(folder: Path, line: str) -> Rig:

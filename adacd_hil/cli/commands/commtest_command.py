@@ -67,7 +67,7 @@ def run_commtest(
             master.identify()
             master.configure()
         except DeviceError as error:
-            raise CommandError(str(error), ExitCode.BUS_MISSING) from None
+            raise CommandError(error.line, ExitCode.BUS_MISSING) from None
         boot_frames = tap.take()
         grant = request_realtime(settings.realtime_request)
         for line in grant.missing:

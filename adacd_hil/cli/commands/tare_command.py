@@ -87,7 +87,7 @@ def tare_on_bus(
     except TareRefusedError as reason:
         raise CommandError(f"tare refused: {reason}", ExitCode.FAILURE) from None
     except DeviceError as reason:
-        raise CommandError(str(reason), ExitCode.BUS_MISSING) from None
+        raise CommandError(reason.line, ExitCode.BUS_MISSING) from None
     return StoredTare(tare, out, write_tare(tare, out))
 
 

@@ -170,12 +170,14 @@ class Supervisor:
         self._clear_cycles = round(settings.reaction.clear_s / period_s)
         self._patience_cycles = round(settings.reaction.patience_s / period_s)
         self._rebound_cycles = round(settings.reaction.rebound_s / period_s)
-        phase_cycles = round(settings.safety.phase_timeout_s / period_s)
+        safety = settings.safety
+        phase_cycles = round(safety.phase_timeout_s / period_s)
+        enable_cycles = round((safety.enable_timeout_s or safety.phase_timeout_s) / period_s)
         adapt_cycles = round(settings.termination.timeout_s / period_s)
         self._limits = {
             SchemeState.INIT: (phase_cycles, FaultReason.COMMISSION_TIMEOUT),
             SchemeState.COMMISSION: (phase_cycles, FaultReason.COMMISSION_TIMEOUT),
-            SchemeState.ENABLE: (phase_cycles, FaultReason.ENABLE_TIMEOUT),
+            SchemeState.ENABLE: (enable_cycles, FaultReason.ENABLE_TIMEOUT),
             SchemeState.ADAPT: (adapt_cycles, FaultReason.ADAPT_TIMEOUT),
             SchemeState.CERTIFY: (adapt_cycles, FaultReason.ADAPT_TIMEOUT),
         }

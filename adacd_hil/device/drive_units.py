@@ -1,0 +1,110 @@
+"""What a drive's objects say of its counts, at the joint: position, velocity, and the torque of its motor.
+
+    position   0x6064 in increments: 0x608F per motor revolution, times the gear 0x6091; where 0x6092 is there, in its
+               units per revolution of the driven shaft; in the unit of 0x60A8 where that is an angle
+    velocity   0x606C in increments per second, or in the unit of 0x60A9, as rpm, of the motor
+    torque     0x6071, 0x6077 in per mille of 0x6076, the motor's rated torque
+
+A unit is coded 0xPPNNDD00: power of ten (signed), numerator, denominator. Source: CiA 402-2 / IEC 61800-7-201 (0x608F,
+0x6091, 0x6092, 0x60A8, 0x60A9), CiA 303-2 (codes of units).
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+Number = Callable[[int, int], int | None]
+"""Gives the value of an object by index and sub-index; None where there is none."""
+
+LEAST_INCREMENTS = 360
+"""Per revolution of a joint. A drive whose factory values are 1 : 1 says 1; coarser than 1 deg no joint is moved."""
+CREDIBLE_INCREMENTS = 4096
+"""Per revolution of a joint, 1.5 mrad: fewer are a factory value rather than a joint."""
+
+_INCREMENTS, _REVOLUTION = 0xB5, 0xB4
+_ANGLES_RAD = {
+    _REVOLUTION: math.tau,
+    0x41: math.radians(1.0),
+    0x42: math.radians(1.0 / 60.0),
+    0x43: math.radians(1.0 / 3600.0),
+    0x10: 1.0,
+}
+"""Numerators that are angles: revolution, degree, minute, second, radian."""
+_TIMES_S = {0x03: 1.0, 0x47: 60.0, 0x48: 3600.0}
+"""Denominators: second, minute, hour."""
+_NAMES = {_INCREMENTS: "increment", _REVOLUTION: "revolution", 0x41: "deg", 0x42: "arcmin", 0x43: "arcsec", 0x10: "rad"}
+_TIME_NAMES = {0x03: "s", 0x47: "min", 0x48: "h"}
+
+
+class DriveUnits(NamedTuple):
+    """What the objects of a drive say; None where they don't.
+
+    gear_ratio: 0x6091, motor revolutions per revolution of the joint. increments_per_joint_rev: counts of 0x6064;
+    increments_text: the objects that say so, with their values. velocity_rad_s: one count of 0x606C at the joint, None
+    where 0x60A9 is no velocity or not there; velocity_unit: its code.
+    """
+
+    gear_ratio: float | None = None
+    increments_per_joint_rev: float | None = None
+    increments_text: str = ""
+    velocity_rad_s: float | None = None
+    velocity_unit: int = 0
+
+    @property
+    def has_increments(self) -> bool:
+        """Whether the increments may be a joint's, not the 1 : 1 of a drive that was never told."""
+        return (self.increments_per_joint_rev or 0.0) >= LEAST_INCREMENTS
+
+
+def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
+    """Read the units of a drive. `gear_ratio`: the gear of a drive that doesn't say it."""
+    encoder, motor_revs = number(0x608F, 1), number(0x608F, 2)
+    gear_in, gear_out = number(0x6091, 1), number(0x6091, 2)
+    feed, shaft_revs = number(0x6092, 1), number(0x6092, 2)
+    position_unit, velocity_unit = number(0x60A8, 0), number(0x60A9, 0)
+    gear = gear_in / gear_out if gear_in and gear_out else None
+    ratio = gear_ratio if gear is None else gear
+    ratio_text = f"`scale.gear_ratio` {gear_ratio:g}" if gear is None else f"{gear_in}/{gear_out}"
+    increments, text = None, ""
+    if encoder:
+        increments = encoder / (motor_revs or 1) * ratio
+        text = f"0x608F x 0x6091 = {encoder}/{motor_revs or 1} x {ratio_text}"
+    if feed and feed / (shaft_revs or 1) >= LEAST_INCREMENTS:
+        increments, text = feed / (shaft_revs or 1), f"0x6092 = {feed}/{shaft_revs or 1}"
+    if (count_rad := _angle_rad(position_unit)) is not None:
+        increments, text = math.tau / count_rad * ratio, f"0x60A8 x 0x6091 = 0x{position_unit:08X} x {ratio_text}"
+    velocity = _velocity_rad_s(velocity_unit, increments, ratio)
+    return DriveUnits(gear, increments, text, velocity, velocity_unit or 0)
+
+
+def _angle_rad(unit: int | None) -> float | None:
+    """Return what a count of a position unit is worth; None for increments and for what is no angle."""
+    if not unit:
+        return None
+    angle_rad = _ANGLES_RAD.get(unit >> 16 & 0xFF)
+    return None if angle_rad is None else angle_rad * 10.0 ** _prefix(unit)
+
+
+def _velocity_rad_s(unit: int | None, increments: float | None, gear_ratio: float) -> float | None:
+    if not unit or (time_s := _TIMES_S.get(unit >> 8 & 0xFF)) is None:
+        return None
+    if unit >> 16 & 0xFF == _INCREMENTS:
+        return None if not increments else 10.0 ** _prefix(unit) * math.tau / increments / time_s
+    angle_rad = _angle_rad(unit)
+    return None if angle_rad is None else angle_rad / time_s / gear_ratio
+
+
+def _prefix(unit: int) -> int:
+    prefix = unit >> 24 & 0xFF
+    return prefix - 256 if prefix > 127 else prefix
+
+
+def name_velocity_unit(unit: int) -> str:
+    """Name the unit of 0x60A9: `rpm`, `10^-3 rpm`, `increment/s`; its code where it is none that is known."""
+    numerator, denominator = unit >> 16 & 0xFF, unit >> 8 & 0xFF
+    if numerator not in _NAMES or denominator not in _TIME_NAMES:
+        return f"0x{unit:08X}"
+    power = f"10^{_prefix(unit)} " if _prefix(unit) else ""
+    if (numerator, denominator) == (_REVOLUTION, 0x47):
+        return f"{power}rpm"
+    return f"{power}{_NAMES[numerator]}/{_TIME_NAMES[denominator]}"
