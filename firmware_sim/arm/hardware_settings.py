@@ -283,6 +283,29 @@ VELOCITY_LOOP_HZ = 200.0
 
 
 @dataclass(frozen=True)
+class HabitSettings:
+    """Ways of a drive that its standard leaves open, or that it has beside it."""
+
+    shows_mode: str = setting(
+        "always",
+        choices=("always", "enabled"),
+        meaning="whether 0x6061 follows 0x6060 always or once it is enabled only",
+    )
+    mode_s: float = setting(
+        0.0, unit="s", low=0.0, high=60.0, meaning="how much later 0x6061 shows another mode; -1 until then"
+    )
+    enable_s: float = setting(
+        0.0, unit="s", low=0.0, high=60.0, meaning="from Enable operation to Operation enabled, as a brake opens"
+    )
+    pause_ms: float = setting(
+        0.0, unit="ms", low=0.0, high=1000.0, meaning="after an SDO answer, in which the next request is lost"
+    )
+    is_halted: bool = setting(
+        False, meaning="it begins with the halt bit of 0x6040, and takes no other mode as long as that is set"
+    )
+
+
+@dataclass(frozen=True)
 class DriveSettings:
     """What the drives get wrong and how long they bear it."""
 

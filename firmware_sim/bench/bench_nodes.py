@@ -7,6 +7,7 @@ from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
 from firmware_sim.arm.arms import STRAIGHT, OwnArmSettings
+from firmware_sim.arm.hardware_settings import HabitSettings
 from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.bench.injector import Handler, Injector
@@ -72,6 +73,7 @@ class BenchNodes:
                 longest,
                 described[i].defaults,
                 described[i].fallbacks,
+                described[i].made_up,
             )
             for i in range(len(_NODES))
         )
@@ -85,6 +87,7 @@ class BenchNodes:
                 rated_Nm[wiring.drive_joint[i]],
                 is_free_running,
                 _scale_of(scenario.own_arm, i),
+                scenario.habits[i] if scenario.habits else HabitSettings(),
             )
             for i in range(JOINTS)
         )

@@ -70,6 +70,10 @@ class Abort(IntEnum):
     NO_DATA = 0x08000024
 
 
+Refusal = canopen.SdoAbortedError
+"""What `refuse` raises."""
+
+
 def refuse(code: Abort) -> NoReturn:
     """Answer the SDO request in progress with an abort."""
     raise canopen.SdoAbortedError(code)
@@ -206,9 +210,23 @@ def _read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
     return canopen.import_od(str(path), node_id)
 
 
-def _with_defaults(objects: canopen.ObjectDictionary, defaults: Values, fallbacks: Values) -> canopen.ObjectDictionary:
-    """Give a copy of a dictionary other defaults, and one to each number that has none: its fallback, or 0."""
+class MadeUp(NamedTuple):
+    """An object that a real device has and its EDS omits: its name, its type, and its value at power-on."""
+
+    name: str
+    data_type: int
+    value: int
+
+
+def _with_defaults(
+    objects: canopen.ObjectDictionary, defaults: Values, fallbacks: Values, made_up: Mapping[int, MadeUp]
+) -> canopen.ObjectDictionary:
+    """Give a copy of a dictionary what it omits, other defaults, and one to each number without: its fallback, or 0."""
     objects = copy.deepcopy(objects)
+    for index, made in made_up.items():
+        added = ODVariable(made.name, index)
+        added.data_type, added.access_type, added.default = made.data_type, "rw", made.value
+        objects.add_object(added)
     for index, entry in objects.items():
         for subindex, variable in {0: entry}.items() if isinstance(entry, ODVariable) else entry.subindices.items():
             key = (index, subindex)
@@ -222,9 +240,13 @@ def _with_defaults(objects: canopen.ObjectDictionary, defaults: Values, fallback
 class _DictionaryNode(canopen.LocalNode):
     """canopen's local node with strict sub-indices and without its own heartbeat."""
 
-    def __init__(self, node_id: int, eds_path: Path, defaults: Values, fallbacks: Values) -> None:
+    def __init__(
+        self, node_id: int, eds_path: Path, defaults: Values, fallbacks: Values, made_up: Mapping[int, MadeUp]
+    ) -> None:
         objects = _read_eds(eds_path, node_id)
-        super().__init__(node_id, _with_defaults(objects, defaults, fallbacks) if defaults or fallbacks else objects)
+        if defaults or fallbacks or made_up:
+            objects = _with_defaults(objects, defaults, fallbacks, made_up)
+        super().__init__(node_id, objects)
         self._write_callbacks.clear()  # NmtSlave.on_write would start a periodic task
         self.sdo = _Server(self)
         self.sdo._index = self.sdo._subindex = 0  # an abort before the first transfer needs an index to name
@@ -244,9 +266,15 @@ class ObjectDictionary:
     """The objects of one device: values from the EDS, live values, checked writes, and SDO over the bus."""
 
     def __init__(
-        self, node_id: int, eds_path: Path, send: Send, defaults: Values = _NO_VALUES, fallbacks: Values = _NO_VALUES
+        self,
+        node_id: int,
+        eds_path: Path,
+        send: Send,
+        defaults: Values = _NO_VALUES,
+        fallbacks: Values = _NO_VALUES,
+        made_up: Mapping[int, MadeUp] | None = None,
     ) -> None:
-        """Read the EDS; `defaults` outweigh its own, `fallbacks` are for numbers without one.
+        """Read the EDS; `defaults` outweigh its own, `fallbacks` are for numbers without one, `made_up` it omits.
 
         Raises OSError when it can't be read.
         """
@@ -257,7 +285,7 @@ class ObjectDictionary:
         self.is_locked: Callable[[int, int], bool] = lambda _index, _subindex: False
         """Whether the state of the device forbids SDO to write an object now."""
         self._is_requested = False  # an SDO request is in progress
-        self._node = _DictionaryNode(node_id, eds_path, defaults, fallbacks)
+        self._node = _DictionaryNode(node_id, eds_path, defaults, fallbacks, made_up or {})
         self._node.associate_network(_SilentNetwork(send))
         self._node.add_read_callback(self._read)  # type: ignore[no-untyped-call]
         self._node.add_write_callback(self._write)  # type: ignore[no-untyped-call]
@@ -388,13 +416,14 @@ def _call_all(functions: list[Callable[[int], None]], value: int) -> None:
 class DeviceDescription:
     """One device: its EDS, and what else its objects hold at power-on.
 
-    defaults: values in place of the EDS's. fallbacks: values where the EDS has none. aliases: objects that hold the
-    live value of another.
+    defaults: values in place of the EDS's. fallbacks: values where the EDS has none. made_up: objects that the EDS
+    omits, by index. aliases: objects that hold the live value of another.
     """
 
     eds: Path
     defaults: Values = field(default_factory=dict)
     fallbacks: Values = field(default_factory=dict)
+    made_up: Mapping[int, MadeUp] = field(default_factory=dict)
     aliases: Mapping[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
 
 

@@ -20,7 +20,8 @@ from firmware_sim.canopen.object_dictionary import ObjectDictionary, Send
 from firmware_sim.canopen.pdo_record import EVENT_DRIVEN, PdoRecord
 
 RECEIVE, TRANSMIT = 0x1400, 0x1800
-COUNT = 4
+COUNT = 8
+"""PDOs of a device that are looked for, each way; our own have 4."""
 
 
 class PdoUser:
@@ -214,6 +215,8 @@ class Pdos:
         self.dictionary = dictionary
         self.send = send
         self.longest = longest
+        self.message_ids = frozenset(messages)
+        """Identifiers of the contract, which are heard besides those that any PDO may have."""
         self.user: PdoUser
         self.header = bytes(4)
         """Header of the last protected frame, received or sent."""

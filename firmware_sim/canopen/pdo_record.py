@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.contract_frames import NOT_VALID
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
-from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, one_of, refuse
+from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Refusal, one_of, refuse
 
 EVENT_DRIVEN = (254, 255)
 """Transmission types."""
@@ -40,6 +40,7 @@ class PdoOwner(Protocol):
 
     dictionary: ObjectDictionary
     longest: int
+    message_ids: frozenset[int]
 
     def refresh(self) -> None:
         """Take over a new configuration."""
@@ -57,7 +58,8 @@ class PdoRecord(ABC):
         self.message = message
         self.can_id = dictionary.value(index, 1) & 0x7FF
         self._is_valid = not dictionary.value(index, 1) & NOT_VALID
-        self.type = dictionary.value(index, 2)
+        self._can_be_invalid = dictionary.find(index, 1).is_writable
+        self.type = dictionary.value_or(EVENT_DRIVEN[-1], index, 2)
         self.inhibit_ns = dictionary.value_or(0, index, 3) * 100_000
         self.timer_ns = dictionary.value_or(0, index, 5) * 1_000_000
         mapping = index + _MAPPING
@@ -65,7 +67,10 @@ class PdoRecord(ABC):
             dictionary.value(mapping, sub) for sub in range(1, 65) if dictionary.has(mapping, sub)
         ]  # sub-indices without gaps
         self._count = dictionary.value(mapping, 0)
-        self._lay_out(self._count)
+        try:
+            self._lay_out(self._count)
+        except Refusal:  # an EDS whose default no master could write
+            self._count = 0
         dictionary.watch(index, 1, self._identify, self._check_cob_id)
         dictionary.watch(index, 2, self._set_type, one_of(*_TYPES))
         dictionary.watch(index, 3, self._set_inhibit, self._check_inhibit)
@@ -97,7 +102,7 @@ class PdoRecord(ABC):
         can_id = value & 0x7FF
         if value & _IS_EXTENDED or value & 0x1FFFF800 or _is_restricted(can_id):
             refuse(Abort.VALUE_RANGE)
-        if self.is_received and can_id not in LISTENED_IDS:
+        if self.is_received and can_id not in LISTENED_IDS and can_id not in self._owner.message_ids:
             refuse(Abort.VALUE_RANGE)
         if self._is_valid and not value & NOT_VALID and can_id != self.can_id:
             refuse(Abort.DEVICE_STATE)
@@ -111,8 +116,13 @@ class PdoRecord(ABC):
         self.type = value
         self._owner.refresh()
 
+    @property
+    def _is_held(self) -> bool:
+        """Whether it has to be made invalid before it is changed; no master can where the identifier is read-only."""
+        return self._is_valid and self._can_be_invalid
+
     def _check_inhibit(self, value: int) -> None:
-        if self._is_valid and value * 100_000 != self.inhibit_ns:
+        if self._is_held and value * 100_000 != self.inhibit_ns:
             refuse(Abort.DEVICE_STATE)
 
     def _set_inhibit(self, tenths_ms: int) -> None:
@@ -126,7 +136,7 @@ class PdoRecord(ABC):
         def check(value: int) -> None:
             if value == self._entries[place]:
                 return
-            if self._is_valid or self._count != 0:
+            if self._is_held or self._count != 0:
                 refuse(Abort.DEVICE_STATE)
             if value != 0:
                 check_entry(self._owner.dictionary, value, self.is_received)
@@ -142,7 +152,7 @@ class PdoRecord(ABC):
     def _check_count(self, value: int) -> None:
         if value == self._count:
             return
-        if self._is_valid:
+        if self._is_held:
             refuse(Abort.DEVICE_STATE)
         if value > len(self._entries):
             refuse(Abort.PDO_TOO_LONG)

@@ -4,9 +4,12 @@ The only place where the emulator reads what the host's package knows of devices
 describe a device, and the contract that follows from them, which is the definition of the messages.
 """
 
+import functools
 import math
+import tomllib
 from collections.abc import Sequence
 from fractions import Fraction
+from importlib import resources
 from typing import NamedTuple
 
 from adacd_hil.device.contract import load_contract
@@ -16,7 +19,8 @@ from adacd_hil.settings.configuration import ConfigurationLayer, Settings, confi
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.contract_frames import NOT_VALID
-from firmware_sim.canopen.object_dictionary import DeviceDescription, EmulatedContract, contract_of
+from firmware_sim.arm.hardware_settings import HabitSettings
+from firmware_sim.canopen.object_dictionary import DeviceDescription, EmulatedContract, MadeUp, contract_of
 from firmware_sim.scenario.rehearsal import DeviceCounts, compose_scenario, told_arm
 from firmware_sim.scenario.scenario import (
     ArmTruth,
@@ -28,6 +32,8 @@ from firmware_sim.scenario.scenario import (
 )
 
 _CYCLIC_SYNCHRONOUS_TORQUE = 1 << 9  # of 0x6502
+_CYCLIC_SYNCHRONOUS_TORQUE_MODE = 10  # of 0x6060
+_DEVICE_TYPES = {"drive": 0x00020192, "sensor": 0x00020194}
 _NEWTON_METRE = 0x00560100
 _RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _OBJECTS = {
@@ -46,8 +52,22 @@ _OBJECTS = {
     "temperature": (0x2111, 0),
 }
 """Where the emulated devices have what a profile maps from objects of its own."""
-_SENSOR_OBJECTS = (0x1006, 0x1017)
-_DRIVE_OBJECTS = (*_SENSOR_OBJECTS, 0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x606C, 0x6071, 0x6076)
+_SIGNED8, _UNSIGNED16, _UNSIGNED32 = 0x0002, 0x0006, 0x0007  # data types, CiA 301 table 44
+
+
+def _made_up(kind: str, settings: Settings) -> dict[int, MadeUp]:
+    """List what every device of a kind has, whether its EDS says so or not."""
+    made = {
+        0x1006: MadeUp("SYNC period", _UNSIGNED32, settings.bus.period_us),
+        0x1017: MadeUp("heartbeat time", _UNSIGNED16, settings.bus.heartbeat_ms),
+    }
+    if kind == "drive":
+        made |= {
+            0x6060: MadeUp("mode of operation", _SIGNED8, _CYCLIC_SYNCHRONOUS_TORQUE_MODE),
+            0x6061: MadeUp("its display", _SIGNED8, 0),
+            0x6076: MadeUp("rated torque", _UNSIGNED32, 0),
+        }
+    return made
 
 
 class Rehearsal(NamedTuple):
@@ -91,8 +111,37 @@ def rehearse_settings(
             raise ConfigError(f"truth {truth_name}: `{name}` = {section!r} must be a table")
         table[name] = {**table.get(name, {}), **section}
     composed, assumed = compose_scenario(told, truth, _counts(codec, devices), table, is_builtin)
+    habits = [truth.habits or _maker_habits(device) for device in devices[:JOINTS]]
+    if any(one != HabitSettings() for one in habits):
+        composed["habits"] = [dict(vars(one)) for one in habits]
     scenario = resolve_scenario(scenario_name, composed, settings.arm.profile, seed)
-    return Rehearsal(codec, describe_devices(codec, devices), scenario, assumed)
+    contract = describe_devices(codec, devices, settings)
+    return Rehearsal(codec, contract, scenario, [*assumed, *_omissions(devices, contract)])
+
+
+def _omissions(devices: list[PlacedDevice], contract: EmulatedContract) -> list[str]:
+    """Say what was made up because an EDS omits it, a line for each EDS."""
+    lines: dict[str, None] = {}
+    for device, description in zip(devices, contract.devices, strict=True):
+        if names := ", ".join(f"0x{index:04X} ({made.name})" for index, made in description.made_up.items()):
+            lines[f"assumed: {names}, which {device.profile.eds.name} omits and every such device has"] = None
+    return list(lines)
+
+
+@functools.cache
+def _habits_by_vendor() -> dict[int, HabitSettings]:
+    text = resources.files("firmware_sim").joinpath("maker_habits.toml").read_text(encoding="utf-8")
+    makers = tomllib.loads(text)["maker"]
+    return {
+        maker["vendor"]: parse(HabitSettings, {key: maker[key] for key in maker if key not in ("vendor", "name")})
+        for maker in makers
+    }
+
+
+def _maker_habits(device: PlacedDevice) -> HabitSettings:
+    """Return the ways of the drives of a device's maker, by the vendor id of its EDS."""
+    vendor = _default(device, 0x1018, 1) or device.objects.device_information.vendor_number
+    return _habits_by_vendor().get(vendor, HabitSettings())
 
 
 def _counts(codec: Codec, devices: list[PlacedDevice]) -> DeviceCounts:
@@ -114,9 +163,9 @@ def _default(device: PlacedDevice, index: int, sub: int) -> int:
     return 0 if variable is None or variable.default is None else variable.default
 
 
-def describe_devices(codec: Codec, devices: list[PlacedDevice]) -> EmulatedContract:
-    """Describe the four devices by their own EDS. Raises ConfigError when one lacks an object that no drive lacks."""
-    return EmulatedContract(codec.path.name, "", "", tuple(_describe(device) for device in devices))
+def describe_devices(codec: Codec, devices: list[PlacedDevice], settings: Settings) -> EmulatedContract:
+    """Describe the devices by their own EDS."""
+    return EmulatedContract(codec.path.name, "", "", tuple(_describe(device, settings) for device in devices))
 
 
 def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
@@ -134,12 +183,10 @@ def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
     }
 
 
-def _describe(device: PlacedDevice) -> DeviceDescription:
+def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
     """Say what a device's objects hold at power-on: what its EDS says, where that is silent what the profile does."""
     kind, scale = device.settings.kind, device.settings.scale
-    needed = _DRIVE_OBJECTS if kind == "drive" else _SENSOR_OBJECTS
-    if lacking := [f"0x{index:04X}" for index in needed if not device.has(index)]:
-        raise ConfigError(f"{device.name}: {device.profile.eds.name} lacks {', '.join(lacking)}; it can't be played")
+    made_up = {index: made for index, made in _made_up(kind, settings).items() if not device.has(index)}
     defaults: dict[tuple[int, int], int] = {}
     if device.settings.serial:
         defaults[0x1018, 4] = device.settings.serial[device.joint]
@@ -150,8 +197,9 @@ def _describe(device: PlacedDevice) -> DeviceDescription:
         if signal.signal in _OBJECTS
     }
     if device.profile.eds.parent == contract_folder():
-        return DeviceDescription(device.profile.eds, defaults, {}, aliases)
-    fallbacks = {(0x1005, 0): 0x80, (0x1006, 0): 1000, (0x1014, 0): 0x80 + device.node_id}
+        return DeviceDescription(device.profile.eds, defaults, {}, made_up, aliases)
+    fallbacks = {(0x1005, 0): 0x80, (0x1006, 0): 0, (0x1014, 0): 0x80 + device.node_id}
+    fallbacks[0x1000, 0] = _DEVICE_TYPES[kind]
     fallbacks |= {(index, 1): NOT_VALID for index in _RECORDS}
     for pdo in device.settings.pdo:
         fallbacks[pdo.communication_index, 1] = device.can_id(pdo)
@@ -162,4 +210,4 @@ def _describe(device: PlacedDevice) -> DeviceDescription:
     else:
         fallbacks |= {(0x6131, sub): _NEWTON_METRE for sub in range(1, 255)}
         fallbacks |= {(0x6132, sub): max(round(-math.log10(scale.torque_Nm)), 0) for sub in range(1, 255)}
-    return DeviceDescription(device.profile.eds, defaults, fallbacks, aliases)
+    return DeviceDescription(device.profile.eds, defaults, fallbacks, made_up, aliases)

@@ -22,7 +22,7 @@ from firmware_sim.canopen.error_control import (
     Watchdog,
     Watchdogs,
 )
-from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, Values, refuse
+from firmware_sim.canopen.object_dictionary import Abort, MadeUp, ObjectDictionary, Send, Values, refuse
 from firmware_sim.canopen.pdo import Pdos, PdoUser
 
 _GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
@@ -87,12 +87,15 @@ class EmulatedDevice(ObjectDictionary):
         longest_pdo: int = CLASSIC_BYTES,
         defaults: Values | None = None,
         fallbacks: Values | None = None,
+        made_up: Mapping[int, MadeUp] | None = None,
     ) -> None:
         """Read the EDS; nothing is sent before `boot`. Raises OSError when the EDS can't be read.
 
-        `messages`: the contract's, by identifier. `longest_pdo` in bytes. `defaults`, `fallbacks`: of objects.
+        `messages`: the contract's, by identifier. `longest_pdo` in bytes. `defaults`, `fallbacks`, `made_up`: of
+        objects.
         """
-        super().__init__(node_id, eds_path, self._send, defaults or {}, fallbacks or {})
+        super().__init__(node_id, eds_path, self._send, defaults or {}, fallbacks or {}, made_up)
+        self._made_up = frozenset(made_up or ())
         self.clock = NodeClock()
         self.is_powered = True
         self.is_on_bus = True
@@ -108,6 +111,9 @@ class EmulatedDevice(ObjectDictionary):
         """Time of the last request, for what it starts."""
         self.power_on_ns = 0
         """When the device got its power, by its own clock."""
+        self.pause_ns = 0
+        """For how long after an SDO answer the device hears no further request."""
+        self._answered_ns: int | None = None
         self._put_on_bus = send
         self._application = Application()
         self._producer = HeartbeatProducer(self, self._send, lambda: self.state, lambda: self.now_ns)
@@ -199,7 +205,10 @@ class EmulatedDevice(ObjectDictionary):
         if not self.is_on_bus:
             return
         self.now_ns = t_ns = self.clock.own_ns(t_ns)
+        if self.pause_ns and self._answered_ns is not None and t_ns - self._answered_ns < self.pause_ns:
+            return
         if len(data) == 8 and self.state != NmtState.STOPPED:
+            self._answered_ns = t_ns
             self.on_request(data, t_ns)
 
     def on_heartbeat(self, node_id: int, t_ns: int) -> None:
@@ -268,10 +277,10 @@ class EmulatedDevice(ObjectDictionary):
             refuse(Abort.DEVICE_STATE)
 
     def _check_overflow(self, overflow: int) -> None:
-        """Accept 0 and 2 to 240, and a change at period 0 only: CiA 301, 7.5.2.22."""
+        """Accept 0 and 2 to 240, and a change at period 0 only, if a master can write that: CiA 301, 7.5.2.22."""
         if overflow == 1 or overflow > SYNC_OVERFLOW:
             refuse(Abort.VALUE_RANGE)
-        if overflow != self.value(0x1019) and self.value(0x1006) != 0:
+        if overflow != self.value(0x1019) and self.value(0x1006) != 0 and 0x1006 not in self._made_up:
             refuse(Abort.DEVICE_STATE)
 
     def _set_overflow(self, overflow: int) -> None:

@@ -15,6 +15,7 @@ Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statuswo
 
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.arm.hardware_settings import HabitSettings
 from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S, DriveMode
 from firmware_sim.canopen.error_control import ERROR_CODES, WARNINGS, Watchdog
 from firmware_sim.canopen.object_dictionary import Abort, one_of, refuse
@@ -39,6 +40,8 @@ from firmware_sim.nodes.drive_profile import (
 )
 
 CYCLIC_SYNCHRONOUS_TORQUE = 10
+_HALT = 1 << 8  # of the controlword
+_SWITCHING = -1  # on 0x6061, while the drive changes its mode
 _BRAKE_WATCH_NS = 1_000_000  # how often a drive without SYNC looks whether it stands still
 
 _ENABLE_OPERATION_WORD = 0x0F
@@ -64,6 +67,7 @@ class DriveNode(Application):
         rated_torque_Nm: float,
         is_free_running: bool,
         scale: DriveScale = DriveScale(),  # noqa: B008 (a constant)
+        habits: HabitSettings = HabitSettings(),  # noqa: B008 (a constant)
     ) -> None:
         """Connect the node to its device.
 
@@ -101,7 +105,14 @@ class DriveNode(Application):
         self._is_braking = False
         self._is_motor_limited = self._is_limiting = False
         self._standstill = Standstill()
-        self._mode = self._wanted_mode = 0
+        self._mode = self._wanted_mode = device.default_or(0, 0x6060)
+        self._habits = habits
+        self._has_habits = habits != HabitSettings()
+        self._shown_mode = self._told_mode = self._mode  # on 0x6061, and what it shows once the time for it has passed
+        self._told_ns = 0
+        self._enabling_ns: int | None = None
+        """When Enable operation was first asked for; None: it isn't."""
+        device.pause_ns = round(habits.pause_ms * 1e6)
         self._patience = Patience(device)
         self._serve(codec)
         self._configure()
@@ -118,7 +129,7 @@ class DriveNode(Application):
         serve(0x603F, 0, lambda: self.error_code)
         serve(0x6040, 0, lambda: self._controlword)
         serve(0x6041, 0, lambda: self.statusword)
-        serve(0x6061, 0, lambda: self._mode)
+        serve(0x6061, 0, lambda: self._shown_mode if self._has_habits else self._mode)
         serve(0x6064, 0, lambda: self._position)
         serve(0x606C, 0, lambda: self._velocity)
         serve(0x6074, 0, lambda: self._demand)
@@ -137,6 +148,7 @@ class DriveNode(Application):
         device.watch(0x605C, 0, check=one_of(*RAMPS))
         device.watch(0x605E, 0, check=one_of(*FAULT_REACTIONS))
         device.watch(0x6060, 0, self._want_mode, one_of(0, CYCLIC_SYNCHRONOUS_TORQUE))
+        device.watch(0x6060, 0, check=self._check_halt)
 
     @property
     def is_enabled(self) -> bool:
@@ -200,6 +212,8 @@ class DriveNode(Application):
             self._obey_received(t_ns)
         if self._mode != self._wanted_mode:
             self._change_mode()
+        if self._has_habits:
+            self._keep_habits(t_ns)
         self._watch_motor(t_ns)
         if self._is_braking:
             self._watch_standstill(t_ns)
@@ -234,6 +248,9 @@ class DriveNode(Application):
         t_ns = self._clock.own_ns(t_ns)
         due_ns = self.device.poll(t_ns)
         self._feel_failure(t_ns)
+        if self._has_habits:
+            self._keep_habits(t_ns)
+            due_ns = min(due_ns, self._told_ns if self._told_ns > t_ns else NEVER_NS)
         if self.is_enabled:
             due_ns = min(due_ns, self._watch_bus(t_ns))
         if self._is_braking and (self.is_free_running or self.is_left_alone):
@@ -295,7 +312,9 @@ class DriveNode(Application):
         self._cause = None
         self.device.is_faulty = False
         self.device.fault_bits = 0
-        self._controlword = self._acted_commands = 0
+        self._controlword = _HALT if self._habits.is_halted else 0
+        self._acted_commands = 0
+        self._enabling_ns = None
         self._limits.target = 0
         self._mode = self._wanted_mode
         self._ramp_end = None
@@ -341,6 +360,10 @@ class DriveNode(Application):
                 return
             if self.state is DriveState.QUICK_STOP_ACTIVE and not self._stop.stays:
                 return
+            if self._habits.enable_s and self.state is DriveState.SWITCHED_ON:
+                self._enabling_ns = t_ns if self._enabling_ns is None else self._enabling_ns
+                return
+        self._enabling_ns = None
         if self.is_enabled and event in _RAMPED:
             if self._ramp_end is None:
                 self._ramp_down(event, t_ns)
@@ -489,6 +512,23 @@ class DriveNode(Application):
     def _torque_permille(self) -> int:
         permille = round(self._motor.torque_Nm() * 1e6 / self._rated_mNm)
         return max(-0x8000, min(0x7FFF, permille))
+
+    def _keep_habits(self, t_ns: int) -> None:
+        """Show the mode, and come to Operation enabled, in the drive's own time."""
+        if self._enabling_ns is not None and t_ns - self._enabling_ns >= self._habits.enable_s * 1e9:
+            self._enabling_ns = None
+            self._apply(DriveEvent.ENABLE_OPERATION, t_ns)
+        if self._habits.shows_mode == "enabled" and not self.is_enabled:
+            return
+        if self._mode != self._told_mode:
+            self._told_mode, self._told_ns = self._mode, t_ns + round(self._habits.mode_s * 1e9)
+        shown = self._told_mode if t_ns >= self._told_ns else _SWITCHING
+        self.has_news |= shown != self._shown_mode
+        self._shown_mode = shown
+
+    def _check_halt(self, _mode: int) -> None:
+        if self._habits.is_halted and self._controlword & _HALT:
+            refuse(Abort.DEVICE_STATE)
 
     def _want_mode(self, mode: int) -> None:
         """Take another mode over: at the next SYNC while the motor has torque, at once elsewhere."""

@@ -118,7 +118,7 @@ def compose_scenario(
     factor = truth.factor
     first, second = (by_eds or told for by_eds, told in zip(counts.rated_torque_Nm, arm.rated_torque_Nm, strict=True))
     rated = truth.arm.rated_torque_Nm or _times((first, second), factor.rated_torque)
-    rated = _times(rated, factor.gear)
+    strength = _times(rated, factor.gear)  # sensors, friction and touches are those of the arm as it was told
     viscous, coulomb = _friction(told, truth, rated, assumed)
     inertia = _joint_inertia(links)
     braking = truth.arm.brake_damping_Nm_s or _times(inertia, (1.0 / _BRAKING_S, 1.0 / _BRAKING_S))
@@ -147,7 +147,7 @@ def compose_scenario(
         "inertia_kg_m2": links.inertia_kg_m2,
         "viscous_Nm_s": viscous,
         "coulomb_Nm": coulomb,
-        "rated_torque_Nm": rated,
+        "rated_torque_Nm": strength,
         "brake_damping_Nm_s": braking,
         "stop_deg": stops,
         **_wire(arm.sign, truth),

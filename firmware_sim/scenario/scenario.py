@@ -17,7 +17,8 @@ Ends of a run:
     lost       the bus failed in operation, or nobody answered any more
 
 A truth says what the real arm is where the host is told otherwise, or nothing. The host never reads it. `[arm]` has
-values of their own; `[factor]` multiplies what the host is told; `[wiring]` exchanges and reverses devices;
+values of their own; `[factor]` multiplies what the host is told; `[wiring]` exchanges and reverses devices; `[habits]`
+are ways of the drives, in place of those of their maker (`firmware_sim/maker_habits.toml`);
 `[sensors]`, `[drives]` and `[mechanics]` are the sections of a scenario and are laid over them. A truth that comes with
 the package states one thing that a user gets wrong, of any arm.
 """
@@ -34,7 +35,13 @@ from adacd_hil.records import FaultReason, Vector
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 from firmware_sim.arm.arms import ARMS, STRAIGHT, ArmProfile, OwnArmSettings, Wiring
-from firmware_sim.arm.hardware_settings import DriveSettings, MechanicsSettings, PayloadBody, SensorSettings
+from firmware_sim.arm.hardware_settings import (
+    DriveSettings,
+    HabitSettings,
+    MechanicsSettings,
+    PayloadBody,
+    SensorSettings,
+)
 from firmware_sim.arm.touch_settings import BodySettings, ContactSettings, HandSettings, WallSettings, ticks
 from firmware_sim.scenario.faults import FaultSettings, check_rows
 
@@ -205,6 +212,7 @@ class Scenario:
     )
     sensors: SensorSettings = setting(SensorSettings, meaning="errors of the torque sensors and the encoders")
     drives: DriveSettings = setting(DriveSettings, meaning="errors and limits of the drives")
+    habits: tuple[HabitSettings, ...] = setting((), meaning="ways of the drives, by place; none: those of our own")
     payloads: tuple[PayloadSettings, ...] = setting((), meaning="changes of the payload, in order of time")
     contacts: tuple[ContactSettings, ...] = setting((), meaning="touches, in order of time, one at a time")
     bodies: tuple[BodySettings, ...] = setting((), meaning="bodies in the arm's way")
@@ -406,6 +414,7 @@ class ArmTruth:
     arm: TruthArmSettings = setting(TruthArmSettings, meaning="the arm")
     factor: FactorSettings = setting(FactorSettings, meaning="factors on what the host is told")
     wiring: WiringSettings = setting(WiringSettings, meaning="devices elsewhere than the host is told")
+    habits: HabitSettings | None = setting(None, meaning="ways of every drive, in place of its maker's")
 
 
 def truth_names() -> list[str]:
