@@ -66,7 +66,7 @@ class Feed:
 
     def judged(self) -> FirstMotion:
         """Return who has judged it."""
-        judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=()))  # type: ignore[arg-type]
+        judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=(), gear_ratios=(1.0, 1.0)))  # type: ignore[arg-type]
         before = SchemeState.INIT
         for row, state in enumerate(self.state.tolist()):
             values = {"q": self.q[row], "dq": self.dq[row], "tau_J": self.tau_J[row]}
@@ -112,7 +112,7 @@ def test_a_joint_that_is_not_known_in_time_is_named_and_judged_no_more(
 ) -> None:
     monkeypatch.setattr(first_motion, "_LONGEST_S", 0.4)
     drives = (SimpleNamespace(is_limited=is_limited),)
-    judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=drives))  # type: ignore[arg-type]
+    judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=drives, gear_ratios=(1.0, 1.0)))  # type: ignore[arg-type]
     for k in range(399 * len(periods) // sum(periods)):
         judge.note(BLANK._replace(periods=periods[k % len(periods)]), SchemeState.ADAPT, np.zeros(2))
     assert (judge.is_on, judge.take_events()) == (True, [])
@@ -276,7 +276,7 @@ def test_a_mistake_that_would_be_certified_stops_the_arm_first_and_replays_to_th
     assert run.certificates == ()
     [line] = [event.message for event in run.events if "-> FAULT" in event.message]
     check(line, TORQUE, 2, 0.5)
-    assert "arm.rated_torque_Nm[1] = 12 Nm and the motor's torque constant" in line
+    assert "arm.rated_torque_Nm[1] = 12 Nm, scale.gear_ratio = 1 of devices.drive[1], and the motor's torque" in line
     replayed = replay(summary.log.path)
     assert replayed.compared > 0
     assert replayed.mismatch_count == 0

@@ -56,6 +56,8 @@ _UNEVEN: Final = 0.1
 """Largest share of Σ Δq² that one scale leaves over: a position that is stuck at times leaves a half."""
 _ALIGNED: Final = 0.7
 """Correlation of torque and acceleration from which on one is along the other, or against it."""
+_FAR: Final = 2.5
+"""Sensed over commanded torque from which on scales are the likeliest reason of an arm that runs away or lags."""
 _OWN, _OTHER = 0, 1
 _COLUMNS: Final = 7
 
@@ -79,7 +81,8 @@ class FirstMotion:
         self._long, self._short = (_Blocks(span_s, self._period_s) for span_s in (BLOCK_S, SHORT_BLOCK_S))
         self._blocks = self._powered = 0  # powered: cycles
         self._readings: DeviceReadings | None = DeviceReadings(settings) if self._error > 0.0 else None
-        self._pushed = np.zeros((6, JOINTS))  # Σ of ddq², tau_c², tau_J², tau_c ddq, tau_J ddq, tau_c dq: short blocks
+        # Over short blocks, Σ of ddq², tau_c², tau_J², tau_c ddq, tau_J ddq, tau_c dq, tau_c tau_J.
+        self._pushed = np.zeros((7, JOINTS))
         self._normal = np.zeros((JOINTS, _COLUMNS + 1, _COLUMNS + 1))
         self._moving = [0] * JOINTS
         self._path = np.zeros((3, JOINTS))  # Σ Δq ∫ dq dt, Σ (∫ dq dt)², Σ Δq²
@@ -137,7 +140,8 @@ class FirstMotion:
         elif block is not None:
             readings.add(block.q, block.dq, block.ddq, block.tau_J, block.dtau_J)
             ddq, tau_c, tau_J = block.ddq, block.tau_c, block.tau_J
-            self._pushed += ddq * ddq, tau_c * tau_c, tau_J * tau_J, tau_c * ddq, tau_J * ddq, tau_c * block.dq
+            squares = ddq * ddq, tau_c * tau_c, tau_J * tau_J
+            self._pushed += *squares, tau_c * ddq, tau_J * ddq, tau_c * block.dq, tau_c * tau_J
             reading = readings.step()
             if reading is not None and (reading.kind != "torque" or not self._open):
                 self.line = readings.describe(reading)
@@ -153,7 +157,9 @@ class FirstMotion:
         """Say what may have made the arm run away, by its first motion; empty where nothing is likely."""
         if self._readings is None or self.line:
             return ""
-        ddq, tau_c, tau_J, commanded, sensed, power = self._pushed
+        if scales := self._suspect_scales():
+            return scales
+        ddq, tau_c, tau_J, commanded, sensed, power, _ = self._pushed
         joint = int(np.argmin(power))  # it drives the other, which is dragged and takes less
         along_c = commanded[joint] / math.sqrt(max(ddq[joint] * tau_c[joint], 1e-12))
         along_J = sensed[joint] / math.sqrt(max(ddq[joint] * tau_J[joint], 1e-12))
@@ -166,6 +172,23 @@ class FirstMotion:
             )
         reading = self._readings.suspect()
         return "" if reading is None else f"perhaps {self._readings.describe(reading)}"
+
+    def _suspect_scales(self) -> str:
+        """Name the joint whose sensor measures far more or less than is commanded, though along it."""
+        _, tau_c, tau_J, _, _, _, both = self._pushed
+        found = [
+            (abs(math.log(ratio)), joint, ratio)
+            for joint in range(JOINTS)
+            if both[joint] > _ALIGNED * math.sqrt(tau_c[joint] * tau_J[joint])
+            and not 1.0 / _FAR < (ratio := both[joint] / tau_c[joint]) < _FAR
+        ]
+        if not found:
+            return ""
+        _, joint, ratio = max(found)
+        return (
+            f"perhaps joint {joint + 1}: its torque sensor measures {ratio:.2g} times the commanded torque: check "
+            f"{self._scales(joint)}"
+        )
 
     def _take_block(self, block: "_Block") -> None:
         self._path += block.travel * block.way, block.way * block.way, block.travel * block.travel
@@ -251,11 +274,12 @@ class FirstMotion:
         self._events.append(Event("warning" if is_off else "info", "first motion", text))
 
     def _scales(self, joint: int) -> str:
-        rated_Nm = self._settings.arm.rated_torque_Nm[joint]
-        return (
-            f"scale.torque_Nm of devices.sensor[{joint}], arm.rated_torque_Nm[{joint}] = {rated_Nm:g} Nm, "
-            f"scale.gear_ratio and scale.gear_efficiency of devices.drive[{joint}], and the motor's torque constant"
-        )
+        gear, rated_Nm = self._arm.gear_ratios[joint], self._settings.arm.rated_torque_Nm[joint]
+        gear_text = f"scale.gear_ratio = {gear:g} of devices.drive[{joint}]"
+        text = f"scale.torque_Nm of devices.sensor[{joint}], arm.rated_torque_Nm[{joint}] = {rated_Nm:g} Nm"
+        if gear == 1.0:
+            return f"{text}, {gear_text}, and the motor's torque constant"
+        return f"{gear_text}, its scale.gear_efficiency, {text}, and the motor's torque constant"
 
     def _describe(self, joint: int, ratio: "TorqueRatio") -> str:
         head = f"joint {joint + 1}: its torque sensor measures {ratio.own:+.2f} times the commanded torque"

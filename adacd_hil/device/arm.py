@@ -62,6 +62,7 @@ class Arm:
             sign * 1000.0 / rated for sign, rated in zip(settings.arm.sign, settings.arm.rated_torque_Nm, strict=True)
         )
         self.max_age_cycles = settings.bus.max_age_cycles
+        self.gear_ratios = tuple(device.settings.scale.gear_ratio for device in devices[:JOINTS])
         self.status_age_limits = tuple(_status_age_limit(device, period_s) for device in devices[:JOINTS])
         """How old each drive's status may be, in cycles; infinite where nothing is expected."""
         self._handlers = self._build_handlers()
