@@ -43,16 +43,20 @@ class Interview:
         question: str,
         read: Callable[[Any], Answer],
         proposal: Proposal = Proposal(None),  # noqa: B008 (immutable)
+        explanation: str = "",
     ) -> tuple[Answer, str]:
         """Return an answer and its source: "given", the proposal's, or "" for a guess that nobody has changed.
 
         read: makes an answer of an option's value, of what was typed, or of a proposal; raises ConfigError for what is
-        none. Raises CommandError where nothing answers.
+        none, and the question is asked again. explanation: what `?` gets. Raises CommandError where nothing answers.
         """
         if given is not None:
             return read(given), "given"
         if self.is_asking:
-            return self._prompt(question, read, proposal)
+            help_text = "; ".join(
+                part for part in (explanation, f"{option} answers it, too", _origin(proposal), "Ctrl-C ends") if part
+            )
+            return self._prompt(question, read, proposal, help_text)
         if proposal.value is None:
             raise CommandError(f"nobody to ask, as stdin is no terminal: give {option} ({question})", ExitCode.USAGE)
         if not self.takes_proposals:
@@ -62,10 +66,15 @@ class Interview:
             )
         return read(proposal.value), proposal.source
 
-    def _prompt(self, question: str, read: Callable[[Any], Answer], proposal: Proposal) -> tuple[Answer, str]:
+    def _prompt(
+        self, question: str, read: Callable[[Any], Answer], proposal: Proposal, help_text: str
+    ) -> tuple[Answer, str]:
         while True:
             default = None if proposal.value is None else told(proposal)
             text = click.prompt(in_line(question), default=default, err=True, show_default=default != "")
+            if text.strip() == "?":
+                self.say(help_text)
+                continue
             try:
                 if text == default and proposal.value is not None:
                     return read(proposal.value), proposal.source
@@ -78,6 +87,12 @@ class Interview:
         if answer is not None:
             return answer
         return self.is_asking and click.confirm(in_line(question), default=False, err=True)
+
+
+def _origin(proposal: Proposal) -> str:
+    if proposal.value is None:
+        return ""
+    return f"Enter takes {told(proposal)}: {proposal.source or 'a guess'}"
 
 
 def told(proposal: Proposal) -> str:

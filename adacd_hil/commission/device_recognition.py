@@ -5,25 +5,21 @@ CiA 404 (0x6131, 0x6132).
 """
 
 import dataclasses
-import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from adacd_hil.clock import Clock
-from adacd_hil.commission.profile_draft import KINDS, SENSOR, DeviceRatings, identity_of
+from adacd_hil.commission.profile_draft import KINDS, SENSOR, DeviceRatings, count_of, identity_of
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.contract import compose
-from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT
 from adacd_hil.device.profile import load_profile, place_devices, profile_names
-from adacd_hil.device.survey import Node
+from adacd_hil.device.survey import BETWEEN_READS_S, Node
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus, Tap
 from adacd_hil.wire.codec import CodecError
-
-_DEG_S_PER_RPM = 6.0
 
 
 class RecognisedDevice(NamedTuple):
@@ -43,14 +39,17 @@ class RecognisedDevice(NamedTuple):
         return f"{node.name or 'a device without a name'}, {', '.join(numbers)}, serial {node.serial or '?'}"
 
 
-def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node]) -> list[RecognisedDevice]:
-    """Tell the drives and sensors among the nodes of a survey, and read their ratings. Raises BusError."""
+def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], told: Mapping[int, str]) -> list[RecognisedDevice]:
+    """Tell the drives and sensors among the nodes of a survey, and read their ratings. Raises BusError.
+
+    `told`: drive or sensor by node id, of nodes whose 0x1000 names neither.
+    """
     canopen = CanopenBus(Tap(bus, clock))
     found = []
     for node in nodes:
-        kind = KINDS.get((node.device_type or 0) & 0xFFFF)
+        kind = KINDS.get((node.device_type or 0) & 0xFFFF) or told.get(node.node_id)
         if kind is not None and node.answers:
-            remote = canopen.add_node(node.node_id, None)
+            remote = canopen.add_node(node.node_id, None, pause_s=BETWEEN_READS_S)
             profiles = fitting_profiles(node, kind)
             if any(load_profile(name, kind).settings.contract_object for name in profiles):
                 node.layout_digest = _number(remote, 0x2000, 2)
@@ -71,6 +70,24 @@ def fitting_profiles(node: Node, kind: str) -> tuple[str, ...]:
     return tuple(sorted(names, key=len))
 
 
+_SIGNED = ((0x607D, 1), (0x607D, 2))
+_OF_DRIVES = (
+    (0x6076, 0),
+    (0x6072, 0),
+    (0x608F, 1),
+    (0x608F, 2),
+    (0x6091, 1),
+    (0x6091, 2),
+    (0x6092, 1),
+    (0x6092, 2),
+    (0x60A8, 0),
+    (0x60A9, 0),
+    *_SIGNED,
+    (0x6080, 0),
+    (0x6502, 0),
+)
+
+
 def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> int | None:
     try:
         data = read_object(remote, index, sub)
@@ -80,36 +97,10 @@ def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> i
 
 
 def _read_ratings(remote: Any, kind: str) -> DeviceRatings:
-    number = functools.partial(_number, remote)
     if kind == SENSOR:
-        unit, digits = number(0x6131, 1), number(0x6132, 1)
-        if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
-            return DeviceRatings()
-        prefix = unit >> PREFIX_SHIFT
-        exponent = (prefix - 256 if prefix > 127 else prefix) - digits
-        return DeviceRatings(torque_Nm=10.0**exponent if abs(exponent) < 12 else None)
-    rated_mNm, permille = number(0x6076), number(0x6072)
-    increments, motor_revs = number(0x608F, 1), number(0x608F, 2) or 1
-    gear_in, gear_out = number(0x6091, 1) or 1, number(0x6091, 2) or 1
-    per_rev = increments * gear_in // (motor_revs * gear_out) if increments else None
-    low, high = number(0x607D, 1, is_signed=True), number(0x607D, 2, is_signed=True)
-    limit = min(-low, high) if low is not None and high is not None else 0
-    rpm = number(0x6080)
-    return DeviceRatings(
-        rated_torque_Nm=rated_mNm * 1e-3 if rated_mNm else None,
-        torque_share=permille * 1e-3 if permille else None,
-        increments_per_rev=per_rev,
-        position_limit_deg=_whole_turn(limit, per_rev),
-        velocity_limit_deg_s=rpm * _DEG_S_PER_RPM * gear_out / gear_in if rpm else None,
-    )
-
-
-def _whole_turn(limit: int, per_rev: int | None) -> float | None:
-    """Return a limit in degrees; None where it is none, as of a drive that has the whole range of its counter."""
-    if not per_rev or limit <= 0:
-        return None
-    degrees = 360.0 * limit / per_rev
-    return degrees if degrees <= 360.0 else None
+        return DeviceRatings(torque_Nm=count_of(_number(remote, 0x6131, 1), _number(remote, 0x6132, 1)))
+    read = {place: _number(remote, *place, is_signed=place in _SIGNED) for place in _OF_DRIVES}
+    return DeviceRatings({place: value for place, value in read.items() if value is not None})
 
 
 def choose_family(

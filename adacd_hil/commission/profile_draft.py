@@ -1,44 +1,173 @@
 """The draft of a device profile from an EDS: the frames that a cycle needs, as the device's mapping allows them.
 
-What an EDS doesn't say, as the worth of a count, is taken from the device's own objects where they were read, and is a
-guess otherwise. Sources: CiA 301 (0x1000, 0x1018; clause 7.5.2, PDO parameters), CiA 402-2, CiA 404.
+What an EDS doesn't say, as the worth of a count, is taken from the answers that are given, from the device's own
+objects where they were read, from what is known of its maker, and is a guess otherwise. A value that an EDS gives for
+an object that may be written is what the factory sets: a guess, too, where it is the arm that decides.
+
+Sources: CiA 301 (0x1000, 0x1018; clause 7.5.2, PDO parameters), CiA 306 (EDS: PDOMapping, AccessType), CiA 402-2,
+CiA 404.
 """
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.device.canopen_bus import find_variable, read_eds
-from adacd_hil.device.device_setup import SIGNAL_OBJECTS
-from adacd_hil.device.profile import ObjectName, ProfileSettings
+from adacd_hil.device.canopen_bus import EdsVariable, find_variable, read_eds
+from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT, SIGNAL_OBJECTS
+from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, name_velocity_unit, read_drive_units
+from adacd_hil.device.profile import (
+    HOST_SIGNALS,
+    ObjectName,
+    PatienceSettings,
+    ProfileSettings,
+    ScaleSettings,
+    load_profile,
+    profile_names,
+)
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import parse_toml
+from adacd_hil.wire.contract_frames import NOT_VALID
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 DRIVE, SENSOR = "drive", "sensor"
 KINDS = {402: DRIVE, 404: SENSOR}
+_DEG_S_PER_RPM = 6.0
+_Place = tuple[int, int]
 
 
 class DeviceRatings(NamedTuple):
-    """What a device's objects say of the arm; None where it doesn't say.
+    """What a device itself says. numbers: of its objects, by index and sub-index. torque_Nm: one count of a sensor."""
 
-    gear: motor revolutions per joint revolution. torque_Nm: one count of a sensor.
+    numbers: Mapping[_Place, int] = {}
+    torque_Nm: float | None = None
+
+    @property
+    def torque_share(self) -> float | None:
+        """0x6072, the largest torque over the rated one; None where it doesn't say."""
+        permille = self.numbers.get((0x6072, 0))
+        return permille * 1e-3 if permille else None
+
+    def rated_torque_Nm(self, scale: ScaleSettings) -> float | None:
+        """Return 0x6076 at the joint; None where it doesn't say."""
+        counts = self.numbers.get((0x6076, 0))
+        return counts * scale.joint_torque_Nm if counts else None
+
+    def position_limit_deg(self, scale: ScaleSettings) -> float | None:
+        """Return 0x607D; None where it is no limit, as of a drive that has the whole range of its counter."""
+        low, high = self.numbers.get((0x607D, 1)), self.numbers.get((0x607D, 2))
+        if low is None or high is None or min(-low, high) <= 0 or not scale.increments_per_joint_rev:
+            return None
+        degrees = 360.0 * min(-low, high) / scale.increments_per_joint_rev
+        return degrees if degrees <= 360.0 else None
+
+    def velocity_limit_deg_s(self, scale: ScaleSettings) -> float | None:
+        """Return 0x6080, rpm of the motor, at the joint; None where it doesn't say."""
+        rpm = self.numbers.get((0x6080, 0))
+        gear = self.numbers.get((0x6091, 1), 0) / (self.numbers.get((0x6091, 2)) or 1) or scale.gear_ratio
+        return rpm * _DEG_S_PER_RPM / gear if rpm else None
+
+
+class Guess(NamedTuple):
+    """A value of a draft that nobody vouches for. key: of the profile. text: of the value, and why it is one."""
+
+    key: str
+    value: float
+    text: str
+
+
+class ProfileDraft(NamedTuple):
+    """The text of a profile. remarks: what the device can't do, a line each.
+
+    rated_torque_Nm: at the joint, by 0x6076; None: not said. is_rated_known: whether no guess is in it.
     """
 
+    kind: str
+    text: str
+    guessed: tuple[Guess, ...]
+    remarks: tuple[str, ...] = ()
     rated_torque_Nm: float | None = None
-    torque_share: float | None = None
-    increments_per_rev: int | None = None
-    position_limit_deg: float | None = None
-    velocity_limit_deg_s: float | None = None
-    torque_Nm: float | None = None
+    is_rated_known: bool = False
+
+    @property
+    def guesses(self) -> tuple[str, ...]:
+        """What in it neither EDS nor device says, a line each."""
+        return tuple(f"{guess.key.partition('.')[2]} = {guess.text}" for guess in self.guessed)
+
+    @property
+    def settings(self) -> ProfileSettings:
+        """The draft as it will be read."""
+        return parse(ProfileSettings, parse_toml(self.text))
 
 
 def identity_of(eds: Path) -> tuple[int | None, int | None]:
-    """Return vendor and product of an EDS, 0x1018:1 and :2. Raises ConfigError."""
-    variables = [find_variable(read_eds(eds, 1), 0x1018, sub) for sub in (1, 2)]
-    vendor, product = (None if variable is None else variable.default for variable in variables)
-    return vendor, product
+    """Return vendor and product of an EDS: 0x1018:1 and :2, else those of its head. Raises ConfigError."""
+    objects = read_eds(eds, 1)
+    head = objects.device_information
+    found = []
+    for sub, number in ((1, head.vendor_number), (2, head.product_number)):
+        variable = find_variable(objects, 0x1018, sub)
+        default = None if variable is None else variable.default
+        found.append(default if default is not None else number)
+    return found[0], found[1]
+
+
+def kind_of(eds: Path) -> str:
+    """Tell whether an EDS is that of a drive or a sensor, by 0x1000; "" where it is of another profile, or of none.
+
+    Raises ConfigError.
+    """
+    variable = find_variable(read_eds(eds, 1), 0x1000, 0)
+    number = None if variable is None or variable.default is None else variable.default & 0xFFFF
+    return KINDS.get(number or 0, "")
+
+
+def draft_profile(
+    eds: Path,
+    ratings: DeviceRatings = DeviceRatings(),  # noqa: B008 (immutable)
+    kind: str = "",
+    answers: Mapping[str, float] | None = None,
+) -> ProfileDraft:
+    """Draft the profile of the device that an EDS describes. Raises ConfigError where it lacks what a cycle needs.
+
+    `kind`: drive or sensor, where 0x1000 doesn't tell. `answers`: values of `scale` that are given, by key;
+    `velocity_unit` is a code of 0x60A9.
+    """
+    kind = kind or kind_of(eds)
+    if not kind:
+        raise ConfigError(f"EDS {eds}: 0x1000 names neither a drive (CiA 402) nor a sensor (CiA 404)")
+    objects = read_eds(eds, 1)
+    make = _DriveWriter if kind == DRIVE else _SensorWriter
+    writer = make(eds, objects, ratings, answers or {})
+    text = writer.text()
+    try:
+        parse(ProfileSettings, parse_toml(text))
+    except ConfigError as error:
+        raise ConfigError(f"EDS {eds}: {error}") from None
+    keys = {guess.key for guess in writer.guessed}
+    is_rated_known = not (keys & _OF_TORQUE or writer.is_factory(0x6076, 0))
+    return ProfileDraft(
+        kind, text, tuple(writer.guessed), tuple(writer.remarks), writer.rated_torque_Nm, is_rated_known
+    )
+
+
+def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
+    """Return the shipped profile of a maker who counts or waits in ways of his own; None: nothing is known."""
+    vendor, _ = identity_of(eds)
+    for name in profile_names():
+        try:
+            profile = load_profile(name, kind)
+        except ConfigError:  # of the other kind
+            continue
+        if vendor is not None and identity_of(profile.eds)[0] == vendor and _has_ways(profile.settings):
+            return profile.settings
+    return None
+
+
+def _has_ways(settings: ProfileSettings) -> bool:
+    plain = settings.scale.rated_torque_count_Nm == ScaleSettings().rated_torque_count_Nm
+    return not plain or settings.patience != PatienceSettings()
 
 
 _TORQUE_OBJECTS = ((0x9130, 1), (0x7130, 1))
@@ -50,71 +179,138 @@ _FEATURES = {
     "torque_limits": (0x6072, 0),
 }
 _PERMILLE = ("torque_actual", "torque_demand", "target_torque", "torque_offset", "max_torque")
-_EVENT = "transmission = 255\nevent_timer_ms = 100\n"
-_Place = tuple[int, int]
+_STATUS_OBJECTS = ((0x6041, 0), (0x6061, 0), (0x6077, 0), (0x603F, 0))
+_EVENT_TYPE, _EVENT_MS = 255, 100
+_MOST_RECORDS = 64
+"""Records of PDO parameters that are looked at; CiA 301 has 512, devices have 4 to 8."""
 _GUESSED_INCREMENTS = 1 << 20
 _GUESSED_TORQUE_NM = 1e-6, 2e-3
 """What a count may be worth, of more than 16 bits and of 16: ±2147 Nm and ±65 Nm in all."""
+_MOST_MOTOR_NM = 100.0
+"""A motor of more in an arm of this size is one whose 0x6076 counts µNm."""
+_CST = 1 << 9  # of 0x6502
+_OF_TORQUE = {"scale.gear_ratio", "scale.rated_torque_count_Nm"}
+_MOST_OPTION = 8  # of 0x605A
 
 
-class ProfileDraft(NamedTuple):
-    """The text of a profile. guesses: what in it neither EDS nor device says, a line each."""
+class _Record(NamedTuple):
+    """A PDO of a device. cob_id: without the node id. entries: what is mapped by default.
 
-    kind: str
-    text: str
-    guesses: tuple[str, ...]
+    room: how many objects may be mapped; 0: its mapping can't be written. transmission: the one that can't be changed,
+    None where it can. inhibit_100us, timer_ms: those that can't be.
+    """
 
+    number: int
+    cob_id: int
+    entries: tuple[_Place, ...]
+    room: int
+    transmission: int | None
+    has_timer: bool
+    inhibit_100us: int
+    timer_ms: int
 
-def kind_of(eds: Path) -> str:
-    """Tell whether an EDS is that of a drive or a sensor, by 0x1000. Raises ConfigError."""
-    variable = find_variable(read_eds(eds, 1), 0x1000, 0)
-    number = None if variable is None or variable.default is None else variable.default & 0xFFFF
-    if number not in KINDS:
-        told = "tells no device profile" if number is None else f"is of CiA {number}"
-        raise ConfigError(f"EDS {eds} {told} in 0x1000; a drive is of CiA 402, a sensor of CiA 404")
-    return KINDS[number]
+    def carries(self, *places: _Place) -> bool:
+        """Whether it brings objects by itself."""
+        return set(places) <= set(self.entries)
 
-
-def draft_profile(eds: Path, ratings: DeviceRatings = DeviceRatings()) -> ProfileDraft:  # noqa: B008 (immutable)
-    """Draft the profile of the device that an EDS describes. Raises ConfigError where it lacks what a cycle needs."""
-    kind = kind_of(eds)
-    objects = read_eds(eds, 1)
-    writer = _DriveWriter(eds, objects, ratings) if kind == DRIVE else _SensorWriter(eds, objects, ratings)
-    text = writer.text()
-    try:
-        parse(ProfileSettings, parse_toml(text))
-    except ConfigError as error:
-        raise ConfigError(f"EDS {eds}: {error}") from None
-    return ProfileDraft(kind, text, tuple(writer.guesses))
+    def can_be(self, transmission: int) -> bool:
+        """Whether it can be sent or taken in this way."""
+        return self.transmission in (None, transmission)
 
 
 class _ProfileWriter(ABC):
     kind = ""
 
-    def __init__(self, eds: Path, objects: Any, ratings: DeviceRatings) -> None:
-        self.eds, self.objects, self.ratings = eds, objects, ratings
-        self.guesses: list[str] = []
+    def __init__(self, eds: Path, objects: Any, ratings: DeviceRatings, answers: Mapping[str, float]) -> None:
+        self.eds, self.objects, self.ratings, self.answers = eds, objects, ratings, answers
+        self.guessed: list[Guess] = []
+        self.remarks: list[str] = []
+        self.rated_torque_Nm: float | None = None
+        self._numbered = read_eds(eds, 2)
+
+    def find(self, place: _Place) -> EdsVariable | None:
+        return find_variable(self.objects, *place)
 
     def has(self, index: int, sub: int = 0) -> bool:
-        return find_variable(self.objects, index, sub) is not None
+        return self.find((index, sub)) is not None
+
+    def can_write(self, index: int, sub: int = 0) -> bool:
+        variable = self.find((index, sub))
+        return variable is not None and variable.is_writable
 
     def default(self, index: int, sub: int = 0) -> int:
-        variable = find_variable(self.objects, index, sub)
+        variable = self.find((index, sub))
         return 0 if variable is None or variable.default is None else variable.default
 
+    def number(self, index: int, sub: int) -> int | None:
+        """Return what the device says, else what the EDS does."""
+        if (index, sub) in self.ratings.numbers:
+            return self.ratings.numbers[index, sub]
+        variable = self.find((index, sub))
+        return None if variable is None else variable.default
+
+    def is_factory(self, index: int, sub: int) -> bool:
+        """Whether the value of an object is the one with which the device leaves its factory."""
+        return (index, sub) not in self.ratings.numbers and self.can_write(index, sub)
+
+    def refuse(self, reason: str) -> ConfigError:
+        return ConfigError(f"EDS {self.eds}: {reason}")
+
     def require(self, index: int, sub: int, what: str) -> None:
-        if not self.has(index, sub):
-            raise ConfigError(f"EDS {self.eds}: no {ObjectName(index, sub)} ({what}), which a {self.kind} needs")
+        name = f"{ObjectName(index, sub)} ({what})"
+        variable = self.find((index, sub))
+        if variable is None:
+            raise self.refuse(f"no {name}, which a {self.kind} needs")
+        if not variable.is_mappable:
+            raise self.refuse(f"{name} can't be in a frame (PDOMapping=0), which a {self.kind} needs")
 
     @property
     def is_fixed(self) -> bool:
-        """Whether the first transmit mapping can't be written."""
-        variable = find_variable(self.objects, 0x1A00, 1)
-        return variable is None or not variable.is_writable
+        """Whether no mapping can be written."""
+        return not any(record.room for is_received in (False, True) for record in self.records(is_received))
+
+    def records(self, is_received: bool) -> list[_Record]:
+        """List the PDOs that can be switched on."""
+        base = 0x1400 if is_received else 0x1800
+        found = []
+        for number in range(1, _MOST_RECORDS + 1):
+            index, mapping = base + number - 1, base + 0x200 + number - 1
+            cob_id = self._cob_id(index, number, is_received) if self.has(index, 1) and self.has(mapping, 0) else None
+            if cob_id is None:
+                continue
+            subs = 0
+            while self.has(mapping, subs + 1):
+                subs += 1
+            can_map = self.can_write(mapping, 0) and self.can_write(mapping, 1)
+            mapped = [self.default(mapping, sub) for sub in range(1, min(self.default(mapping, 0), subs) + 1)]
+            entries = tuple((entry >> 16, entry >> 8 & 0xFF) for entry in mapped if entry >> 16)
+            transmission = None if self.can_write(index, 2) else self.default(index, 2)
+            room = subs if can_map else 0
+            times = [0 if self.can_write(index, sub) else self.default(index, sub) for sub in (3, 5)]
+            has_timer = self.can_write(index, 5)
+            found.append(_Record(number, cob_id, entries, room, transmission, has_timer, *times))
+        return found
+
+    def _cob_id(self, index: int, number: int, is_received: bool) -> int | None:
+        """Return the EDS's identifier of a PDO without the node id; None where it can't be used."""
+        told = self.default(index, 1)
+        if told & NOT_VALID and not self.can_write(index, 1):
+            return None
+        second = find_variable(self._numbered, index, 1)
+        other = 0 if second is None or second.default is None else second.default
+        # An identifier without $NODEID is that of the node with which the file was made.
+        node = 1 if other != told else (self.objects.node_id or 1)
+        cob_id = (told & 0x7FF) - node
+        if 0x180 <= cob_id <= 0x57F:
+            return cob_id
+        predefined = (0x200 if is_received else 0x180) + 0x100 * (number - 1)
+        return predefined if self.can_write(index, 1) and predefined <= 0x57F else None
 
     def text(self) -> str:
-        features = [name for name, place in _FEATURES.items() if self.has(*place) and self.allows(name)]
-        watchdog = "0x1400:5" if self.kind == DRIVE and self.has(0x1400, 5) else "none"
+        self.check()
+        features = [name for name, place in _FEATURES.items() if self.can_write(*place) and self.allows(name)]
+        frames = self.frames()
+        scale = self.scale()
         lines = [
             f"# Drafted from {self.eds.name} by `adacd-hil init`. `adacd-hil doctor` compares it with the device.",
             "",
@@ -123,19 +319,36 @@ class _ProfileWriter(ABC):
         ]
         if self.is_fixed:
             lines.append('mapping = "fixed"')
-        if watchdog != "none":
-            lines.append(f'command_watchdog = "{watchdog}"')
-        elif self.kind == DRIVE:
-            lines.append("# command_watchdog: the EDS has no 0x1400:5; see that the drive stops without commands.")
+        lines += self.watchdog()
         lines.append(f"features = [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in features)}]")
-        if "option_codes" in features:
-            lines += ["# Brake on a ramp, then without torque.", "quick_stop_option = 2", "fault_reaction_option = 2"]
-        lines += ["", "[scale]", *self.scale(), ""]
-        return "\n".join([*lines, *self.frames()])
+        lines += self.options("option_codes" in features)
+        if self.guessed:
+            keys = ", ".join(f'"{guess.key}"' for guess in self.guessed)
+            lines += [
+                "# Guesses: look each up or measure it, write it, and take the key off here.",
+                f"assumed = [{keys}]",
+            ]
+        lines += ["", "[scale]", *scale, ""]
+        return "\n".join([*lines, *self.further(), *frames])
+
+    def check(self) -> None:
+        """Raise ConfigError where the device can't do what a cycle needs."""
 
     def allows(self, feature: str) -> bool:
         """Whether a feature is one of this kind of device."""
         return self.kind == DRIVE or feature in ("heartbeat_consumer", "sync_counter")
+
+    def watchdog(self) -> list[str]:
+        """Write where the deadline of commands is."""
+        return []
+
+    def options(self, can_write: bool) -> list[str]:  # noqa: ARG002 (of a drive)
+        """Write how it stops."""
+        return []
+
+    def further(self) -> list[str]:
+        """Write what is known of the maker's devices."""
+        return []
 
     @abstractmethod
     def scale(self) -> list[str]:
@@ -145,16 +358,28 @@ class _ProfileWriter(ABC):
     def frames(self) -> list[str]:
         """Write the PDOs."""
 
-    def pdo(self, message: str, number: int, cob_id: int, places: list[_Place], further: str = "") -> list[str]:
-        """Write one PDO; a fixed one has what the EDS maps by default."""
-        mapping = (0x1600 if message == "Command" else 0x1A00) + number - 1
-        self.require(mapping, 0, f"mapping of {message}")
-        if self.is_fixed:
-            entries = [self.default(mapping, sub) for sub in range(1, self.default(mapping, 0) + 1)]
-            places = [(entry >> 16, entry >> 8 & 0xFF) for entry in entries if entry >> 16]
-        rows = [f'    {{ object = "{ObjectName(*place)}", {self.signal(place)} }},' for place in places]
-        head = ["[[pdo]]", f'message = "{message}"', f"number = {number}", f"cob_id = 0x{cob_id:X}"]
-        return [*head, *further.splitlines(), "signals = [", *rows, "]", ""]
+    def guess(self, key: str, value: float, text: str) -> str:
+        """Note a guess; return the comment above it."""
+        self.guessed.append(Guess(f"scale.{key}", value, text))
+        return f"# A guess: {text}"
+
+    def pdo(self, message: str, record: _Record, places: Sequence[_Place], transmission: int = 1) -> list[str]:
+        """Write one PDO; one whose mapping is fixed has what the EDS maps by default."""
+        rows = [
+            f'    {{ object = "{ObjectName(*place)}", {self.signal(place)} }},'
+            for place in (places if record.room else record.entries)
+        ]
+        head = ["[[pdo]]", f'message = "{message}"', f"number = {record.number}", f"cob_id = 0x{record.cob_id:X}"]
+        kept = record.transmission if record.transmission is not None else transmission
+        if kept != 1:
+            head.append(f"transmission = {kept}")
+        if record.inhibit_100us:
+            head.append(f"inhibit_100us = {record.inhibit_100us}")
+        if kept > 240 and message == "Status" and record.has_timer:
+            head.append(f"event_timer_ms = {_EVENT_MS}")
+        elif record.timer_ms:
+            head.append(f"event_timer_ms = {record.timer_ms}")
+        return [*head, "signals = [", *rows, "]", ""]
 
     def signal(self, place: _Place) -> str:
         index, sub = place
@@ -164,12 +389,15 @@ class _ProfileWriter(ABC):
         unit = ', unit = "permille"' if name in _PERMILLE else ""
         return f'signal = "{name or f"object_{index:04X}_{sub}"}"{unit}'
 
-    def fill(self, places: list[_Place]) -> list[_Place]:
-        """Keep of some objects those that the EDS has and that fit into a frame, in order."""
-        kept, bits = [], 0
+    def fill(self, places: Sequence[_Place], room: int) -> list[_Place]:
+        """Keep of some objects those that may be in a frame and fit into one of so much room, in order."""
+        kept: list[_Place] = []
+        bits = 0
         for place in places:
-            variable = find_variable(self.objects, *place)
-            if variable is not None and variable.bits and bits + variable.bits <= 8 * CLASSIC_BYTES:
+            variable = self.find(place)
+            if variable is None or not (variable.bits and variable.is_mappable) or len(kept) >= room:
+                continue
+            if bits + variable.bits <= 8 * CLASSIC_BYTES:
                 kept.append(place)
                 bits += variable.bits
         return kept
@@ -178,32 +406,174 @@ class _ProfileWriter(ABC):
 class _DriveWriter(_ProfileWriter):
     kind = DRIVE
 
-    def scale(self) -> list[str]:
-        for index, what in ((0x6064, "position"), (0x606C, "velocity"), (0x6041, "statusword"), (0x6071, "torque")):
+    def check(self) -> None:
+        target = self.find((0x6071, 0))
+        if target is None:
+            raise self.refuse("no 0x6071 (target torque): it can't be commanded by torque")
+        if not (target.is_mappable and target.is_writable):
+            raise self.refuse(
+                "0x6071 (target torque) can't be in a frame to the drive: it can't be commanded by torque"
+            )
+        modes = self.number(0x6502, 0)
+        if modes and not modes & _CST and not self.is_factory(0x6502, 0):
+            raise self.refuse(f"0x6502 = 0x{modes:X} has no cyclic synchronous torque: it can't be commanded by torque")
+        for index, what in (
+            (0x6040, "controlword"),
+            (0x6041, "statusword"),
+            (0x6064, "position"),
+            (0x606C, "velocity"),
+        ):
             self.require(index, 0, what)
-        increments = self.ratings.increments_per_rev or self._increments()
-        lines = []
-        if not increments:
-            increments = _GUESSED_INCREMENTS
-            self.guesses.append(f"increments_per_joint_rev = {increments}: neither 0x608F nor 0x6091 says it")
-            lines.append("# A guess: the device doesn't say it. Increments per motor revolution times the gear.")
-        lines.append(f"increments_per_joint_rev = {increments}")
-        lines.append("# As CiA 402 has it without further units: a count is one increment per second.")
-        lines.append(f"velocity_rad_s = {math.tau / increments!r}")
+
+    def watchdog(self) -> list[str]:
+        command = self._command()
+        if command.number == 1 and command.has_timer:
+            return ['command_watchdog = "0x1400:5"']
+        self.remarks.append(
+            "no deadline of commands (0x1400:5): only the loss of the host's heartbeat stops the drive"
+            if self.can_write(0x1016, 1)
+            else "neither a deadline of commands (0x1400:5) nor a heartbeat consumer (0x1016): see that the drive "
+            "stops when the host is gone"
+        )
+        return [f"# command_watchdog: {self.remarks[-1]}."]
+
+    def options(self, can_write: bool) -> list[str]:
+        if can_write:
+            return ["# Brake on a ramp, then without torque.", "quick_stop_option = 2", "fault_reaction_option = 2"]
+        variable = self.find((0x605A, 0))
+        option = -1 if variable is None or variable.default is None else variable.default
+        return [f"quick_stop_option = {option}"] if 0 <= option <= _MOST_OPTION else []
+
+    def further(self) -> list[str]:
+        facts = maker_facts(self.eds, DRIVE)
+        if facts is None or facts.patience == PatienceSettings():
+            return []
+        plain, patience = vars(PatienceSettings()), vars(facts.patience)
+        return ["[patience]", *(f"{key} = {value!r}" for key, value in patience.items() if value != plain[key]), ""]
+
+    def scale(self) -> list[str]:
+        gear, gear_lines = self._gear()
+        increments, lines = self._increments(gear)
+        return [*lines, *self._velocity(gear, increments), *gear_lines, *self._torque(gear)]
+
+    def _gear(self) -> tuple[float, list[str]]:
+        told = read_drive_units(self.number).gear_ratio
+        lines: list[str] = []
+        if "gear_ratio" in self.answers:
+            gear = self.answers["gear_ratio"]
+        elif told not in (None, 1.0) and not self.is_factory(0x6091, 1):
+            gear = told or 1.0
+        else:
+            gear = told or 1.0
+            why = "0x6091 is as the factory sets it" if told is not None else "no 0x6091 says it"
+            lines = [self.guess("gear_ratio", gear, f"{gear:g}: {why}")]
+        text = [*lines, f"gear_ratio = {gear:.10g}"]
+        if gear != 1.0:
+            efficiency = self.answers.get("gear_efficiency", 1.0)
+            if "gear_efficiency" not in self.answers:
+                text.append(self.guess("gear_efficiency", 1.0, "1: it is in the gear's data sheet"))
+            text.append(f"gear_efficiency = {efficiency:g}")
+        return gear, text
+
+    def _increments(self, gear: float) -> tuple[float, list[str]]:
+        units = read_drive_units(self._numbers_with_gear(), gear)
+        if "increments_per_joint_rev" in self.answers:
+            increments, lines = self.answers["increments_per_joint_rev"], []
+        elif not units.has_increments or units.increments_per_joint_rev is None:
+            increments = float(_GUESSED_INCREMENTS)
+            why = (
+                f"{units.increments_text} is a factory value"
+                if units.increments_text
+                else "neither 0x608F nor 0x6091 says it"
+            )
+            lines = [self.guess("increments_per_joint_rev", increments, f"{_GUESSED_INCREMENTS}: {why}")]
+        else:
+            increments, lines = units.increments_per_joint_rev, []
+            is_factory = any(
+                self.is_factory(*place) for place in ((0x608F, 1), (0x6092, 1)) if self.number(*place) is not None
+            )
+            if is_factory or increments < CREDIBLE_INCREMENTS:
+                text = f"{increments:.10g}: {units.increments_text} is a factory value"
+                lines = [self.guess("increments_per_joint_rev", increments, text)]
+        if not lines and units.increments_text and "increments_per_joint_rev" not in self.answers:
+            lines = [f"# By {units.increments_text}."]
+        return increments, [*lines, f"increments_per_joint_rev = {increments:.16g}"]
+
+    def _numbers_with_gear(self) -> Any:
+        """Return the drive's numbers, without a gear of 1 : 1 that was never told."""
+        told = read_drive_units(self.number).gear_ratio
+        is_told = told not in (None, 1.0) and "gear_ratio" not in self.answers
+        return lambda index, sub: None if index == 0x6091 and not is_told else self.number(index, sub)
+
+    def _velocity(self, gear: float, increments: float) -> list[str]:
+        unit = self.answers.get("velocity_unit")
+        code = int(unit) if unit is not None else self.number(0x60A9, 0)
+        objects = {(0x60A9, 0): code, (0x608F, 1): 1}
+        found = read_drive_units(lambda index, sub: objects.get((index, sub)), gear).velocity_rad_s
+        if code and code >> 16 & 0xFF == 0xB5 and found is not None:
+            found *= gear / increments
+        if code and found is not None:
+            return [f"# In {name_velocity_unit(code)} of the motor.", f"velocity_rad_s = {found!r}"]
+        rad_s = math.tau / increments
+        text = f"{rad_s:.6g}: a count is one increment per second, as CiA 402 has it without 0x60A9"
+        return [self.guess("velocity_rad_s", rad_s, text), f"velocity_rad_s = {rad_s!r}"]
+
+    def _torque(self, gear: float) -> list[str]:
+        counts = self.number(0x6076, 0) or 0
+        count_Nm, lines = self.answers.get("rated_torque_count_Nm", 1e-3), []
+        if "rated_torque_count_Nm" not in self.answers:
+            facts = maker_facts(self.eds, DRIVE)
+            if facts is not None and facts.scale.rated_torque_count_Nm != count_Nm:
+                count_Nm = facts.scale.rated_torque_count_Nm
+            elif counts * count_Nm > _MOST_MOTOR_NM:
+                count_Nm = 1e-6
+                text = f"1e-6: 0x6076 = {counts} mNm would be a motor of {counts * 1e-3:.4g} Nm, so these are µNm"
+                lines.append(self.guess("rated_torque_count_Nm", count_Nm, text))
+        if count_Nm != 1e-3:
+            lines.append(f"rated_torque_count_Nm = {count_Nm!r}")
+        if counts:
+            efficiency = self.answers.get("gear_efficiency", 1.0)
+            self.rated_torque_Nm = float(f"{counts * count_Nm * gear * efficiency:.10g}")
         return lines
 
-    def _increments(self) -> int:
-        encoder, motor_revs = self.default(0x608F, 1), self.default(0x608F, 2) or 1
-        gear_in, gear_out = self.default(0x6091, 1) or 1, self.default(0x6091, 2) or 1
-        return encoder * gear_in // (motor_revs * gear_out)
+    def _command(self) -> _Record:
+        wanted = ((0x6040, 0), (0x6071, 0))
+        for record in self.records(is_received=True):
+            known = {SIGNAL_OBJECTS[name] for name in HOST_SIGNALS}
+            if record.room >= len(wanted) and self.find((0x6040, 0)):
+                return record
+            if not record.room and record.carries(*wanted) and {index for index, _ in record.entries} <= known:
+                return record
+        raise self.refuse("no RPDO takes 0x6040 (controlword) and 0x6071 (target torque) together")
 
     def frames(self) -> list[str]:
-        status = self.fill([(0x6041, 0), (0x6061, 0), (0x6077, 0), (0x603F, 0)])
-        return [
-            *self.pdo("Feedback", 1, 0x180, [(0x6064, 0), (0x606C, 0)]),
-            *self.pdo("Status", 2, 0x280, status, _EVENT),
-            *self.pdo("Command", 1, 0x200, [(0x6040, 0), (0x6071, 0)]),
-        ]
+        sample = ((0x6064, 0), (0x606C, 0))
+        sent = self.records(is_received=False)
+        feedback = next(
+            (
+                record
+                for record in sent
+                if record.can_be(1) and (record.room >= len(sample) or (not record.room and record.carries(*sample)))
+            ),
+            None,
+        )
+        if feedback is None:
+            raise self.refuse("no TPDO brings 0x6064 (position) and 0x606C (velocity) together on every SYNC")
+        lines = self.pdo("Feedback", feedback, sample)
+        if not (not feedback.room and feedback.carries((0x6041, 0))):
+            status = next(
+                (record for record in sent if record is not feedback and (record.room or record.carries((0x6041, 0)))),
+                None,
+            )
+            if status is None:
+                raise self.refuse("no TPDO is left for 0x6041 (statusword)")
+            lines += self.pdo("Status", status, self.fill(_STATUS_OBJECTS, status.room), _EVENT_TYPE)
+            if status.transmission is None and not status.has_timer:
+                self.remarks.append(
+                    f"its statusword comes on change only, as 0x{0x1800 + status.number - 1:X}:5 (event timer) is not "
+                    "there: one that is lost is not missed"
+                )
+        return [*lines, *self.pdo("Command", self._command(), ((0x6040, 0), (0x6071, 0)))]
 
 
 class _SensorWriter(_ProfileWriter):
@@ -211,21 +581,46 @@ class _SensorWriter(_ProfileWriter):
 
     def scale(self) -> list[str]:
         torque_Nm = self.ratings.torque_Nm
+        if torque_Nm is None:
+            torque_Nm = self._by_eds()
         if torque_Nm is not None:
             return [f"torque_Nm = {torque_Nm!r}"]
         place = next((place for place in _TORQUE_OBJECTS if self.has(*place)), _TORQUE_OBJECTS[0])
-        variable = find_variable(self.objects, *place)
+        variable = self.find(place)
         guess_Nm = _GUESSED_TORQUE_NM[0 if variable is None or variable.bits > 16 else 1]
-        self.guesses.append(f"torque_Nm = {guess_Nm:g}: the worth of a count is in the data sheet")
-        return ["# A guess: the worth of a count is in the data sheet.", f"torque_Nm = {guess_Nm!r}"]
+        return [
+            self.guess("torque_Nm", guess_Nm, f"{guess_Nm:g}: the worth of a count is in the data sheet"),
+            f"torque_Nm = {guess_Nm!r}",
+        ]
+
+    def _by_eds(self) -> float | None:
+        """Return what unit and digits say that can't be changed; None where they don't."""
+        if self.is_factory(0x6131, 1) or self.is_factory(0x6132, 1):
+            return None
+        return count_of(self.number(0x6131, 1), self.number(0x6132, 1))
 
     def frames(self) -> list[str]:
         torque = next((place for place in _TORQUE_OBJECTS if self.has(*place)), None)
         if torque is None:
             told = "; its 0x6130:1 is a float, which no frame of a cycle can hold" if self.has(0x6130, 1) else ""
-            raise ConfigError(f"EDS {self.eds}: no 0x9130:1 or 0x7130:1 (torque), which a sensor needs{told}")
-        lines = self.pdo("Torque", 1, 0x180, [torque])
-        status = self.fill([(0x6150, 1), (0x1001, 0)])
-        if not self.is_fixed and self.has(0x6150, 1) and self.has(0x1A01, 0):
-            lines += self.pdo("Status", 2, 0x280, status, _EVENT)
+            raise self.refuse(f"no 0x9130:1 or 0x7130:1 (torque), which a sensor needs{told}")
+        self.require(*torque, "torque")
+        sent = self.records(is_received=False)
+        record = next((one for one in sent if one.can_be(1) and (one.room or one.carries(torque))), None)
+        if record is None:
+            raise self.refuse(f"no TPDO brings {ObjectName(*torque)} (torque) on every SYNC")
+        lines = self.pdo("Torque", record, [torque])
+        status = next((one for one in sent if one is not record and one.room), None)
+        mapped = [] if status is None else self.fill([(0x6150, 1), (0x1001, 0)], status.room)
+        if status is not None and (0x6150, 1) in mapped:
+            lines += self.pdo("Status", status, mapped, _EVENT_TYPE)
         return lines
+
+
+def count_of(unit: int | None, digits: int | None) -> float | None:
+    """Return what a count of a sensor is worth by 0x6131 and 0x6132, Nm; None where it is no torque."""
+    if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
+        return None
+    prefix = unit >> PREFIX_SHIFT
+    exponent = (prefix - 256 if prefix > 127 else prefix) - digits
+    return 10.0**exponent if abs(exponent) < 12 else None

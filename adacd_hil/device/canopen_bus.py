@@ -185,7 +185,6 @@ class CanopenBus:
         self._bus = bus
         self._network = _BusNetwork(self._send)
         self._patience: dict[int, tuple[float, float]] = {}
-        self._has_answered: set[int] = set()
         self.malformed_frames = 0
         """Frames so far whose length or content doesn't fit what their identifier says they are."""
 
@@ -200,7 +199,7 @@ class CanopenBus:
         """Return canopen's node with the objects of `read_eds`.
 
         With None it has no objects, and SDO goes by index through `node.sdo.upload`. `answer_s`: longest wait for an
-        answer. `pause_s`: between an answer and the next request, for a device that loses what comes sooner.
+        answer. `pause_s`: before each request, for a device that loses what comes soon after its answer.
         """
         node = canopen.RemoteNode(node_id, canopen.ObjectDictionary() if objects is None else objects)  # type: ignore[no-untyped-call]
         self._network.add_node(node)
@@ -216,13 +215,12 @@ class CanopenBus:
 
     def _send(self, can_id: int, data: bytes) -> None:
         is_request = can_id & 0x780 == SDO_REQUEST_ID and data[0] != SDO_ABORT
-        node_id = can_id & 0x7F
-        answer_s, pause_s = self._patience.get(node_id, (ANSWER_TIMEOUT_S, 0.0))
-        if is_request and pause_s and node_id in self._has_answered:
+        answer_s, pause_s = self._patience.get(can_id & 0x7F, (ANSWER_TIMEOUT_S, 0.0))
+        if is_request and pause_s:
             self.pump(lambda _: False, pause_s)
         self._bus.send(can_id, data)
-        if is_request and self.pump(lambda frame: frame.can_id == can_id - 0x80, answer_s):
-            self._has_answered.add(node_id)
+        if is_request:
+            self.pump(lambda frame: frame.can_id == can_id - 0x80, answer_s)
 
     def pump(self, is_answer: Callable[[Frame], bool], timeout_s: float) -> bool:
         """Read the bus until an answer is in; False after a silence of `timeout_s`, or as much of other traffic."""

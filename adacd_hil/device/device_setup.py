@@ -443,13 +443,12 @@ def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
             )
     timers = {pdo.message: _event_timer(slave, pdo, command_deadline_ms) for pdo in profile.pdo}
     compared = set()
-    if profile.mapping != "fixed":
-        _switch_off_others(slave)
-        for pdo in profile.pdo:
-            if profile.mapping == "rewritten" or _difference(slave, pdo, timers[pdo.message]):
-                _write_pdo(slave, pdo, timers[pdo.message])
-            else:
-                compared.add(pdo.message)
+    _switch_off_others(slave)
+    for pdo in profile.pdo:
+        if profile.mapping == "rewritten" or _difference(slave, pdo, timers[pdo.message]):
+            _write_pdo(slave, pdo, timers[pdo.message])
+        else:
+            compared.add(pdo.message)
     for pdo in profile.pdo:
         if pdo.message not in compared and (text := _difference(slave, pdo, timers[pdo.message])):
             slave.fail(
@@ -480,10 +479,11 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
     kept = slave.read(index, _COB_ID) & RTR_NOT_ALLOWED
     cob_id = slave.device.can_id(pdo) | kept
     entries = slave.device.mapping(pdo)
-    is_all = slave.device.settings.mapping == "rewritten"
+    mapping = slave.device.settings.mapping
+    is_all = mapping == "rewritten"
     if slave.can_write(index, _COB_ID):
         slave.write(index, _COB_ID, cob_id | NOT_VALID)
-    if is_all or _mapping_difference(slave, pdo):
+    if is_all or (mapping != "fixed" and _mapping_difference(slave, pdo)):
         if not slave.has(mapping_index, len(entries)):
             slave.fail(
                 f"{pdo.message}: {len(entries)} objects are to be mapped, 0x{mapping_index:04X} has no sub-index "
@@ -516,12 +516,11 @@ def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
     slave.known[index, _COB_ID] = expected | identifier & RTR_NOT_ALLOWED
     if found != expected:
         return f"identifier {ObjectName(index, _COB_ID)} = 0x{found:X}, 0x{expected:X} expected"
-    parameters = [(_TYPE, pdo.transmission, "transmission type", "")]
-    if slave.device.settings.mapping != "fixed":
-        parameters += [
-            (_INHIBIT, pdo.inhibit_100us, "inhibit time", "x 100 µs"),
-            (_EVENT_TIMER, event_timer_ms, "event timer", "ms"),
-        ]
+    parameters = (
+        (_TYPE, pdo.transmission, "transmission type", ""),
+        (_INHIBIT, pdo.inhibit_100us, "inhibit time", "x 100 µs"),
+        (_EVENT_TIMER, event_timer_ms, "event timer", "ms"),
+    )
     for sub, value, quantity, unit in parameters:
         if slave.has(index, sub) and (text := slave.difference(index, sub, value, quantity, unit)):
             return text

@@ -80,6 +80,8 @@ _TOGETHER = {
     "Torque": ("torque",),
 }
 """Signals that are one sample or one command, and so travel in one frame."""
+HOST_SIGNALS = ("controlword", "target_torque", "torque_offset", "max_torque", "mode")
+"""What the host can fill in a command frame."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +231,7 @@ class ProfileSettings:
     mapping: str = setting(
         "writable",
         choices=("writable", "rewritten", "fixed"),
-        meaning="PDO parameters are written where they differ; always; or only compared",
+        meaning="written where it differs, always, or only compared",
     )
     command_watchdog: str = setting(
         "none", choices=("none", "0x2200", "0x1400:5"), meaning="where the deadline of commands is set: SYNCs, or ms"

@@ -30,6 +30,8 @@ LISTEN_S = 1.5
 _NODE_IDS = range(1, 128)
 _BETWEEN_REQUESTS_S = 0.002
 """Request and answer are 270 bits at worst, 0.27 ms at 1 Mbit/s: the rest is for the bus's own traffic."""
+BETWEEN_READS_S = 0.02
+"""From an answer to the next request to a device that nobody knows yet: an EPOS loses what comes within 15 ms."""
 _ANSWER_S = 0.1
 _UPLOAD_DEVICE_TYPE = bytes.fromhex("4000100000000000")
 _IDENTITY = ("vendor", "product", "revision", "serial")
@@ -185,7 +187,7 @@ def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
 
 def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
     """Read what a node says of itself; what it doesn't tell stays None."""
-    remote = canopen.add_node(node.node_id, None)
+    remote = canopen.add_node(node.node_id, None, pause_s=BETWEEN_READS_S)
     try:
         name = read_object(remote, 0x1008)
         node.name = None if name is None else name.rstrip(b"\0").decode("ascii", "replace").strip()

@@ -299,9 +299,12 @@ def foreign_truth(log: Path, truth: Path) -> str:
 def config_digest(config: str) -> str:
     """Give the digest by which a truth names its host's configuration. Raises ConfigError.
 
-    Of `realtime` a session makes what the host grants, so that it doesn't count.
+    Of `realtime` a session makes what the host grants, and of `safety.enable_timeout_s` what the devices' profiles ask
+    for, so that they don't count.
     """
     table = {key: value for key, value in parse_toml(config).items() if key != "realtime"}
+    if isinstance(safety := table.get("safety"), dict):
+        table["safety"] = {key: value for key, value in safety.items() if key != "enable_timeout_s"}
     return hashlib.sha256(json.dumps(table, sort_keys=True, default=str).encode()).hexdigest()
 
 

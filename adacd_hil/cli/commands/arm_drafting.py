@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,16 @@ from adacd_hil.commission.arm_draft import (
 from adacd_hil.commission.configuration_check import ConfigurationFindings, examine_configuration
 from adacd_hil.commission.device_recognition import RecognisedDevice, choose_family, recognise
 from adacd_hil.commission.host_checks import Status, look_for_socketcan
-from adacd_hil.commission.profile_draft import DRIVE, SENSOR, DeviceRatings, draft_profile, identity_of, kind_of
-from adacd_hil.device.profile import load_profile, profile_names
+from adacd_hil.commission.profile_draft import (
+    DRIVE,
+    SENSOR,
+    DeviceRatings,
+    ProfileDraft,
+    draft_profile,
+    identity_of,
+    kind_of,
+)
+from adacd_hil.device.profile import ScaleSettings, load_profile, profile_names
 from adacd_hil.device.survey import survey
 from adacd_hil.file_access import read_input, replace_file
 from adacd_hil.log.recording.run_folder import is_there
@@ -63,6 +71,14 @@ class InitOptions:
     drive_node: tuple[int, int] | None = None
     sensor_node: tuple[int, int] | None = None
     eds: tuple[Path, ...] = ()
+    drive_eds: tuple[Path, ...] = ()
+    sensor_eds: tuple[Path, ...] = ()
+    gear: Pair | None = None
+    gear_efficiency: Pair | None = None
+    increments: Pair | None = None
+    velocity_unit: str | None = None
+    rated_torque_unit: str | None = None
+    torque_count_nm: Pair | None = None
 
 
 @dataclass
@@ -116,7 +132,10 @@ class Drafting:
         self.bus: dict[str, Any] | None = None
         self.bitrate = options.bitrate
         self.guessed: set[str] = set()
-        """Drafted profiles in which something is a guess."""
+        """Profiles in which what a count is worth is a guess."""
+        self._answers: dict[str, tuple[Any, str]] = {}
+        self._drafts: dict[tuple[str, int], ProfileDraft] = {}
+        """By kind and joint, of the profiles that are drafted or completed."""
 
     def draft(self) -> tuple[str, dict[str, Any]]:
         """Find out, ask, propose; return the text of the file and a summary."""
@@ -134,7 +153,7 @@ class Drafting:
             "drive_node": list(facts.drive_node.value),
             "sensor": list(facts.sensor.value),
             "sensor_node": list(facts.sensor_node.value),
-            "assumed": list(draft.assumed),
+            "assumed": [*draft.assumed, *self._profile_guesses(facts)],
             "warnings": [*self.warnings, *draft.warnings],
         }
         return text, summary
@@ -143,13 +162,16 @@ class Drafting:
 
         options = self.options
         drives, sensors = self._find_devices()
+        drive, sensor = self._profiles(drives, sensors)
+        scales = [self._scale(drive.value[joint], joint) for joint in range(2)]
         geometry, length_source, mass_source, gravity_source = self._ask_geometry()
         ratings = [device.ratings for device in drives]
-        rated = self._rated(ratings, geometry)
+        rated = self._rated(ratings, scales, geometry)
         torque = self._limit("torque_limit_Nm", "--torque-limit-nm", _torque_proposals(rated, ratings, geometry))
-        position = self._limit("position_limit_deg", "--position-limit-deg", _position_proposals(ratings, geometry))
-        velocity = self._limit("velocity_limit_deg_s", "--velocity-limit-deg-s", _speed_proposals(ratings, geometry))
-        drive, sensor = self._profiles(drives, sensors)
+        proposal = _position_proposals(ratings, scales, geometry)
+        position = self._limit("position_limit_deg", "--position-limit-deg", proposal)
+        proposal = _speed_proposals(ratings, scales, geometry)
+        velocity = self._limit("velocity_limit_deg_s", "--velocity-limit-deg-s", proposal)
         nodes = [
             Fact(tuple(device.node.node_id for device in found), "found on the bus")
             if found
@@ -178,6 +200,26 @@ class Drafting:
             self.bitrate,
         )
 
+    def _scale(self, name: str, joint: int) -> ScaleSettings:
+        draft = self._drafts.get((DRIVE, joint))
+        if draft is not None:
+            return draft.settings.scale
+        path = Path(name)
+        there = name if name in profile_names() or path.is_absolute() else str(self.writing.out.parent / path)
+        return load_profile(there, DRIVE).settings.scale
+
+    def _profile_guesses(self, facts: ArmFacts) -> list[str]:
+        """Name the guesses within profiles, each once."""
+        keys: dict[str, None] = {}
+        for kind, names in ((DRIVE, facts.drive.value), (SENSOR, facts.sensor.value)):
+            for joint, name in enumerate(names):
+                draft = self._drafts.get((kind, joint))
+                if draft is not None and name not in profile_names():
+                    keys |= dict.fromkeys(f"{name}: {guess.key}" for guess in draft.guessed)
+                elif name in profile_names():
+                    keys |= dict.fromkeys(f"{name}: {key}" for key in load_profile(name, kind).settings.assumed)
+        return list(keys)
+
     # -- devices
 
     def _find_devices(self) -> tuple[list[RecognisedDevice], list[RecognisedDevice]]:
@@ -191,7 +233,9 @@ class Drafting:
         bus = open_bus(interface, channel, clock, None, self.options.bitrate, False)
         try:
             found = survey(bus, clock, progress=self.interview.say)
-            devices = recognise(bus, clock, found.nodes)
+            told = dict.fromkeys(self.options.drive_node or (), DRIVE)
+            told |= dict.fromkeys(self.options.sensor_node or (), SENSOR)
+            devices = recognise(bus, clock, found.nodes, told)
         finally:
             bus.close()
         self.bus = {"interface": interface, "channel": channel, "bitrate": self.options.bitrate}
@@ -202,7 +246,10 @@ class Drafting:
             self.interview.say(f"node {device.node.node_id}: {device.kind}, {device.title}: {what}")
         for node in found.nodes:
             if all(device.node is not node for device in devices):
-                self.interview.say(f"node {node.node_id}: {node.device_text}, neither drive nor sensor")
+                self.interview.say(
+                    f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; --drive-node and "
+                    "--sensor-node say what such a node is"
+                )
         chosen = [self._two(devices, kind, getattr(self.options, f"{kind}_node"), channel) for kind in (DRIVE, SENSOR)]
         return chosen[0], chosen[1]
 
@@ -227,7 +274,13 @@ class Drafting:
             self.interview.say(told)
         proposal = Proposal(present[0] if self.interview.is_asking and present else _NO_BUS)
         question = f"CAN interface of the arm, `{_NO_BUS}` for an arm without hardware"
-        channel, _ = self.interview.ask("--channel or --no-bus", None, question, str, proposal)
+
+        def read(text: str) -> str:
+            if text != _NO_BUS and present and text not in present:
+                raise ConfigError(f"no CAN interface {text!r}; there are {', '.join(present)}")
+            return text
+
+        channel, _ = self.interview.ask("--channel or --no-bus", None, question, read, proposal)
         return None if channel == _NO_BUS else channel
 
     def _two(
@@ -266,20 +319,26 @@ class Drafting:
         found = choose_family(drives, sensors) if drives else (("",) * 2, ("",) * 2)
         facts = []
         for kind, devices, names, default in (
-            ("drive", drives, found[0], "adacd-drive"),
-            ("sensor", sensors, found[1], "adacd-sensor"),
+            (DRIVE, drives, found[0], "adacd-drive"),
+            (SENSOR, sensors, found[1], "adacd-sensor"),
         ):
             given = getattr(options, kind)
             if given is not None:
-                facts.append(Fact(tuple(self.beside(name, kind) for name in given), "given"))
+                named = tuple(self.beside(name, kind) for name in given)
+                facts.append(Fact(self._complete(kind, named, devices), "given"))
                 continue
             from_eds = tuple(drafted.get((kind, joint), "") for joint in range(2))
             chosen = tuple(from_eds[joint] or names[joint] for joint in range(2))
+            for joint, name in enumerate(chosen):
+                if not name and devices and self.interview.is_asking:
+                    asked = self._ask_eds(kind, joint, devices[joint])
+                    chosen = tuple(asked if other == joint else known for other, known in enumerate(chosen))
             if not any(chosen) and not devices:
                 facts.append(Fact((default, default)))
             elif all(chosen):
                 source = "from the EDS" if all(from_eds) else "recognised by vendor and product"
-                facts.append(Fact(chosen, "" if self.guessed & set(chosen) else source))
+                completed = self._complete(kind, chosen, devices)
+                facts.append(Fact(completed, "" if self.guessed & set(completed) else source))
             else:
                 joint = 0 if not chosen[0] else 1
                 title = devices[joint].title if devices else "the device"
@@ -289,6 +348,18 @@ class Drafting:
                     ExitCode.USAGE,
                 )
         return facts[0], facts[1]
+
+    def _ask_eds(self, kind: str, joint: int, device: RecognisedDevice) -> str:
+        """Ask for the EDS of a device that no profile describes; return the name of its draft."""
+
+        def read(text: str) -> str:
+            eds = Path(text)
+            if not eds.is_file():
+                raise ConfigError(f"EDS {eds} is not there")
+            return self._write_drafts(eds, kind, {joint: device.ratings})[kind, joint]
+
+        question = f"EDS of the {kind} of joint {joint + 1} ({in_line(device.title)})"
+        return self.interview.ask("--eds FILE", None, question, read)[0]
 
     def beside(self, name: str, kind: str) -> str:
         """Return a profile's name as the file will have it: a file is named from where the configuration lies."""
@@ -303,13 +374,13 @@ class Drafting:
     def _draft_profiles(self, devices: Sequence[RecognisedDevice]) -> dict[tuple[str, int], str]:
         """Draft a profile of each EDS, to lie beside the file; return the names by kind and joint."""
         names: dict[tuple[str, int], str] = {}
-        for eds in self.options.eds:
-            kind, identity = kind_of(eds), identity_of(eds)
+        for eds, kind in self._eds_files():
+            identity = identity_of(eds)
             same = [device for device in devices if device.kind == kind]
             fitting = [
                 joint
                 for joint in range(2)
-                if not same or (same[joint].node.vendor, same[joint].node.product) == identity
+                if not same or _is_of(identity, (same[joint].node.vendor, same[joint].node.product))
             ]
             if not fitting:
                 vendor, product = ("?" if number is None else f"0x{number:X}" for number in identity)
@@ -318,29 +389,130 @@ class Drafting:
                     f"{'; '.join(in_line(device.title) for device in same)}",
                     ExitCode.USAGE,
                 )
-            draft = draft_profile(eds, *(device.ratings for device in same[fitting[0] : fitting[0] + 1]))
-            name = f"{self.writing.out.stem}-{eds.stem}.toml"
-            self.warnings += [f"{name}: {line}" for line in draft.guesses]
-            self.guessed |= {name} if draft.guesses else set()
-            folder = self.writing.out.parent
-            self.writing.add(folder / eds.name, eds.read_bytes())
-            self.writing.add(folder / name, draft.text)
-            names |= {(kind, joint): name for joint in fitting}
+            names |= self._write_drafts(
+                eds, kind, {joint: same[joint].ratings if same else DeviceRatings() for joint in fitting}
+            )
         return names
+
+    def _eds_files(self) -> list[tuple[Path, str]]:
+        """List the EDS files with what each describes; asks where 0x1000 doesn't tell."""
+        options = self.options
+        found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
+        for eds in options.eds:
+            kind = kind_of(eds)
+            if not kind:
+                kind, _ = self.interview.ask(
+                    f"--drive-eds {eds} or --sensor-eds {eds} in place of --eds",
+                    None,
+                    f"0x1000 of {eds.name} names neither a drive (CiA 402) nor a sensor (CiA 404): which is it",
+                    _drive_or_sensor,
+                )
+            found.append((eds, kind))
+        return found
+
+    def _write_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
+        """Draft the profile of an EDS for some joints, ask for what it doesn't say; return the names of the files."""
+        drafts = self._draft(eds, kind, ratings)
+        folder, stem = self.writing.out.parent, f"{self.writing.out.stem}-{eds.stem}"
+        self.writing.add(folder / eds.name, eds.read_bytes())
+        names: dict[tuple[str, int], str] = {}
+        texts: dict[str, str] = {}
+        for joint, draft in drafts.items():
+            name = texts.setdefault(draft.text, f"{stem}.toml" if not texts else f"{stem}-{joint + 1}.toml")
+            names[kind, joint] = name
+            self._note(kind, joint, name, draft)
+        for text, name in texts.items():
+            self.writing.add(folder / name, text)
+        return names
+
+    def _note(self, kind: str, joint: int, name: str, draft: ProfileDraft) -> None:
+        """Remember a draft, and warn of what is a guess in it."""
+        self._drafts[kind, joint] = draft
+        for line in (*draft.guesses, *draft.remarks):
+            if (warning := f"{name}: {line}") not in self.warnings:
+                self.warnings.append(warning)
+        self.guessed |= {name} if _ESSENTIAL & {guess.key for guess in draft.guessed} else set()
+
+    def _draft(
+        self, eds: Path, kind: str, ratings: dict[int, DeviceRatings], among: Collection[str] | None = None
+    ) -> dict[int, ProfileDraft]:
+        """Draft the profile of an EDS for some joints, asking for guesses, one after the other. `among`: of these."""
+        answers: dict[int, dict[str, float]] = {joint: {} for joint in ratings}
+
+        def drafted() -> dict[int, ProfileDraft]:
+            return {joint: draft_profile(eds, ratings[joint], kind, answers[joint]) for joint in ratings}
+
+        drafts = drafted()
+        for question in _QUESTIONS:
+            if question.kind != kind or (among is not None and question.key not in among):
+                continue
+            guessed = {guess.key: guess.value for draft in drafts.values() for guess in draft.guessed}
+            if question.given(self.options) is None and question.key not in guessed:
+                continue
+            if question.option not in self._answers:
+                proposal = Proposal(question.propose(guessed.get(question.key, 1.0)))
+                self._answers[question.option] = self.interview.ask(
+                    question.option,
+                    question.given(self.options),
+                    question.text,
+                    question.read,
+                    proposal,
+                    question.explanation,
+                )
+            value, source = self._answers[question.option]
+            if source == "given":
+                for joint, known in answers.items():
+                    known[question.answer] = value[joint]
+                drafts = drafted()
+        return drafts
+
+    def _complete(self, kind: str, names: tuple[str, ...], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
+        """Write a file that extends a shipped profile where gear and encoder, which are the arm's, get known."""
+        completed, texts = list(names), dict[str, str]()
+        for joint, name in enumerate(names):
+            if name not in profile_names():
+                continue
+            profile = load_profile(name, kind)
+            if not profile.settings.assumed:
+                continue
+            ratings = devices[joint].ratings if devices else DeviceRatings()
+            (draft,) = self._draft(profile.eds, kind, {joint: ratings}, profile.settings.assumed).values()
+            left = [guess.key for guess in draft.guessed if guess.key in profile.settings.assumed]
+            if len(left) < len(profile.settings.assumed):
+                scale = draft.settings.scale
+                text = _extension(name, scale, left)
+                file = f"{self.writing.out.stem}-{name}.toml" if not texts else f"{self.writing.out.stem}-{name}-2.toml"
+                completed[joint] = texts.setdefault(text, file)
+                self._drafts[kind, joint] = draft._replace(
+                    guessed=tuple(guess for guess in draft.guessed if guess.key in left), remarks=()
+                )
+            else:
+                self.guessed.add(name)
+        for text, file in texts.items():
+            self.writing.add(self.writing.out.parent / file, text)
+        return tuple(completed)
 
     # -- the arm
 
     def _ask_geometry(self) -> tuple[PlanarArm, str, str, str]:
         """Return the geometry, and who says the lengths, the masses, and whether gravity acts."""
         options, interview = self.options, self.interview
-        urdf = options.urdf
-        if urdf is None and options.length_m is None and interview.is_asking:
-            text, _ = interview.ask("--urdf", None, "URDF of the arm, - for none", str, Proposal("-"))
-            urdf = None if text == "-" else Path(text)
+        urdf, arm = options.urdf, None
         if urdf is not None:
             if options.length_m is not None or options.mass_kg is not None:
                 raise CommandError("--urdf says lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE)
-            arm = _read_urdf(urdf, options.locked)
+            try:
+                arm = _read_urdf(urdf, options.locked)
+            except ConfigError as error:
+                raise CommandError(str(error), ExitCode.USAGE) from None
+        elif options.length_m is None and interview.is_asking:
+
+            def read(text: str) -> tuple[Path, PlanarArm] | None:
+                return None if text == "-" else (Path(text), _read_urdf(Path(text), options.locked))
+
+            found, _ = interview.ask("--urdf", None, "URDF of the arm, - for none", read, Proposal("-"))
+            urdf, arm = found or (None, None)
+        if urdf is not None and arm is not None:
             if not arm.is_tip_known:
                 self.warnings.append(f"{urdf} has no frame at the tip: the length of link 2 is a guess")
             source = f"URDF {urdf.name}"
@@ -371,14 +543,23 @@ class Drafting:
         self.warnings.append("inertia is that of uniform rods, without motors and gears")
         return arm, length_source, "given masses, as uniform rods", gravity_source
 
-    def _rated(self, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Fact:
-
-        told = [rating.rated_torque_Nm for rating in ratings]
-        if self.options.rated_torque_nm is None and len(told) == 2 and None not in told:
-            return Fact(_checked("rated_torque_Nm", (told[0], told[1])), "0x6076 of the drives")
+    def _rated(self, ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm) -> Fact:
+        """Take the rated torque at the joints from the drives, from their EDS, or ask."""
+        told = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
+        drafts = [self._drafts.get((DRIVE, joint)) for joint in range(2)]
+        by_eds = [None if draft is None else draft.rated_torque_Nm for draft in drafts]
+        is_known = all(draft is None or draft.is_rated_known for draft in drafts)
+        if self.options.rated_torque_nm is None and is_known:
+            for pair, source in ((told, "0x6076 of the drives"), (by_eds, "0x6076 of their EDS")):
+                if len(pair) == 2 and None not in pair:
+                    behind = " behind their gears" if any(scale.gear_ratio != 1.0 for scale in scales) else ""
+                    return Fact(_checked("rated_torque_Nm", (pair[0], pair[1])), source + behind)
         proposal = Proposal((12.0, 6.0))
         if geometry.effort_Nm is not None and min(geometry.effort_Nm) > 0.0:
             proposal = Proposal(geometry.effort_Nm)  # a URDF's effort is a limit, no rating
+        for pair in (by_eds, told):
+            if len(pair) == 2 and None not in pair and _is_rating(pair):
+                proposal = Proposal((pair[0], pair[1]))
         return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
 
     def _limit(self, key: str, option: str, proposal: Proposal) -> Fact:
@@ -427,15 +608,15 @@ def _masses(value: Any) -> Pair | None:
 
 
 def _read_urdf(path: Path, locked: Sequence[str]) -> PlanarArm:
-
+    """Read a URDF. Raises ConfigError."""
     try:
         return planar_from_urdf(read_input(path), locked)
     except FileNotFoundError:
-        raise CommandError(f"URDF {path} does not exist", ExitCode.USAGE) from None
+        raise ConfigError(f"URDF {path} does not exist") from None
     except OSError as error:
-        raise CommandError(f"URDF {path}: {error.strerror}", ExitCode.USAGE) from None
+        raise ConfigError(f"URDF {path}: {error.strerror}") from None
     except UrdfError as error:
-        raise CommandError(f"URDF {path}: {error}", ExitCode.USAGE) from None
+        raise ConfigError(f"URDF {path}: {error}") from None
 
 
 def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Proposal:
@@ -447,8 +628,10 @@ def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: P
     return Proposal(limit, source if rated.source else "")
 
 
-def _position_proposals(ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Proposal:
-    told = [rating.position_limit_deg for rating in ratings]
+def _position_proposals(
+    ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm
+) -> Proposal:
+    told = [rating.position_limit_deg(scale) for rating, scale in zip(ratings, scales, strict=False)]
     if geometry.position_limit_deg is not None:
         return Proposal(geometry.position_limit_deg, "the URDF's")
     if told and None not in told:
@@ -456,10 +639,144 @@ def _position_proposals(ratings: Sequence[DeviceRatings], geometry: PlanarArm) -
     return Proposal((75.0, 120.0))
 
 
-def _speed_proposals(ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Proposal:
-    told = [rating.velocity_limit_deg_s for rating in ratings]
+def _speed_proposals(
+    ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm
+) -> Proposal:
+    told = [rating.velocity_limit_deg_s(scale) for rating, scale in zip(ratings, scales, strict=False)]
     if geometry.velocity_limit_deg_s is not None:
         return Proposal(geometry.velocity_limit_deg_s, "the URDF's")
     if told and None not in told:
         return Proposal(tuple(told), "0x6080 of the drives, by their gears")
     return Proposal((250.0, 300.0))
+
+
+_ESSENTIAL = {"scale.increments_per_joint_rev", "scale.torque_Nm", "scale.rated_torque_count_Nm"}
+"""Guesses in a profile for which the configuration's `devices` is one, too."""
+_VELOCITY_UNITS = {
+    "increment/s": 0x00B50300,
+    "rpm": 0x00B44700,
+    "0.1rpm": 0xFFB44700,
+    "mrpm": 0xFDB44700,
+    "deg/s": 0x00410300,
+    "rad/s": 0x00100300,
+}
+_TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "uNm": 1e-6, "Nm": 1.0, "0.01Nm": 0.01}
+
+
+@dataclass(frozen=True)
+class ScaleQuestion:
+    """What a drive's or a sensor's file may leave open. key: of a profile; answer: of `draft_profile`'s answers."""
+
+    kind: str
+    key: str
+    option: str
+    text: str
+    explanation: str
+    units: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def answer(self) -> str:
+        """Name of the answer."""
+        return "velocity_unit" if self.key == "scale.velocity_rad_s" else self.key.partition(".")[2]
+
+    def given(self, options: InitOptions) -> Any:
+        """Return what the command line says, None where it says nothing."""
+        return getattr(options, self.option.split()[0].lstrip("-").replace("-", "_"))
+
+    def propose(self, value: float) -> Any:
+        """Return the guess as it would be typed."""
+        if self.units:
+            return next((name for name, worth in self.units.items() if worth == value), next(iter(self.units)))
+        return (value, value)
+
+    def read(self, value: Any) -> tuple[float, float]:
+        """Read an answer, for joint 1 and 2. Raises ConfigError."""
+        if not self.units:
+            first, second = _numbers(value, float, self.option.split()[0])
+        elif value in self.units:
+            first = second = self.units[value]
+        else:
+            raise ConfigError(f"{self.option.split()[0]}: {value!r} must be one of {', '.join(self.units)}")
+        name = self.key.partition(".")[2]
+        if self.answer != "velocity_unit":
+            parse(ScaleSettings, {name: first})
+            parse(ScaleSettings, {name: second})
+        if min(first, second) <= 0.0:
+            raise ConfigError(f"{self.option.split()[0]}: {min(first, second):g} must be above 0")
+        return first, second
+
+
+_QUESTIONS = (
+    ScaleQuestion(
+        DRIVE,
+        "scale.gear_ratio",
+        "--gear A B",
+        "Gear of joint 1 and 2: motor revolutions per revolution of the joint",
+        "0x6076 is the motor's torque, and velocities are the motor's; 1 without a gear",
+    ),
+    ScaleQuestion(
+        DRIVE,
+        "scale.gear_efficiency",
+        "--gear-efficiency A B",
+        "Efficiency of these gears, 0 to 1; 1 where it is not known",
+        "part of the motor's torque that leaves the gear, 0.6 to 0.9 mostly",
+    ),
+    ScaleQuestion(
+        DRIVE,
+        "scale.increments_per_joint_rev",
+        "--increments A B",
+        "Position increments per revolution of joint 1 and 2",
+        "counts of 0x6064: increments per motor revolution times the gear; turn the joint by hand and look",
+    ),
+    ScaleQuestion(
+        DRIVE,
+        "scale.velocity_rad_s",
+        "--velocity-unit UNIT",
+        "Unit of the drives' velocity 0x606C: increment/s, rpm, 0.1rpm, mrpm, deg/s or rad/s, of the motor",
+        "the drive's manual has it under 0x606C or 0x60A9",
+        {name: float(code) for name, code in _VELOCITY_UNITS.items()},
+    ),
+    ScaleQuestion(
+        DRIVE,
+        "scale.rated_torque_count_Nm",
+        "--rated-torque-unit UNIT",
+        "Unit of the drives' rated torque 0x6076: mNm, µNm, Nm or 0.01Nm",
+        "mNm by CiA 402-2; an EPOS4 has µNm",
+        _TORQUE_UNITS_NM,
+    ),
+    ScaleQuestion(
+        SENSOR,
+        "scale.torque_Nm",
+        "--torque-count-nm A B",
+        "One count of the torque sensors of joint 1 and 2, Nm",
+        "in the sensor's data sheet, or by a known weight",
+    ),
+)
+
+
+def _is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int | None]) -> bool:
+    """Whether an EDS may be a node's: what it leaves open fits all."""
+    return all(told in (None, found) for told, found in zip(identity, node, strict=True))
+
+
+def _is_rating(pair: Sequence[float | None]) -> bool:
+    try:
+        _checked("rated_torque_Nm", (pair[0], pair[1]))
+    except ConfigError:
+        return False
+    return True
+
+
+def _drive_or_sensor(text: str) -> str:
+    if text.casefold() not in (DRIVE, SENSOR):
+        raise ConfigError(f"{text!r} must be drive or sensor")
+    return text.casefold()
+
+
+def _extension(name: str, scale: ScaleSettings, left: Sequence[str]) -> str:
+    """Write a profile that extends a shipped one by what belongs to the arm."""
+    plain = ScaleSettings()
+    rows = [f"{key} = {value:.16g}" for key, value in vars(scale).items() if value and value != getattr(plain, key)]
+    assumed = ", ".join(f'"{key}"' for key in left)
+    head = [f"# {name} with gear and encoder of this arm, by `adacd-hil init`.", "", f'extends = "{name}"']
+    return "\n".join([*head, f"assumed = [{assumed}]", "", "[scale]", *rows]) + "\n"

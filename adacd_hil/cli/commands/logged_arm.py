@@ -27,6 +27,7 @@ _NOT_TAKEN = {
     "operator.acknowledge_faults": "the scripted user is left out: on an arm nothing is acknowledged without a person",
     "operator.acknowledge_on_hardware": "",
     "realtime.sample_period": "",
+    "safety.enable_timeout_s": "",
 }
 """Keys that belong to the run and not to the arm, and what is said of them."""
 

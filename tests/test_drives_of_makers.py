@@ -1,0 +1,162 @@
+"""`init` writes of an EDS what `demo` plays: drives that lack objects, count in other units, keep other orders."""
+
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from eds_variants import EdsVariant
+
+from adacd_hil.api import load
+from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.main import cli
+from adacd_hil.cli.output import ExitCode, exit_code
+from adacd_hil.settings.configuration import load_settings
+
+pytestmark = pytest.mark.slow
+
+SHORT = "lasts_s = 0.4\n"
+LENGTHS = ("--no-bus", "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--flat", "--yes")
+RPM, INCREMENTS_PER_S = 0x00B44700, 0x00B50300
+RECEIVED, SENT = ("1400", "1401", "1402", "1403"), ("1800", "1801", "1802", "1803")
+FIXED_COMMAND = (0x60400010, 0x60710010, 0x60600008)
+
+
+def every(sub: int, *records: str) -> list[str]:
+    return [f"{record}sub{sub}" for record in records]
+
+
+def fixed_pdos() -> EdsVariant:
+    """A drive that brings and takes what it does, mode included."""
+    eds = EdsVariant()
+    mapped = {"1600": FIXED_COMMAND, "1A00": (0x60640020, 0x606C0020), "1A01": (0x60410010, 0x60770010)}
+    for record, entries in mapped.items():
+        eds.with_value(len(entries), f"{record}sub0")
+        for sub, entry in enumerate(entries, start=1):
+            eds.with_value(f"0x{entry:08X}", f"{record}sub{sub}")
+    for record in ("1600", "1601", "1602", "1603", "1A00", "1A01", "1A02", "1A03"):
+        eds.with_value("const", *(f"{record}sub{sub}" for sub in range(9)), key="AccessType")
+    eds.with_value("$NODEID+0x200", "1400sub1").with_value("$NODEID+0x180", "1800sub1")
+    return eds.with_value("$NODEID+0x280", "1801sub1").with_value(1, "1400sub2", "1800sub2")
+
+
+KINDS = {
+    "no SYNC period": EdsVariant().without("1006"),
+    "neither SYNC period nor counter": EdsVariant().without("1006", "1019"),
+    "no rated torque": EdsVariant().without("6076"),
+    "no event timers": EdsVariant().without(*every(5, *SENT)),
+    "no deadline of commands": EdsVariant().without(*every(5, *RECEIVED)),
+    "error code and mode in no frame": EdsVariant().with_value(0, "603F", "6061", key="PDOMapping"),
+    "no mode at all": EdsVariant().without("6060", "6061"),
+    "identifiers that can't be written": EdsVariant()
+    .with_value("ro", *every(1, "1400", "1800", "1801"), key="AccessType")
+    .with_value("$NODEID+0x200", "1400sub1")
+    .with_value("$NODEID+0x180", "1800sub1")
+    .with_value("$NODEID+0x280", "1801sub1"),
+    "room for two objects in a frame": EdsVariant().without(
+        *(f"{record}sub{sub}" for record in ("1600", "1A00", "1A01") for sub in range(3, 9))
+    ),
+    "2000 increments from the factory": EdsVariant().with_value(2000, "608Fsub1").with_value(1, "6091sub1"),
+    "one increment from the factory": EdsVariant().with_value(1, "608Fsub1", "6091sub1"),
+    "velocity in rpm": EdsVariant().with_object("60A9", RPM),
+    "rated torque in millionths": EdsVariant().with_value(380_000, "6076").with_value(30, "6091sub1"),
+    "fixed mapping with the mode in it": fixed_pdos(),
+    "no emergency, no heartbeat consumer": EdsVariant().without("1014", "1015", "1016"),
+}
+
+
+def init(folder: Path, *words: str) -> Result:
+    return CliRunner().invoke(cli, ["init", str(folder / "my-arm.toml"), *LENGTHS, *words])
+
+
+def rehearse(folder: Path, truth: str | None = None) -> tuple[ExitCode, tuple[str, ...]]:
+    """Play 0.4 s of the arm; return the exit status, and what was assumed."""
+    (folder / "short.toml").write_text(SHORT)
+    cast = resolve(str(folder / "my-arm.toml"), str(folder / "short.toml"), None, None, truth)
+    return exit_code(run_embedded(cast, "lockstep", folder / "run")[0]), cast.assumed
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_drive_from_its_eds_is_rehearsed(tmp_path: Path, kind: str) -> None:
+    written = init(tmp_path, "--eds", str(KINDS[kind].write(tmp_path / "drive.eds")))
+    assert written.exit_code == 0, written.stderr
+    assert rehearse(tmp_path)[0] == ExitCode.OK
+
+
+def test_what_an_eds_omits_is_made_up_and_said(tmp_path: Path) -> None:
+    eds = EdsVariant().without("1006", "6076").write(tmp_path / "drive.eds")
+    assert init(tmp_path, "--eds", str(eds)).exit_code == 0
+    _, assumed = rehearse(tmp_path)
+    assert (
+        "assumed: 0x1006 (SYNC period), 0x6076 (rated torque), which drive.eds omits and every such device has"
+        in assumed
+    )
+
+
+# -- an arm whose motors are behind gears
+
+GEARED = EdsVariant().with_value(380_000, "6076").with_value(30, "6091sub1")
+"""0.38 Nm in µNm behind a gear of 30: 11.4 Nm at the joint."""
+
+
+@pytest.fixture(scope="module")
+def geared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("geared")
+    drive = GEARED.write(folder / "drive.eds")
+    known = ("--rated-torque-unit", "µNm", "--gear-efficiency", "1", "1", "--velocity-unit", "increment/s")
+    written = init(folder, "--eds", str(drive), *known)
+    assert written.exit_code == 0, written.stderr
+    assert not any("rated_torque" in line for line in written.stdout.splitlines() if line.startswith("guesses"))
+    return folder
+
+
+def play(geared: Path, folder: Path, gear: tuple[float, float], lasts_s: float) -> list[str]:
+    """Play an arm whose gears are other than told by factors; return what was said of it, events of the log."""
+    (folder / "truth.toml").write_text(f"[factor]\ngear = {list(gear)}\n")
+    (folder / "scenario.toml").write_text(f"lasts_s = {lasts_s}\n")
+    files = str(folder / "scenario.toml"), None, None, str(folder / "truth.toml")
+    run_embedded(resolve(str(geared / "my-arm.toml"), *files), "lockstep", folder / "run")
+    return [event.message for event in load(folder / "run").events]
+
+
+def test_the_torque_of_a_geared_arm_is_the_joint_s(geared: Path, tmp_path: Path) -> None:
+    arm = load_settings(str(geared / "my-arm.toml")).arm
+    assert arm.rated_torque_Nm == pytest.approx((11.4, 11.4))
+    said = play(geared, tmp_path, (1.0, 1.0), 4.0)
+    assert any("CERTIFY -> MONITOR" in line for line in said)
+    ratios = [float(found) for line in said for found in re.findall(r"measures ([\d.]+) .*times the commanded", line)]
+    assert ratios == pytest.approx([1.0, 1.0], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("gear", "joint", "least", "most"),
+    [
+        ((1.2, 1.0), 1, 1.15, 1.25),
+        ((1.0, 1.2), 2, 1.15, 1.25),
+        ((1.0 / 1.2, 1.0), 1, 0.79, 0.87),
+        ((26.0, 1.0), 1, 15.0, 35.0),
+        ((1.0, 26.0), 2, 15.0, 35.0),
+        ((1.0 / 26.0, 1.0), 1, 0.02, 0.06),
+        ((1.0, 1.0 / 26.0), 2, 0.02, 0.06),
+    ],
+)
+def test_a_gear_that_is_told_wrong_is_named(
+    geared: Path, tmp_path: Path, gear: tuple[float, float], joint: int, least: float, most: float
+) -> None:
+    said = play(geared, tmp_path, gear, 10.0)
+    named = [line for line in said if f"scale.gear_ratio = 30 of devices.drive[{joint - 1}]" in line]
+    assert named, said
+    (number,) = re.findall(rf"joint {joint}: its torque sensor measures \+?([\d.]+) ", named[0])
+    assert least <= float(number) <= most
+    assert not any("CERTIFY -> MONITOR" in line for line in said)
+
+
+def test_a_gear_that_contradicts_the_drive_is_refused_before_anything_moves(geared: Path, tmp_path: Path) -> None:
+    for path in geared.glob("*.*"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    profile = tmp_path / "my-arm-drive.toml"
+    profile.write_text(profile.read_text().replace("gear_ratio = 30", "gear_ratio = 36"))
+    cast = resolve(str(tmp_path / "my-arm.toml"), "idle", None, None)
+    summary, _ = run_embedded(cast, "lockstep", tmp_path / "run")
+    assert "0x6076 = 380000 µNm, 316667 µNm expected of a motor behind a gear of 36" in summary.error
+    assert "scale.gear_ratio" in summary.error
