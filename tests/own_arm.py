@@ -81,6 +81,13 @@ def describe_arm(folder: Path) -> list[str]:
     return words
 
 
+def describe_geared_arm(folder: Path) -> list[str]:
+    """Give the words after `init` that write an arm whose motors count µNm behind gears, `my-arm.toml` in `folder`."""
+    words = describe_arm(folder)
+    place = words.index("--drive")
+    return [*words[:place], *words[place + 3 :], "--drive", *["maxon-epos4"] * 2, "--gear", "50", "30"]
+
+
 _ROW = "[[contacts]]\nat_s = {:.1f}\nlink = {}\npoint_m = {}\nangle_deg = {}\nforce_N = 20.0\nduration_s = 0.1\n"
 _TOUCHES = ((1, 0.3, 90.0), (1, 0.3, -90.0), (2, 0.2, 90.0), (2, 0.2, -90.0)) * 2
 EIGHT_TOUCHES = "lasts_s = 12.8\nstart_deg = [-30.0, -60.0]\n" + "".join(

@@ -250,7 +250,7 @@ def test_the_readme_leads_to_the_contents_of_the_site(documents):
 RUN = (
     r"adacd-hil (replay|compare|budget|runs|log (info|check|recover|cut|merge|export)) ?",
     r"adacd-hil report run.mcap --out ",
-    r"adacd-hil init as-it-ran.toml ",
+    r"adacd-hil init (as-it-ran|geared).toml ",
     r"firmware-sim (list|show|check|truths)",
 )
 """Commands that need no bus, no terminal, and a second or two at most: they are run here as they stand."""

@@ -1,5 +1,6 @@
 """`init` writes of an EDS what `demo` plays: drives that lack objects, count in other units, keep other orders."""
 
+import math
 import re
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from adacd_hil.api import load
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import ExitCode, exit_code
+from adacd_hil.device.profile import load_profile
 from adacd_hil.settings.configuration import load_settings
 
 pytestmark = pytest.mark.slow
@@ -91,6 +93,28 @@ def test_what_an_eds_omits_is_made_up_and_said(tmp_path: Path) -> None:
         "assumed: 0x1006 (SYNC period), 0x6076 (rated torque), which drive.eds omits and every such device has"
         in assumed
     )
+
+
+@pytest.mark.parametrize("gears", [(), ("--gear", "50", "30")])
+@pytest.mark.parametrize("name", ["maxon-epos4", "zeroerr-erob"])
+def test_a_shipped_profile_is_rehearsed(tmp_path: Path, name: str, gears: tuple[str, ...]) -> None:
+    written = init(tmp_path, "--drive", name, name, *gears)
+    assert written.exit_code == 0, written.stderr
+    drives = load_settings(str(tmp_path / "my-arm.toml")).devices.drive
+    named = [load_profile(str(tmp_path / drive) if gears else drive, "drive").settings for drive in drives]
+    assert [one.scale.gear_ratio for one in named] == ([50.0, 30.0] if gears else [named[0].scale.gear_ratio] * 2)
+    assert ("scale.gear_ratio" in named[0].assumed) == (not gears)
+    assert rehearse(tmp_path)[0] == ExitCode.OK
+
+
+def test_an_eds_of_a_known_maker_is_read_with_what_is_known_of_it(tmp_path: Path) -> None:
+    eds = EdsVariant("maxon_epos4.eds").with_value(512871, "6076").write(tmp_path / "drive.eds")
+    assert init(tmp_path, "--eds", str(eds), "--gear", "26", "26").exit_code == 0
+    profile = load_profile(str(tmp_path / "my-arm-drive.toml"), "drive").settings
+    assert 512871 * profile.scale.joint_torque_Nm == pytest.approx(13.3346, rel=1e-5)
+    assert profile.scale.velocity_rad_s == pytest.approx(math.pi / 30.0 / 26.0)
+    assert profile.patience.pause_ms == 15.0
+    assert set(profile.assumed) == {"scale.gear_efficiency", "scale.increments_per_joint_rev"}
 
 
 # -- an arm whose motors are behind gears

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from adacd_hil.clock import Clock
-from adacd_hil.commission.profile_draft import KINDS, SENSOR, DeviceRatings, count_of, identity_of
+from adacd_hil.commission.profile_draft import KINDS, SENSOR, DeviceRatings, count_of, identity_of, is_of
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.contract import compose
 from adacd_hil.device.profile import load_profile, place_devices, profile_names
@@ -58,14 +58,15 @@ def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], told: Mapping[int, 
 
 
 def fitting_profiles(node: Node, kind: str) -> tuple[str, ...]:
-    """Name the built-in profiles whose EDS has this node's vendor and product."""
+    """Name the built-in profiles whose EDS has this node's vendor, and its product where it gives one."""
     names = []
     for name in profile_names():
         try:
             profile = load_profile(name, kind)
         except ConfigError:  # of the other kind
             continue
-        if identity_of(profile.eds) == (node.vendor, node.product):
+        identity = identity_of(profile.eds)
+        if identity[0] is not None and is_of(identity, (node.vendor, node.product)):
             names.append(name)
     return tuple(sorted(names, key=len))
 

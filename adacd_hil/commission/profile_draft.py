@@ -113,6 +113,11 @@ def identity_of(eds: Path) -> tuple[int | None, int | None]:
     return found[0], found[1]
 
 
+def is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int | None]) -> bool:
+    """Whether an EDS of some vendor and product may be a node's: what it leaves open fits all."""
+    return all(told in (None, found) for told, found in zip(identity, node, strict=True))
+
+
 def kind_of(eds: Path) -> str:
     """Tell whether an EDS is that of a drive or a sensor, by 0x1000; "" where it is of another profile, or of none.
 
@@ -146,28 +151,26 @@ def draft_profile(
     except ConfigError as error:
         raise ConfigError(f"EDS {eds}: {error}") from None
     keys = {guess.key for guess in writer.guessed}
-    is_rated_known = not (keys & _OF_TORQUE or writer.is_factory(0x6076, 0))
+    is_rated_known = not (keys & TORQUE_KEYS or writer.is_factory(0x6076, 0))
     return ProfileDraft(
         kind, text, tuple(writer.guessed), tuple(writer.remarks), writer.rated_torque_Nm, is_rated_known
     )
 
 
 def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
-    """Return the shipped profile of a maker who counts or waits in ways of his own; None: nothing is known."""
+    """Return the shipped profile of a maker's devices; None where there is none.
+
+    What it doesn't list as assumed holds for all of them.
+    """
     vendor, _ = identity_of(eds)
     for name in profile_names():
         try:
             profile = load_profile(name, kind)
         except ConfigError:  # of the other kind
             continue
-        if vendor is not None and identity_of(profile.eds)[0] == vendor and _has_ways(profile.settings):
+        if vendor is not None and profile.settings.assumed and identity_of(profile.eds)[0] == vendor:
             return profile.settings
     return None
-
-
-def _has_ways(settings: ProfileSettings) -> bool:
-    plain = settings.scale.rated_torque_count_Nm == ScaleSettings().rated_torque_count_Nm
-    return not plain or settings.patience != PatienceSettings()
 
 
 _TORQUE_OBJECTS = ((0x9130, 1), (0x7130, 1))
@@ -181,6 +184,9 @@ _FEATURES = {
 _PERMILLE = ("torque_actual", "torque_demand", "target_torque", "torque_offset", "max_torque")
 _STATUS_OBJECTS = ((0x6041, 0), (0x6061, 0), (0x6077, 0), (0x603F, 0))
 _EVENT_TYPE, _EVENT_MS = 255, 100
+_INHIBIT_100US = 50
+"""Of a status frame with the torque, which changes all the time: 5 ms leave two drives 4 % of a bus."""
+_RECEIVED, _SENT = 0x1400, 0x1800
 _MOST_RECORDS = 64
 """Records of PDO parameters that are looked at; CiA 301 has 512, devices have 4 to 8."""
 _GUESSED_INCREMENTS = 1 << 20
@@ -188,8 +194,14 @@ _GUESSED_TORQUE_NM = 1e-6, 2e-3
 """What a count may be worth, of more than 16 bits and of 16: ±2147 Nm and ±65 Nm in all."""
 _MOST_MOTOR_NM = 100.0
 """A motor of more in an arm of this size is one whose 0x6076 counts µNm."""
+_LEAST_JOINT_NM, _JOINT_NM = 3.0, 10.0
+"""A drive that rates less rates its motor; its gear is guessed to make an arm's joint of it."""
+_LIKELY_GEAR, _MOST_GEAR = 50.0, 160.0
+_RPM_UNITS = {prefix << 24 | 0x00B44700 for prefix in (0, *range(0xF7, 0x100))}
+"""0x60A9: rpm, and decimal fractions of it."""
 _CST = 1 << 9  # of 0x6502
-_OF_TORQUE = {"scale.gear_ratio", "scale.rated_torque_count_Nm"}
+TORQUE_KEYS = {"scale.gear_ratio", "scale.rated_torque_count_Nm"}
+"""What lies between 0x6076 and the torque at the joint, the efficiency apart, which is within a third of 1."""
 _MOST_OPTION = 8  # of 0x605A
 
 
@@ -226,6 +238,7 @@ class _ProfileWriter(ABC):
         self.guessed: list[Guess] = []
         self.remarks: list[str] = []
         self.rated_torque_Nm: float | None = None
+        self.facts = maker_facts(eds, self.kind)
         self._numbered = read_eds(eds, 2)
 
     def find(self, place: _Place) -> EdsVariable | None:
@@ -271,7 +284,7 @@ class _ProfileWriter(ABC):
 
     def records(self, is_received: bool) -> list[_Record]:
         """List the PDOs that can be switched on."""
-        base = 0x1400 if is_received else 0x1800
+        base = _RECEIVED if is_received else _SENT
         found = []
         for number in range(1, _MOST_RECORDS + 1):
             index, mapping = base + number - 1, base + 0x200 + number - 1
@@ -358,6 +371,13 @@ class _ProfileWriter(ABC):
     def frames(self) -> list[str]:
         """Write the PDOs."""
 
+    def fact(self, key: str) -> float | None:
+        """Return a value of `scale` that holds for all devices of this maker; None where none is known."""
+        if self.facts is None or f"scale.{key}" in self.facts.assumed:
+            return None
+        value: float = getattr(self.facts.scale, key)
+        return value or None
+
     def guess(self, key: str, value: float, text: str) -> str:
         """Note a guess; return the comment above it."""
         self.guessed.append(Guess(f"scale.{key}", value, text))
@@ -373,8 +393,11 @@ class _ProfileWriter(ABC):
         kept = record.transmission if record.transmission is not None else transmission
         if kept != 1:
             head.append(f"transmission = {kept}")
-        if record.inhibit_100us:
-            head.append(f"inhibit_100us = {record.inhibit_100us}")
+        inhibit = record.inhibit_100us
+        if kept > 240 and (0x6077, 0) in places and self.can_write(_SENT + record.number - 1, 3):
+            inhibit = _INHIBIT_100US
+        if inhibit:
+            head.append(f"inhibit_100us = {inhibit}")
         if kept > 240 and message == "Status" and record.has_timer:
             head.append(f"event_timer_ms = {_EVENT_MS}")
         elif record.timer_ms:
@@ -445,18 +468,21 @@ class _DriveWriter(_ProfileWriter):
         return [f"quick_stop_option = {option}"] if 0 <= option <= _MOST_OPTION else []
 
     def further(self) -> list[str]:
-        facts = maker_facts(self.eds, DRIVE)
-        if facts is None or facts.patience == PatienceSettings():
+        if self.facts is None or self.facts.patience == PatienceSettings():
             return []
-        plain, patience = vars(PatienceSettings()), vars(facts.patience)
+        plain, patience = vars(PatienceSettings()), vars(self.facts.patience)
         return ["[patience]", *(f"{key} = {value!r}" for key, value in patience.items() if value != plain[key]), ""]
 
     def scale(self) -> list[str]:
-        gear, gear_lines = self._gear()
+        motor_Nm, torque_lines = self._torque()
+        gear, gear_lines = self._gear(motor_Nm)
+        if motor_Nm:
+            efficiency = self.answers.get("gear_efficiency", 1.0)
+            self.rated_torque_Nm = float(f"{motor_Nm * gear * efficiency:.10g}")
         increments, lines = self._increments(gear)
-        return [*lines, *self._velocity(gear, increments), *gear_lines, *self._torque(gear)]
+        return [*lines, *self._velocity(gear, increments), *gear_lines, *torque_lines]
 
-    def _gear(self) -> tuple[float, list[str]]:
+    def _gear(self, motor_Nm: float) -> tuple[float, list[str]]:
         told = read_drive_units(self.number).gear_ratio
         lines: list[str] = []
         if "gear_ratio" in self.answers:
@@ -464,7 +490,7 @@ class _DriveWriter(_ProfileWriter):
         elif told not in (None, 1.0) and not self.is_factory(0x6091, 1):
             gear = told or 1.0
         else:
-            gear = told or 1.0
+            gear = told if told not in (None, 1.0) else self._likely_gear(motor_Nm)
             why = "0x6091 is as the factory sets it" if told is not None else "no 0x6091 says it"
             lines = [self.guess("gear_ratio", gear, f"{gear:g}: {why}")]
         text = [*lines, f"gear_ratio = {gear:.10g}"]
@@ -475,28 +501,39 @@ class _DriveWriter(_ProfileWriter):
             text.append(f"gear_efficiency = {efficiency:g}")
         return gear, text
 
+    def _likely_gear(self, motor_Nm: float) -> float:
+        """Guess the gear of a drive that doesn't say it: too large a one commands too little torque, and not too much.
+
+        Drives that rate their joint have none; a weak motor, or a velocity in rpm, is behind one.
+        """
+        if self.facts is not None:
+            return self.facts.scale.gear_ratio
+        if 0.0 < motor_Nm < _LEAST_JOINT_NM:
+            return float(max(1, round(min(_JOINT_NM / motor_Nm, _MOST_GEAR))))
+        return _LIKELY_GEAR if not motor_Nm and self.number(0x60A9, 0) in _RPM_UNITS else 1.0
+
     def _increments(self, gear: float) -> tuple[float, list[str]]:
+        """Return the increments per revolution of the joint, by who knows them best."""
         units = read_drive_units(self._numbers_with_gear(), gear)
+        found, text = units.increments_per_joint_rev, units.increments_text
+        is_factory = any(
+            self.is_factory(*place) for place in ((0x608F, 1), (0x6092, 1)) if self.number(*place) is not None
+        )
+        lines: list[str] = []
         if "increments_per_joint_rev" in self.answers:
-            increments, lines = self.answers["increments_per_joint_rev"], []
-        elif not units.has_increments or units.increments_per_joint_rev is None:
-            increments = float(_GUESSED_INCREMENTS)
-            why = (
-                f"{units.increments_text} is a factory value"
-                if units.increments_text
-                else "neither 0x608F nor 0x6091 says it"
-            )
-            lines = [self.guess("increments_per_joint_rev", increments, f"{_GUESSED_INCREMENTS}: {why}")]
+            increments = self.answers["increments_per_joint_rev"]
+        elif (fact := self.fact("increments_per_joint_rev")) is not None:
+            increments = fact
+        elif found is not None and units.has_increments:
+            increments, lines = found, [f"# By {text}."]
+            if is_factory or found < CREDIBLE_INCREMENTS:
+                lines = [self.guess("increments_per_joint_rev", found, f"{found:.10g}: {text} is a factory value")]
         else:
-            increments, lines = units.increments_per_joint_rev, []
-            is_factory = any(
-                self.is_factory(*place) for place in ((0x608F, 1), (0x6092, 1)) if self.number(*place) is not None
-            )
-            if is_factory or increments < CREDIBLE_INCREMENTS:
-                text = f"{increments:.10g}: {units.increments_text} is a factory value"
-                lines = [self.guess("increments_per_joint_rev", increments, text)]
-        if not lines and units.increments_text and "increments_per_joint_rev" not in self.answers:
-            lines = [f"# By {units.increments_text}."]
+            increments = float(_GUESSED_INCREMENTS)
+            if self.facts is not None:
+                increments = self.facts.scale.increments_per_joint_rev * gear / self.facts.scale.gear_ratio
+            why = f"{text} is a factory value" if text else "neither 0x608F nor 0x6091 says it"
+            lines = [self.guess("increments_per_joint_rev", increments, f"{increments:.10g}: {why}")]
         return increments, [*lines, f"increments_per_joint_rev = {increments:.16g}"]
 
     def _numbers_with_gear(self) -> Any:
@@ -514,27 +551,26 @@ class _DriveWriter(_ProfileWriter):
             found *= gear / increments
         if code and found is not None:
             return [f"# In {name_velocity_unit(code)} of the motor.", f"velocity_rad_s = {found!r}"]
+        if (fact := self.fact("velocity_rad_s")) is not None:
+            return [f"velocity_rad_s = {fact!r}"]
         rad_s = math.tau / increments
         text = f"{rad_s:.6g}: a count is one increment per second, as CiA 402 has it without 0x60A9"
         return [self.guess("velocity_rad_s", rad_s, text), f"velocity_rad_s = {rad_s!r}"]
 
-    def _torque(self, gear: float) -> list[str]:
+    def _torque(self) -> tuple[float, list[str]]:
+        """Return the rated torque of the motor, Nm, 0 where nothing says it; and one count of it."""
         counts = self.number(0x6076, 0) or 0
-        count_Nm, lines = self.answers.get("rated_torque_count_Nm", 1e-3), []
+        count_Nm, lines = self.answers.get("rated_torque_count_Nm", 1e-3), list[str]()
         if "rated_torque_count_Nm" not in self.answers:
-            facts = maker_facts(self.eds, DRIVE)
-            if facts is not None and facts.scale.rated_torque_count_Nm != count_Nm:
-                count_Nm = facts.scale.rated_torque_count_Nm
+            if (fact := self.fact("rated_torque_count_Nm")) is not None:
+                count_Nm = fact
             elif counts * count_Nm > _MOST_MOTOR_NM:
                 count_Nm = 1e-6
                 text = f"1e-6: 0x6076 = {counts} mNm would be a motor of {counts * 1e-3:.4g} Nm, so these are µNm"
                 lines.append(self.guess("rated_torque_count_Nm", count_Nm, text))
         if count_Nm != 1e-3:
             lines.append(f"rated_torque_count_Nm = {count_Nm!r}")
-        if counts:
-            efficiency = self.answers.get("gear_efficiency", 1.0)
-            self.rated_torque_Nm = float(f"{counts * count_Nm * gear * efficiency:.10g}")
-        return lines
+        return counts * count_Nm, lines
 
     def _command(self) -> _Record:
         wanted = ((0x6040, 0), (0x6071, 0))
@@ -567,10 +603,13 @@ class _DriveWriter(_ProfileWriter):
             )
             if status is None:
                 raise self.refuse("no TPDO is left for 0x6041 (statusword)")
-            lines += self.pdo("Status", status, self.fill(_STATUS_OBJECTS, status.room), _EVENT_TYPE)
+            # Without an inhibit time, a torque that changes all the time would fill the bus.
+            is_bounded = self.has(_SENT + status.number - 1, 3)
+            wanted = [place for place in _STATUS_OBJECTS if is_bounded or place != (0x6077, 0)]
+            lines += self.pdo("Status", status, self.fill(wanted, status.room), _EVENT_TYPE)
             if status.transmission is None and not status.has_timer:
                 self.remarks.append(
-                    f"its statusword comes on change only, as 0x{0x1800 + status.number - 1:X}:5 (event timer) is not "
+                    f"its statusword comes on change only, as 0x{_SENT + status.number - 1:X}:5 (event timer) is not "
                     "there: one that is lost is not missed"
                 )
         return [*lines, *self.pdo("Command", self._command(), ((0x6040, 0), (0x6071, 0)))]

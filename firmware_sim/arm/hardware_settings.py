@@ -291,9 +291,8 @@ class HabitSettings:
         choices=("always", "enabled"),
         meaning="whether 0x6061 follows 0x6060 always or once it is enabled only",
     )
-    mode_s: float = setting(
-        0.0, unit="s", low=0.0, high=60.0, meaning="how much later 0x6061 shows another mode; -1 until then"
-    )
+    mode_s: float = setting(0.0, unit="s", low=0.0, high=60.0, meaning="how much later 0x6061 shows another mode")
+    shows_change: bool = setting(False, meaning="0x6061 is -1 meanwhile, in place of the last mode")
     enable_s: float = setting(
         0.0, unit="s", low=0.0, high=60.0, meaning="from Enable operation to Operation enabled, as a brake opens"
     )

@@ -98,7 +98,7 @@ class BenchNodes:
                     device.serve(*alias, device.reader(*place))
                     device.pdos.accept(*alias, device.pdos.writer(*place))
         injector.attach(self.devices, self.drives, self.sensors)
-        self.period_ns = _UNTOLD_PERIOD_NS
+        self.period_ns = contract.period_us * 1000 or _UNTOLD_PERIOD_NS
         """How far one SYNC takes the arm, where time goes by SYNC."""
         self.told_period_ns = 0
         """0x1006 of drive 1; 0: nobody has told it the period."""

@@ -429,12 +429,17 @@ class DeviceDescription:
 
 @dataclass(frozen=True)
 class EmulatedContract:
-    """File names within `contract_folder`. `devices`: those of an arm of one's own, by place, in their stead."""
+    """File names within `contract_folder`.
+
+    devices: those of an arm of one's own, by place, in their stead. period_us: what a SYNC is worth where no master
+    can write 0x1006; 0: 1 ms.
+    """
 
     dbc: str
     drive_eds: str
     sensor_eds: str
     devices: tuple[DeviceDescription, ...] = ()
+    period_us: int = 0
 
     def describe(self, place: int) -> DeviceDescription:
         """Describe the device at a place: drive 1, drive 2, sensor 1, sensor 2."""

@@ -20,7 +20,13 @@ from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.contract_frames import NOT_VALID
 from firmware_sim.arm.hardware_settings import HabitSettings
-from firmware_sim.canopen.object_dictionary import DeviceDescription, EmulatedContract, MadeUp, contract_of
+from firmware_sim.canopen.object_dictionary import (
+    CONTRACTS,
+    DeviceDescription,
+    EmulatedContract,
+    MadeUp,
+    contract_of,
+)
 from firmware_sim.scenario.rehearsal import DeviceCounts, compose_scenario, told_arm
 from firmware_sim.scenario.scenario import (
     ArmTruth,
@@ -52,13 +58,15 @@ _OBJECTS = {
     "temperature": (0x2111, 0),
 }
 """Where the emulated devices have what a profile maps from objects of its own."""
+_OWN_EDS = {eds for contract in CONTRACTS.values() for eds in (contract.drive_eds, contract.sensor_eds)}
+"""EDS that give every object a value."""
 _SIGNED8, _UNSIGNED16, _UNSIGNED32 = 0x0002, 0x0006, 0x0007  # data types, CiA 301 table 44
 
 
 def _made_up(kind: str, settings: Settings) -> dict[int, MadeUp]:
     """List what every device of a kind has, whether its EDS says so or not."""
     made = {
-        0x1006: MadeUp("SYNC period", _UNSIGNED32, settings.bus.period_us),
+        0x1006: MadeUp("SYNC period", _UNSIGNED32, 0),
         0x1017: MadeUp("heartbeat time", _UNSIGNED16, settings.bus.heartbeat_ms),
     }
     if kind == "drive":
@@ -165,7 +173,8 @@ def _default(device: PlacedDevice, index: int, sub: int) -> int:
 
 def describe_devices(codec: Codec, devices: list[PlacedDevice], settings: Settings) -> EmulatedContract:
     """Describe the devices by their own EDS."""
-    return EmulatedContract(codec.path.name, "", "", tuple(_describe(device, settings) for device in devices))
+    described = tuple(_describe(device, settings) for device in devices)
+    return EmulatedContract(codec.path.name, "", "", described, settings.bus.period_us)
 
 
 def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
@@ -196,7 +205,7 @@ def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
         for signal in pdo.signals
         if signal.signal in _OBJECTS
     }
-    if device.profile.eds.parent == contract_folder():
+    if device.profile.eds.name in _OWN_EDS and device.profile.eds.parent == contract_folder():
         return DeviceDescription(device.profile.eds, defaults, {}, made_up, aliases)
     fallbacks = {(0x1005, 0): 0x80, (0x1006, 0): 0, (0x1014, 0): 0x80 + device.node_id}
     fallbacks[0x1000, 0] = _DEVICE_TYPES[kind]

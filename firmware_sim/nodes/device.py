@@ -95,7 +95,6 @@ class EmulatedDevice(ObjectDictionary):
         objects.
         """
         super().__init__(node_id, eds_path, self._send, defaults or {}, fallbacks or {}, made_up)
-        self._made_up = frozenset(made_up or ())
         self.clock = NodeClock()
         self.is_powered = True
         self.is_on_bus = True
@@ -277,10 +276,10 @@ class EmulatedDevice(ObjectDictionary):
             refuse(Abort.DEVICE_STATE)
 
     def _check_overflow(self, overflow: int) -> None:
-        """Accept 0 and 2 to 240, and a change at period 0 only, if a master can write that: CiA 301, 7.5.2.22."""
+        """Accept 0 and 2 to 240, and a change at period 0 only: CiA 301, 7.5.2.22."""
         if overflow == 1 or overflow > SYNC_OVERFLOW:
             refuse(Abort.VALUE_RANGE)
-        if overflow != self.value(0x1019) and self.value(0x1006) != 0 and 0x1006 not in self._made_up:
+        if overflow != self.value(0x1019) and self.value(0x1006) != 0:
             refuse(Abort.DEVICE_STATE)
 
     def _set_overflow(self, overflow: int) -> None:

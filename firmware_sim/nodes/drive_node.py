@@ -108,7 +108,8 @@ class DriveNode(Application):
         self._mode = self._wanted_mode = device.default_or(0, 0x6060)
         self._habits = habits
         self._has_habits = habits != HabitSettings()
-        self._shown_mode = self._told_mode = self._mode  # on 0x6061, and what it shows once the time for it has passed
+        # On 0x6061; what it shows once the time for it has passed, and until then.
+        self._shown_mode = self._told_mode = self._meanwhile = self._mode
         self._told_ns = 0
         self._enabling_ns: int | None = None
         """When Enable operation was first asked for; None: it isn't."""
@@ -116,6 +117,8 @@ class DriveNode(Application):
         self._patience = Patience(device)
         self._serve(codec)
         self._configure()
+        if not codec.message(f"Drive{number}Command").is_protected:
+            device.open_at_work |= {(0x6071, 0)}
         device.attach(self)
         self.restart(is_node_reset=True)
 
@@ -521,8 +524,9 @@ class DriveNode(Application):
         if self._habits.shows_mode == "enabled" and not self.is_enabled:
             return
         if self._mode != self._told_mode:
+            self._meanwhile = _SWITCHING if self._habits.shows_change else self._shown_mode
             self._told_mode, self._told_ns = self._mode, t_ns + round(self._habits.mode_s * 1e9)
-        shown = self._told_mode if t_ns >= self._told_ns else _SWITCHING
+        shown = self._told_mode if t_ns >= self._told_ns else self._meanwhile
         self.has_news |= shown != self._shown_mode
         self._shown_mode = shown
 

@@ -44,7 +44,9 @@ def test_profiles_for_each_contract_are_built_in() -> None:
         "adacd-sensor-fd",
         "adacd-sensor-fd-500us",
         "int32-sensor",
+        "maxon-epos4",
         "stock-drive",
+        "zeroerr-erob",
     ]
 
 

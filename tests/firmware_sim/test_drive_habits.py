@@ -39,14 +39,15 @@ def test_a_mode_may_be_shown_only_once_the_drive_is_enabled() -> None:
     assert (before, shown_mode(host)) == (0, TORQUE_MODE)
 
 
-def test_a_mode_may_be_shown_long_after_it_was_asked_for() -> None:
-    host = host_of(mode_s=0.05)
+@pytest.mark.parametrize(("shows_change", "meanwhile"), [(False, 0), (True, IN_BETWEEN)])
+def test_a_mode_may_be_shown_long_after_it_was_asked_for(shows_change: bool, meanwhile: int) -> None:
+    host = host_of(mode_s=0.05, shows_change=shows_change)
     host.enable()
     shown = []
     for _ in range(60):
         host.step(ENABLE)
         shown.append(shown_mode(host))
-    assert shown[:40] == [IN_BETWEEN] * 40
+    assert shown[:40] == [meanwhile] * 40
     assert shown[-1] == TORQUE_MODE
 
 

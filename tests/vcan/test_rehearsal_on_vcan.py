@@ -2,7 +2,7 @@
 
 import pytest
 from experiment_runs import Played, adacd_hil, emulator, run_on_vcan
-from own_arm import EIGHT_TOUCHES, describe_arm
+from own_arm import EIGHT_TOUCHES, describe_arm, describe_geared_arm
 
 from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.analysis.score.evaluation import evaluate
@@ -10,11 +10,11 @@ from adacd_hil.analysis.score.evaluation import evaluate
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
 
-@pytest.fixture(scope="module")
-def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> Played:
+@pytest.fixture(scope="module", params=[describe_arm, describe_geared_arm])
+def rehearsed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Played:
     """Write the arm's file with `init`, then play eight touches on vcan."""
     folder = tmp_path_factory.mktemp("rehearsal")
-    written = adacd_hil(folder, "init", *describe_arm(folder))
+    written = adacd_hil(folder, "init", *request.param(folder))
     assert written.status == 0, written.stderr
     (folder / "touches.toml").write_text(EIGHT_TOUCHES)
     play = ("--config", str(folder / "my-arm.toml"), "--scenario", str(folder / "touches.toml"))

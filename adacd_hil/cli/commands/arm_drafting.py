@@ -1,5 +1,6 @@
 """The draft of one's own arm as `init` makes it: scans the bus, asks, and lets what is known decide the rest."""
 
+import math
 import os
 import tempfile
 from collections.abc import Collection, Sequence
@@ -26,13 +27,15 @@ from adacd_hil.commission.host_checks import Status, look_for_socketcan
 from adacd_hil.commission.profile_draft import (
     DRIVE,
     SENSOR,
+    TORQUE_KEYS,
     DeviceRatings,
     ProfileDraft,
     draft_profile,
     identity_of,
+    is_of,
     kind_of,
 )
-from adacd_hil.device.profile import ScaleSettings, load_profile, profile_names
+from adacd_hil.device.profile import ProfileSettings, ScaleSettings, load_profile, profile_names
 from adacd_hil.device.survey import survey
 from adacd_hil.file_access import read_input, replace_file
 from adacd_hil.log.recording.run_folder import is_there
@@ -163,10 +166,11 @@ class Drafting:
         options = self.options
         drives, sensors = self._find_devices()
         drive, sensor = self._profiles(drives, sensors)
-        scales = [self._scale(drive.value[joint], joint) for joint in range(2)]
+        profiles = [self._drive_profile(drive.value[joint], joint) for joint in range(2)]
+        scales = [profile.scale for profile in profiles]
         geometry, length_source, mass_source, gravity_source = self._ask_geometry()
         ratings = [device.ratings for device in drives]
-        rated = self._rated(ratings, scales, geometry)
+        rated = self._rated(ratings, profiles, geometry)
         torque = self._limit("torque_limit_Nm", "--torque-limit-nm", _torque_proposals(rated, ratings, geometry))
         proposal = _position_proposals(ratings, scales, geometry)
         position = self._limit("position_limit_deg", "--position-limit-deg", proposal)
@@ -200,13 +204,13 @@ class Drafting:
             self.bitrate,
         )
 
-    def _scale(self, name: str, joint: int) -> ScaleSettings:
+    def _drive_profile(self, name: str, joint: int) -> ProfileSettings:
         draft = self._drafts.get((DRIVE, joint))
         if draft is not None:
-            return draft.settings.scale
+            return draft.settings
         path = Path(name)
         there = name if name in profile_names() or path.is_absolute() else str(self.writing.out.parent / path)
-        return load_profile(there, DRIVE).settings.scale
+        return load_profile(there, DRIVE).settings
 
     def _profile_guesses(self, facts: ArmFacts) -> list[str]:
         """Name the guesses within profiles, each once."""
@@ -380,7 +384,7 @@ class Drafting:
             fitting = [
                 joint
                 for joint in range(2)
-                if not same or _is_of(identity, (same[joint].node.vendor, same[joint].node.product))
+                if not same or is_of(identity, (same[joint].node.vendor, same[joint].node.product))
             ]
             if not fitting:
                 vendor, product = ("?" if number is None else f"0x{number:X}" for number in identity)
@@ -479,8 +483,7 @@ class Drafting:
             (draft,) = self._draft(profile.eds, kind, {joint: ratings}, profile.settings.assumed).values()
             left = [guess.key for guess in draft.guessed if guess.key in profile.settings.assumed]
             if len(left) < len(profile.settings.assumed):
-                scale = draft.settings.scale
-                text = _extension(name, scale, left)
+                text = _extension(name, profile.settings.scale, draft.settings.scale, left)
                 file = f"{self.writing.out.stem}-{name}.toml" if not texts else f"{self.writing.out.stem}-{name}-2.toml"
                 completed[joint] = texts.setdefault(text, file)
                 self._drafts[kind, joint] = draft._replace(
@@ -543,14 +546,18 @@ class Drafting:
         self.warnings.append("inertia is that of uniform rods, without motors and gears")
         return arm, length_source, "given masses, as uniform rods", gravity_source
 
-    def _rated(self, ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm) -> Fact:
+    def _rated(
+        self, ratings: Sequence[DeviceRatings], profiles: Sequence[ProfileSettings], geometry: PlanarArm
+    ) -> Fact:
         """Take the rated torque at the joints from the drives, from their EDS, or ask."""
+        scales = [profile.scale for profile in profiles]
         told = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
         drafts = [self._drafts.get((DRIVE, joint)) for joint in range(2)]
         by_eds = [None if draft is None else draft.rated_torque_Nm for draft in drafts]
-        is_known = all(draft is None or draft.is_rated_known for draft in drafts)
+        is_known = not any(TORQUE_KEYS & set(profile.assumed) for profile in profiles)
+        are_of_eds = all(draft is not None and draft.is_rated_known for draft in drafts)
         if self.options.rated_torque_nm is None and is_known:
-            for pair, source in ((told, "0x6076 of the drives"), (by_eds, "0x6076 of their EDS")):
+            for pair, source in ((told, "0x6076 of the drives"), (by_eds if are_of_eds else [], "0x6076 of their EDS")):
                 if len(pair) == 2 and None not in pair:
                     behind = " behind their gears" if any(scale.gear_ratio != 1.0 for scale in scales) else ""
                     return Fact(_checked("rated_torque_Nm", (pair[0], pair[1])), source + behind)
@@ -754,11 +761,6 @@ _QUESTIONS = (
 )
 
 
-def _is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int | None]) -> bool:
-    """Whether an EDS may be a node's: what it leaves open fits all."""
-    return all(told in (None, found) for told, found in zip(identity, node, strict=True))
-
-
 def _is_rating(pair: Sequence[float | None]) -> bool:
     try:
         _checked("rated_torque_Nm", (pair[0], pair[1]))
@@ -773,10 +775,11 @@ def _drive_or_sensor(text: str) -> str:
     return text.casefold()
 
 
-def _extension(name: str, scale: ScaleSettings, left: Sequence[str]) -> str:
+def _extension(name: str, shipped: ScaleSettings, scale: ScaleSettings, left: Sequence[str]) -> str:
     """Write a profile that extends a shipped one by what belongs to the arm."""
-    plain = ScaleSettings()
-    rows = [f"{key} = {value:.16g}" for key, value in vars(scale).items() if value and value != getattr(plain, key)]
+    rows = [
+        f"{key} = {value!r}" for key, value in vars(scale).items() if not math.isclose(value, getattr(shipped, key))
+    ]
     assumed = ", ".join(f'"{key}"' for key in left)
     head = [f"# {name} with gear and encoder of this arm, by `adacd-hil init`.", "", f'extends = "{name}"']
     return "\n".join([*head, f"assumed = [{assumed}]", "", "[scale]", *rows]) + "\n"
