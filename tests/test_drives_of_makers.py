@@ -13,6 +13,7 @@ from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import ExitCode, exit_code
 from adacd_hil.device.profile import load_profile
+from adacd_hil.log.editing.log_info import attachment
 from adacd_hil.settings.configuration import load_settings
 
 pytestmark = pytest.mark.slow
@@ -150,6 +151,9 @@ def test_the_torque_of_a_geared_arm_is_the_joint_s(geared: Path, tmp_path: Path)
     assert any("CERTIFY -> MONITOR" in line for line in said)
     ratios = [float(found) for line in said for found in re.findall(r"measures ([\d.]+) .*times the commanded", line)]
     assert ratios == pytest.approx([1.0, 1.0], abs=0.02)
+    profile = attachment(tmp_path / "run" / "run.mcap", "Drive1.toml")
+    assert profile is not None
+    assert b"gear_ratio = 30.0" in profile
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.cycle_frames import SensorStatus
-from adacd_hil.device.device_setup import contract_differences, read_pdos
+from adacd_hil.device.device_setup import contract_differences, describe_torque_scale, read_pdos
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, survey
@@ -191,11 +191,23 @@ def check_set_up(patient: ArmExamination) -> CheckOutcome:
 def check_pdo_map(patient: ArmExamination) -> CheckOutcome:
     """Check that the PDOs that the devices have configured are those of the contract."""
     lines = []
-    for name, node in patient.master.nodes.items():
-        lines += [f"{name}: {line}" for line in contract_differences(patient.codec, node.id, read_pdos(node))]
+    for slave in patient.master.slaves:
+        lines += contract_differences(slave.device, read_pdos(patient.master.nodes[slave.name]))
     if lines:
-        return failed("; ".join(lines), "choose the contract that the devices have, or map their PDOs by its layout")
+        return failed(
+            "; ".join(lines), "correct [[pdo]] of the devices' profiles, or map the devices' PDOs as these say"
+        )
     return ok("read back, equal to the contract")
+
+
+def check_torque_scale(patient: ArmExamination) -> CheckOutcome:
+    """Say what the drives' rated torques are at the joints; the set-up has compared them."""
+    slaves = patient.master.slaves[:JOINTS]
+    pairs = zip(slaves, patient.settings.arm.rated_torque_Nm, strict=True)
+    text = "; ".join(describe_torque_scale(slave, rated_Nm) for slave, rated_Nm in pairs)
+    if any(not slave.has(0x6076) for slave in slaves):
+        return warning(text, "compare `arm.rated_torque_Nm` with the data sheets of motor and gear")
+    return ok(text)
 
 
 def check_protection(patient: ArmExamination) -> CheckOutcome:
@@ -451,6 +463,7 @@ ARM_CHECKS: tuple[Check[ArmExamination], ...] = (
     Check("contract", check_contract, ("boot",)),
     Check("set-up", check_set_up, ("boot", "contract")),
     Check("PDO map", check_pdo_map, ("boot", "set-up")),
+    Check("torque scale", check_torque_scale, ("boot", "set-up")),
     Check("protection", check_protection),
     Check("cycle", check_cycle, ("boot", "contract", "set-up", "PDO map")),
     Check("rate", check_rate, ("cycle",)),

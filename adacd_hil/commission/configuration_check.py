@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import PurePath
 from typing import NamedTuple
 
 from adacd_hil.commission.host_checks import Check, CheckOutcome, ok, warning
@@ -54,14 +55,15 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
     settings = parse(Settings, table)
     if problems := motion_problems(settings):
         return ConfigurationFindings([*problems, *_radians(settings)], [], None)
-    if problems := _device_problems(settings):
+    if problems := [*_device_problems(settings), *_detector_problems(settings)]:
         return ConfigurationFindings(problems, [], None)
     try:
         codec = load_contract(settings)
     except (ConfigError, CodecError) as error:
         return ConfigurationFindings([str(error)], [], None)
     late = list(_budget_warnings(codec, settings))
-    assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in settings.assumed)}"] if settings.assumed else []
+    guesses = [*settings.assumed, *profile_guesses(settings)]
+    assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in guesses)}"] if guesses else []
     warnings = [*_oddities(settings), *_narrow(codec, settings), *assumed, *_layer_warnings(layers), *late]
     return ConfigurationFindings([], warnings, settings, bool(late))
 
@@ -70,7 +72,11 @@ def configuration_checks(settings: Settings) -> list[Check[Settings]]:
     """Make doctor's checks of a configuration: what it may not mean, and one for each value that is a guess."""
     known = known_keys()
     guesses = [key for key in settings.assumed if key in known]
-    return [Check("settings", _check_oddities), *(Check(f"`{key}`", _asking_for(known[key])) for key in guesses)]
+    return [
+        Check("settings", _check_oddities),
+        *(Check(f"`{key}`", _asking_for(known[key])) for key in guesses),
+        *(Check(f"`{key}`", _asking_for_profile(value)) for key, value in profile_guesses(settings).items()),
+    ]
 
 
 def _check_oddities(settings: Settings) -> CheckOutcome:
@@ -90,6 +96,26 @@ def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
     return ask
 
 
+def _asking_for_profile(value: float) -> Callable[[Settings], CheckOutcome]:
+    def ask(_: Settings) -> CheckOutcome:
+        remedy = "look it up or measure it, write it into that profile, and take the key off its `assumed`"
+        return warning(f"{value:.10g} is a guess", remedy)
+
+    return ask
+
+
+def profile_guesses(settings: Settings) -> dict[str, float]:
+    """Return the guesses within the profiles of the devices, as `my-drive.toml: scale.gear_ratio`."""
+    found = {}
+    for kind, names in (("drive", settings.devices.drive), ("sensor", settings.devices.sensor)):
+        for name in dict.fromkeys(names):
+            profile = load_profile(name, kind).settings
+            for key in profile.assumed:
+                section, _, field = key.partition(".")
+                found[f"{PurePath(name).name}: {key}"] = getattr(getattr(profile, section), field)
+    return found
+
+
 def _oddities(settings: Settings) -> list[str]:
     return [line for look in _LOOKS for line in look(settings)]
 
@@ -100,7 +126,7 @@ _MOST_NAMED = 4
 
 def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
     """Say in a line which values of a configuration are guesses, but for those that are measured; "" without any."""
-    guesses = [f"`{key}`" for key in settings.assumed if key not in measured]
+    guesses = [f"`{key}`" for key in (*profile_guesses(settings), *settings.assumed) if key not in measured]
     more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
     named = f"{', '.join(guesses[:_MOST_NAMED])}{more}"
     remedy = "`adacd-hil config check` names all" if more else "`adacd-hil doctor` asks for each"
@@ -117,6 +143,14 @@ def _device_problems(settings: Settings) -> list[str]:
             except ConfigError as error:
                 problems[str(error)] = None
     return list(problems)
+
+
+def _detector_problems(settings: Settings) -> list[str]:
+    if not settings.detector.live:
+        return []
+    from adacd_hil.scheme.detect.live_detectors import live_problems
+
+    return live_problems(settings)
 
 
 _BOUNDS = (

@@ -123,9 +123,19 @@ def kind_of(eds: Path) -> str:
 
     Raises ConfigError.
     """
+    return KINDS.get(_profile_number(eds), "")
+
+
+def describe_kind(eds: Path) -> str:
+    """Say which profile 0x1000 of an EDS names, where it is neither a drive's nor a sensor's. Raises ConfigError."""
+    number = _profile_number(eds)
+    told = f"names CiA {number}" if number else "names no profile"
+    return f"0x1000 of {eds.name} {told}, neither a drive's (CiA 402) nor a sensor's (CiA 404)"
+
+
+def _profile_number(eds: Path) -> int:
     variable = find_variable(read_eds(eds, 1), 0x1000, 0)
-    number = None if variable is None or variable.default is None else variable.default & 0xFFFF
-    return KINDS.get(number or 0, "")
+    return 0 if variable is None or variable.default is None else variable.default & 0xFFFF
 
 
 def draft_profile(
@@ -141,7 +151,7 @@ def draft_profile(
     """
     kind = kind or kind_of(eds)
     if not kind:
-        raise ConfigError(f"EDS {eds}: 0x1000 names neither a drive (CiA 402) nor a sensor (CiA 404)")
+        raise ConfigError(f"EDS {eds}: {describe_kind(eds)}")
     objects = read_eds(eds, 1)
     make = _DriveWriter if kind == DRIVE else _SensorWriter
     writer = make(eds, objects, ratings, answers or {})

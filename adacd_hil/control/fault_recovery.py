@@ -102,7 +102,7 @@ class SelfChecks:
         )
 
     def _judge_torque(self, cycle: int) -> str:
-        for drive in self._arm.drives:
+        for drive, rated_Nm in zip(self._arm.drives, self._arm.limits.rated_torque_Nm, strict=True):
             if drive.status_cycle != cycle or not drive.shows_torque:
                 continue
             excess = self._excess(drive)
@@ -113,8 +113,8 @@ class SelfChecks:
             self._wrong[drive.name] = since, count + 1
             if count + 1 >= TORQUE_STATUSES and cycle - since >= self._torque_cycles:
                 return (
-                    f"{drive.name}: torque {drive.torque_actual_permille / 10:.1f} % of rated torque, "
-                    f"{drive.recent_permille[-1] / 10:.1f} % commanded, "
+                    f"{drive.name}: torque {drive.torque_actual_permille / 10:.1f} % of {rated_Nm:g} Nm rated at the "
+                    f"joint, {drive.recent_permille[-1] / 10:.1f} % commanded, "
                     f"arm.torque_error_share = {100.0 * self._torque_share:g} %"
                 )
         return ""

@@ -20,7 +20,7 @@ from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
-from adacd_hil.device.profile import enable_timeout_s
+from adacd_hil.device.profile import enable_timeout_s, place_devices
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import place_file
 from adacd_hil.log.log_files import LOG_NAME, MOST_VIEWERS, arithmetic
@@ -36,7 +36,7 @@ from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus, BusError, Tap
-from adacd_hil.wire.codec import Codec, contract_folder
+from adacd_hil.wire.codec import Codec
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,10 @@ class Session:
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
-        attachments = {path.name: path.read_bytes() for path in sorted(contract_folder().glob("*.eds"))}
+        attachments = {}
+        for device in place_devices(self.settings):
+            attachments[device.profile.eds.name] = device.profile.eds.read_bytes()
+            attachments[f"{device.name}.toml"] = to_toml(device.settings).encode()
         attachments["arm.dbc"] = self.codec.text
         attachments["config.toml"] = to_toml(self.settings).encode()
         if self.tare is not None:

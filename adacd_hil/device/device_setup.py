@@ -8,6 +8,7 @@ A PDO is made invalid before anything of it is changed, the mapping is emptied b
 valid last. PDOs that the contract doesn't know are switched off: a stock device's defaults would take bus time.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, NoReturn
@@ -23,11 +24,11 @@ from adacd_hil.device.canopen_bus import (
 )
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
 from adacd_hil.device.drive_units import name_velocity_unit, read_drive_units
-from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice
+from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, ScaleSettings
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
-from adacd_hil.wire.codec import Codec, MessageCodec
+from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import NOT_VALID, SDO_REQUEST_ID, SDO_RESPONSE_ID
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
@@ -185,7 +186,7 @@ def _check_rated_torque(slave: Slave, rated_Nm: Sequence[float]) -> None:
             "rated torque 0x6076 = 0: the drive does not know its motor",
             "enter the motor with the maker's tool, and store it",
         )
-    unit = _TORQUE_UNITS.get(scale.rated_torque_count_Nm, f"x {scale.rated_torque_count_Nm:g} Nm")
+    unit = _torque_unit(scale)
     text = f"rated torque 0x6076 = {found} {unit}, {round(expected[joint])} {unit} expected"
     if scale.joint_torque_Nm != scale.rated_torque_count_Nm:
         text += (
@@ -203,6 +204,23 @@ def _check_rated_torque(slave: Slave, rated_Nm: Sequence[float]) -> None:
         f"correct `arm.rated_torque_Nm[{joint}]`, the torque at the joint; or `scale.gear_ratio`, "
         f"`scale.gear_efficiency`, `scale.rated_torque_count_Nm` of {place}",
     )
+
+
+def _torque_unit(scale: ScaleSettings) -> str:
+    return _TORQUE_UNITS.get(scale.rated_torque_count_Nm, f"x {scale.rated_torque_count_Nm:g} Nm")
+
+
+def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
+    """Say how the rated torque of a motor becomes that of its joint, `rated_Nm`. Raises DeviceError."""
+    if not slave.has(0x6076):
+        return f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint"
+    scale = slave.device.settings.scale
+    parts = [f"{slave.read(0x6076)} {_torque_unit(scale)}"]
+    if scale.gear_ratio != 1.0:
+        parts.append(f"gear {scale.gear_ratio:g}")
+    if scale.gear_efficiency != 1.0:
+        parts.append(f"efficiency {scale.gear_efficiency:g}")
+    return f"{slave.name}: 0x6076 = {' x '.join(parts)}, {rated_Nm:.4g} Nm at the joint, 0.1 % of it a count"
 
 
 def _check_units(slave: Slave, codec: Codec) -> list[str]:
@@ -538,7 +556,6 @@ def _mapping_difference(slave: Slave, pdo: PdoSettings) -> str:
 
 _RECEIVED, _SENT = 0x1400, 0x1800
 _MOST_PDOS = 8
-_PDO_FUNCTIONS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
 
 SIGNAL_OBJECTS = {
     "position": 0x6064,
@@ -557,7 +574,7 @@ SIGNAL_OBJECTS = {
     "torque": 0x9130,
     "status": 0x6150,
 }
-"""CiA 301, 402 and 404: the object behind a signal's name. Signals of other names are compared by their place."""
+"""CiA 301, 402 and 404: the object behind a signal's name."""
 
 
 class MappedObject(NamedTuple):
@@ -566,6 +583,9 @@ class MappedObject(NamedTuple):
     object_index: int
     subindex: int
     bits: int
+
+    def __str__(self) -> str:
+        return f"{ObjectName(self.object_index, self.subindex)} of {self.bits} bits"
 
 
 class Pdo(NamedTuple):
@@ -600,38 +620,19 @@ def _read_number(node: Any, index: int, subindex: int) -> int | None:
     return None if data is None else int.from_bytes(data, "little")
 
 
-def contract_differences(codec: Codec, node_id: int, pdos: list[Pdo]) -> list[str]:
-    """Say where the PDOs of a node are not the contract's, one line each."""
+def contract_differences(device: PlacedDevice, pdos: list[Pdo]) -> list[str]:
+    """Say where the PDOs of a device are not those of its profile, from which the contract follows, one line each."""
     by_id = {pdo.can_id: pdo for pdo in pdos}
     lines = []
-    for message in codec.messages.values():
-        if message.can_id & 0x7F != node_id or message.can_id & 0x780 not in _PDO_FUNCTIONS:
+    for pdo in device.settings.pdo:
+        name, can_id = f"{device.name}{pdo.message}", device.can_id(pdo)
+        found = by_id.get(can_id)
+        if found is None:
+            lines.append(f"{name}: the device has no PDO with identifier 0x{can_id:03X}")
             continue
-        pdo = by_id.get(message.can_id)
-        if pdo is None:
-            lines.append(f"{message.name}: the device has no PDO with identifier 0x{message.can_id:03X}")
-        else:
-            lines.extend(_differences(message, pdo))
-    return lines
-
-
-def _differences(message: MessageCodec, pdo: Pdo) -> list[str]:
-    total = sum(entry.bits for entry in pdo.objects)
-    if total != 8 * message.length:
-        return [f"{message.name}: {total} bits are mapped, the contract has {8 * message.length}"]
-    places = {}
-    bit = 0
-    for entry in pdo.objects:
-        places[bit] = entry
-        bit += entry.bits
-    lines = []
-    bit = 0
-    for signal in message.signals:
-        wanted = SIGNAL_OBJECTS.get(signal.name)
-        found = places.get(bit)
-        width = signal.bits
-        if wanted is not None and (found is None or found.object_index != wanted or found.bits != width):
-            there = "no object" if found is None else f"0x{found.object_index:04X} with {found.bits} bits"
-            lines.append(f"{message.name}.{signal.name}: {there} at bit {bit}, not 0x{wanted:04X} with {width}")
-        bit += width
+        wanted = [MappedObject(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in device.mapping(pdo)]
+        for place, pair in enumerate(itertools.zip_longest(found.objects, wanted), start=1):
+            if pair[0] != pair[1]:
+                there, right = ("nothing" if entry is None else str(entry) for entry in pair)
+                lines.append(f"{name}: {there} is mapped at place {place}, {right} expected")
     return lines

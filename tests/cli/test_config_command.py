@@ -7,6 +7,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from adacd_hil.cli.main import cli
+from adacd_hil.commission.configuration_check import configuration_checks
+from adacd_hil.commission.host_checks import Status
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.toml_files import builtin_names
 
@@ -126,6 +128,28 @@ def test_devices_and_contract_are_looked_at(tmp_path: Path) -> None:
     assert "int32-sensor is a sensor, a drive is needed" in result.stdout
     path.write_text('[devices]\ndrive = ["stock-drive", "stock-drive"]\n')
     assert "Drive1" in config("check", str(path)).stdout
+
+
+def test_a_detector_that_nobody_knows_is_an_error_with_the_nearest_name(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('extends = "certified"\n[[detector.live]]\nname = "cusums"\nthreshold = [1.0, 1.0]\n')
+    result = config("check", str(path))
+    assert result.exit_code == USAGE
+    assert "no detector cusums is registered here; did you mean cusum?" in result.stdout
+
+
+def test_the_guesses_of_a_device_s_profile_are_those_of_the_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('extends = "certified"\n[devices]\ndrive = ["geared.toml", "maxon-epos4"]\ncontract = ""\n')
+    (tmp_path / "geared.toml").write_text('extends = "maxon-epos4"\n[scale]\ngear_ratio = 30\n')
+    (warning,) = [line for line in config("check", str(path)).stdout.splitlines() if "assumed" in line]
+    assert "`geared.toml: scale.increments_per_joint_rev`" in warning
+    assert "`maxon-epos4: scale.gear_ratio`" in warning
+    assert "`geared.toml: scale.gear_ratio`" not in warning
+    checks = {check.name: check for check in configuration_checks(load_settings(str(path)))}
+    outcome = checks["`maxon-epos4: scale.gear_ratio`"].run(load_settings(str(path)))
+    assert outcome.status is Status.WARNING
+    assert outcome.reason == "26 is a guess"
 
 
 def test_several_files_are_checked_each() -> None:

@@ -3,15 +3,20 @@
 import dataclasses
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
+from own_arm import describe_arm, describe_geared_arm
 from rig import CODEC, Rig
 
 from adacd_hil.cli.commands.doctor_command import as_json, as_text
+from adacd_hil.cli.main import cli
 from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
 from adacd_hil.commission.host_checks import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.codec import load_codec
+from firmware_sim.cli.own_devices import rehearse
 from firmware_sim.nodes.device import NmtState
 
 COMMAND = CODEC.message("Drive1Command")
@@ -23,7 +28,7 @@ EARLIER = [Finding(name, Status.OK, "", "") for name in PASSED]
 
 def doctor(rig: Rig, ask: Callable[[str], None] | None = None) -> dict[str, Finding]:
     patient = ArmExamination(
-        rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None, ask=ask, cycle_s=0.4, move_s=1.0
+        rig.settings, rig.codec, rig.clock, lambda: rig.bus, lambda: None, ask=ask, cycle_s=0.4, move_s=1.0
     )
     findings = diagnose(ARM_CHECKS, patient, lambda finding: None, EARLIER)
     assert patient.leave() == ""
@@ -127,11 +132,12 @@ def break_pdo_map(rig: Rig, index: int, subindex: int, value: int) -> None:
 @pytest.mark.parametrize(
     ("index", "subindex", "value", "reason"),
     [
-        (0x1A00, 1, 0x60640010, "Drive1Feedback: 48 bits are mapped, the contract has 64"),
-        (0x1A00, 1, 0x60630020, "Drive1Feedback.position: 0x6063 with 32 bits at bit 0, not 0x6064 with 32"),
+        (0x1A00, 1, 0x60640010, "Drive1Feedback: 0x6064 of 16 bits is mapped at place 1, 0x6064 of 32 bits expected"),
+        (0x1A00, 1, 0x60630020, "Drive1Feedback: 0x6063 of 32 bits is mapped at place 1, 0x6064 of 32 bits expected"),
+        (0x1A00, 0, 1, "Drive1Feedback: nothing is mapped at place 2, 0x606C of 32 bits expected"),
         (0x1800, 1, 0x80000181, "Drive1Feedback: the device has no PDO with identifier 0x181"),
         (0x1400, 1, 0x00000211, "Drive1Command: the device has no PDO with identifier 0x201"),
-        (0x1600, 3, 0x60710010, "Drive1Command.controlword: 0x6071 with 16 bits at bit 16, not 0x6040 with 16"),
+        (0x1600, 3, 0x60710010, "Drive1Command: 0x6071 of 16 bits is mapped at place 3, 0x6040 of 16 bits expected"),
     ],
 )
 def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, value: int, reason: str) -> None:
@@ -144,13 +150,20 @@ def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, v
     assert reason in finding.reason
 
 
-def test_an_object_mapped_with_another_width_is_told_though_the_length_is_right() -> None:
-    rig = Rig(is_wall=True)
-    break_pdo_map(rig, 0x1A00, 1, 0x60640010)
-    break_pdo_map(rig, 0x1A00, 2, 0x606C0030)
-    patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
-    patient.connect()
-    assert "Drive1Feedback.position: 0x6064 with 16 bits at bit 0" in check_pdo_map(patient).reason
+@pytest.mark.parametrize("describe", [describe_arm, describe_geared_arm])
+def test_devices_of_one_s_own_pass(tmp_path: Path, describe: Callable[[Path], list[str]]) -> None:
+    """Sensors of 16 bits have their torque in 0x7130, and the drives theirs in objects of the maker, or in µNm."""
+    written = CliRunner().invoke(cli, ["init", *describe(tmp_path)])
+    assert written.exit_code == 0, written.stderr
+    config = str(tmp_path / "my-arm.toml")
+    played = rehearse(config, "idle")
+    rig = Rig(load_settings(config), played.scenario, codec=played.codec, is_wall=True, contract=played.contract)
+    findings = doctor(rig)
+    assert statuses(findings, Status.FAILED) == []
+    assert findings["PDO map"].status is Status.OK
+    if describe is describe_geared_arm:
+        text = "Drive1: 0x6076 = 400000 µNm x gear 50, 20 Nm at the joint, 0.1 % of it a count"
+        assert text in findings["torque scale"].reason
 
 
 def change_torque(rig: Rig, change: Callable[[int, float], float]) -> None:

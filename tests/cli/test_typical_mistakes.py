@@ -116,7 +116,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     (f"{RUN} --tare none.toml", USAGE, ("tare none.toml does not exist", "`adacd-hil tare` makes one")),
     (f"{INIT} --urdf arm.urdf", USAGE, ("3 joints move (j1, j2, j3), an arm has 2 here", "with --lock")),
     (f"{INIT} --urdf notes.txt", USAGE, ("URDF notes.txt: not XML",)),
-    (f"{INIT} --eds other.eds", USAGE, ("EDS other.eds is of CiA 401", "a drive is of CiA 402")),
+    (f"{INIT} --eds other.eds", USAGE, ("other.eds names CiA 401", "a drive's (CiA 402)", "--drive-eds other.eds")),
     (f"{INIT} --length-m 350 300", USAGE, ("350.0 m is above 5 m", "350 mm are 0.35 m")),
     ("init my-arm.toml --no-bus --yes", USAGE, ("my-arm.toml exists", "--force to replace it")),
     ("init new.toml", USAGE, ("stdin is no terminal", "give --channel or --no-bus")),

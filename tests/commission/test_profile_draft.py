@@ -135,7 +135,8 @@ def test_an_event_timer_that_is_absent_is_a_remark(eds: Path) -> None:
         (EdsVariant().without("606C"), r"no 0x606C \(velocity\)"),
         (EdsVariant().without("1400", "1401", "1402", "1403"), "no RPDO takes 0x6040 .* and 0x6071"),
         (EdsVariant().without("1800", "1801", "1802", "1803"), "no TPDO brings 0x6064 .* and 0x606C"),
-        (EdsVariant().with_value(0, "1000"), "0x1000 names neither a drive"),
+        (EdsVariant().with_value(0, "1000"), "names no profile, neither a drive's"),
+        (EdsVariant().with_value(401, "1000"), "names CiA 401, neither a drive's"),
     ],
 )
 def test_the_reason_of_a_refusal_is_the_object_that_lacks(eds: Path, variant: EdsVariant, reason: str) -> None:

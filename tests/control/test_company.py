@@ -131,7 +131,7 @@ def test_a_drive_whose_torque_is_not_the_commanded_one_faults(tmp_path: Path) ->
     assert summary.result is not None
     assert summary.result.fault is FaultReason.TORQUE
     assert TROUBLE_CYCLE < faulted(log) <= TROUBLE_CYCLE + 210
-    assert "Drive1: torque 70.0 % of rated torque, " in reason(log)
+    assert "Drive1: torque 70.0 % of 12 Nm rated at the joint, " in reason(log)
     assert np.count_nonzero(log.scheme["request"] == Request.FAULT_TORQUE) > 0
 
 

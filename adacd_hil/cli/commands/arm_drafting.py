@@ -30,6 +30,7 @@ from adacd_hil.commission.profile_draft import (
     TORQUE_KEYS,
     DeviceRatings,
     ProfileDraft,
+    describe_kind,
     draft_profile,
     identity_of,
     is_of,
@@ -408,7 +409,7 @@ class Drafting:
                 kind, _ = self.interview.ask(
                     f"--drive-eds {eds} or --sensor-eds {eds} in place of --eds",
                     None,
-                    f"0x1000 of {eds.name} names neither a drive (CiA 402) nor a sensor (CiA 404): which is it",
+                    f"{describe_kind(eds)}: which is it",
                     _drive_or_sensor,
                 )
             found.append((eds, kind))

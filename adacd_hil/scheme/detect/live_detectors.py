@@ -259,6 +259,17 @@ def _maker(name: str) -> Maker:
     raise DetectorError(f"`detector.live`: no detector {name} is registered here; {hint}")
 
 
+def live_problems(settings: Settings) -> list[str]:
+    """Say which detectors of `detector.live` can't run, a line each."""
+    problems = []
+    for name in dict.fromkeys(wish.name for wish in settings.detector.live):
+        try:
+            _maker(name)
+        except DetectorError as error:
+            problems.append(str(error))
+    return problems
+
+
 def describe_code(settings: Settings) -> str:
     """Name each live detector with the digest of its code, as a log's metadata say it; empty without any."""
     told = []
