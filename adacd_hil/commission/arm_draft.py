@@ -219,6 +219,10 @@ _MODEL_TORQUE_NM = (12.0, 6.0)
 _RATE_PER_NM = 1000.0 / 6.0
 """Torque rate limit per rated torque, 1/s."""
 _AMPLITUDE_DEG, _HALF_PERIOD_S, _EXCITATION_S = (30.0, 60.0), (1.125, 4.5), 2.4
+_MOST_HALF_PERIOD_S = 60.0
+_MOST_SLOWER = _MOST_HALF_PERIOD_S / max(_HALF_PERIOD_S)
+"""Beyond it the motion gets shorter, by steps of this factor."""
+_SHORTER = 0.95
 _UPRIGHT_DEG, _LEAST_UPRIGHT_DEG = (60.0, 60.0), 45.0
 """Where gravity acts: amplitude, and that of joint 1 below which its offset is hardly seen beside gravity."""
 _PEAK_DEG_S = (100.0, 120.0)
@@ -344,13 +348,23 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
             f"joint 1 may swing by ±{amplitude[0]:g} deg only, {_LEAST_UPRIGHT_DEG:g} deg tell gravity from the offset "
             "of its torque sensor: without a tare the arm may not be certified"
         )
-    yield Entry("trajectory.amplitude_deg", amplitude, told)
     slower = _slowdown(facts, amplitude, warnings)
+    if slower > _MOST_SLOWER:
+        whole = amplitude
+        while slower > _MOST_SLOWER:
+            amplitude = tuple(_round(_SHORTER * value) for value in amplitude)
+            slower = _slowdown(facts, amplitude, [])
+        told += f"; {amplitude[0] / whole[0]:.2g} of it, for a half period of {_MOST_HALF_PERIOD_S:g} s at most"
+        warnings.append(
+            f"by its limits of speed and torque the arm moves by ±{amplitude[0]:g} and ±{amplitude[1]:g} deg only, in "
+            f"{slower * max(_HALF_PERIOD_S):.3g} s: learning it takes minutes; are the limits and the gears right?"
+        )
+    yield Entry("trajectory.amplitude_deg", amplitude, told)
     half_period = tuple(_round(slower * period_s) for period_s in _HALF_PERIOD_S)
     reason = "as of the emulated arm" if slower == 1.0 else f"{slower:.2f} times slower than the emulated arm"
     yield Entry("trajectory.half_period_s", half_period, reason)
     yield Entry("excitation.period_s", _round(slower * _EXCITATION_S), reason)
-    withdrawal = tuple(_round(min(_PEAK_DEG_S[i], _SPEED_SHARE * speed[i])) for i in range(JOINTS))
+    withdrawal = tuple(_round(min(_PEAK_DEG_S[i], max(_SPEED_SHARE * speed[i], 1.0))) for i in range(JOINTS))
     if withdrawal != _PEAK_DEG_S:
         yield Entry("reaction.velocity_limit_deg_s", withdrawal, f"{_SPEED_SHARE:.0%} of the velocity limit")
     inertia = _inertia(facts)

@@ -238,6 +238,21 @@ def test_masses_and_friction_of_a_urdf_are_for_the_emulator(tmp_path: Path, out:
     assert (played.mass_kg, played.coulomb_Nm) == ((3.0, 1.5), (0.1, 0.1))
 
 
+@pytest.mark.parametrize(
+    "limits",
+    [("--velocity-limit-deg-s", "5", "5"), ("--velocity-limit-deg-s", "1", "1"), ("--torque-limit-nm", "0.1", "0.1")],
+)
+def test_an_arm_that_is_slow_or_weak_moves_less_and_within_bounds(out: Path, limits: tuple[str, ...]) -> None:
+    masses = ("--length-m", "0.6", "0.5", "--mass-kg", "10", "6", "--flat")
+    result = init(out, *NO_BUS, *masses, *limits)
+    assert result.exit_code == 0, result.stderr
+    motion = written(out).trajectory
+    assert max(motion.half_period_s) <= 60.0
+    assert motion.amplitude_deg[0] < 30.0
+    assert motion.amplitude_deg[1] == pytest.approx(2.0 * motion.amplitude_deg[0], rel=0.01)
+    assert "learning it takes minutes" in result.stdout
+
+
 def test_an_upright_arm_may_rest_on_its_brakes_and_swings_wide(out: Path) -> None:
     arm = ("--mass-kg", "1.5", "1", "--length-m", "0.3", "0.3", "--upright")
     assert init(out, *NO_BUS, *arm, "--position-limit-deg", "90", "120").exit_code == 0
