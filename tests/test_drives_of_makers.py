@@ -86,6 +86,15 @@ def test_a_drive_from_its_eds_is_rehearsed(tmp_path: Path, kind: str) -> None:
     assert rehearse(tmp_path)[0] == ExitCode.OK
 
 
+def test_a_drive_whose_eds_names_no_profile_is_told_to_be_one(tmp_path: Path) -> None:
+    eds = str(EdsVariant().with_value("", "1000").write(tmp_path / "drive.eds"))
+    refused = init(tmp_path, "--eds", eds)
+    assert refused.exit_code == ExitCode.USAGE
+    assert f"--drive-eds {eds}" in refused.stderr
+    assert init(tmp_path, "--drive-eds", eds).exit_code == 0
+    assert rehearse(tmp_path)[0] == ExitCode.OK
+
+
 def test_what_an_eds_omits_is_made_up_and_said(tmp_path: Path) -> None:
     eds = EdsVariant().without("1006", "6076").write(tmp_path / "drive.eds")
     assert init(tmp_path, "--eds", str(eds)).exit_code == 0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cli.bus_lab import complaints
 from click.testing import CliRunner, Result
+from eds_variants import EdsVariant
 from own_arm import write_sensor_eds
 from rig import Rig, SessionRig
 
@@ -18,6 +19,7 @@ from adacd_hil.commission.configuration_check import configuration_checks, exami
 from adacd_hil.commission.host_checks import Status, diagnose
 from adacd_hil.commission.profile_draft import DeviceRatings, draft_profile
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.profile import load_profile
 from adacd_hil.scheme.model.urdf import UrdfError
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.wire.codec import contract_folder, load_codec
@@ -490,6 +492,39 @@ def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out: Path, mo
     assert settings.arm.cad_theta[0] == pytest.approx(2.0 * 0.16 / 3.0 + 0.16 + 0.0625 / 3.0, rel=1e-5)
     assert "arm.rated_torque_Nm" in settings.assumed
     assert "arm.torque_limit_Nm" not in settings.assumed
+
+
+def test_a_question_mark_and_a_mistyped_path_lose_no_answer(
+    tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("adacd_hil.cli.interview.is_terminal", lambda: True)
+    monkeypatch.setattr("adacd_hil.wire.can_interface.can_interfaces", list)
+    eds = EdsVariant().without("6091", "608F").write(tmp_path / "drive.eds")
+    answers = [
+        "?",
+        "none",
+        "?",
+        "fity fity",
+        "50 50",  # gear
+        "0.8 0.8",
+        "?",
+        "204800 204800",
+        "parsec",
+        "rpm",
+        str(tmp_path / "lap.urdf"),
+        str(urdf(tmp_path)),
+        *[""] * 4,
+        "n",
+    ]
+    result = init(out, "--eds", str(eds), typed="\n".join(answers) + "\n")
+    assert result.exit_code == 0, result.stderr
+    assert "1 without a gear; --gear A B answers it, too; Enter takes 1 1: a guess" in result.stderr
+    assert "'parsec' must be one of increment/s, rpm" in result.stderr
+    assert "lap.urdf does not exist" in result.stderr
+    scale = load_profile(str(out.parent / "my-arm-drive.toml"), "drive").settings.scale
+    assert (scale.gear_ratio, scale.gear_efficiency, scale.increments_per_joint_rev) == (50.0, 0.8, 204800.0)
+    assert scale.velocity_rad_s == pytest.approx(np.pi / 30.0 / 50.0)
+    assert written(out).arm.link_length_m == (0.35, 0.3)
 
 
 def test_who_ends_the_questions_gets_no_file(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
