@@ -123,7 +123,10 @@ def kind_of(eds: Path) -> str:
 
     Raises ConfigError.
     """
-    return KINDS.get(_profile_number(eds), "")
+    number = _profile_number(eds)
+    if not number:
+        return next((kind for kind in (DRIVE, SENSOR) if maker_facts(eds, kind) is not None), "")
+    return KINDS.get(number, "")
 
 
 def describe_kind(eds: Path) -> str:
@@ -321,8 +324,8 @@ class _ProfileWriter(ABC):
             return None
         second = find_variable(self._numbered, index, 1)
         other = 0 if second is None or second.default is None else second.default
-        # An identifier without $NODEID is that of the node with which the file was made.
-        node = 1 if other != told else (self.objects.node_id or 1)
+        # An identifier without $NODEID is that of the node with which the file was made: a DCF says of which.
+        node = 1 if other != told else (read_eds(self.eds, None).node_id or 1)
         cob_id = (told & 0x7FF) - node
         if 0x180 <= cob_id <= 0x57F:
             return cob_id

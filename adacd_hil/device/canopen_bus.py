@@ -103,8 +103,8 @@ class EdsVariable(NamedTuple):
     is_mappable: bool = True
 
 
-def read_eds(path: Path, node_id: int) -> Any:
-    """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`. Raises ConfigError.
+def read_eds(path: Path, node_id: int | None) -> Any:
+    """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`, None: that of a DCF. Raises ConfigError.
 
     canopen leaves out what it can't read as a number: without its default an object is not looked at.
     """

@@ -150,6 +150,19 @@ def test_a_node_without_profile_number_can_be_said_to_be_a_drive(eds: Path) -> N
     assert draft_profile(path, kind="drive").settings.kind == "drive"
 
 
+def test_a_known_maker_s_eds_need_not_name_its_profile(eds: Path) -> None:
+    assert kind_of(EdsVariant("maxon_epos4.eds").with_value("", "1000").write(eds)) == "drive"
+
+
+def test_the_identifiers_of_a_dcf_are_those_of_its_node(eds: Path) -> None:
+    variant = (
+        EdsVariant().with_value("0x187", "1800sub1").with_value("0x287", "1801sub1").with_value("0x207", "1400sub1")
+    )
+    variant.table["DeviceComissioning"] = {"NodeID": "7"}
+    drafted = draft(eds, variant)
+    assert [frame(drafted, message).cob_id for message in ("Feedback", "Status", "Command")] == [0x180, 0x280, 0x200]
+
+
 def test_a_maker_s_drive_is_recognised_whatever_its_model() -> None:
     node = Node(5)
     node.vendor, node.product = 0xFB, 0x65510000
