@@ -529,18 +529,19 @@ class _DriveWriter(_ProfileWriter):
         """Return the increments per revolution of the joint, by who knows them best."""
         units = read_drive_units(self._numbers_with_gear(), gear)
         found, text = units.increments_per_joint_rev, units.increments_text
-        is_factory = any(
-            self.is_factory(*place) for place in ((0x608F, 1), (0x6092, 1)) if self.number(*place) is not None
-        )
+        places = [place for place in ((0x608F, 1), (0x6092, 1)) if self.number(*place) is not None]
+        is_factory = any(self.is_factory(*place) for place in places)
+        is_read = any(place in self.ratings.numbers for place in places)
         lines: list[str] = []
         if "increments_per_joint_rev" in self.answers:
             increments = self.answers["increments_per_joint_rev"]
         elif (fact := self.fact("increments_per_joint_rev")) is not None:
             increments = fact
-        elif found is not None and units.has_increments:
+        elif found is not None and (found >= CREDIBLE_INCREMENTS or (is_read and units.has_increments)):
             increments, lines = found, [f"# By {text}."]
             if is_factory or found < CREDIBLE_INCREMENTS:
-                lines = [self.guess("increments_per_joint_rev", found, f"{found:.10g}: {text} is a factory value")]
+                why = f"{text} is a factory value" if is_factory else f"{text} is coarse for a joint"
+                lines = [self.guess("increments_per_joint_rev", found, f"{found:.10g}: {why}")]
         else:
             increments = float(_GUESSED_INCREMENTS)
             if self.facts is not None:

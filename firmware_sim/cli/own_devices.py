@@ -171,6 +171,13 @@ def _default(device: PlacedDevice, index: int, sub: int) -> int:
     return 0 if variable is None or variable.default is None else variable.default
 
 
+def _can_be_set(device: PlacedDevice, index: int, sub: int) -> bool:
+    if not device.has(index, sub):
+        return False
+    is_guess = "scale.increments_per_joint_rev" in device.settings.assumed
+    return is_guess or device.variable(ObjectName(index, sub)).is_writable
+
+
 def describe_devices(codec: Codec, devices: list[PlacedDevice], settings: Settings) -> EmulatedContract:
     """Describe the devices by their own EDS."""
     described = tuple(_describe(device, settings) for device in devices)
@@ -214,7 +221,10 @@ def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
         fallbacks[pdo.communication_index, 1] = device.can_id(pdo)
         fallbacks[pdo.communication_index, 2] = pdo.transmission
     if kind == "drive":
-        fallbacks |= _counts_of_position(device)
+        counts = _counts_of_position(device)
+        fallbacks |= counts
+        # What can be written has been set up for this arm, whatever the factory said; a guess is played as it is.
+        defaults |= {place: value for place, value in counts.items() if _can_be_set(device, *place)}
         fallbacks[0x6502, 0] = _CYCLIC_SYNCHRONOUS_TORQUE
     else:
         fallbacks |= {(0x6131, sub): _NEWTON_METRE for sub in range(1, 255)}

@@ -70,9 +70,17 @@ def test_increments_that_the_factory_sets_are_a_guess(eds: Path, access: str) ->
     assert "increments_per_joint_rev" in guessed(drafted)
 
 
-def test_one_increment_per_revolution_is_nobody_s(eds: Path) -> None:
-    drafted = draft(eds, EdsVariant().with_value(1, "608Fsub1", "6091sub1"))
+@pytest.mark.parametrize("increments", [1, 2000])
+def test_fewer_increments_than_a_joint_has_are_nobody_s(eds: Path, increments: int) -> None:
+    drafted = draft(eds, EdsVariant().with_value(increments, "608Fsub1").with_value(1, "6091sub1"))
     assert drafted.settings.scale.increments_per_joint_rev > 1e5
+    assert "increments_per_joint_rev" in guessed(drafted)
+
+
+def test_the_coarse_increments_of_a_device_that_was_read_are_kept_as_a_guess(eds: Path) -> None:
+    told = {(0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
+    drafted = draft_profile(EdsVariant().write(eds), DeviceRatings(numbers=told), answers={"gear_ratio": 1.0})
+    assert drafted.settings.scale.increments_per_joint_rev == 2000
     assert "increments_per_joint_rev" in guessed(drafted)
 
 
