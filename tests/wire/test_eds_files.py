@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from eds_utils.eds_validate import eds_validate
+from eds_utils.core.file_io.read_eds import read_eds
 
 from adacd_hil.wire.codec import contract_folder
 
@@ -16,6 +16,13 @@ MANDATORY = {0x1000, 0x1001, 0x1018}
 BITS = {0x1: 1, 0x2: 8, 0x3: 16, 0x4: 32, 0x5: 8, 0x6: 16, 0x7: 32, 0x15: 64, 0x1B: 64}  # by DataType
 SIGNED = {0x2, 0x3, 0x4, 0x15}
 ACCESS = {"ro", "wo", "rw", "rwr", "rww", "const"}
+SERIES = {"maxon_epos4", "zeroerr_erob"}
+"""Files of all models of a maker's series."""
+OPEN_IN_A_SERIES = {
+    "ProductNumber was missing from [DeviceInfo]",
+    "RevisionNumber was missing from [DeviceInfo]",
+    "Section [ManufacturerObjects] was missing",  # said of an empty one, too
+}
 DRIVES = [path for path in FILES if "drive" in path.stem]
 
 
@@ -47,9 +54,10 @@ def test_there_are_files() -> None:
 
 
 @EVERY_FILE
-def test_eds_validate_is_content(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    eds_validate([str(path)])  # exits when it isn't
-    assert capsys.readouterr().err == ""
+def test_eds_validate_has_no_complaint(path: Path) -> None:
+    _, complaints = read_eds(str(path))
+    missing = {line.partition(": ")[2] for line in complaints}
+    assert missing == (OPEN_IN_A_SERIES if path.stem in SERIES else set())
 
 
 @EVERY_FILE
@@ -58,7 +66,7 @@ def test_the_three_lists_name_every_object_once_and_nothing_else(path: Path) -> 
     listed: dict[int, str] = {}
     for name in LISTS:
         count = int(parser[name]["SupportedObjects"])
-        assert count > 0
+        assert count > 0 or (name == "ManufacturerObjects" and path.stem in SERIES)
         assert set(parser[name]) == {"SupportedObjects", *map(str, range(1, count + 1))}
         for place in range(1, count + 1):
             index = int(parser[name][str(place)], 16)
