@@ -227,6 +227,8 @@ _UPRIGHT_DEG, _LEAST_UPRIGHT_DEG = (60.0, 60.0), 45.0
 """Where gravity acts: amplitude, and that of joint 1 below which its offset is hardly seen beside gravity."""
 _PEAK_DEG_S = (100.0, 120.0)
 """Peak speed of the certified scheme's excitation at those amplitudes and that period, and of a withdrawal."""
+_FULL_ACCELERATION = 1.02
+"""Its acceleration there is a withdrawal's limit; two percent are left for values that are rounded."""
 _TRAVEL_SHARE, _SPEED_SHARE = 0.8, 0.8
 """Part of the position and velocity limit that the motion has."""
 _HEAVY = 2.0
@@ -442,7 +444,7 @@ def _scaled(by_kind: Sequence[float], scale: float) -> list[float]:
 
 
 def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) -> float:
-    """Return how much slower than on arm P the motion must be for speed and torque to suffice; 1 or more.
+    """Return how much slower than on arm P the motion must be for speed, acceleration and torque to suffice; 1 or more.
 
     Raises ConfigError where a joint has no torque.
     """
@@ -453,6 +455,7 @@ def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) 
             raise ConfigError(f"`arm.torque_limit_Nm[{i}]` = 0 Nm: joint {i + 1} can't move without torque")
         share = amplitude[i] / _AMPLITUDE_DEG[i]
         slower = max(slower, share * _PEAK_DEG_S[i] / (_SPEED_SHARE * speed[i]))
+        slower = max(slower, math.sqrt(_FULL_ACCELERATION * share)) if share > 1.0 else slower
         left_Nm = limit_Nm[i] - gravity[i]
         if left_Nm < _LEAST_TORQUE_SHARE * limit_Nm[i]:
             warnings.append(
