@@ -110,6 +110,11 @@ def demo(
 @on_bus
 @click.option("--tare", type=GivenPath(dir_okay=False), help="Offsets that `adacd-hil tare` wrote.")
 @click.option(
+    "--without-anchor",
+    is_flag=True,
+    help="Don't ask: nothing bounds the torque offsets, so who leans on the arm before it moves is learnt.",
+)
+@click.option(
     "--history",
     type=WrittenPath(dir_okay=False),
     help="What the arm's runs have certified; the last is compared with, and this run's are added.",
@@ -127,6 +132,7 @@ def demo(
 def run(
     connection: "Connection",
     tare: Path | None,
+    without_anchor: bool,
     history: Path | None,
     scenario: str | None,
     out: Path | None,
@@ -143,7 +149,7 @@ def run(
     """
     from adacd_hil.cli.commands.run_command import as_text, next_of_run, run_on_bus
 
-    result, code = run_on_bus(connection, clock, out, tare, live, history, scenario)
+    result, code = run_on_bus(connection, clock, out, tare, live, history, scenario, without_anchor)
     if as_json:
         print(json.dumps(result, indent=2))
     else:

@@ -190,6 +190,11 @@ class Cycle:
             self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0, self._data.shares()
         )
 
+    @property
+    def reached(self) -> tuple[int, SchemeState]:
+        """How many cycles there have been, and the state they have come to."""
+        return self._arm.cycle + 1, self._state
+
     def _look_after_devices(self, arm: ArmState, output: SchemeOutput) -> None:
         """Stop drives that a command has not stopped; else read again what was written into the devices."""
         if self._faulted_cycle is not None:

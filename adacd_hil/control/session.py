@@ -29,7 +29,7 @@ from adacd_hil.log.recording.recorder import LogSummary, Recorder
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
 from adacd_hil.log.viewer.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.viewer.scene import LAYOUT_NAME, viewer_layout
-from adacd_hil.records import Event, FaultReason
+from adacd_hil.records import Event, FaultReason, SchemeState
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
 from adacd_hil.scheme.detect.live_detectors import describe_code
 from adacd_hil.scheme.identify.certificate import Certificate
@@ -43,9 +43,10 @@ from adacd_hil.wire.codec import Codec
 class SessionSummary:
     """How a session ended. `error`: empty, or the one line that ended the run early.
 
-    `has_started`: whether the devices had been put into operation, so that the arm may have moved. `recoveries`: how
-    often a fault was acknowledged and the run begun again. `elapsed_s`: by the host's clock, from the first frame to
-    the last, without compiling. `certificates`: those that were not taken back; `identities`: of the devices.
+    `has_started`: whether the devices had been put into operation, so that the arm may have moved. `reached`: cycles
+    and state of the last attempt, however it ended. `recoveries`: how often a fault was acknowledged and the run begun
+    again. `elapsed_s`: by the host's clock, from the first frame to the last, without compiling. `certificates`: those
+    that were not taken back; `identities`: of the devices.
     """
 
     result: RunResult | None
@@ -53,6 +54,7 @@ class SessionSummary:
     grant: RealtimeGrant
     error: str
     has_started: bool
+    reached: tuple[int, SchemeState]
     recoveries: int
     elapsed_s: float
     certificates: tuple[Certificate, ...]
@@ -178,6 +180,7 @@ class Session:
             grant,
             ending.error,
             self._has_started,
+            attempt.cycle.reached,
             recoveries,
             elapsed_s,
             tuple(certificates),

@@ -58,8 +58,8 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
 
     A configuration of an arm of one's own is played as that arm, unless a profile is given. Else the profile is the
     given one, else that of the scenario's file, else the configuration's. A configuration without a
-    script gets the demo's user: who only watches can't acknowledge. One that doesn't say what the motors hold gets it
-    from the emulated arm, as from a data sheet.
+    script gets the demo's user: who only watches can't acknowledge. The emulated arm's own configuration gets from it
+    what its motors hold, as from a data sheet; an arm of one's own runs by its file alone.
     """
     contract: EmulatedContract | None = None
     assumed: list[str] = []
@@ -80,7 +80,7 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
             acknowledge_faults=scenario.acknowledge_faults,
         )
     arm = settings.arm
-    if arm.holding_torque_Nm is None:
+    if contract is None and arm.holding_torque_Nm is None:
         arm = dataclasses.replace(arm, holding_torque_Nm=scenario.mechanics.holding_torque_Nm)
     return Cast(dataclasses.replace(settings, arm=arm, operator=operator), scenario, contract, tuple(assumed))
 

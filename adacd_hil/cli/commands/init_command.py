@@ -120,5 +120,7 @@ def as_text(summary: dict[str, Any], bus: dict[str, Any] | None) -> str:
         "next:",
         f"  adacd-hil demo --config {summary['file']}   # rehearse",
         f"  adacd-hil doctor {where} --config {summary['file']}",
+        f"  adacd-hil tare {where} --config {summary['file']}   # the sensors' zero, which tells a lean from an offset",
+        f"  adacd-hil run {where} --config {summary['file']} --tare tare.toml",
     ]
     return "\n".join(map(in_line, lines))

@@ -31,12 +31,13 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.progress_lines import Progress
 from adacd_hil.records import FaultReason
+from adacd_hil.scheme.identify.anchor import unanchored_joints
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line
 from adacd_hil.wire.budget import check_budget
 from adacd_hil.wire.bus import Bus
-from adacd_hil.wire.can_interface import CanInterface
+from adacd_hil.wire.can_interface import CanInterface, is_virtual
 from adacd_hil.wire.codec import Codec
 
 
@@ -77,10 +78,12 @@ def run_on_bus(
     live: LiveAddress | None = None,
     history_path: Path | None = None,
     scenario: str | None = None,
+    without_anchor: bool = False,
 ) -> tuple[dict[str, Any], ExitCode]:
     """Run the scheme on a bus, with the offsets of a tare and the arm's history when they are given.
 
-    `out` None: a new folder by date. scenario: whose user acts, for an emulated arm.
+    `out` None: a new folder by date. scenario: whose user acts, for an emulated arm. without_anchor: the user knows
+    that nothing bounds the torque offsets.
 
     Raises ConfigError, CodecError, BusMissingError, LogError, CommandError, OSError.
     """
@@ -108,6 +111,8 @@ def run_on_bus(
         bus = connection.open(clock, codec, settings)
         stack.callback(bus.close)
         drop_old_frames(bus, interface)
+        if settings.scheme == "certified" and not (without_anchor or is_virtual(interface, channel)):
+            ask_without_anchor(unanchored_joints(settings))
         operator: Operator = ScriptedOperator(settings.operator)
         if sys.stdin is not None and sys.stdin.isatty():
             operator = ConsoleOperator(ScriptedOperator(settings.operator))
@@ -158,6 +163,32 @@ def ask_first_run(history: UsedHistory) -> None:
         raise CommandError("not started: somebody touches the arm")
 
 
+def ask_without_anchor(joints: list[int]) -> None:
+    """Have the user say on the terminal that an arm may learn its torque offsets without an anchor.
+
+    Raises CommandError where they don't, and where there is no terminal.
+    """
+    if not joints:
+        return
+    named = " and ".join(f"joint {i + 1}" for i in joints)
+    unknown = (
+        f"nothing bounds the torque offset of {named}: neither a tare nor a history is given, and "
+        "`arm.holding_torque_Nm` doesn't say that the motor holds little"
+    )
+    remedy = "`adacd-hil tare` first, then `run --tare tare.toml`"
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise CommandError(f"{unknown}; {remedy}, or `run --without-anchor`", ExitCode.USAGE)
+    print(
+        in_line(
+            f"{unknown}. Who leans on the arm from before its first motion is learnt as the sensors' zero, and no run "
+            f"can tell. Better: {remedy}."
+        ),
+        file=sys.stderr,
+    )
+    if not click.confirm("Run without?", err=True):
+        raise CommandError(f"not started: {remedy}")
+
+
 def summarise(summary: SessionSummary) -> dict[str, Any]:
     """Describe how a session ended, for people and machines."""
     described: dict[str, Any] = {"log": str(summary.log.path), "scheduler": summary.grant.scheduler}
@@ -173,6 +204,9 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
             "recoveries": summary.recoveries,
             "data": dataclasses.asdict(summary.result.data),
         }
+    elif summary.has_started:
+        cycles, state = summary.reached
+        described["broke_off"] = f"in {state.name}, after {cycles} cycles"
     log = summary.log
     return described | {
         "certificates": [certificate.text for certificate in summary.certificates],
@@ -187,7 +221,7 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
 
 def next_of_run(result: dict[str, Any]) -> tuple[str, ...]:
     """Name what may be typed after a run; after one that didn't begin the error has said it."""
-    if "cycles" not in result:
+    if not {"cycles", "broke_off"} & set(result):
         return ()
     return (
         f"adacd-hil report {quoted(Path(result['log']))}",
@@ -197,6 +231,10 @@ def next_of_run(result: dict[str, Any]) -> tuple[str, ...]:
 
 def _verdict(result: dict[str, Any]) -> str:
     """Say in one line how a run ended."""
+    if "broke_off" in result:
+        certified = len(result["certificates"])
+        known = f" and {certified} certificate{'s' * (certified > 1)}" if certified else ""
+        return f"The run broke off {result['broke_off']}{known}. The drives are disabled as far as the bus carried it."
     if "cycles" not in result:
         return "The run did not start."
     if result["fault"] != FaultReason.NONE.name:
@@ -205,7 +243,7 @@ def _verdict(result: dict[str, Any]) -> str:
     return f"The run ended without a fault, in {result['state']}, after {result['cycles']} cycles{lost}."
 
 
-_FOR_MACHINES = ("data", "certificates")
+_FOR_MACHINES = ("data", "certificates", "broke_off")
 """Of what `summarise` says: told otherwise, or while it runs."""
 
 

@@ -70,6 +70,18 @@ def constants_of(settings: Settings) -> dict[str, Vector]:
     }
 
 
+def unanchored_joints(settings: Settings) -> list[int]:
+    """Return the joints whose torque offset nothing outside a run can bound: no tare, no last certificate, no motor.
+
+    A motor that may hold more than `beta_Nm` without power tells too little.
+    """
+    arm = settings.arm
+    if arm.torque_offset_std_Nm is not None or settings.history.is_known:
+        return []
+    holding = _or_unknown(arm.holding_torque_Nm)
+    return [i for i in range(JOINTS) if not holding[i] < settings.certified.beta_Nm]
+
+
 def _or_unknown(values: tuple[float, ...] | None) -> Vector:
     return np.full(JOINTS, np.inf) if values is None else np.array(values)
 

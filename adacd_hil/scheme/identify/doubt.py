@@ -61,7 +61,8 @@ AT_ONCE_S = 3.0
 AT_REST_S, MOST_STRAIN = 0.2, 4.0
 """A contact so soon after going on is met at rest, and raises the thresholds of its joints, to this many times."""
 MANY, HELD_S = 10, 0.3
-"""So many contacts in a row, each so soon after going on, are no person's. No more are remembered."""
+"""So many contacts in a row, each so soon after going on, are no person's; of one the run says that it may be a load.
+No more are remembered."""
 WEAK = 1.5
 """The residual of a weak contact comes to less than so many times its threshold."""
 RARELY_PER_H, OFTEN_PER_H, ODDS = 1.0, 30.0, 1000.0
@@ -243,7 +244,7 @@ class Doubt:
 
     def describe_again(self) -> str | None:
         """Say what the last contact may be, if it came at once after the arm had gone on from another."""
-        if len(self._contacts) < 2 or self._contacts[-1].waited_s > AT_ONCE_S:
+        if len(self._contacts) < 2 or self._contacts[-1].waited_s > HELD_S:
             return None
         waited_s = self._contacts[-1].waited_s
         return (

@@ -1,0 +1,89 @@
+"""What `run` asks before the arm moves, and what it says of a run that has broken off."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import pytest
+from bus_lab import SHORT_RUN, Lab, complaints
+from click.testing import CliRunner
+
+from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.commands.run_command import as_text, ask_without_anchor, next_of_run, summarise
+from adacd_hil.scheme.identify.anchor import unanchored_joints
+from adacd_hil.settings.configuration import load_settings
+
+SETTINGS = load_settings("certified")
+
+
+LAST = replace(
+    SETTINGS.history,
+    date_utc="2026-11-22T10:00:00Z",
+    friction_Nm=(0.1,) * 6,
+    friction_std_Nm=(0.01,) * 6,
+    inertia_kgm2=(0.2, 0.03, 0.02),
+    inertia_std_kgm2=(0.01,) * 3,
+    offset_Nm=(0.0, 0.0),
+    offset_std_Nm=(0.01, 0.01),
+)
+
+
+def with_arm(**arm):
+    return replace(SETTINGS, arm=replace(SETTINGS.arm, **arm))
+
+
+@pytest.mark.parametrize(
+    ("settings", "joints"),
+    [
+        (with_arm(holding_torque_Nm=None), [0, 1]),
+        (with_arm(holding_torque_Nm=(0.0, 0.0)), []),
+        (with_arm(holding_torque_Nm=(8.0, 0.05)), [0]),
+        (with_arm(holding_torque_Nm=None, torque_offset_std_Nm=(0.005, 0.005)), []),
+        (replace(with_arm(holding_torque_Nm=None), history=LAST), []),
+    ],
+    ids=["nothing is known", "free motors", "one brake", "a tare", "a last certificate"],
+)
+def test_a_joint_has_an_anchor_by_a_tare_a_last_certificate_or_a_motor_that_holds_little(settings, joints) -> None:
+    assert unanchored_joints(settings) == joints
+
+
+@pytest.mark.parametrize(("answer", "is_started"), [("y\n", True), ("n\n", False), ("\n", False)])
+def test_on_a_terminal_the_user_says_that_an_arm_may_run_without_an_anchor(
+    monkeypatch: pytest.MonkeyPatch, answer: str, is_started: bool
+) -> None:
+    @click.command()
+    def command() -> None:
+        monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+        ask_without_anchor([1])
+        print("started")
+
+    result = CliRunner().invoke(command, input=answer)
+    assert ("started" in result.stdout) is is_started
+    assert result.exit_code == (0 if is_started else 1)
+    assert "nothing bounds the torque offset of joint 2: " in result.stderr
+    assert "run --tare tare.toml" in result.stderr
+
+
+def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = Lab(tmp_path, monkeypatch)
+    lab.settings_file.write_text('scheme = "certified"\n' + SHORT_RUN)
+    monkeypatch.setattr("adacd_hil.cli.commands.run_command.is_virtual", lambda interface, channel: False)
+    refused = lab.run()
+    assert refused.exit_code == 2
+    (line,) = complaints(refused)
+    assert line.startswith("adacd-hil: nothing bounds the torque offset of joint 1 and joint 2: ")
+    assert not (tmp_path / "run.mcap").exists()
+    assert lab.run("--without-anchor").exit_code == 0
+
+
+@pytest.mark.slow
+def test_a_run_that_loses_its_devices_says_how_far_it_had_come(tmp_path: Path) -> None:
+    summary, _ = run_embedded(resolve("certified", "power-loss", None, None), "lockstep", tmp_path)
+    assert summary.result is None
+    told = summarise(summary)
+    cycles, state = summary.reached
+    assert cycles > 1000
+    assert f"The run broke off in {state.name}, after {cycles} cycles" in as_text(told)
+    assert next_of_run(told)
