@@ -86,6 +86,22 @@ def test_a_drive_from_its_eds_is_rehearsed(tmp_path: Path, kind: str) -> None:
     assert rehearse(tmp_path)[0] == ExitCode.OK
 
 
+@pytest.mark.parametrize(
+    ("name", "head", "encoding"),
+    [
+        ("drive.eds", "; Gr\u00f6\u00dfe in \u00b5Nm\r\n", "latin-1"),
+        ("drive.eds", "", "utf-8-sig"),
+        ("DRIVE.EDS", "", "ascii"),
+    ],
+)
+def test_an_eds_of_any_encoding_is_rehearsed(tmp_path: Path, name: str, head: str, encoding: str) -> None:
+    text = EdsVariant().write(tmp_path / "plain.eds").read_text()
+    (tmp_path / name).write_text(head + text, encoding=encoding)
+    written = init(tmp_path, "--eds", str(tmp_path / name))
+    assert written.exit_code == 0, written.stderr
+    assert rehearse(tmp_path)[0] == ExitCode.OK
+
+
 def test_a_drive_whose_eds_names_no_profile_is_told_to_be_one(tmp_path: Path) -> None:
     eds = str(EdsVariant().with_value("", "1000").write(tmp_path / "drive.eds"))
     refused = init(tmp_path, "--eds", eds)
@@ -144,10 +160,10 @@ def geared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def play(geared: Path, folder: Path, gear: tuple[float, float], lasts_s: float) -> list[str]:
+def play(geared: Path, folder: Path, gear: tuple[float, float], lasts_s: float, scenario: str = "") -> list[str]:
     """Play an arm whose gears are other than told by factors; return what was said of it, events of the log."""
     (folder / "truth.toml").write_text(f"[factor]\ngear = {list(gear)}\n")
-    (folder / "scenario.toml").write_text(f"lasts_s = {lasts_s}\n")
+    (folder / "scenario.toml").write_text(f"lasts_s = {lasts_s}\n{scenario}")
     files = str(folder / "scenario.toml"), None, None, str(folder / "truth.toml")
     run_embedded(resolve(str(geared / "my-arm.toml"), *files), "lockstep", folder / "run")
     return [event.message for event in load(folder / "run").events]
@@ -186,6 +202,13 @@ def test_a_gear_that_is_told_wrong_is_named(
     (number,) = re.findall(rf"joint {joint}: its torque sensor measures \+?([\d.]+) ", named[0])
     assert least <= float(number) <= most
     assert not any("CERTIFY -> MONITOR" in line for line in said)
+
+
+def test_a_wrong_gear_of_an_arm_that_is_not_at_zero_is_named_before_it_moves(geared: Path, tmp_path: Path) -> None:
+    said = play(geared, tmp_path, (26.0, 1.0), 6.0, "start_deg = [-30.0, -60.0]\n")
+    (line,) = [line for line in said if "COMMISSION -> FAULT" in line]
+    assert "joint 1: position -780" in line
+    assert "scale.gear_ratio" in line
 
 
 def test_a_gear_that_contradicts_the_drive_is_refused_before_anything_moves(geared: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ there is one, answers a read; the dictionary checks a write before it stores it.
 
 import contextlib
 import copy
+import io
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -206,8 +207,10 @@ def _compare_lengths(length: int, expected: int) -> None:
 
 @cache
 def _read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
-    """Read an EDS; nodes never change what was read."""
-    return canopen.import_od(str(path), node_id)
+    """Read an EDS or a DCF of any encoding and ending; nodes never change what was read."""
+    stream = io.StringIO(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff"))
+    stream.name = "object dictionary.eds"
+    return canopen.import_od(stream, node_id)
 
 
 class MadeUp(NamedTuple):
