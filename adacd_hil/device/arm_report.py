@@ -23,6 +23,7 @@ WINDOW_S = 1.0
 MOST_IN_A_ROW = 2
 SHORTEST_SHARE = 0.2
 """Part of a window that is judged, too, when the attempt ends in it."""
+_REVOLUTION_DEG = 360.0
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,13 @@ class ArmReport:
             ):
                 value_deg = math.degrees(sign * value)
                 if abs(value_deg) > bound:
-                    lines.append(f"joint {joint + 1}: {quantity} {value_deg:.2f} {unit}, ±{bound:g} {unit} allowed")
+                    text = f"joint {joint + 1}: {quantity} {value_deg:.2f} {unit}, ±{bound:g} {unit} allowed"
+                    if quantity == "position" and abs(value_deg) > _REVOLUTION_DEG:
+                        text += (
+                            "; more than a revolution: check scale.increments_per_joint_rev, scale.gear_ratio and the "
+                            f"encoder's zero of devices.drive[{joint}]"
+                        )
+                    lines.append(text)
         return lines
 
 
