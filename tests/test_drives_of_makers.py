@@ -220,3 +220,11 @@ def test_a_gear_that_contradicts_the_drive_is_refused_before_anything_moves(gear
     summary, _ = run_embedded(cast, "lockstep", tmp_path / "run")
     assert "0x6076 = 380000 µNm, 316667 µNm expected of a motor behind a gear of 36" in summary.error
     assert "scale.gear_ratio" in summary.error
+
+
+def test_exchanged_drives_behind_different_gears_are_called_so(tmp_path: Path) -> None:
+    assert init(tmp_path, "--drive", "maxon-epos4", "maxon-epos4", "--gear", "50", "30").exit_code == 0
+    cast = resolve(str(tmp_path / "my-arm.toml"), "idle", None, None, "swapped-drives")
+    summary, _ = run_embedded(cast, "lockstep", tmp_path / "run")
+    assert "0x6076 = 200000 µNm, 240000 µNm expected of a motor behind a gear of 50" in summary.error
+    assert "it is that of joint 2: the drives are exchanged" in summary.error

@@ -10,7 +10,7 @@ valid last. PDOs that the contract doesn't know are switched off: a stock device
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, NoReturn
 
 from adacd_hil.device.arm_watch import RateLimitedEvents, Recurrence
@@ -24,7 +24,7 @@ from adacd_hil.device.canopen_bus import (
 )
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
 from adacd_hil.device.drive_units import name_velocity_unit, read_drive_units
-from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, ScaleSettings
+from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, ScaleSettings, place_devices
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
@@ -143,7 +143,7 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> list[str]:
 
     Raises DeviceError.
     """
-    arm, joint, profile = settings.arm, slave.device.joint, slave.device.settings
+    joint, profile = slave.device.joint, slave.device.settings
     if slave.has(0x6502):
         modes = slave.read(0x6502)
         if not modes & _CST_SUPPORTED:
@@ -152,7 +152,7 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> list[str]:
                 "this drive can't be commanded by torque; a newer firmware may",
             )
     if slave.has(0x6076):
-        _check_rated_torque(slave, arm.rated_torque_Nm)
+        _check_rated_torque(slave, settings)
     remarks = _check_units(slave, codec)
     if slave.device.can("option_codes"):
         quick_stop, fault_reaction = option_codes(settings, profile)
@@ -171,12 +171,14 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> list[str]:
     return remarks
 
 
-def _check_rated_torque(slave: Slave, rated_Nm: Sequence[float]) -> None:
-    """Compare the motor's rated torque, behind its gear, with that of the joint, Nm (n,)."""
+def _check_rated_torque(slave: Slave, settings: Settings) -> None:
+    """Compare the motor's rated torque, behind its gear, with that of the joint. Raises DeviceError."""
     found = slave.read(0x6076)
     slave.known[0x6076, 0] = found
     scale, joint = slave.device.settings.scale, slave.device.joint
-    expected = [one_Nm / scale.joint_torque_Nm for one_Nm in rated_Nm]
+    rated_Nm = settings.arm.rated_torque_Nm
+    drives = [device for device in place_devices(settings) if device.settings.kind == "drive"]
+    expected = [rated_Nm[drive.joint] / drive.settings.scale.joint_torque_Nm for drive in drives]
     alike = [other for other, counts in enumerate(expected) if abs(found - counts) <= _ROUNDED_SHARE * counts]
     if joint in alike:
         return
@@ -191,7 +193,7 @@ def _check_rated_torque(slave: Slave, rated_Nm: Sequence[float]) -> None:
     if scale.joint_torque_Nm != scale.rated_torque_count_Nm:
         text += (
             f" of a motor behind a gear of {scale.gear_ratio:g}: {found * scale.joint_torque_Nm:.4g} Nm at the joint, "
-            f"{rated_Nm[joint]:.4g} Nm told"
+            f"`arm.rated_torque_Nm[{joint}]` = {rated_Nm[joint]:.4g} Nm"
         )
     if later:
         slave.fail(
