@@ -34,6 +34,8 @@ from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 DRIVE, SENSOR = "drive", "sensor"
 KINDS = {402: DRIVE, 404: SENSOR}
 _DEG_S_PER_RPM = 6.0
+_LEAST_LIMIT_DEG, _MOST_LIMIT_DEG, _MOST_SPEED_DEG_S = 1.0, 360.0, 720.0
+"""Limits of a joint; others are a drive's factory values. A wrist of a UR3e turns by 360 deg/s."""
 _Place = tuple[int, int]
 
 
@@ -55,18 +57,19 @@ class DeviceRatings(NamedTuple):
         return counts * scale.joint_torque_Nm if counts else None
 
     def position_limit_deg(self, scale: ScaleSettings) -> float | None:
-        """Return 0x607D; None where it is no limit, as of a drive that has the whole range of its counter."""
+        """Return 0x607D; None where it is no joint's limit, as the whole range of a counter."""
         low, high = self.numbers.get((0x607D, 1)), self.numbers.get((0x607D, 2))
         if low is None or high is None or min(-low, high) <= 0 or not scale.increments_per_joint_rev:
             return None
         degrees = 360.0 * min(-low, high) / scale.increments_per_joint_rev
-        return degrees if degrees <= 360.0 else None
+        return degrees if _LEAST_LIMIT_DEG <= degrees <= _MOST_LIMIT_DEG else None
 
     def velocity_limit_deg_s(self, scale: ScaleSettings) -> float | None:
-        """Return 0x6080, rpm of the motor, at the joint; None where it doesn't say."""
+        """Return 0x6080, rpm of the motor, at the joint; None where it is no joint's limit, as 50000 of a factory."""
         rpm = self.numbers.get((0x6080, 0))
         gear = self.numbers.get((0x6091, 1), 0) / (self.numbers.get((0x6091, 2)) or 1) or scale.gear_ratio
-        return rpm * _DEG_S_PER_RPM / gear if rpm else None
+        degrees_s = (rpm or 0) * _DEG_S_PER_RPM / gear
+        return degrees_s if _LEAST_LIMIT_DEG <= degrees_s <= _MOST_SPEED_DEG_S else None
 
 
 class Guess(NamedTuple):

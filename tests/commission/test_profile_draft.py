@@ -8,7 +8,7 @@ from eds_variants import EdsVariant
 
 from adacd_hil.commission.device_recognition import fitting_profiles
 from adacd_hil.commission.profile_draft import DeviceRatings, ProfileDraft, draft_profile, kind_of
-from adacd_hil.device.profile import PdoSettings
+from adacd_hil.device.profile import PdoSettings, ScaleSettings
 from adacd_hil.device.survey import Node
 from adacd_hil.settings.schema import ConfigError
 
@@ -177,3 +177,15 @@ def test_a_maker_s_drive_is_recognised_whatever_its_model() -> None:
     assert fitting_profiles(node, "drive") == ("maxon-epos4",)
     node.vendor = 0xB0B  # whose stock drive has another product
     assert fitting_profiles(node, "drive") == ()
+
+
+@pytest.mark.parametrize(("rpm", "degrees_s"), [(50_000, None), (3000, 360.0), (6, None), (0, None)])
+def test_a_speed_limit_that_no_joint_has_is_the_factory_s(rpm: int, degrees_s: float | None) -> None:
+    ratings = DeviceRatings(numbers={(0x6080, 0): rpm})
+    assert ratings.velocity_limit_deg_s(ScaleSettings(gear_ratio=50.0)) == degrees_s
+
+
+@pytest.mark.parametrize(("counts", "degrees"), [(1, None), (25_600, 90.0), (0x7FFFFFFF, None)])
+def test_a_position_limit_that_no_joint_has_is_the_factory_s(counts: int, degrees: float | None) -> None:
+    ratings = DeviceRatings(numbers={(0x607D, 1): -counts, (0x607D, 2): counts})
+    assert ratings.position_limit_deg(ScaleSettings(increments_per_joint_rev=102_400.0)) == degrees
