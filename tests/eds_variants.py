@@ -1,4 +1,4 @@
-"""EDS files of drives that nobody sells: the stock drive's, with what makers' have otherwise."""
+"""EDS files for tests: the stock drive's, changed as the makers' files differ from it."""
 
 import configparser
 from pathlib import Path

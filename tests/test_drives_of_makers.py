@@ -30,7 +30,7 @@ def every(sub: int, *records: str) -> list[str]:
 
 
 def fixed_pdos() -> EdsVariant:
-    """A drive that brings and takes what it does, mode included."""
+    """A drive with a read-only mapping; its command frame has the mode."""
     eds = EdsVariant()
     mapped = {"1600": FIXED_COMMAND, "1A00": (0x60640020, 0x606C0020), "1A01": (0x60410010, 0x60770010)}
     for record, entries in mapped.items():
@@ -161,7 +161,7 @@ def geared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def play(geared: Path, folder: Path, gear: tuple[float, float], lasts_s: float, scenario: str = "") -> list[str]:
-    """Play an arm whose gears are other than told by factors; return what was said of it, events of the log."""
+    """Play an arm whose gears differ by factors from the profile's; return the log's events."""
     (folder / "truth.toml").write_text(f"[factor]\ngear = {list(gear)}\n")
     (folder / "scenario.toml").write_text(f"lasts_s = {lasts_s}\n{scenario}")
     files = str(folder / "scenario.toml"), None, None, str(folder / "truth.toml")

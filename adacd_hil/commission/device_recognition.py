@@ -39,15 +39,15 @@ class RecognisedDevice(NamedTuple):
         return f"{node.name or 'a device without a name'}, {', '.join(numbers)}, serial {node.serial or '?'}"
 
 
-def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], told: Mapping[int, str]) -> list[RecognisedDevice]:
+def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int, str]) -> list[RecognisedDevice]:
     """Tell the drives and sensors among the nodes of a survey, and read their ratings. Raises BusError.
 
-    `told`: drive or sensor by node id, of nodes whose 0x1000 names neither.
+    `kinds`: drive or sensor by node id, for nodes whose 0x1000 names neither.
     """
     canopen = CanopenBus(Tap(bus, clock))
     found = []
     for node in nodes:
-        kind = KINDS.get((node.device_type or 0) & 0xFFFF) or told.get(node.node_id)
+        kind = KINDS.get((node.device_type or 0) & 0xFFFF) or kinds.get(node.node_id)
         if kind is not None and node.answers:
             remote = canopen.add_node(node.node_id, None, pause_s=BETWEEN_READS_S)
             profiles = fitting_profiles(node, kind)

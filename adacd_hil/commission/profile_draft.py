@@ -1,8 +1,8 @@
 """The draft of a device profile from an EDS: the frames that a cycle needs, as the device's mapping allows them.
 
-What an EDS doesn't say, as the worth of a count, is taken from the answers that are given, from the device's own
-objects where they were read, from what is known of its maker, and is a guess otherwise. A value that an EDS gives for
-an object that may be written is what the factory sets: a guess, too, where it is the arm that decides.
+A value that the EDS leaves open, such as the worth of a count, comes from the user's answers, else from the device's
+objects, else from a shipped profile of the same maker; else it is a guess. The EDS's value of a writable object is a
+factory setting: a guess, too, where the right value depends on the arm.
 
 Sources: CiA 301 (0x1000, 0x1018; clause 7.5.2, PDO parameters), CiA 306 (EDS: PDOMapping, AccessType), CiA 402-2,
 CiA 404.
@@ -40,19 +40,19 @@ _Place = tuple[int, int]
 
 
 class DeviceRatings(NamedTuple):
-    """What a device itself says. numbers: of its objects, by index and sub-index. torque_Nm: one count of a sensor."""
+    """Values read from a device. numbers: by index and sub-index. torque_Nm: one count of a sensor."""
 
     numbers: Mapping[_Place, int] = {}
     torque_Nm: float | None = None
 
     @property
     def torque_share(self) -> float | None:
-        """0x6072, the largest torque over the rated one; None where it doesn't say."""
+        """0x6072, the largest torque over the rated one; None if unknown."""
         permille = self.numbers.get((0x6072, 0))
         return permille * 1e-3 if permille else None
 
     def rated_torque_Nm(self, scale: ScaleSettings) -> float | None:
-        """Return 0x6076 at the joint; None where it doesn't say."""
+        """Return 0x6076 at the joint; None if unknown."""
         counts = self.numbers.get((0x6076, 0))
         return counts * scale.joint_torque_Nm if counts else None
 
@@ -73,7 +73,7 @@ class DeviceRatings(NamedTuple):
 
 
 class Guess(NamedTuple):
-    """A value of a draft that nobody vouches for. key: of the profile. text: of the value, and why it is one."""
+    """A guessed value of a draft. key: in the profile. text: the value, and why it is a guess."""
 
     key: str
     value: float
@@ -81,9 +81,9 @@ class Guess(NamedTuple):
 
 
 class ProfileDraft(NamedTuple):
-    """The text of a profile. remarks: what the device can't do, a line each.
+    """The text of a profile. remarks: limits of the device, a line each.
 
-    rated_torque_Nm: at the joint, by 0x6076; None: not said. is_rated_known: whether no guess is in it.
+    rated_torque_Nm: at the joint, by 0x6076; None if unknown. is_rated_known: it contains no guess.
     """
 
     kind: str
@@ -95,7 +95,7 @@ class ProfileDraft(NamedTuple):
 
     @property
     def guesses(self) -> tuple[str, ...]:
-        """What in it neither EDS nor device says, a line each."""
+        """The guesses as text, a line each."""
         return tuple(f"{guess.key.partition('.')[2]} = {guess.text}" for guess in self.guessed)
 
     @property
@@ -117,8 +117,8 @@ def identity_of(eds: Path) -> tuple[int | None, int | None]:
 
 
 def is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int | None]) -> bool:
-    """Whether an EDS of some vendor and product may be a node's: what it leaves open fits all."""
-    return all(told in (None, found) for told, found in zip(identity, node, strict=True))
+    """Whether an EDS of this vendor and product fits a node; a number that the EDS omits fits all."""
+    return all(expected in (None, found) for expected, found in zip(identity, node, strict=True))
 
 
 def kind_of(eds: Path) -> str:
@@ -135,8 +135,8 @@ def kind_of(eds: Path) -> str:
 def describe_kind(eds: Path) -> str:
     """Say which profile 0x1000 of an EDS names, where it is neither a drive's nor a sensor's. Raises ConfigError."""
     number = _profile_number(eds)
-    told = f"names CiA {number}" if number else "names no profile"
-    return f"0x1000 of {eds.name} {told}, neither a drive's (CiA 402) nor a sensor's (CiA 404)"
+    profile = f"names CiA {number}" if number else "names no profile"
+    return f"0x1000 of {eds.name} {profile}, neither a drive's (CiA 402) nor a sensor's (CiA 404)"
 
 
 def _profile_number(eds: Path) -> int:
@@ -174,9 +174,9 @@ def draft_profile(
 
 
 def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
-    """Return the shipped profile of a maker's devices; None where there is none.
+    """Return the shipped profile of the EDS's maker; None if there is none.
 
-    What it doesn't list as assumed holds for all of them.
+    Its values that are not `assumed` hold for all devices of this maker.
     """
     vendor, _ = identity_of(eds)
     for name in profile_names():
@@ -207,25 +207,25 @@ _MOST_RECORDS = 64
 """Records of PDO parameters that are looked at; CiA 301 has 512, devices have 4 to 8."""
 _GUESSED_INCREMENTS = 1 << 20
 _GUESSED_TORQUE_NM = 1e-6, 2e-3
-"""What a count may be worth, of more than 16 bits and of 16: ±2147 Nm and ±65 Nm in all."""
+"""Guessed worth of a count, for more than 16 bits and for 16: a range of ±2147 Nm and ±65 Nm."""
 _MOST_MOTOR_NM = 100.0
 """A motor of more in an arm of this size is one whose 0x6076 counts µNm."""
 _LEAST_JOINT_NM, _JOINT_NM = 3.0, 10.0
-"""A drive that rates less rates its motor; its gear is guessed to make an arm's joint of it."""
+"""A rated torque below the first is a motor's; the guessed gear brings it to the second."""
 _LIKELY_GEAR, _MOST_GEAR = 50.0, 160.0
 _RPM_UNITS = {prefix << 24 | 0x00B44700 for prefix in (0, *range(0xF7, 0x100))}
 """0x60A9: rpm, and decimal fractions of it."""
 _CST = 1 << 9  # of 0x6502
 TORQUE_KEYS = {"scale.gear_ratio", "scale.rated_torque_count_Nm"}
-"""What lies between 0x6076 and the torque at the joint, the efficiency apart, which is within a third of 1."""
+"""Factors between 0x6076 and the torque at the joint, without the efficiency, which is within a third of 1."""
 _MOST_OPTION = 8  # of 0x605A
 
 
 class _Record(NamedTuple):
-    """A PDO of a device. cob_id: without the node id. entries: what is mapped by default.
+    """A PDO of a device. cob_id: without the node id. entries: the default mapping.
 
-    room: how many objects may be mapped; 0: its mapping can't be written. transmission: the one that can't be changed,
-    None where it can. inhibit_100us, timer_ms: those that can't be.
+    room: how many objects may be mapped; 0: the mapping is read-only. transmission, inhibit_100us, timer_ms: read-only
+    values; None and 0 if they can be written.
     """
 
     number: int
@@ -272,14 +272,14 @@ class _ProfileWriter(ABC):
         return 0 if variable is None or variable.default is None else variable.default
 
     def number(self, index: int, sub: int) -> int | None:
-        """Return what the device says, else what the EDS does."""
+        """Return the device's value, else the EDS's default."""
         if (index, sub) in self.ratings.numbers:
             return self.ratings.numbers[index, sub]
         variable = self.find((index, sub))
         return None if variable is None else variable.default
 
     def is_factory(self, index: int, sub: int) -> bool:
-        """Whether the value of an object is the one with which the device leaves its factory."""
+        """Whether the known value of an object is a factory setting."""
         return (index, sub) not in self.ratings.numbers and self.can_write(index, sub)
 
     def refuse(self, reason: str) -> ConfigError:
@@ -322,14 +322,14 @@ class _ProfileWriter(ABC):
 
     def _cob_id(self, index: int, number: int, is_received: bool) -> int | None:
         """Return the EDS's identifier of a PDO without the node id; None where it can't be used."""
-        told = self.default(index, 1)
-        if told & NOT_VALID and not self.can_write(index, 1):
+        by_eds = self.default(index, 1)
+        if by_eds & NOT_VALID and not self.can_write(index, 1):
             return None
         second = find_variable(self._numbered, index, 1)
         other = 0 if second is None or second.default is None else second.default
-        # An identifier without $NODEID is that of the node with which the file was made: a DCF says of which.
-        node = 1 if other != told else (read_eds(self.eds, None).node_id or 1)
-        cob_id = (told & 0x7FF) - node
+        # An identifier without $NODEID belongs to the node id of the file; a DCF states it.
+        node = 1 if other != by_eds else (read_eds(self.eds, None).node_id or 1)
+        cob_id = (by_eds & 0x7FF) - node
         if 0x180 <= cob_id <= 0x57F:
             return cob_id
         predefined = (0x200 if is_received else 0x180) + 0x100 * (number - 1)
@@ -376,7 +376,7 @@ class _ProfileWriter(ABC):
         return []
 
     def further(self) -> list[str]:
-        """Write what is known of the maker's devices."""
+        """Write the maker's facts beside scale and PDOs."""
         return []
 
     @abstractmethod
@@ -499,15 +499,15 @@ class _DriveWriter(_ProfileWriter):
         return [*lines, *self._velocity(gear, increments), *gear_lines, *torque_lines]
 
     def _gear(self, motor_Nm: float) -> tuple[float, list[str]]:
-        told = read_drive_units(self.number).gear_ratio
+        by_drive = read_drive_units(self.number).gear_ratio
         lines: list[str] = []
         if "gear_ratio" in self.answers:
             gear = self.answers["gear_ratio"]
-        elif told not in (None, 1.0) and not self.is_factory(0x6091, 1):
-            gear = told or 1.0
+        elif by_drive not in (None, 1.0) and not self.is_factory(0x6091, 1):
+            gear = by_drive or 1.0
         else:
-            gear = told if told not in (None, 1.0) else self._likely_gear(motor_Nm)
-            why = "0x6091 is as the factory sets it" if told is not None else "no 0x6091 says it"
+            gear = by_drive if by_drive not in (None, 1.0) else self._likely_gear(motor_Nm)
+            why = "0x6091 is a factory value" if by_drive is not None else "the EDS has no 0x6091"
             lines = [self.guess("gear_ratio", gear, f"{gear:g}: {why}")]
         text = [*lines, f"gear_ratio = {gear:.10g}"]
         if gear != 1.0:
@@ -518,9 +518,9 @@ class _DriveWriter(_ProfileWriter):
         return gear, text
 
     def _likely_gear(self, motor_Nm: float) -> float:
-        """Guess the gear of a drive that doesn't say it: too large a one commands too little torque, and not too much.
+        """Guess the gear: rather too large, which commands too little torque.
 
-        Drives that rate their joint have none; a weak motor, or a velocity in rpm, is behind one.
+        A rated torque of a joint means no gear; a weak motor, or a velocity in rpm, means one.
         """
         if self.facts is not None:
             return self.facts.scale.gear_ratio
@@ -529,7 +529,7 @@ class _DriveWriter(_ProfileWriter):
         return _LIKELY_GEAR if not motor_Nm and self.number(0x60A9, 0) in _RPM_UNITS else 1.0
 
     def _increments(self, gear: float) -> tuple[float, list[str]]:
-        """Return the increments per revolution of the joint, by who knows them best."""
+        """Return the increments per revolution of the joint from the best source, and the lines of the profile."""
         units = read_drive_units(self._numbers_with_gear(), gear)
         found, text = units.increments_per_joint_rev, units.increments_text
         places = [place for place in ((0x608F, 1), (0x6092, 1)) if self.number(*place) is not None]
@@ -549,15 +549,15 @@ class _DriveWriter(_ProfileWriter):
             increments = float(_GUESSED_INCREMENTS)
             if self.facts is not None:
                 increments = self.facts.scale.increments_per_joint_rev * gear / self.facts.scale.gear_ratio
-            why = f"{text} is a factory value" if text else "neither 0x608F nor 0x6091 says it"
+            why = f"{text} is a factory value" if text else "the EDS gives no usable 0x608F and 0x6091"
             lines = [self.guess("increments_per_joint_rev", increments, f"{increments:.10g}: {why}")]
         return increments, [*lines, f"increments_per_joint_rev = {increments:.16g}"]
 
     def _numbers_with_gear(self) -> Any:
-        """Return the drive's numbers, without a gear of 1 : 1 that was never told."""
-        told = read_drive_units(self.number).gear_ratio
-        is_told = told not in (None, 1.0) and "gear_ratio" not in self.answers
-        return lambda index, sub: None if index == 0x6091 and not is_told else self.number(index, sub)
+        """Return the drive's numbers, without 0x6091 where it is the default 1 : 1 or overridden by an answer."""
+        by_drive = read_drive_units(self.number).gear_ratio
+        is_set = by_drive not in (None, 1.0) and "gear_ratio" not in self.answers
+        return lambda index, sub: None if index == 0x6091 and not is_set else self.number(index, sub)
 
     def _velocity(self, gear: float, increments: float) -> list[str]:
         unit = self.answers.get("velocity_unit")
@@ -575,7 +575,7 @@ class _DriveWriter(_ProfileWriter):
         return [self.guess("velocity_rad_s", rad_s, text), f"velocity_rad_s = {rad_s!r}"]
 
     def _torque(self) -> tuple[float, list[str]]:
-        """Return the rated torque of the motor, Nm, 0 where nothing says it; and one count of it."""
+        """Return the rated torque of the motor, Nm (0 if unknown), and the lines of the profile."""
         counts = self.number(0x6076, 0) or 0
         count_Nm, lines = self.answers.get("rated_torque_count_Nm", 1e-3), list[str]()
         if "rated_torque_count_Nm" not in self.answers:
@@ -627,7 +627,7 @@ class _DriveWriter(_ProfileWriter):
             if status.transmission is None and not status.has_timer:
                 self.remarks.append(
                     f"its statusword comes on change only, as 0x{_SENT + status.number - 1:X}:5 (event timer) is not "
-                    "there: one that is lost is not missed"
+                    "there: nobody notices one that is lost"
                 )
         return [*lines, *self.pdo("Command", self._command(), ((0x6040, 0), (0x6071, 0)))]
 
@@ -650,7 +650,7 @@ class _SensorWriter(_ProfileWriter):
         ]
 
     def _by_eds(self) -> float | None:
-        """Return what unit and digits say that can't be changed; None where they don't."""
+        """Return one count by read-only unit and digits; None if they are writable or missing."""
         if self.is_factory(0x6131, 1) or self.is_factory(0x6132, 1):
             return None
         return count_of(self.number(0x6131, 1), self.number(0x6132, 1))
@@ -658,8 +658,8 @@ class _SensorWriter(_ProfileWriter):
     def frames(self) -> list[str]:
         torque = next((place for place in _TORQUE_OBJECTS if self.has(*place)), None)
         if torque is None:
-            told = "; its 0x6130:1 is a float, which no frame of a cycle can hold" if self.has(0x6130, 1) else ""
-            raise self.refuse(f"no 0x9130:1 or 0x7130:1 (torque), which a sensor needs{told}")
+            hint = "; its 0x6130:1 is a float, which no frame of a cycle can hold" if self.has(0x6130, 1) else ""
+            raise self.refuse(f"no 0x9130:1 or 0x7130:1 (torque), which a sensor needs{hint}")
         self.require(*torque, "torque")
         sent = self.records(is_received=False)
         record = next((one for one in sent if one.can_be(1) and (one.room or one.carries(torque))), None)
@@ -674,7 +674,7 @@ class _SensorWriter(_ProfileWriter):
 
 
 def count_of(unit: int | None, digits: int | None) -> float | None:
-    """Return what a count of a sensor is worth by 0x6131 and 0x6132, Nm; None where it is no torque."""
+    """Return one count of a sensor by 0x6131 and 0x6132, Nm; None if the unit is no torque."""
     if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
         return None
     prefix = unit >> PREFIX_SHIFT

@@ -139,7 +139,7 @@ _TORQUE_UNITS = {1.0: "Nm", 1e-3: "mNm", 1e-6: "µNm"}
 
 
 def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> list[str]:
-    """Check what the drive is, write limits, option codes and mode; return what could not be checked, a line each.
+    """Check the drive, write limits, option codes and mode; return values that could not be checked, a line each.
 
     Raises DeviceError.
     """
@@ -226,9 +226,9 @@ def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
 
 
 def _check_units(slave: Slave, codec: Codec) -> list[str]:
-    """Compare the worth of the drive's counts, as far as its EDS lists what says it, with the contract's.
+    """Compare the units of the drive, as far as its EDS has the objects, with the contract's.
 
-    Return what could not be compared, a line each. Raises DeviceError.
+    Return units that could not be compared, a line each. Raises DeviceError.
     """
 
     def number(index: int, sub: int) -> int | None:
@@ -254,7 +254,7 @@ def _check_units(slave: Slave, codec: Codec) -> list[str]:
             f"{found.velocity_rad_s:.6g} rad/s at the joint, {velocity:.6g} rad/s expected",
             f"correct `scale.velocity_rad_s` of {place}, or set 0x60A9 in the drive",
         )
-    # A gear of 1 is that of a drive that rates its joint; 1 : 1 in the drive, that it was never told.
+    # 1 in the profile: 0x6076 is the joint's. 1 : 1 in the drive: the factory's value.
     if found.gear_ratio not in (None, 1.0) and scale.gear_ratio not in (1.0, found.gear_ratio):
         slave.fail(
             f"gear ratio 0x6091 = {found.gear_ratio:g}, {scale.gear_ratio:g} expected",
@@ -283,7 +283,7 @@ def _enter_mode(slave: Slave, codec: Codec) -> None:
     except RefusedError:
         if not (slave.can_write(0x6040) and slave.read(0x6040) & _HALT):
             raise
-        slave.write(0x6040, 0, 0)  # drives that refuse another mode under halt
+        slave.write(0x6040, 0, 0)  # some drives refuse another mode under halt
         slave.known.pop((0x6040, 0))
         slave.write(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
     if not slave.has(0x6061):
@@ -450,7 +450,7 @@ _RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 
 
 def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
-    """Bring all PDOs of a device into the form of its profile; what is so already is compared only. Raises DeviceError.
+    """Bring all PDOs of a device into the form of its profile; write those that differ. Raises DeviceError.
 
     `command_deadline_ms`: event timer of the command PDO where the profile has the deadline there.
     """

@@ -1,4 +1,4 @@
-"""What a drive's objects say of its counts, at the joint: position, velocity, and the torque of its motor.
+"""Units of a drive's counts at the joint, by its objects: position, velocity, and the torque of its motor.
 
     position   0x6064 in increments: 0x608F per motor revolution, times the gear 0x6091; where 0x6092 is there, in its
                units per revolution of the driven shaft; in the unit of 0x60A8 where that is an angle
@@ -17,9 +17,9 @@ Number = Callable[[int, int], int | None]
 """Gives the value of an object by index and sub-index; None where there is none."""
 
 LEAST_INCREMENTS = 360
-"""Per revolution of a joint. A drive whose factory values are 1 : 1 says 1; coarser than 1 deg no joint is moved."""
+"""Per revolution of a joint, 1 deg. A drive with factory values of 1 : 1 has 1."""
 CREDIBLE_INCREMENTS = 4096
-"""Per revolution of a joint, 1.5 mrad: fewer are a factory value rather than a joint."""
+"""Per revolution of a joint, 1.5 mrad: fewer are more likely a factory value."""
 
 _INCREMENTS, _REVOLUTION = 0xB5, 0xB4
 _ANGLES_RAD = {
@@ -37,11 +37,11 @@ _TIME_NAMES = {0x03: "s", 0x47: "min", 0x48: "h"}
 
 
 class DriveUnits(NamedTuple):
-    """What the objects of a drive say; None where they don't.
+    """Units by the objects of a drive; None if they are missing.
 
     gear_ratio: 0x6091, motor revolutions per revolution of the joint. increments_per_joint_rev: counts of 0x6064;
-    increments_text: the objects that say so, with their values. velocity_rad_s: one count of 0x606C at the joint, None
-    where 0x60A9 is no velocity or not there; velocity_unit: its code.
+    increments_text: the objects behind it, with their values. velocity_rad_s: one count of 0x606C at the joint, None if
+    0x60A9 is missing or no velocity; velocity_unit: its code.
     """
 
     gear_ratio: float | None = None
@@ -52,12 +52,12 @@ class DriveUnits(NamedTuple):
 
     @property
     def has_increments(self) -> bool:
-        """Whether the increments may be a joint's, not the 1 : 1 of a drive that was never told."""
+        """Whether the increments may be a joint's, and not the factory's 1 : 1."""
         return (self.increments_per_joint_rev or 0.0) >= LEAST_INCREMENTS
 
 
 def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
-    """Read the units of a drive. `gear_ratio`: the gear of a drive that doesn't say it."""
+    """Read the units of a drive. `gear_ratio`: the gear of a drive without 0x6091."""
     encoder, motor_revs = number(0x608F, 1), number(0x608F, 2)
     gear_in, gear_out = number(0x6091, 1), number(0x6091, 2)
     feed, shaft_revs = number(0x6092, 1), number(0x6092, 2)
@@ -78,7 +78,7 @@ def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
 
 
 def _angle_rad(unit: int | None) -> float | None:
-    """Return what a count of a position unit is worth; None for increments and for what is no angle."""
+    """Return one count of a position unit; None for increments and other units that are no angle."""
     if not unit:
         return None
     angle_rad = _ANGLES_RAD.get(unit >> 16 & 0xFF)
@@ -100,7 +100,7 @@ def _prefix(unit: int) -> int:
 
 
 def name_velocity_unit(unit: int) -> str:
-    """Name the unit of 0x60A9: `rpm`, `10^-3 rpm`, `increment/s`; its code where it is none that is known."""
+    """Name the unit of 0x60A9: `rpm`, `10^-3 rpm`, `increment/s`; the code of an unknown one."""
     numerator, denominator = unit >> 16 & 0xFF, unit >> 8 & 0xFF
     if numerator not in _NAMES or denominator not in _TIME_NAMES:
         return f"0x{unit:08X}"

@@ -73,7 +73,7 @@ def parse_object(text: str) -> ObjectName:
 
 
 _MERGED = ("scale", "plausibility", "patience")
-"""Sections of a profile that one which extends it need not repeat."""
+"""Sections that are merged key by key where a profile extends another."""
 _TOGETHER = {
     "Feedback": ("position", "velocity"),
     "Command": ("controlword", "target_torque"),
@@ -375,7 +375,7 @@ _MOST_EXTENDED = 8
 
 
 def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path]]:
-    """Read a profile over the one that it extends; return it with the folders of both, its own first."""
+    """Read a profile and those that it extends; return the merged table, and their folders, its own first."""
     table = read_toml(path, "device profile")
     extended = table.pop("extends", None)
     if extended is None:
@@ -476,7 +476,7 @@ def place_devices(settings: Settings) -> list[PlacedDevice]:
 
 
 def enable_timeout_s(settings: Settings) -> float:
-    """Return how long ENABLE may take: as the configuration says, else as long as the most patient profile wants.
+    """Return how long ENABLE may take: the configuration's value, else the longest of the drives' profiles.
 
     Raises ConfigError.
     """

@@ -31,7 +31,7 @@ _NODE_IDS = range(1, 128)
 _BETWEEN_REQUESTS_S = 0.002
 """Request and answer are 270 bits at worst, 0.27 ms at 1 Mbit/s: the rest is for the bus's own traffic."""
 BETWEEN_READS_S = 0.02
-"""From an answer to the next request to a device that nobody knows yet: an EPOS loses what comes within 15 ms."""
+"""Pause between an answer and the next request to an unknown device: an EPOS loses requests within 15 ms."""
 _ANSWER_S = 0.1
 _UPLOAD_DEVICE_TYPE = bytes.fromhex("4000100000000000")
 _IDENTITY = ("vendor", "product", "revision", "serial")

@@ -30,7 +30,7 @@ TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
 _UNTOLD_PERIOD_NS = 1_000_000
-"""What a SYNC is worth while 0x1006 is 0, as in a drive that nobody has set up."""
+"""Time that a SYNC stands for while 0x1006 is 0, as before a set-up."""
 
 
 class BenchNodes:
@@ -101,7 +101,7 @@ class BenchNodes:
         self.period_ns = contract.period_us * 1000 or _UNTOLD_PERIOD_NS
         """How far one SYNC takes the arm, where time goes by SYNC."""
         self.told_period_ns = 0
-        """0x1006 of drive 1; 0: nobody has told it the period."""
+        """0x1006 of drive 1; 0: not set."""
         self._set_period(self.devices[0].value(0x1006))
         for device in self.devices:
             device.watch(0x1006, 0, check=_check_period)

@@ -300,7 +300,7 @@ class SyncOrder:
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:
         """Judge a SYNC of the right length.
 
-        `counter`: 0 where it has none. `overflow`: 0x1019. `period_ns`: 0x1006; 0: not told, so no SYNC is early.
+        `counter`: 0 where it has none. `overflow`: 0x1019. `period_ns`: 0x1006; 0: not set, so no SYNC is early.
         """
         last = self.counter
         self.kind, self.is_taken, self.periods = SyncKind.RIGHT, True, 1

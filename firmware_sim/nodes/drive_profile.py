@@ -281,7 +281,7 @@ class Patience:
 
     @property
     def sync_due_ns(self) -> int:
-        """When SYNC is missing, by the device's clock; never while nobody has told its period."""
+        """When SYNC is missing, by the device's clock; never while 0x1006 is 0."""
         if not self._period_us:
             return NEVER_NS
         return self.sync_ns + self._period_us * self._tenth_periods * 100

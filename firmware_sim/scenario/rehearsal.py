@@ -60,8 +60,8 @@ class DeviceCounts(NamedTuple):
     """What a profile says that the emulated devices count in; pairs are by place.
 
     increments_per_joint_rev: of position. torque_range_Nm: the most that the sensors' signals can carry, or that the
-    profile says. rated_count_Nm: one count of 0x6076 behind the gear. rated_torque_Nm: what the EDS gives of 0x6076,
-    behind the gear; 0: nothing.
+    profile says. rated_count_Nm: one count of 0x6076 behind the gear. rated_torque_Nm: 0x6076 of the EDS, behind the
+    gear; 0: the EDS gives none.
     """
 
     increments_per_joint_rev: Pair
@@ -116,9 +116,9 @@ def compose_scenario(
     assumed: list[str] = []
     links = _place_links(told, truth, assumed)
     factor = truth.factor
-    first, second = (by_eds or told for by_eds, told in zip(counts.rated_torque_Nm, arm.rated_torque_Nm, strict=True))
+    first, second = (by_eds or own for by_eds, own in zip(counts.rated_torque_Nm, arm.rated_torque_Nm, strict=True))
     rated = truth.arm.rated_torque_Nm or _times((first, second), factor.rated_torque)
-    strength = _times(rated, factor.gear)  # sensors, friction and touches are those of the arm as it was told
+    strength = _times(rated, factor.gear)  # sensors, friction and touches follow the configured gear
     viscous, coulomb = _friction(told, truth, rated, assumed)
     inertia = _joint_inertia(links)
     braking = truth.arm.brake_damping_Nm_s or _times(inertia, (1.0 / _BRAKING_S, 1.0 / _BRAKING_S))

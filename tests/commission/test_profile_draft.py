@@ -78,16 +78,16 @@ def test_fewer_increments_than_a_joint_has_are_nobody_s(eds: Path, increments: i
 
 
 def test_the_coarse_increments_of_a_device_that_was_read_are_kept_as_a_guess(eds: Path) -> None:
-    told = {(0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
-    drafted = draft_profile(EdsVariant().write(eds), DeviceRatings(numbers=told), answers={"gear_ratio": 1.0})
+    numbers = {(0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
+    drafted = draft_profile(EdsVariant().write(eds), DeviceRatings(numbers=numbers), answers={"gear_ratio": 1.0})
     assert drafted.settings.scale.increments_per_joint_rev == 2000
     assert "increments_per_joint_rev" in guessed(drafted)
 
 
 def test_what_the_device_says_is_no_factory_value(eds: Path) -> None:
     variant = EdsVariant().with_value(2000, "608Fsub1").with_value("rw", "608Fsub1", key="AccessType").write(eds)
-    told = {(0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 16, (0x6091, 2): 1}
-    drafted = draft_profile(variant, DeviceRatings(numbers=told))
+    numbers = {(0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 16, (0x6091, 2): 1}
+    drafted = draft_profile(variant, DeviceRatings(numbers=numbers))
     assert "increments_per_joint_rev" not in guessed(drafted)
 
 

@@ -136,10 +136,10 @@ class Drafting:
         self.bus: dict[str, Any] | None = None
         self.bitrate = options.bitrate
         self.guessed: set[str] = set()
-        """Profiles in which what a count is worth is a guess."""
+        """Profiles in which the worth of a count is a guess."""
         self._answers: dict[str, tuple[Any, str]] = {}
         self._drafts: dict[tuple[str, int], ProfileDraft] = {}
-        """By kind and joint, of the profiles that are drafted or completed."""
+        """Drafted and completed profiles, by kind and joint."""
 
     def draft(self) -> tuple[str, dict[str, Any]]:
         """Find out, ask, propose; return the text of the file and a summary."""
@@ -238,9 +238,9 @@ class Drafting:
         bus = open_bus(interface, channel, clock, None, self.options.bitrate, False)
         try:
             found = survey(bus, clock, progress=self.interview.say)
-            told = dict.fromkeys(self.options.drive_node or (), DRIVE)
-            told |= dict.fromkeys(self.options.sensor_node or (), SENSOR)
-            devices = recognise(bus, clock, found.nodes, told)
+            kinds = dict.fromkeys(self.options.drive_node or (), DRIVE)
+            kinds |= dict.fromkeys(self.options.sensor_node or (), SENSOR)
+            devices = recognise(bus, clock, found.nodes, kinds)
         finally:
             bus.close()
         self.bus = {"interface": interface, "channel": channel, "bitrate": self.options.bitrate}
@@ -416,7 +416,7 @@ class Drafting:
         return found
 
     def _write_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
-        """Draft the profile of an EDS for some joints, ask for what it doesn't say; return the names of the files."""
+        """Draft the profile of an EDS for some joints, ask for missing values; return the names of the files."""
         drafts = self._draft(eds, kind, ratings)
         folder, stem = self.writing.out.parent, f"{self.writing.out.stem}-{eds.stem}"
         self.writing.add(folder / eds.name, eds.read_bytes())
@@ -431,7 +431,7 @@ class Drafting:
         return names
 
     def _note(self, kind: str, joint: int, name: str, draft: ProfileDraft) -> None:
-        """Remember a draft, and warn of what is a guess in it."""
+        """Remember a draft, and warn of its guesses."""
         self._drafts[kind, joint] = draft
         for line in (*draft.guesses, *draft.remarks):
             if (warning := f"{name}: {line}") not in self.warnings:
@@ -441,7 +441,7 @@ class Drafting:
     def _draft(
         self, eds: Path, kind: str, ratings: dict[int, DeviceRatings], among: Collection[str] | None = None
     ) -> dict[int, ProfileDraft]:
-        """Draft the profile of an EDS for some joints, asking for guesses, one after the other. `among`: of these."""
+        """Draft the profile of an EDS for some joints, and ask for each guess; only for keys `among` these if given."""
         answers: dict[int, dict[str, float]] = {joint: {} for joint in ratings}
 
         def drafted() -> dict[int, ProfileDraft]:
@@ -472,7 +472,7 @@ class Drafting:
         return drafts
 
     def _complete(self, kind: str, names: tuple[str, ...], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
-        """Write a file that extends a shipped profile where gear and encoder, which are the arm's, get known."""
+        """Extend shipped profiles by gear and encoder of this arm, if known; return the names of the files."""
         completed, texts = list(names), dict[str, str]()
         for joint, name in enumerate(names):
             if name not in profile_names():
@@ -552,20 +552,23 @@ class Drafting:
     ) -> Fact:
         """Take the rated torque at the joints from the drives, from their EDS, or ask."""
         scales = [profile.scale for profile in profiles]
-        told = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
+        by_drives = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
         drafts = [self._drafts.get((DRIVE, joint)) for joint in range(2)]
         by_eds = [None if draft is None else draft.rated_torque_Nm for draft in drafts]
         is_known = not any(TORQUE_KEYS & set(profile.assumed) for profile in profiles)
         are_of_eds = all(draft is not None and draft.is_rated_known for draft in drafts)
         if self.options.rated_torque_nm is None and is_known:
-            for pair, source in ((told, "0x6076 of the drives"), (by_eds if are_of_eds else [], "0x6076 of their EDS")):
+            for pair, source in (
+                (by_drives, "0x6076 of the drives"),
+                (by_eds if are_of_eds else [], "0x6076 of their EDS"),
+            ):
                 if len(pair) == 2 and None not in pair:
                     behind = " behind their gears" if any(scale.gear_ratio != 1.0 for scale in scales) else ""
                     return Fact(_checked("rated_torque_Nm", (pair[0], pair[1])), source + behind)
         proposal = Proposal((12.0, 6.0))
         if geometry.effort_Nm is not None and min(geometry.effort_Nm) > 0.0:
             proposal = Proposal(geometry.effort_Nm)  # a URDF's effort is a limit, no rating
-        for pair in (by_eds, told):
+        for pair in (by_eds, by_drives):
             if len(pair) == 2 and None not in pair and _is_rating(pair):
                 proposal = Proposal((pair[0], pair[1]))
         return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
@@ -659,7 +662,7 @@ def _speed_proposals(
 
 
 _ESSENTIAL = {"scale.increments_per_joint_rev", "scale.torque_Nm", "scale.rated_torque_count_Nm"}
-"""Guesses in a profile for which the configuration's `devices` is one, too."""
+"""Guesses in a profile that make `devices` of the configuration a guess, too."""
 _VELOCITY_UNITS = {
     "increment/s": 0x00B50300,
     "rpm": 0x00B44700,
@@ -673,7 +676,7 @@ _TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "uNm": 1e-6, "Nm": 1.0, "0.01Nm":
 
 @dataclass(frozen=True)
 class ScaleQuestion:
-    """What a drive's or a sensor's file may leave open. key: of a profile; answer: of `draft_profile`'s answers."""
+    """A question about a value that an EDS may leave open. key: in a profile."""
 
     kind: str
     key: str
@@ -684,11 +687,11 @@ class ScaleQuestion:
 
     @property
     def answer(self) -> str:
-        """Name of the answer."""
+        """Name of the answer for `draft_profile`."""
         return "velocity_unit" if self.key == "scale.velocity_rad_s" else self.key.partition(".")[2]
 
     def given(self, options: InitOptions) -> Any:
-        """Return what the command line says, None where it says nothing."""
+        """Return the option's value, None if it is absent."""
         return getattr(options, self.option.split()[0].lstrip("-").replace("-", "_"))
 
     def propose(self, value: float) -> Any:
@@ -777,7 +780,7 @@ def _drive_or_sensor(text: str) -> str:
 
 
 def _extension(name: str, shipped: ScaleSettings, scale: ScaleSettings, left: Sequence[str]) -> str:
-    """Write a profile that extends a shipped one by what belongs to the arm."""
+    """Write a profile that extends a shipped one by gear and encoder of the arm."""
     rows = [
         f"{key} = {value!r}" for key, value in vars(scale).items() if not math.isclose(value, getattr(shipped, key))
     ]
