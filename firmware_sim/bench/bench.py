@@ -314,7 +314,7 @@ class Bench:
                 self._nodes.lose_sync(heard, now_ns)
         if now_ns >= self.time.due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
             self.time.poll(now_ns)
-        if not self.is_scenario_started and drive1.is_enabled and drive2.is_enabled:
+        if not self.is_scenario_started and drive1.is_ready and drive2.is_ready:
             self.is_scenario_started = True
             self.injector.start(now_ns)
             self._body.start_scenario()

@@ -291,7 +291,7 @@ class Body:
         )  # fmt: skip
 
     def start_scenario(self) -> None:
-        """Let scenario time start now: both drives are in Operation enabled. Later calls change nothing."""
+        """Let scenario time start now: both drives are enabled and show torque mode. Later calls change nothing."""
         if not self.is_started:
             self._course["start_tick"] = self._course["tick"]
 

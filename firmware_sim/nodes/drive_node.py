@@ -159,6 +159,11 @@ class DriveNode(Application):
         return self.state is DriveState.OPERATION_ENABLED
 
     @property
+    def is_ready(self) -> bool:
+        """Whether a master that looks at statusword and mode may command torque."""
+        return self.is_enabled and (not self._has_habits or self._shown_mode == CYCLIC_SYNCHRONOUS_TORQUE)
+
+    @property
     def is_at_work(self) -> bool:
         """Whether the motor has power by command, so that neither watchdogs nor limits may change."""
         return self.state in _POWERED

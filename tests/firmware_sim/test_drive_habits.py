@@ -90,3 +90,15 @@ def test_a_drive_under_halt_refuses_another_mode() -> None:
     host.write(1, 0x6040, 0, 0)
     host.write(1, 0x6060, 0, TORQUE_MODE)
     assert shown_mode(host) == TORQUE_MODE
+
+
+def test_scenario_time_begins_when_both_drives_show_their_mode() -> None:
+    host = host_of(mode_s=0.05, shows_change=True)
+    host.enable()
+    started, modes = [], []
+    for _ in range(60):
+        host.step(ENABLE)
+        started.append(host.bench.is_scenario_started)
+        modes.append(shown_mode(host))
+    assert modes.index(TORQUE_MODE) > 30
+    assert abs(started.index(True) - modes.index(TORQUE_MODE)) <= 1
