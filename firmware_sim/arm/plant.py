@@ -232,7 +232,7 @@ def external_torque(
     stop1, stop2 = _stop_torque(arm, 0, q1, dq1), _stop_torque(arm, 1, q2, dq2)
     if contact.size == 0:
         return stop1, stop2
-    ext1, ext2 = contact_torque(contact[0], contact_force(contact[0], elapsed_s), arm["length_m"][0], q1, q2)
+    ext1, ext2 = contact_torque(contact[0], contact_force(contact[0], elapsed_s), arm["length_m"][0], q1, q2, dq1, dq2)
     return ext1 + stop1, ext2 + stop2
 
 

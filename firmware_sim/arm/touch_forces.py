@@ -26,7 +26,7 @@ import numpy as np
 
 from adacd_hil.compiled import Structured, compiled, float_fields
 from adacd_hil.records import Vector
-from firmware_sim.arm.touch_settings import TICK_S, contact_force, contact_torque
+from firmware_sim.arm.touch_settings import TICK_S, aim, contact_force, contact_torque
 
 BODY: Final = 0
 HAND: Final = 1
@@ -404,8 +404,9 @@ def describe_touch(
     torque1, torque2 = 0.0, 0.0
     if contact.size != 0:
         force = contact_force(contact[0], elapsed_s)
-        torque1, torque2 = contact_torque(contact[0], force, length1_m, q1, q2)
-        _note(out, force, 0.0, contact[0]["link"], contact_index)
+        torque1, torque2 = contact_torque(contact[0], force, length1_m, q1, q2, dq1, dq2)
+        _, size_N = aim(contact[0], force, length1_m, q1, q2, dq1, dq2)
+        _note(out, size_N, 0.0, contact[0]["link"], contact_index)
     pose = _cosines(q1, q2)
     for row in range(things.shape[0]):
         thing, own = things[row], _own(state, row)
@@ -447,11 +448,14 @@ def add_prescribed_work(
 ) -> None:
     """Add what the arm gave to a prescribed contact in a step: the mean torque along the way of the joints.
 
-    before1, before2: joint positions at the start of the step, at elapsed_s; q1, q2: at its end. No contact adds
-    nothing.
+    before1, before2: joint positions at the start of the step, at elapsed_s; q1, q2: at its end. Frame "motion" goes by
+    the mean velocity of the step. No contact adds nothing.
     """
     if contact.size == 0:
         return
-    torque1, torque2 = contact_torque(contact[0], contact_force(contact[0], elapsed_s), length1_m, before1, before2)
-    after1, after2 = contact_torque(contact[0], contact_force(contact[0], elapsed_s + step_s), length1_m, q1, q2)
-    state[ENERGY] -= 0.5 * ((torque1 + after1) * (q1 - before1) + (torque2 + after2) * (q2 - before2))
+    way1, way2 = q1 - before1, q2 - before2
+    dq1, dq2 = way1 / step_s, way2 / step_s
+    begun_N, ended_N = contact_force(contact[0], elapsed_s), contact_force(contact[0], elapsed_s + step_s)
+    torque1, torque2 = contact_torque(contact[0], begun_N, length1_m, before1, before2, dq1, dq2)
+    after1, after2 = contact_torque(contact[0], ended_N, length1_m, q1, q2, dq1, dq2)
+    state[ENERGY] -= 0.5 * ((torque1 + after1) * way1 + (torque2 + after2) * way2)

@@ -2,7 +2,9 @@
 
 A scripted contact pushes with force_N · shape(t) at `point_m` from the joint that carries the link. Its direction is
 `angle_deg`, from the link's own axis (frame "link"; 90° is the normal on the side of +q, the force turns with the
-link) or from the world's x axis (frame "world"). Shapes, t from 0 to duration d:
+link), from the world's x axis (frame "world"), or from the velocity v of the touched point (frame "motion": 0° helps
+the motion, 180° drags). With frame "motion" the force has the factor |v| / √(|v|² + FADE_M_S²), so it is smooth where
+the motion reverses, and zero at rest. Shapes, t from 0 to duration d:
 
     step       1
     half_sine  sin(π t / d)
@@ -38,7 +40,12 @@ PAIR: Final = (2,)
 """Shape of what both joints have."""
 
 SHAPES: Final = ("step", "half_sine", "push")
-FRAMES: Final = ("link", "world")
+FRAMES: Final = ("link", "world", "motion")
+FADE_M_S: Final = 0.01
+"""Speed of the touched point at which a force of frame "motion" has 1/√2 of its size; a moving tip has some 0.5 m/s."""
+LARGEST_MOTION_N: Final = 100.0
+"""Largest force of frame "motion". Across FADE_M_S it damps the base arms' tip (0.21 kg) by up to 5e4 1/s; RK4 with
+LARGEST_SUBSTEPS is stable up to 4e5."""
 
 CONTACT: Final = float_fields(
     {
@@ -57,6 +64,7 @@ CONTACT: Final = float_fields(
 """One row of a contact table."""
 
 _WORLD: Final = FRAMES.index("world")
+_MOTION: Final = FRAMES.index("motion")
 _HALF_SINE: Final = SHAPES.index("half_sine")
 _PUSH: Final = SHAPES.index("push")
 
@@ -87,6 +95,8 @@ class ContactSettings:
             raise ConfigError(f"ramp_s = {self.ramp_s} s belongs to shape 'push', this contact is a {self.shape!r}")
         if self.ramp_s is not None and 2.0 * self.ramp_s > self.duration_s:
             raise ConfigError(f"ramp_s = {self.ramp_s} s is above half of duration_s = {self.duration_s} s")
+        if self.frame == "motion" and self.force_N > LARGEST_MOTION_N:
+            raise ConfigError(f"force_N = {self.force_N} N is above {LARGEST_MOTION_N} N, the most with frame 'motion'")
 
     @property
     def onset_tick(self) -> int:
@@ -145,15 +155,37 @@ def contact_force(contact: np.void, elapsed_s: float) -> float:
 
 
 @compiled
-def contact_torque(contact: np.void, force_N: float, length1_m: float, q1: float, q2: float) -> tuple[float, float]:
+def aim(
+    contact: np.void, force_N: float, length1_m: float, q1: float, q2: float, dq1: float, dq2: float
+) -> tuple[float, float]:
+    """Give the world's angle of a contact's force, rad, and its size, N, which only frame "motion" changes."""
+    angle_rad = contact["angle_rad"]
+    if contact["frame"] == _WORLD:
+        return angle_rad, force_N
+    phi = q1 + q2 if contact["link"] == 2.0 else q1
+    if contact["frame"] != _MOTION:
+        return phi + angle_rad, force_N
+    rate = contact["point_m"] * (dq1 + dq2 if contact["link"] == 2.0 else dq1)
+    elbow_rate = length1_m * dq1 if contact["link"] == 2.0 else 0.0
+    v_x = -elbow_rate * math.sin(q1) - rate * math.sin(phi)
+    v_y = elbow_rate * math.cos(q1) + rate * math.cos(phi)
+    speed_m_s = math.sqrt(v_x * v_x + v_y * v_y)
+    faded_N = force_N * speed_m_s / math.sqrt(speed_m_s * speed_m_s + FADE_M_S * FADE_M_S)
+    return math.atan2(v_y, v_x) + angle_rad, faded_N
+
+
+@compiled
+def contact_torque(
+    contact: np.void, force_N: float, length1_m: float, q1: float, q2: float, dq1: float, dq2: float
+) -> tuple[float, float]:
     """Give the external torque of the two joints, J(q)ᵀ F, Nm: moments of the force about the two joint axes.
 
-    A force at the angle ψ has the moment p F sin(ψ − φ) about the joint at the other end of the lever p, which
-    itself points along φ.
+    force_N: as `contact_force` gives it. A force at the angle ψ has the moment p F sin(ψ − φ) about the joint at the
+    other end of the lever p, which itself points along φ.
     """
     link2 = contact["link"] == 2.0
     phi = q1 + q2 if link2 else q1
-    psi = contact["angle_rad"] if contact["frame"] == _WORLD else phi + contact["angle_rad"]
+    psi, force_N = aim(contact, force_N, length1_m, q1, q2, dq1, dq2)
     moment = contact["point_m"] * force_N * math.sin(psi - phi)
     if link2:
         return moment + length1_m * force_N * math.sin(psi - q1), moment

@@ -21,7 +21,15 @@ from firmware_sim.arm.mechanics import work_space
 from firmware_sim.arm.plant import fit_payload, mirror_stiff_joints
 from firmware_sim.arm.sensing import Measurement, TorqueNoise
 from firmware_sim.arm.touch_forces import BODY, HAND, THING, THING_PLACES, TOUCH_HEADER, TOUCH_TRUTH, WALL
-from firmware_sim.arm.touch_settings import TICK_S, BodySettings, HandSettings, WallSettings, contact_table, ticks
+from firmware_sim.arm.touch_settings import (
+    FADE_M_S,
+    TICK_S,
+    BodySettings,
+    HandSettings,
+    WallSettings,
+    contact_table,
+    ticks,
+)
 from firmware_sim.body.body_ticks import (
     BODY_NUMBERS,
     BODY_STATE,
@@ -147,6 +155,18 @@ def largest_rate_rad_s(things: Structured) -> float:
     return largest
 
 
+def fade_rate_rad_s(scenario: Scenario) -> float:
+    """Return the fastest rate that a scripted force of frame "motion" gives the unloaded arm at rest; 0 without one."""
+    return max(
+        (
+            one.force_N / FADE_M_S * _largest_mobility(scenario.arm, one.link, np.array([one.point_m]))
+            for one in scenario.contacts
+            if one.frame == "motion"
+        ),
+        default=0.0,
+    )
+
+
 SUBSTEPS: Final = 1
 """Integration steps per tick: RK4 at 10 kHz. Halving the step changes a period's velocity by less than 2e-10 rad/s, and
 by up to 2e-8 rad/s where a joint brushes against standstill (profile M in the paper's experiment)."""
@@ -209,11 +229,11 @@ class Body:
         is_rigid = scenario.mechanics.is_rigid and self._things.size == 0
         self._mechanics: Structured | None = None
         self._substeps = SUBSTEPS
+        touch_rad_s = largest_rate_rad_s(self._things) + fade_rate_rad_s(scenario)
         if not is_rigid:
             self._mechanics = np.array([scenario.mechanics.numbers(scenario.arm)])
-            self._substeps = scenario.mechanics.substeps(
-                scenario.arm, scenario.payload_bodies, largest_rate_rad_s(self._things)
-            )
+        if not is_rigid or touch_rad_s > 0.0:
+            self._substeps = scenario.mechanics.substeps(scenario.arm, scenario.payload_bodies, touch_rad_s)
         self._work = work_space(self._touch_state.size)
         self._number_vector = _pack_numbers(scenario)
         self._numbers: np.void = self._number_vector.view(BODY_NUMBERS)[0]

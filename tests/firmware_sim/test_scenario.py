@@ -54,7 +54,7 @@ def test_every_contact_of_the_paper_scenario_is_well_above_the_threshold(index):
     row = contact_table((contact,))[0]
     sign = math.copysign(1, contact.angle_deg)
     for elbow_rad in np.radians(np.linspace(-68, 68, 35)):
-        tau1, tau2 = contact_torque(row, contact_force(row, 0.0), 0.35, 0.1, elbow_rad)
+        tau1, tau2 = contact_torque(row, contact_force(row, 0.0), 0.35, 0.1, elbow_rad, 0.0, 0.0)
         assert sign * tau1 >= 2.5
         if contact.link == 1:
             assert tau2 == 0.0

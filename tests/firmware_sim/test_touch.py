@@ -32,7 +32,7 @@ def test_the_torque_of_a_contact_is_its_virtual_work(link, frame):
         q = generator.uniform(-3, 3, 2)
         point_m, angle_deg = generator.uniform(0, 0.3), generator.uniform(-360, 360)
         row = contact_table((contact(link=link, frame=frame, point_m=point_m, angle_deg=angle_deg),))[0]
-        found = contact_torque(row, 20.0, L1_M, q[0], q[1])
+        found = contact_torque(row, 20.0, L1_M, q[0], q[1], 0.4, -0.9)
         link_angle = q[0] if link == 1 else q[0] + q[1]
         psi = math.radians(angle_deg) + (link_angle if frame == "link" else 0.0)
         force = 20.0 * np.array([math.cos(psi), math.sin(psi)])
@@ -45,22 +45,51 @@ def test_the_torque_of_a_contact_is_its_virtual_work(link, frame):
 
 
 def test_a_push_along_the_normal_of_a_link_turns_its_joint_forward():
-    assert contact_torque(contact_table((contact(link=1),))[0], 20.0, L1_M, 0.7, -0.3) == pytest.approx((4.0, 0.0))
-    forward = contact_torque(contact_table((contact(link=2),))[0], 20.0, L1_M, 0.7, 0.0)
+    alone = contact_torque(contact_table((contact(link=1),))[0], 20.0, L1_M, 0.7, -0.3, 0.0, 0.0)
+    assert alone == pytest.approx((4.0, 0.0))
+    forward = contact_torque(contact_table((contact(link=2),))[0], 20.0, L1_M, 0.7, 0.0, 0.0, 0.0)
     assert forward == pytest.approx((20.0 * (0.35 + 0.2), 4.0))
 
 
 def test_a_push_along_link_2_is_not_felt_by_joint_2():
     row = contact_table((contact(link=2, angle_deg=0.0),))[0]
-    assert contact_torque(row, 20.0, L1_M, 0.7, -0.3)[1] == 0.0
+    assert contact_torque(row, 20.0, L1_M, 0.7, -0.3, 0.0, 0.0)[1] == 0.0
 
 
 def test_the_force_and_lever_of_a_link_2_contact_follow_from_both_torques():
     """Closed form for a frictionless contact: F = (tau1 − tau2) / (l1 cos q2), lever tau2 / F."""
-    tau1, tau2 = contact_torque(contact_table((contact(link=2),))[0], 17.0, L1_M, -0.4, 0.9)
+    tau1, tau2 = contact_torque(contact_table((contact(link=2),))[0], 17.0, L1_M, -0.4, 0.9, 0.0, 0.0)
     force_N = (tau1 - tau2) / (L1_M * math.cos(0.9))
     assert force_N == pytest.approx(17.0, rel=1e-12)
     assert tau2 / force_N == pytest.approx(0.2, rel=1e-12)
+
+
+def velocity_of(link: int, point_m: float, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+    """Return the velocity of the touched point, m/s (2,), by a central difference."""
+    ahead, behind = (touched_point(link, point_m, q + sign * 1e-6 * dq) for sign in (1.0, -1.0))
+    return (ahead - behind) / 2e-6
+
+
+@pytest.mark.parametrize("link", [1, 2])
+@pytest.mark.parametrize(("angle_deg", "share"), [(0.0, 1.0), (180.0, -1.0), (60.0, 0.5), (90.0, 0.0)])
+def test_a_force_along_the_motion_has_the_power_of_its_part_that_helps(link, angle_deg, share):
+    generator = np.random.default_rng(5)
+    row = contact_table((contact(link=link, frame="motion", angle_deg=angle_deg),))[0]
+    for _ in range(50):
+        q, dq = generator.uniform(-3, 3, 2), generator.uniform(-2, 2, 2) * generator.choice([0.01, 1.0])
+        speed_m_s = float(np.hypot(*velocity_of(link, 0.2, q, dq)))
+        force_N = 20.0 * speed_m_s / math.hypot(speed_m_s, 0.01)
+        found = contact_torque(row, 20.0, L1_M, *q, *dq)
+        assert np.array(found) @ dq == pytest.approx(share * force_N * speed_m_s, rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize("link", [1, 2])
+def test_a_force_along_the_motion_is_none_at_rest_and_grows_with_the_speed_from_there(link):
+    row = contact_table((contact(link=link, frame="motion", angle_deg=0.0),))[0]
+    assert contact_torque(row, 20.0, L1_M, 0.7, -0.3, 0.0, 0.0) == (0.0, 0.0)
+    slow = np.array(contact_torque(row, 20.0, L1_M, 0.7, -0.3, 1e-6, 2e-6))
+    assert np.abs(slow).max() > 0.0
+    assert np.array(contact_torque(row, 20.0, L1_M, 0.7, -0.3, 2e-6, 4e-6)) == pytest.approx(2.0 * slow, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +130,8 @@ def test_onset_and_end_lie_on_the_drives_ticks():
         ({"link": 3}, "`link` = 3 is above 2"),
         ({"shape": "sine"}, "`shape` = 'sine' must be one of step, half_sine, push"),
         ({"shape": "halfsine"}, "did you mean 'half_sine'"),
-        ({"frame": "tool"}, "`frame` = 'tool' must be one of link, world"),
+        ({"frame": "tool"}, "`frame` = 'tool' must be one of link, world, motion"),
+        ({"frame": "motion", "force_N": 101.0}, "force_N = 101.0 N is above 100.0 N, the most with frame 'motion'"),
         ({"force_N": 0.0}, "`force_N` = 0.0 N is below 0.01 N"),
         ({"duration_s": 0.0}, "`duration_s` = 0.0 s is below 0.0001 s"),
         ({"ramp_s": 0.01}, "ramp_s = 0.01 s belongs to shape 'push'"),

@@ -196,7 +196,7 @@ def test_a_bodys_torque_is_that_of_a_prescribed_force_of_its_size(link, side):
         )
         assert deep_m > 0.0
         assert found == pytest.approx(
-            contact_torque(contact_table((push,))[0], 25_000.0 * deep_m, 0.35, *bent), rel=1e-9, abs=1e-9
+            contact_torque(contact_table((push,))[0], 25_000.0 * deep_m, 0.35, *bent, 0.0, 0.0), rel=1e-9, abs=1e-9
         )
 
 

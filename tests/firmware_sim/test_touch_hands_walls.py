@@ -26,11 +26,12 @@ from firmware_sim.arm.touch_settings import (
     ContactSettings,
     HandSettings,
     WallSettings,
+    contact_force,
     contact_table,
     contact_torque,
 )
-from firmware_sim.body.body import largest_rate_rad_s
-from firmware_sim.scenario.scenario import load_scenario
+from firmware_sim.body.body import Body, largest_rate_rad_s
+from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 POSE = (0.3, 0.7)
 
@@ -224,6 +225,12 @@ def test_a_hard_blow_on_a_wall_with_much_damping_sets_the_largest_rate():
     assert rates[1] == pytest.approx(10.0 * rates[0], rel=1e-12)
 
 
+def kinetic_energy_J(state):
+    m11, m12, m22 = mass_matrix(state, state["q"][1])
+    dq1, dq2 = state["dq"]
+    return 0.5 * m11 * dq1**2 + m12 * dq1 * dq2 + 0.5 * m22 * dq2**2
+
+
 PRESCRIBED = [
     {"link": 2, "point_m": 0.2, "force_N": 20.0, "duration_s": 0.05, "shape": "step"},
     {"link": 1, "point_m": 0.3, "force_N": 30.0, "duration_s": 0.05, "shape": "half_sine", "angle_deg": -60.0},
@@ -247,19 +254,63 @@ def test_a_prescribed_force_gives_the_arm_the_energy_that_is_logged(changes):
         change_touch(things, elapsed_s, *state["q"], touched, True)
         external = describe_touch(things, elapsed_s, *state["q"], *state["dq"], touched, row, 4.0, elapsed_s, 0.35, out)
         powers.append(out[3])
-        assert external == contact_torque(row[0], out["force_N"], 0.35, *state["q"])
+        asked_N = contact_force(row[0], elapsed_s)
+        assert external == contact_torque(row[0], asked_N, 0.35, *state["q"], *state["dq"])
+        assert out["force_N"] == asked_N
         assert (out["link"], out["index"]) == (changes["link"], 4.0)
         before = tuple(state["q"])
         integrate(state, numbers, row, elapsed_s, 0.0, 0.0, TICK_S)
         add_prescribed_work(row, elapsed_s, TICK_S, 0.35, *before, *state["q"], touched)
-    m11, m12, m22 = mass_matrix(state, state["q"][1])
-    dq1, dq2 = state["dq"][0], state["dq"][1]
-    kinetic_J = 0.5 * m11 * dq1**2 + m12 * dq1 * dq2 + 0.5 * m22 * dq2**2
+    kinetic_J = kinetic_energy_J(state)
     assert kinetic_J > 0.01
     assert touched[ENERGY] == pytest.approx(-kinetic_J, rel=2e-5)
     assert TICK_S * sum(powers) == pytest.approx(-kinetic_J, rel=0.02)
     change_touch(things, 0.06, *state["q"], touched, False)
     assert touched[ENERGY] == 0.0
+
+
+@pytest.mark.parametrize(("angle_deg", "sign"), [(0.0, 1.0), (180.0, -1.0)])
+def test_a_hand_that_helps_gives_the_moving_arm_energy_and_one_that_drags_takes_it(angle_deg, sign):
+    contact = ContactSettings(
+        at_s=0.0, link=2, point_m=0.2, force_N=3.0, duration_s=1.0, frame="motion", angle_deg=angle_deg
+    )
+    numbers = dataclasses.replace(ARMS["P"], viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0)).numbers()
+    state = np.zeros(1, MECHANICAL_STATE)[0]
+    fit_payload(state, numbers, 0.0)
+    state["q"][:], state["dq"][:] = POSE, (0.8, -0.4)
+    row, things = contact_table((contact,)), TouchedArm().things
+    touched, out = np.zeros(1), np.zeros(1, TOUCH_TRUTH)[0]
+    before_J = kinetic_energy_J(state)
+    for tick in range(500):
+        elapsed_s = tick * TICK_S
+        describe_touch(things, elapsed_s, *state["q"], *state["dq"], touched, row, 0.0, elapsed_s, 0.35, out)
+        assert 0.0 < out["force_N"] < 3.0
+        assert sign * out["power_W"] < 0.0
+        before = tuple(state["q"])
+        for part in range(4):
+            integrate(state, numbers, row, elapsed_s + part * TICK_S / 4, 0.0, 0.0, TICK_S / 4)
+        add_prescribed_work(row, elapsed_s, TICK_S, 0.35, *before, *state["q"], touched)
+    gained_J = kinetic_energy_J(state) - before_J
+    assert sign * gained_J > 0.01
+    assert touched[ENERGY] == pytest.approx(-gained_J, rel=2e-5)
+
+
+def test_the_strongest_hand_that_drags_brings_the_arm_to_rest_without_a_tremor():
+    drag = ContactSettings(
+        at_s=0.0, link=2, point_m=0.3, force_N=100.0, duration_s=1.0, frame="motion", angle_deg=180.0
+    )
+    substeps = Body(Scenario(contacts=(drag,))).parts.substeps
+    numbers = dataclasses.replace(ARMS["P"], viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0)).numbers()
+    row = contact_table((drag,))
+    state = np.zeros(1, MECHANICAL_STATE)[0]
+    fit_payload(state, numbers, 0.0)
+    state["q"][:], state["dq"][:] = (0.3, 1.5), (0.3, -1.0)
+    energies_J = [kinetic_energy_J(state)]
+    for step in range(500 * substeps):
+        integrate(state, numbers, row, step * TICK_S / substeps, 0.0, 0.0, TICK_S / substeps)
+        energies_J.append(kinetic_energy_J(state))
+    assert np.diff(energies_J).max() <= 0.0
+    assert energies_J[-1] < 1e-9 * energies_J[0]
 
 
 BODY = "at_s = 1.0, link = 2, x_m = 0.5, y_m = 0.3"
