@@ -59,6 +59,7 @@ class ExpectSettings:
 
     adaptations: int = setting(low=0, high=1000, meaning="adaptations that come to their end")
     contacts: int = setting(low=0, high=100_000, meaning="true contacts that are detected")
+    adaptations_most: int | None = setting(None, low=0, high=1000, meaning="at most; absent: exactly `adaptations`")
     contacts_most: int | None = setting(None, low=0, high=100_000, meaning="at most; absent: exactly `contacts`")
     false_alarms: int = setting(0, low=0, high=100_000, meaning="detections without a contact")
     false_alarms_most: int | None = setting(
@@ -107,7 +108,7 @@ class ExpectSettings:
         return f"{least}" if most is None else f"{least}-{most}"
 
 
-_COUNTS: Final = ("contacts", "false_alarms", "missed")
+_COUNTS: Final = ("adaptations", "contacts", "false_alarms", "missed")
 _TROUBLES: Final = (("false_alarms", "false"), ("missed", "missed"))
 
 
@@ -141,7 +142,7 @@ class ScenarioOutcome(NamedTuple):
 def deviations(expect: ExpectSettings, outcome: ScenarioOutcome) -> tuple[str, ...]:
     """Say, a line each, where a run differs from what was expected; nothing where it doesn't."""
     found = []
-    for key in ("end", "fault", "adaptations"):
+    for key in ("end", "fault"):
         wanted, got = getattr(expect, key), getattr(outcome, key)
         if got != wanted:
             found.append(f"{key}: {got or 'none'}, expected {wanted or 'none'}")

@@ -21,7 +21,7 @@ def test_a_run_as_expected_has_no_deviation():
     [
         ({"end": "lost"}, "end: lost, expected finished"),
         ({"fault": "DRIVE"}, "fault: DRIVE, expected none"),
-        ({"adaptations": 0}, "adaptations: none, expected 1"),
+        ({"adaptations": 0}, "adaptations: 0, expected 1"),
         ({"contacts": 1}, "contacts: 1, expected 2"),
         ({"contacts": 3}, "contacts: 3, expected 2"),
         ({"missed": 1}, "missed: 1, expected 0"),
@@ -43,6 +43,17 @@ def test_bounds_are_inclusive_and_a_delay_needs_a_contact(changes):
     assert deviations(EXPECTED, AS_EXPECTED._replace(**changes)) == ()
 
 
+def test_an_arm_that_may_be_learnt_anew_has_room_in_its_adaptations():
+    expected = ExpectSettings(adaptations=1, adaptations_most=2, contacts=2, false_alarms=2)
+    assert [deviations(expected, AS_EXPECTED._replace(adaptations=count)) for count in range(4)] == [
+        ("adaptations: 0, expected 1 to 2",),
+        (),
+        (),
+        ("adaptations: 3, expected 1 to 2",),
+    ]
+    assert expected.text == "1-2 adapted, 2 detected, 2 false"
+
+
 def test_a_fault_is_expected_with_its_time():
     expected = ExpectSettings(adaptations=0, contacts=0, end="fault", fault="DRIVE", fault_s=(1.0, 1.2))
     faulted = ScenarioOutcome("fault", "DRIVE", 1.1, 0, None, 0, 0, 0, None, 0.0)
@@ -60,6 +71,10 @@ def test_a_fault_is_expected_with_its_time():
         (
             {"adaptations": 1, "contacts": 2, "contacts_most": 1},
             "`expect.contacts_most` = 1 is below `expect.contacts`",
+        ),
+        (
+            {"adaptations": 2, "contacts": 2, "adaptations_most": 1},
+            "`expect.adaptations_most` = 1 is below `expect.adaptations` = 2",
         ),
         ({"adaptations": 1, "contacts": 0, "fault": "DRIV"}, "did you mean 'DRIVE'"),
         ({"adaptations": 1, "contacts": 0, "fault": "NONE"}, "`expect.fault` = 'NONE' must be one of DATA_AGE"),
