@@ -88,7 +88,9 @@ def test_a_run_of_it_comes_to_what_it_expects(name: str, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", long_but(1, ["push-during-adaptation", "payload-fitted-in-motion"]))
+@pytest.mark.parametrize(
+    "name", long_but(1, ["push-during-adaptation", "payload-fitted-in-motion", "hand-helps-and-lets-go"])
+)
 def test_a_certified_host_comes_to_what_is_expected_of_it(name: str, tmp_path: Path) -> None:
     cast = resolve("certified", name, None, None)
     outcome = outcome_of(*run_embedded(cast, "lockstep", tmp_path))
