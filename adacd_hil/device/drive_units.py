@@ -1,7 +1,7 @@
 """Units of a drive's counts at the joint, by its objects: position, velocity, and the torque of its motor.
 
-    position   0x6064 in increments: 0x608F per motor revolution, times the gear 0x6091; where 0x6092 is there, in its
-               units per revolution of the driven shaft; in the unit of 0x60A8 where that is an angle
+    position   0x6064 in increments: 0x608F per motor revolution, times the gear 0x6091; if 0x6092 is there, in its
+               units per revolution of the driven shaft; else, if 0x60A8 is an angle, in that angle of the motor
     velocity   0x606C in increments per second, or in the unit of 0x60A9, as rpm, of the motor
     torque     0x6071, 0x6077 in per mille of 0x6076, the motor's rated torque
 
@@ -71,7 +71,7 @@ def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
         text = f"0x608F x 0x6091 = {encoder}/{motor_revs or 1} x {ratio_text}"
     if feed and feed / (shaft_revs or 1) >= LEAST_INCREMENTS:
         increments, text = feed / (shaft_revs or 1), f"0x6092 = {feed}/{shaft_revs or 1}"
-    if (count_rad := _angle_rad(position_unit)) is not None:
+    elif (count_rad := _angle_rad(position_unit)) is not None:
         increments, text = math.tau / count_rad * ratio, f"0x60A8 x 0x6091 = 0x{position_unit:08X} x {ratio_text}"
     velocity = _velocity_rad_s(velocity_unit, increments, ratio)
     return DriveUnits(gear, increments, text, velocity, velocity_unit or 0)
