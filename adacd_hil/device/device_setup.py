@@ -237,10 +237,13 @@ def _check_units(slave: Slave, codec: Codec) -> list[str]:
     scale, remarks = slave.device.settings.scale, []
     place = f"devices.drive[{slave.device.joint}]"
     found = read_drive_units(number, scale.gear_ratio)
+    readings = [found]
+    if found.gear_ratio == 1.0 and scale.gear_ratio != 1.0:  # the encoder is at the joint, or 0x6091 was never set
+        readings.append(read_drive_units(lambda *at: None if at[0] == 0x6091 else number(*at), scale.gear_ratio))
     feedback = codec.message(f"{slave.name}Feedback")
     position, velocity = (feedback.values[feedback.place(name)].scale for name in ("position", "velocity"))
     increments = math.tau / position
-    if found.has_increments and not _is_alike(found.increments_per_joint_rev, increments):
+    if found.has_increments and not any(_is_alike(one.increments_per_joint_rev, increments) for one in readings):
         slave.fail(
             f"increments per joint revolution {found.increments_text}, {increments:.10g} expected",
             f"correct `scale.increments_per_joint_rev` and `scale.gear_ratio` of {place}, or encoder and gear in the "
@@ -248,7 +251,7 @@ def _check_units(slave: Slave, codec: Codec) -> list[str]:
         )
     if found.increments_text and not found.has_increments:
         remarks.append(f"{found.increments_text} is a factory value: nothing confirms {increments:.10g} increments")
-    if found.velocity_rad_s is not None and not _is_alike(found.velocity_rad_s, velocity):
+    if found.velocity_rad_s is not None and not any(_is_alike(one.velocity_rad_s, velocity) for one in readings):
         slave.fail(
             f"a count of velocity by 0x60A9 = {name_velocity_unit(found.velocity_unit)} is "
             f"{found.velocity_rad_s:.6g} rad/s at the joint, {velocity:.6g} rad/s expected",

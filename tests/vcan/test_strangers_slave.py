@@ -4,6 +4,7 @@ Only the application is here: the CiA 402 state machine, a mass, a torque, and P
 in one process, in virtual time.
 """
 
+import contextlib
 import dataclasses
 import functools
 from collections import deque
@@ -735,6 +736,19 @@ def rig_with_profile(folder: Path, line: str) -> Rig:
     settings = load_settings("stock")
     devices = dataclasses.replace(settings.devices, sensor=(str(path), str(path)))
     return Rig(dataclasses.replace(settings, devices=devices), "torque_sensor.eds")
+
+
+@pytest.mark.parametrize(("encoder", "is_taken"), [(65536, True), (1048576, True), (32768, False)])
+def test_a_gear_that_the_drive_was_never_given_is_the_profile_s(tmp_path: Path, encoder: int, is_taken: bool) -> None:
+    path = tmp_path / "geared.toml"
+    path.write_text('extends = "stock-drive"\n[scale]\ngear_ratio = 16\n')
+    settings = load_settings("stock")
+    devices = dataclasses.replace(settings.devices, drive=(str(path), str(path)))
+    rig = Rig(dataclasses.replace(settings, devices=devices))
+    for drive, rated in zip(rig.drives, (750, 375), strict=True):  # 12 and 6 Nm over 16
+        drive.lies.update({(0x6091, 1): 1, (0x6091, 2): 1, (0x608F, 1): encoder, (0x6076, 0): rated})
+    with contextlib.nullcontext() if is_taken else pytest.raises(DeviceError, match="increments per joint revolution"):
+        rig.boot()
 
 
 def test_any_identity_is_taken_where_the_profile_says_so(tmp_path: Path) -> None:
