@@ -228,3 +228,13 @@ def test_exchanged_drives_behind_different_gears_are_called_so(tmp_path: Path) -
     summary, _ = run_embedded(cast, "lockstep", tmp_path / "run")
     assert "0x6076 = 200000 µNm, 240000 µNm expected of a motor behind a gear of 50" in summary.error
     assert "it is that of joint 2: the drives are exchanged" in summary.error
+
+
+def test_the_documented_example_has_the_documented_numbers(tmp_path: Path) -> None:
+    eds = str(Path(__file__).parents[1] / "docs" / "examples" / "drive.eds")
+    known = ("--gear", "30", "30", "--gear-efficiency", "0.8", "0.8", "--increments", "122880", "122880")
+    assert init(tmp_path, "--eds", eds, *known, "--rated-torque-unit", "µNm").exit_code == 0
+    scale = load_profile(str(tmp_path / "my-arm-drive.toml"), "drive").settings.scale
+    assert scale.velocity_rad_s == pytest.approx(math.pi / 30.0 / 30.0)
+    assert (scale.increments_per_joint_rev, scale.rated_torque_count_Nm) == (122880.0, 1e-6)
+    assert load_settings(str(tmp_path / "my-arm.toml")).arm.rated_torque_Nm == pytest.approx((9.12, 9.12))

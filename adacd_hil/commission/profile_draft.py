@@ -571,7 +571,8 @@ class _DriveWriter(_ProfileWriter):
         if (fact := self.fact("velocity_rad_s")) is not None:
             return [f"velocity_rad_s = {fact!r}"]
         rad_s = math.tau / increments
-        text = f"{rad_s:.6g}: a count is one increment per second, as CiA 402 has it without 0x60A9"
+        why = f"0x60A9 = 0x{code:08X} is no known unit of velocity" if code else "CiA 402's default without 0x60A9"
+        text = f"{rad_s:.6g}: one increment per second; {why}"
         return [self.guess("velocity_rad_s", rad_s, text), f"velocity_rad_s = {rad_s!r}"]
 
     def _torque(self) -> tuple[float, list[str]]:
