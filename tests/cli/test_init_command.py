@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -532,3 +533,15 @@ def test_who_ends_the_questions_gets_no_file(out: Path, monkeypatch: pytest.Monk
     result = init(out, typed="none\n")
     assert result.exit_code != 0
     assert not out.exists()
+
+
+@pytest.mark.slow
+def test_init_ends_with_the_commands_up_to_the_first_run_of_which_tare_is_one(tmp_path: Path) -> None:
+    out = tmp_path / "my lab" / "my-arm.toml"
+    result = init(out, *NO_BUS, "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--flat")
+    assert result.exit_code == 0, result.stderr
+    typed = [shlex.split(line.removeprefix("next:"), comments=True) for line in result.stderr.splitlines()[-4:]]
+    assert [words[1] for words in typed] == ["demo", "doctor", "tare", "run"]
+    arm = ["-i", "socketcan", "-c", "can0", "--config", str(out)]
+    assert typed[2][2:] == [*arm, "--out", str(out.with_name("tare.toml"))]
+    assert typed[3][2:] == [*arm, "--tare", str(out.with_name("tare.toml"))]

@@ -10,7 +10,7 @@ import click
 from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
 from adacd_hil.cli.interview import Interview
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, show
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
@@ -84,7 +84,7 @@ def init(
     summary |= {"file": str(out), "written": [str(path) for path in writing.contents]}
     bus, code = summary.pop("bus", None), ExitCode.OK
     if not as_json:
-        show(as_text(summary, bus))
+        show(as_text(summary))
     if interview.confirm(rehearse, "Rehearse with an emulated arm now?"):
         from adacd_hil.cli.commands.demo_command import play
 
@@ -106,21 +106,30 @@ def init(
             show(doctor_command.as_text(findings))
     if as_json:
         print(json.dumps(summary, indent=2))
+    else:
+        suggest(*next_of_init(str(out), bus))
     return code
 
 
-def as_text(summary: dict[str, Any], bus: dict[str, Any] | None) -> str:
-    """Say what was written, what in it is a guess, and what comes next."""
+def as_text(summary: dict[str, Any]) -> str:
+    """Say what was written, and what in it is a guess."""
     lines = [f"written: {', '.join(summary['written'])}"]
     lines += [f"warning: {line}" for line in summary["warnings"]]
     if summary["assumed"]:
         lines.append(f"guesses, which `adacd-hil doctor` asks for: {', '.join(summary['assumed'])}")
-    where = "-i socketcan -c can0" if bus is None else f"-i {bus['interface']} -c {bus['channel']}"
-    lines += [
-        "next:",
-        f"  adacd-hil demo --config {summary['file']}   # rehearse",
-        f"  adacd-hil doctor {where} --config {summary['file']}",
-        f"  adacd-hil tare {where} --config {summary['file']}   # the sensors' zero, which tells a lean from an offset",
-        f"  adacd-hil run {where} --config {summary['file']} --tare tare.toml",
-    ]
     return "\n".join(map(in_line, lines))
+
+
+def next_of_init(file: str, bus: dict[str, Any] | None) -> tuple[str, ...]:
+    """Name what may be typed after a draft, up to the first run. bus: where the arm was found."""
+    from adacd_hil.cli.connection import Connection
+
+    bus = bus or {"interface": "socketcan", "channel": "can0", "bitrate": None}
+    arm = Connection(bus["interface"], bus["channel"], bus["bitrate"], file, None, None).arguments
+    tare = quoted(Path(file).with_name("tare.toml"))
+    return (
+        f"adacd-hil demo --config {quoted(Path(file))}   # rehearse",
+        f"adacd-hil doctor {arm}",
+        f"adacd-hil tare {arm} --out {tare}   # the zero of the torque sensors, while nobody touches the arm",
+        f"adacd-hil run {arm} --tare {tare}   # moves the arm",
+    )
