@@ -1,6 +1,7 @@
 """What the commands that work on a bus share: settings, contract, an open bus, and an orderly end."""
 
 import dataclasses
+import shlex
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -34,7 +35,7 @@ def check_clock(name: str, interface: str, channel: str) -> None:
 
     An interface that is not there is nothing yet; opening it says so.
     """
-    if name == "lockstep" and _may_be_hardware(interface, channel):
+    if name == "lockstep" and may_be_hardware(interface, channel):
         raise CommandError(
             f"--clock lockstep is for emulated arms; {interface} {channel} may be hardware: it needs --clock realtime",
             ExitCode.USAGE,
@@ -43,7 +44,7 @@ def check_clock(name: str, interface: str, channel: str) -> None:
 
 def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
     """Raise CommandError for a scripted user on what may be hardware: there a person acknowledges."""
-    if _may_be_hardware(interface, channel):
+    if may_be_hardware(interface, channel):
         raise CommandError(
             f"--scenario {in_line(scenario)} plays the user of an emulated arm; {interface} {channel} may be hardware: "
             "leave it out",
@@ -51,7 +52,8 @@ def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
         )
 
 
-def _may_be_hardware(interface: str, channel: str) -> bool:
+def may_be_hardware(interface: str, channel: str) -> bool:
+    """Tell whether an arm may be on a channel that is there: all but vcan, vxcan and python-can's own virtual bus."""
     is_there = interface != "socketcan" or channel in can_interfaces()
     return is_there and not is_virtual(interface, channel)
 
@@ -115,6 +117,19 @@ class Connection:
     config: str
     profile: str | None
     dbc: Path | None
+
+    @property
+    def arguments(self) -> str:
+        """The options by which another command reaches the same arm, as typed in a shell."""
+        given = [
+            ("-i", self.interface),
+            ("-c", self.channel),
+            ("-b", self.bitrate),
+            ("--config", self.config),
+            ("--profile", self.profile),
+            ("--dbc", self.dbc),
+        ]
+        return " ".join(f"{option} {shlex.quote(str(value))}" for option, value in given if value is not None)
 
     def settings(self) -> Settings:
         """Read the configuration, of which the option --dbc outweighs the contract. Raises ConfigError."""

@@ -54,14 +54,14 @@ def test_on_a_terminal_the_user_says_that_an_arm_may_run_without_an_anchor(
     @click.command()
     def command() -> None:
         monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-        ask_without_anchor([1])
+        ask_without_anchor([1], "-i kvaser -c 0")
         print("started")
 
     result = CliRunner().invoke(command, input=answer)
     assert ("started" in result.stdout) is is_started
     assert result.exit_code == (0 if is_started else 1)
     assert "nothing bounds the torque offset of joint 2: " in result.stderr
-    assert "run --tare tare.toml" in result.stderr
+    assert "`adacd-hil tare -i kvaser -c 0` first, then `run --tare tare.toml`" in result.stderr
 
 
 def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
@@ -69,7 +69,7 @@ def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
 ) -> None:
     lab = Lab(tmp_path, monkeypatch)
     lab.settings_file.write_text('scheme = "certified"\n' + SHORT_RUN)
-    monkeypatch.setattr("adacd_hil.cli.commands.run_command.is_virtual", lambda interface, channel: False)
+    monkeypatch.setattr("adacd_hil.cli.commands.run_command.may_be_hardware", lambda interface, channel: True)
     refused = lab.run()
     assert refused.exit_code == 2
     (line,) = complaints(refused)

@@ -187,7 +187,7 @@ def test_the_life_has_all_of_it(lived):
     if scheme == "certified":
         assert {output.reaction.name for output in outputs} == {"NONE", "STOP", "WITHDRAW", "SLOW_DOWN"}
         assert outputs[6000].block[layout_of(settings_of(scheme)).slices["promotions"]] >= 5
-        assert [event.name for event in pipeline._policy._events] == ["certificate", "margin", "touch", "touch"]
+        assert [event.name for event in pipeline._policy._events] == ["certificate", "margin", "touch"]
 
 
 def test_step_gives_the_bits_of_concluding_each_cycle(life, lived):

@@ -18,6 +18,7 @@ from adacd_hil.cli.connection import (
     check_rehearsal,
     check_shared,
     make_clock,
+    may_be_hardware,
     never_stopped,
     on_interrupt,
 )
@@ -37,7 +38,7 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line
 from adacd_hil.wire.budget import check_budget
 from adacd_hil.wire.bus import Bus
-from adacd_hil.wire.can_interface import CanInterface, is_virtual
+from adacd_hil.wire.can_interface import CanInterface
 from adacd_hil.wire.codec import Codec
 
 
@@ -103,6 +104,8 @@ def run_on_bus(
         history = use_history(history_path, wall_ns())
         settings = history.apply(settings)
         ask_first_run(history)
+    if settings.scheme == "certified" and not without_anchor and may_be_hardware(interface, channel):
+        ask_without_anchor(unanchored_joints(settings), connection.arguments)
     codec = load_contract(settings)
     if clock_name == "realtime":
         check_budget_of(codec, settings)
@@ -111,8 +114,6 @@ def run_on_bus(
         bus = connection.open(clock, codec, settings)
         stack.callback(bus.close)
         drop_old_frames(bus, interface)
-        if settings.scheme == "certified" and not (without_anchor or is_virtual(interface, channel)):
-            ask_without_anchor(unanchored_joints(settings))
         operator: Operator = ScriptedOperator(settings.operator)
         if sys.stdin is not None and sys.stdin.isatty():
             operator = ConsoleOperator(ScriptedOperator(settings.operator))
@@ -163,10 +164,11 @@ def ask_first_run(history: UsedHistory) -> None:
         raise CommandError("not started: somebody touches the arm")
 
 
-def ask_without_anchor(joints: list[int]) -> None:
+def ask_without_anchor(joints: list[int], arguments: str) -> None:
     """Have the user say on the terminal that an arm may learn its torque offsets without an anchor.
 
-    Raises CommandError where they don't, and where there is no terminal.
+    arguments: those of the command that name bus and arm. Raises CommandError where they don't, and where there is no
+    terminal.
     """
     if not joints:
         return
@@ -175,7 +177,7 @@ def ask_without_anchor(joints: list[int]) -> None:
         f"nothing bounds the torque offset of {named}: neither a tare nor a history is given, and "
         "`arm.holding_torque_Nm` doesn't say that the motor holds little"
     )
-    remedy = "`adacd-hil tare` first, then `run --tare tare.toml`"
+    remedy = f"`adacd-hil tare {arguments}` first, then `run --tare tare.toml`"
     if sys.stdin is None or not sys.stdin.isatty():
         raise CommandError(f"{unknown}; {remedy}, or `run --without-anchor`", ExitCode.USAGE)
     print(
