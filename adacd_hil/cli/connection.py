@@ -54,7 +54,9 @@ def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
 
 def may_be_hardware(interface: str, channel: str) -> bool:
     """Tell whether an arm may be on a channel that is there: all but vcan, vxcan and python-can's own virtual bus."""
-    is_there = interface != "socketcan" or channel in can_interfaces()
+    from adacd_hil.wire.python_can import is_usable
+
+    is_there = channel in can_interfaces() if interface == "socketcan" else is_usable(interface)
     return is_there and not is_virtual(interface, channel)
 
 

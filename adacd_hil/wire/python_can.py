@@ -32,6 +32,11 @@ def interface_names() -> list[str]:
     return sorted(can.VALID_INTERFACES)
 
 
+def is_usable(interface: str) -> bool:
+    """Tell whether python-can knows an interface and a cycle can run on it."""
+    return interface in can.VALID_INTERFACES and interface not in _ECHOING_INTERFACES
+
+
 class PythonCanBus(Bus):
     """Any other python-can interface. How CAN FD's second bit rate is set, python-can leaves to its own settings."""
 

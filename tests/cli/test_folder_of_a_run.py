@@ -69,7 +69,7 @@ def test_a_start_that_fails_leaves_yesterday_alone_and_can_be_tried_again(tmp_pa
         (("-c", "x", "--config", "wrong.toml"), USAGE),
         (("-c", "x", "--dbc", "none.dbc"), USAGE),
         (("-c", "x", "--tare", "none.toml"), USAGE),
-        (("-c", "x", "-b", "77777777", "--out", "runs/new/one"), BUS_MISSING),
+        (("-c", "x", "-b", "77777777", "--without-anchor", "--out", "runs/new/one"), BUS_MISSING),
     ):
         interface = "slcan" if status == BUS_MISSING else "virtual"
         assert adacd_hil(tmp_path, "run", "-i", interface, *arguments).status == status

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import click
 import pytest
-from bus_lab import SHORT_RUN, Lab, complaints
+from bus_lab import BUS_MISSING, SHORT_RUN, Lab, complaints
 from click.testing import CliRunner
 
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.cli.commands.run_command import as_text, ask_without_anchor, next_of_run, summarise
+from adacd_hil.cli.main import cli
 from adacd_hil.scheme.identify.anchor import unanchored_joints
 from adacd_hil.settings.configuration import load_settings
 
@@ -76,6 +77,13 @@ def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
     assert line.startswith("adacd-hil: nothing bounds the torque offset of joint 1 and joint 2: ")
     assert not (tmp_path / "run.mcap").exists()
     assert lab.run("--without-anchor").exit_code == 0
+
+
+@pytest.mark.parametrize("interface", ["socketcan", "sockercan", "udp_multicast"])
+def test_an_interface_that_cannot_be_used_is_named_before_any_question(interface: str) -> None:
+    result = CliRunner().invoke(cli, ["run", "-i", interface, "-c", "can77", "--config", "certified"])
+    assert result.exit_code == BUS_MISSING
+    assert "nothing bounds" not in result.stderr
 
 
 @pytest.mark.slow
