@@ -68,7 +68,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     # -- the bus
     ("run -i sockecan -c can0", BUS_MISSING, ("unknown interface 'sockecan'", "did you mean 'socketcan'?")),
     ("scan -i socketcan -c cann0", BUS_MISSING, ("CAN interface cann0 does not exist", "did you mean 'can0'?")),
-    ("run -i socketcan -c can0", BUS_MISSING, ("CAN interface can0 is down", "ip link set can0 up")),
+    ("run -i socketcan -c can0 --without-anchor", BUS_MISSING, ("CAN interface can0 is down", "ip link set can0 up")),
     ("run -i slcan -c tty1 --clock lockstep", USAGE, ("lockstep is for emulated arms", "it needs --clock realtime")),
     (f"{RUN} -b 1M", USAGE, ("'1M' is not a valid integer", "run --help")),
     ("init new.toml -i virtual -c x --yes", BUS_MISSING, ("drives that answer: none", "Check power, wiring and node")),
