@@ -195,7 +195,7 @@ def flood(fed):
     """Write more than the system and the server keep for a client that doesn't read."""
     for number in range(FLOOD):
         fed.event(number, Event("info", "flood", 4000 * "x"))
-        if number % 500 == 0:
+        if number % 500 == 0 or number == FLOOD - 1:
             fed.write()
             while fed.live is not None and fed.live.waiting_bytes:  # what finds no room isn't shown at all
                 os.sched_yield()
