@@ -40,9 +40,11 @@ def with_arm(**arm):
         (with_arm(holding_torque_Nm=(0.0, 0.0)), []),
         (with_arm(holding_torque_Nm=(8.0, 0.05)), [0]),
         (with_arm(holding_torque_Nm=None, torque_offset_std_Nm=(0.005, 0.005)), []),
+        (with_arm(holding_torque_Nm=None, torque_offset_std_Nm=(0.005, 0.03)), [1]),
         (replace(with_arm(holding_torque_Nm=None), history=LAST), []),
+        (replace(with_arm(holding_torque_Nm=None), history=replace(LAST, offset_std_Nm=(0.03, 0.01))), [0]),
     ],
-    ids=["nothing is known", "free motors", "one brake", "a tare", "a last certificate"],
+    ids=["nothing", "free motors", "one brake", "a tare", "a rough tare", "a last certificate", "a rough one"],
 )
 def test_a_joint_has_an_anchor_by_a_tare_a_last_certificate_or_a_motor_that_holds_little(settings, joints) -> None:
     assert unanchored_joints(settings) == joints

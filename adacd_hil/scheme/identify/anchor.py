@@ -71,15 +71,18 @@ def constants_of(settings: Settings) -> dict[str, Vector]:
 
 
 def unanchored_joints(settings: Settings) -> list[int]:
-    """Return the joints whose torque offset nothing outside a run can bound: no tare, no last certificate, no motor.
+    """Return the joints whose torque offset nothing outside a run bounds to `beta_Nm`.
 
-    A motor that may hold more than `beta_Nm` without power tells too little.
+    Neither a tare, nor a last certificate, nor a motor that holds little without power does.
     """
-    arm = settings.arm
-    if arm.torque_offset_std_Nm is not None or settings.history.is_known:
-        return []
-    holding = _or_unknown(arm.holding_torque_Nm)
-    return [i for i in range(JOINTS) if not holding[i] < settings.certified.beta_Nm]
+    arm, history = settings.arm, settings.history
+    bounds_Nm = (
+        SIGMAS * _or_unknown(arm.torque_offset_std_Nm),
+        SIGMAS * _or_unknown(history.offset_std_Nm if history.is_known else None),
+        SIGMAS * REST_STD_NM + _or_unknown(arm.holding_torque_Nm),
+    )
+    tightest_Nm = np.min(bounds_Nm, axis=0)
+    return [i for i in range(JOINTS) if not tightest_Nm[i] <= settings.certified.beta_Nm]
 
 
 def _or_unknown(values: tuple[float, ...] | None) -> Vector:
