@@ -177,6 +177,18 @@ class _Claims:
 _claims = _Claims()
 
 
+def _name_of_layout(record: numba.types.Record) -> tuple[str, tuple[str]]:
+    """Name a record in the symbols of compiled code.
+
+    numba names it by a count of its process (numba's issue 7654). Two processes then save code of two layouts below one
+    symbol, and a third one that loads both runs the code of the first with the memory of the second.
+    """
+    return "Record", (hashlib.sha256(record.name.encode()).hexdigest()[:16],)
+
+
+numba.types.Record.mangling_args = property(_name_of_layout)  # type: ignore[method-assign, assignment]
+
+
 class _SharedCache(FunctionCache):
     """numba's cache on disk, for processes that compile at the same time.
 

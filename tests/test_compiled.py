@@ -212,6 +212,34 @@ def test_processes_that_compile_for_different_types_at_once_take_nothing_from_ea
     assert start(3, 5).communicate() == ("1\n2\n", None)
 
 
+SYMBOL_OF_A_LAYOUT = """
+import sys
+import numpy as np
+from adacd_hil.compiled import compiled
+
+@compiled
+def last(records):
+    return records[0]["last"]
+
+last(np.zeros(1, [("first", "f8", (int(sys.argv[1]),)), ("last", "f8")]))
+print(*(overload.fndesc.mangled_name for overload in last.overloads.values()))
+"""
+
+
+@pytest.mark.slow
+def test_no_two_layouts_share_a_symbol_even_if_two_processes_compile_them(tmp_path: Path) -> None:
+    """Of two functions below one symbol, a process that loads both from the cache runs one with the other's memory."""
+    program = tmp_path / "last.py"
+    program.write_text(SYMBOL_OF_A_LAYOUT)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def symbol(count: int) -> str:
+        return subprocess.check_output([sys.executable, str(program), str(count)], text=True, env=environment)
+
+    assert symbol(3) != symbol(500)
+    assert symbol(3) == symbol(3)
+
+
 def test_a_disk_that_takes_no_compiled_code_costs_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
