@@ -209,7 +209,7 @@ def check_as_text(check: "LogCheck") -> str:
     for finding in check.findings:
         where = f"{finding.file}, byte {finding.offset}" if finding.offset >= 0 else finding.file
         lines.append(f"{finding.severity}: {where}: {finding.text} ({finding.rule})")
-    left_out = check.errors + check.warnings - len(check.findings)
+    left_out = check.errors + check.warnings + check.notes - len(check.findings)
     if left_out:
         lines.append(f"and {left_out} more of these")
     verdict = "clean" if not check.errors + check.warnings else f"{check.errors} errors, {check.warnings} warnings"
@@ -293,7 +293,7 @@ dbc_option = click.option(
 )
 @click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
 @click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Of the output.")
-@click.option("--out", type=WrittenPath(), help="Folder of the tables, or file of the frames.")
+@click.option("--out", type=WrittenPath(), help="Folder of the tables, or file of the frames; default: beside LOG.")
 @click.option(
     "--topic", "topics", multiple=True, metavar="TOPIC", help="For tables: a topic, or a pattern such as 'decoded/*'."
 )

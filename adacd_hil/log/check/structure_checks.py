@@ -83,7 +83,7 @@ class ChunkCheck:
         self._latest = self.facts[record.offset] = facts
         self._expected, self._offsets = None, {}
         if not chunk.uncompressed_crc:
-            self._findings.add("no-crc", "a chunk has no CRC", record.offset)
+            self._findings.without_crc["chunk"] += 1
         try:
             data = self._opening.open_checked(chunk)
         except ChunkError as error:
@@ -298,7 +298,7 @@ class SummaryCheck:
             text = f"the Footer says {footer.summary_offset_start} for the summary offsets, it is {self._offset_start}"
             self._findings.add("summary-offset", text, record.offset)
         if not footer.summary_crc:
-            self._findings.add("no-crc", "the summary has no CRC", record.offset)
+            self._findings.without_crc["summary"] += 1
         elif footer.summary_crc != crc:
             self._findings.add("summary-crc", "the summary fails its CRC", record.offset)
 
