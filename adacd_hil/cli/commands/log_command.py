@@ -336,7 +336,8 @@ def export(
     if kind in TABLES:
         described, problem = _export_tables(log, out or log.with_name(f"{log.stem}-tables"), kind, topics, decoder)
     else:
-        out = out or log.with_suffix(_SUFFIXES.get(kind, f".{kind}"))
+        suffix = _SUFFIXES.get(kind, f".{kind}")
+        out = out or log.with_suffix(suffix if log.suffix.lower() != suffix else f".exported{suffix}")
         described, problem = _export_frames(log, out, kind, only, can_ids, decoder, has_direction)
     if problem:
         print(in_line(f"warning: {problem}"), file=sys.stderr)
@@ -359,6 +360,8 @@ def _export_tables(
     from adacd_hil.log.formats.signal_tables import export_tables
 
     summary = export_tables(log, out, kind, topics, decoder, _Teller("rows"))
+    for note in summary.notes:
+        _tell(f"{kind}: {note}")
     lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
     described = {
         "files": {str(path): rows for path, rows in summary.rows.items()},
