@@ -120,6 +120,12 @@ def clipped(motion: Motion) -> Motion:
     return replace(motion, tau=np.column_stack([np.clip(motion.tau[:, 0], -limit, limit), motion.tau[:, 1]]))
 
 
+def bounded(motion: Motion) -> Motion:
+    """Clip a torque before the sensor adds its noise, so that no two readings are equal."""
+    cut = clipped(motion)
+    return replace(cut, tau=cut.tau + noise(cut.tau.shape))
+
+
 def short(motion: Motion) -> Motion:
     return Motion(*(values[:300] for values in (motion.t, motion.q, motion.dq, motion.tau)))
 
@@ -157,6 +163,21 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], tuple[str, ...], str]] 
     "a stuck sensor": (stuck, ("the torque of joint1 (tau1) is stuck at", "for 0.99 s, from 4.5"), "--from"),
     "a clipped sensor": (clipped, ("the torque of joint1 (tau1) is clipped at -",), "range"),
     "a dead encoder": (lambda m: still(m, 1), ("the position of joint2 (q2) is always",), "`columns.q`"),
+    "a bound before the noise of the sensor": (
+        bounded,
+        ("joint1: ", "% is explained, 99 % are needed", "of the time, as if clipped"),
+        "range of that sensor",
+    ),
+    "positions that are noise": (
+        lambda m: replace(m, q=30.0 * noise(m.q.shape)),
+        ("the position of joint1 (q1) and joint2 (q2) is noise",),
+        "`columns.q`",
+    ),
+    "an encoder that is noise": (
+        lambda m: replace(m, q=np.column_stack([m.q[:, 0], 30.0 * noise(len(m.q))])),
+        ("the position of joint2 (q2) is noise",),
+        "check that encoder",
+    ),
     "an arm at rest": (lambda m: still(still(m, 0), 1), ("the arm does not move",), "motion of every joint"),
     "too short": (short, ("too short: 0.9 s fitted and 0.6 s tested",), "record more"),
 }
@@ -444,6 +465,11 @@ VELOCITIES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str, str]] = {
     "rpm": (lambda dq: dq * 30.0 / math.pi, "the velocity of joint1 (dq1) is 9.55 times", '`units.dq` = "rpm"'),
     "another sign": (lambda dq: dq * TURNED, "the velocity of joint2 (dq2) has the other sign", "`columns.dq`"),
     "exchanged": (lambda dq: dq[:, ::-1], "the velocity of joint1 (dq1) is in the column of joint2", "`columns.dq`"),
+    "exchanged, of joints that move much alike": (
+        lambda dq: (dq @ [[1.0, 0.7], [0.0, 0.7]])[:, ::-1],
+        "the velocity of joint1 (dq1) is in the column of joint2",
+        "`columns.dq`",
+    ),
 }
 
 
@@ -468,6 +494,15 @@ def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path: Path, upr
     noisy = replace(upright, dq=upright.dq + 1.0 * np.random.default_rng(5).standard_normal(upright.dq.shape))
     verdict = judged(tmp_path, noisy, has_dq=True).verdict
     assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in verdict.remarks)
+
+
+def test_a_stuck_sensor_makes_no_share_that_is_no_number(tmp_path: Path, upright: Motion) -> None:
+    tau = upright.tau.copy()
+    tau[len(tau) // 3 :, 0] = tau[len(tau) // 3, 0]
+    verdict = judged(tmp_path, replace(upright, tau=tau)).verdict
+    assert math.isnan(verdict.joints[0].share)
+    assert "is stuck at" in verdict.reasons[0]
+    assert not any(text.startswith("joint1:") for text in (*verdict.reasons, *verdict.remarks))
 
 
 # The command.

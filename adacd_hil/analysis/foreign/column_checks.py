@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.foreign.recording_import import ForeignRecording, derivative_window, derive
+from adacd_hil.analysis.foreign.recording_import import MEDIAN_TO_SIGMA, ForeignRecording, derivative_window, derive
 from adacd_hil.analysis.foreign.recording_map import RecordingMap, units_by_slope
 from adacd_hil.records import Vector
 
@@ -24,10 +24,19 @@ _STUCK_TIMES: Final = 5.0
 _CLIPPED_SHARE, _CLIPPED_ROWS, _CLIPPED_RUN = 0.005, 10, 5
 _CLIPPED_BAND: Final = 0.05
 """Of the span below the largest reading, which a clipped sensor passes in less time than it stays at the bound."""
+_PLATEAU_SIGMAS: Final = 3.5
+_PLATEAU_WIDTH: Final = 0.1
+_PLATEAU_SHARE, _PLATEAU_TIMES = 0.02, 4.0
+"""A sine stays at its crest for 2.4 times as long as just below it."""
 _FEWEST_LEVELS, _FINE_LEVELS = 50, 200
 """Of a sensor whose largest reading says anything, and of one that a sine leaves sooner, to half the time."""
 STILL_RAD: Final = 0.01
 """A joint that travels less is at rest."""
+_NOISE_STEP: Final = 0.5
+"""Mean square of the steps from sample to sample over twice the variance: 1 of white noise, 0.01 of a motion of 1 Hz at
+50 Hz."""
+_NOISE_PERIOD_S: Final = 0.02
+"""At longer periods a fast motion has such steps, too."""
 _TURNS_THOUGH_STILL_RAD: Final = 0.3
 """Travel by the velocities, of a joint at rest, that neither their noise nor their offset makes."""
 _WELL_CORRELATED: Final = 0.8
@@ -36,6 +45,8 @@ _BEYOND_LIMITS: Final = 3.0
 """Times the limits of a joint: no arm goes there, but degrees taken for radians are 57 times."""
 _BEYOND_EFFORT: Final = 30.0
 """Times the effort of the URDF: mNm taken for Nm are 1000 times."""
+
+CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 
 
 class ColumnFinding(NamedTuple):
@@ -119,7 +130,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFi
         if bounds := list(_clipped_at(torque)):
             yield ColumnFinding(
                 f"the torque of {name} is clipped at {' and '.join(f'{bound:g}' for bound in bounds)} Nm",
-                "move slower, or raise the range of that sensor",
+                CLIPPED_REMEDY,
             )
     yield from _against_effort(described, columns)
 
@@ -163,7 +174,15 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
             "can be learnt",
             "move every joint, name one that never moves in `arm.locked`, and check `columns.q`",
         )
-    for joint in range(n):
+    noise = [joint for joint in range(n) if joint not in still and _is_noise(columns.q[:, joint], columns.period_s)]
+    if noise:
+        names = joined_names([column_name(described, "q", joint) for joint in noise], n)
+        yield ColumnFinding(
+            f"the position of {names} is noise: from sample to sample it jumps as far as it goes at all",
+            "check that encoder, and `columns.q`",
+            is_dead=True,
+        )
+    for joint in (joint for joint in range(n) if joint not in noise):
         low, high = urdf.position_low[joint], urdf.position_high[joint]
         is_known = np.isfinite(low) and np.isfinite(high) and high > low
         bound = max(abs(low), abs(high)) if is_known else math.pi * 4.0
@@ -178,6 +197,12 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
                 f'if the positions are degrees: `units.q` = "deg", which the map has as "{described.units.q}"',
             )
             return
+
+
+def _is_noise(column: Vector, period_s: float) -> bool:
+    return period_s <= _NOISE_PERIOD_S and float(np.mean(np.diff(column) ** 2)) > _NOISE_STEP * 2.0 * float(
+        np.var(column)
+    )
 
 
 def _of_rest(
@@ -212,10 +237,9 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
     slopes = np.diag(products) / np.maximum(squares, 1e-12)
     alike = products / np.sqrt(np.maximum(np.outer(squares, own), 1e-24))
     moving = [joint for joint in range(n) if squares[joint] > 0.0]
-    strangers = [joint for joint in moving if abs(alike[joint, joint]) < 0.5]
-    for joint in strangers:
+    for joint in moving:
         other = int(np.argmax(np.abs(alike[joint])))
-        if other != joint and alike[joint, other] > _WELL_CORRELATED:
+        if abs(alike[joint, joint]) < _WELL_CORRELATED < alike[joint, other]:
             yield ColumnFinding(
                 f"the velocity of {column_name(described, 'dq', joint)} is in the column of "
                 f"{column_name(described, 'dq', other)}",
@@ -255,6 +279,26 @@ def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | 
     is_long = (last - first) * period_s >= _STUCK_S and last - first >= 20 and last - first > _STUCK_TIMES * usual
     is_moving = np.any(np.ptp(q[first:last], axis=0) > _STUCK_TRAVEL * np.ptp(q, axis=0))
     return (first, last) if is_long and is_moving else None
+
+
+def plateau(torque: Vector) -> tuple[float, float] | None:
+    """Find a bound at which a torque stays within its noise: the bound, and the share of the time; None: there is none.
+
+    The last stretch before its extreme reading, as wide as the noise, holds far more readings than the one before it.
+    A joint that overcomes nothing but friction is like that, too.
+    """
+    noise = float(MEDIAN_TO_SIGMA) * float(np.median(np.abs(np.diff(torque, 2))))
+    width, span = 2.0 * _PLATEAU_SIGMAS * noise, float(np.ptp(torque))
+    if not 0.0 < width < _PLATEAU_WIDTH * span:
+        return None
+    for sign in (1.0, -1.0):
+        if np.count_nonzero(torque == sign * np.max(sign * torque)) >= _CLIPPED_RUN:
+            continue  # cut off behind the noise, see `_clipped_at`
+        below = float(np.max(sign * torque)) - sign * torque
+        at, beside = np.count_nonzero(below < width), np.count_nonzero((below >= width) & (below < 2.0 * width))
+        if at > _PLATEAU_SHARE * len(torque) and at > _PLATEAU_TIMES * beside:
+            return float(np.median(torque[below < width])), at / len(torque)
+    return None
 
 
 def _clipped_at(torque: Vector) -> Iterator[float]:

@@ -32,6 +32,10 @@ _KINDS_OF_FILE: Final = (
     (b"MATLAB", "a MATLAB file: adacd_hil.api.detect takes arrays"),
     (b"\x93NUMPY", "a numpy array: adacd_hil.api.detect takes arrays"),
     (b"\x89HDF", "an HDF5 file: adacd_hil.api.detect takes arrays"),
+    (b"PAR1", "a Parquet file: save it as CSV"),
+    (b"LOGG", "a BLF of frames: `adacd-hil log export --format csv --dbc` makes tables of it"),
+    (b"<?xml", "XML, no recording: if it is the URDF, the map names it, `arm.urdf`"),
+    (b"<robot", "a URDF: the map names it, `arm.urdf`"),
 )
 
 

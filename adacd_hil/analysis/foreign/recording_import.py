@@ -24,8 +24,10 @@ from adacd_hil.scheme.identify.offline import Record
 
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.1
 _LEAST_NOISE_NM = 1e-4
+_MOST_BESIDE_JUMP_RAD = 0.8
+"""Motion in the time of a jump, 8 rad/s in the longest period."""
 _DEGREE = 3  # of the polynomial whose slope is a derived velocity
-_MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white noise
+MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white noise
 _STEP_TO_SIGMA = 1.0 / np.sqrt(12.0)  # of the rounding to a step
 
 
@@ -116,7 +118,8 @@ def recording_of(
         raise LogError(f"recording {path}: {number_of(len(time_s), 'row')} with all values, {SHORTEST_SAMPLES} needed")
     period_s = described.sampling.period_s or period_s or _period_s(path, time_s, described)
     values, idle = _without_idle_velocities(values, described)
-    notes += idle
+    values, turned = _without_jumps(values, described)
+    notes += [*idle, *turned]
     has_dq = values.shape[1] > 2 * n
     longest_s = max(described.sampling.longest_gap_s, 1.5 * period_s)
     window = derivative_window(described, period_s)
@@ -181,6 +184,20 @@ def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[V
     return values[:, : 2 * n], [note]
 
 
+def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
+    """Let positions go on where they jump by a turn, as those of joints without end do from +180 to -180 degrees."""
+    notes = []
+    values = values.copy()
+    for joint in np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist():
+        steps = np.abs(np.diff(values[:, joint]))
+        jumps = steps[steps > np.pi]
+        if len(jumps) and np.all(np.abs(jumps - 2.0 * np.pi) < _MOST_BESIDE_JUMP_RAD):
+            values[:, joint] = np.unwrap(values[:, joint])
+            name, times = described.urdf.joint_names[joint], number_of(len(jumps), "time")
+            notes.append(f"the position of {name} jumps by a turn {times}: it goes on instead")
+    return values, notes
+
+
 def derivative_window(described: RecordingMap, period_s: float) -> int:
     """Return over how many samples velocities are derived."""
     return max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
@@ -198,7 +215,7 @@ def _noise(parts: list[Vector], given: Vector) -> Vector:
     """
     seconds = np.concatenate([np.abs(np.diff(part, 2, axis=0)) for part in parts])
     rounding = _STEP_TO_SIGMA * np.array([_step(column) for column in given.T])
-    return np.asarray(np.maximum(_MEDIAN_TO_SIGMA * np.median(seconds, axis=0), rounding))
+    return np.asarray(np.maximum(MEDIAN_TO_SIGMA * np.median(seconds, axis=0), rounding))
 
 
 def _step(column: Vector) -> float:

@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.foreign.column_checks import ColumnFinding, find_faults, joined_names
+from adacd_hil.analysis.foreign.column_checks import CLIPPED_REMEDY, ColumnFinding, find_faults, joined_names, plateau
 from adacd_hil.analysis.foreign.other_readings import UNITS, find_readings
 from adacd_hil.analysis.foreign.recording_import import ForeignRecording
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
@@ -463,14 +463,23 @@ def _of_excitation(fit: Fitted) -> Iterator[_Finding]:
 
 def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
     """Say which joints are not explained where nothing says why."""
-    unexplained = [i for i, joint in enumerate(joints) if not joint.is_explained]
-    for i in unexplained:
-        joint = joints[i]
+    for i, joint in enumerate(joints):
+        if joint.is_explained or math.isnan(joint.share):
+            continue
+        torque = np.concatenate(
+            [part.record.tau_J[:, i] for each in (*fit.fitted, fit.tested) for part in each.stretches]
+        )
+        bound = plateau(torque)
         largest, rms = fit.certificate.residual_max_Nm[i], fit.certificate.residual_rms_Nm[i]
         yield _Finding(
             f"{joint.name}: {percent(joint.share)} is explained, {100.0 * WHOLE:.0f} % are needed; the residual "
-            f"reaches {largest:.3g} Nm ({rms:.2g} rms), {_times_threshold(joint.margin)}",
-            _lack_remedy(fit),
+            f"reaches {largest:.3g} Nm ({rms:.2g} rms), {_times_threshold(joint.margin)}"
+            + (
+                f"; the torque stays at {bound[0]:.3g} Nm for {percent(bound[1])} of the time, as if clipped"
+                if bound
+                else ""
+            ),
+            CLIPPED_REMEDY if bound else _lack_remedy(fit),
             is_against=True,
         )
 
