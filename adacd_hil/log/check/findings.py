@@ -88,8 +88,8 @@ RULES: dict[str, Rule] = {
     "duplicate": Rule(_WARNING, "the data section defines each number once", "doctor"),
     "undefined-schema": Rule(_ERROR, "the schema of a channel is defined before it", "doctor"),
     "undefined-channel": Rule(_ERROR, "the channel of a message is defined before it", "doctor"),
-    "summary-only": Rule(_ERROR, "what the summary defines, the data section defines too", "doctor"),
-    "unused-summary-only": Rule(_WARNING, "the same, in a file without messages"),
+    "summary-only": Rule(_ERROR, "what the summary defines and messages use, the data section defines too", "doctor"),
+    "unused-summary-only": Rule(_NOTE, "the data section defines what no message uses, too"),
     # chunks and indexes
     "chunk-record": Rule(_ERROR, "a chunk holds schemas, channels and messages, whole ones", "doctor"),
     "chunk-times": Rule(_ERROR, "a chunk's times are those of its earliest and latest message", "doctor"),

@@ -220,7 +220,7 @@ class _FileCheck:
             self._findings.add("magic", "the file doesn't end with a Footer and MCAP's magic", size)
         elif end < size:
             self._findings.add("magic", f"{size - end} bytes follow the end", end)
-        self._definitions.finish(has_messages=bool(self._chunks.counts.any()))
+        self._definitions.finish(self._chunks.counts)
         self._summary.finish()
         self._judge_missing_crcs()
 

@@ -282,8 +282,9 @@ def _export_topics(
             if events := stream.events(piece):
                 tables.write(EVENTS.name, event_columns(events))
             progress(sum(tables.rows.values()))
-    varying = "" if tables.rows else f"messages of varying size are not exported: {', '.join(topics)}"
-    return TableSummary(tables.rows, stream.problem or varying)
+        if not tables.rows and not stream.problem:
+            raise LogError(f"{path} makes no table: messages of varying size are not exported: {', '.join(topics)}")
+    return TableSummary(tables.rows, stream.problem)
 
 
 def _export_frames(
