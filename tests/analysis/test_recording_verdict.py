@@ -453,6 +453,13 @@ def test_an_arm_without_masses_in_its_urdf_is_judged_by_its_effort_and_by_its_re
     assert judged(tmp_path, upright, has_masses=False).verdict.is_explained
 
 
+def test_torques_of_a_third_of_what_the_masses_need_are_a_remark(tmp_path: Path, upright: Motion) -> None:
+    """As currents taken for torques, of motors with a few Nm/A behind their gears."""
+    verdict = judged(tmp_path, replace(upright, tau=0.35 * upright.tau)).verdict
+    assert any(remark.startswith("the torques are 0.3") and "a gain is wrong" in remark for remark in verdict.remarks)
+    assert verdict.is_explained
+
+
 def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path: Path, upright: Motion) -> None:
     """Some have a thousandth of a kilogram to please a simulator."""
     verdict = judged(tmp_path, upright, density=1e-3).verdict

@@ -42,7 +42,7 @@ _UNKNOWN: Final = 0.3
 """Of the deviation before any motion: a parameter of which more is left was not excited."""
 _MILLI: Final = (300.0, 3000.0)
 """Times the masses of the URDF that torques ask for if they are mNm."""
-_ODD_SCALE: Final = 5.0
+_ODD_SCALE: Final = 2.0
 _ODD_MASSES: Final = 0.3
 """Share by which the parameters of a URDF may be off."""
 _HEAVIEST_KG, _LIGHTEST_KG = 300.0, 0.01
