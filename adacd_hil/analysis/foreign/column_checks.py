@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.foreign.recording_import import MEDIAN_TO_SIGMA, ForeignRecording, derivative_window, derive
 from adacd_hil.analysis.foreign.recording_map import RecordingMap, units_by_slope
 from adacd_hil.records import Vector
+from adacd_hil.scheme.model.urdf import SerialArm
 
 _STUCK_S: Final = 0.5
 _STUCK_TRAVEL: Final = 0.2
@@ -135,18 +136,20 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFi
     yield from _against_effort(described, columns)
 
 
+def largest_torque(tau_J: Vector, arm: SerialArm) -> tuple[int, float, float]:
+    """Return the joint whose torque (k, n) is most of its effort, the torque, and the effort: inf where unknown."""
+    effort = np.where(np.isfinite(arm.torque_limit) & (arm.torque_limit > 0.0), arm.torque_limit, np.inf)
+    largest = np.nanquantile(np.abs(tau_J), 0.99, axis=0)
+    joint = int(np.argmax(largest / effort))
+    return joint, float(largest[joint]), float(effort[joint])
+
+
 def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
-    effort = described.urdf.torque_limit
-    known = np.isfinite(effort) & (effort > 0.0)
-    if not known.any() or "A" in described.units.tau_J:
-        return
-    largest = np.quantile(np.abs(columns.tau_J), 0.99, axis=0)
-    over = np.where(known, largest / np.where(known, effort, 1.0), 0.0)
-    joint = int(np.argmax(over))
-    if over[joint] > _BEYOND_EFFORT:
+    joint, largest, effort = largest_torque(columns.tau_J, described.urdf)
+    if largest > _BEYOND_EFFORT * effort and "A" not in described.units.tau_J:
         yield ColumnFinding(
-            f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest[joint]:.3g} Nm, the URDF allows "
-            f"{effort[joint]:g} Nm",
+            f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest:.3g} Nm, the URDF allows "
+            f"{effort:g} Nm",
             f'if the torques are mNm: `units.tau_J` = "mNm", which the map has as "{described.units.tau_J}"',
             is_dead=not np.any(described.urdf.theta_full),  # else its masses say more
         )
