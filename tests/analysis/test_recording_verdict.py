@@ -315,6 +315,12 @@ SUMS = np.array([[1.0, 0.0], [1.0, 1.0]])
 """Columns that count from the base: q1, q1 + q2."""
 DEGREE = math.pi / 180.0
 
+
+def gravity_torque(motion: Motion, *gravity_m_s2: tuple[float, float, float]) -> np.ndarray:
+    arm = read_urdf(urdf_text(2, UPRIGHT), *gravity_m_s2)
+    return rigid_torque(arm, np.array([motion.q, 0.0 * motion.q, 0.0 * motion.q]))
+
+
 MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str, str]] = {
     "mNm": (lambda m: replace(m, tau=1e3 * m.tau), "", "they are mNm", '`units.tau_J` = "mNm"'),
     "mNm that are none": (lambda m: m, '[units]\ntau_J = "mNm"\n', "they are Nm", '`units.tau_J` = "Nm"'),
@@ -385,6 +391,18 @@ MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str, str]] = {
         "the column of joint2 has the sum of joint1 and joint2, and so do the torques:",
         "own positions",
     ),
+    "torques without gravity": (
+        lambda m: replace(m, tau=m.tau - gravity_torque(m)),
+        "",
+        "there is no gravity in the torques",
+        "`arm.gravity_m_s2` = [0, 0, 0]",
+    ),
+    "an arm that is mounted on its side": (
+        lambda m: replace(m, tau=m.tau - gravity_torque(m) + gravity_torque(m, (9.81, 0.0, 0.0))),
+        "",
+        "gravity acts along +x of the URDF's root:",
+        "`arm.gravity_m_s2` = [9.80665, 0, 0]",
+    ),
     "rotors": (
         lambda m: replace(m, tau=m.tau + np.array([0.9, 0.5]) * np.gradient(m.dq, m.t, axis=0)),
         "",
@@ -403,6 +421,29 @@ def test_a_common_mistake_is_named_with_its_key(tmp_path: Path, upright: Motion,
     assert said in verdict.reasons[0]
     assert verdict.remedy.startswith("in the map: ")
     assert remedy in verdict.remedy
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said", "remedy"),
+    [
+        (
+            lambda m: replace(m, tau=m.tau * [1.0, 1e3]),
+            "the torque of joint2 (tau2) reaches",
+            "if the torques are mNm: `scale.tau_J` = [1, 0.001]",
+        ),
+        (
+            lambda m: replace(m, q=m.q * [1.0, 57.29578]),
+            "joint2 (q2) goes to",
+            "if the positions are degrees: `scale.q` = [1, 0.0174533]",
+        ),
+    ],
+    ids=["mNm", "degrees"],
+)
+def test_the_unit_of_one_joint_alone_is_its_scale(tmp_path: Path, upright: Motion, spoil, said, remedy) -> None:
+    verdict = judged(tmp_path, spoil(upright)).verdict
+    assert not verdict.is_explained
+    assert verdict.reasons[0].startswith(said)
+    assert verdict.remedy == remedy
 
 
 def test_what_is_named_makes_the_recording_explained(tmp_path: Path, upright: Motion) -> None:

@@ -136,23 +136,33 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFi
     yield from _against_effort(described, columns)
 
 
-def largest_torque(tau_J: Vector, arm: SerialArm) -> tuple[int, float, float]:
-    """Return the joint whose torque (k, n) is most of its effort, the torque, and the effort: inf where unknown."""
+def largest_torques(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
+    """Return the largest torque (n,) of each joint, but for outliers, and its effort (n,): inf where unknown."""
     effort = np.where(np.isfinite(arm.torque_limit) & (arm.torque_limit > 0.0), arm.torque_limit, np.inf)
-    largest = np.nanquantile(np.abs(tau_J), 0.99, axis=0)
-    joint = int(np.argmax(largest / effort))
-    return joint, float(largest[joint]), float(effort[joint])
+    return np.nanquantile(np.abs(tau_J), 0.99, axis=0), effort
 
 
 def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
-    joint, largest, effort = largest_torque(columns.tau_J, described.urdf)
-    if largest > _BEYOND_EFFORT * effort and "A" not in described.units.tau_J:
-        yield ColumnFinding(
-            f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest:.3g} Nm, the URDF allows "
-            f"{effort:g} Nm",
-            f'if the torques are mNm: `units.tau_J` = "mNm", which the map has as "{described.units.tau_J}"',
-            is_dead=not np.any(described.urdf.theta_full),  # else its masses say more
-        )
+    largest, effort = largest_torques(columns.tau_J, described.urdf)
+    is_over = largest > _BEYOND_EFFORT * effort
+    if "A" in described.units.tau_J or not is_over.any():
+        return
+    joint = int(np.argmax(largest / effort))
+    yield ColumnFinding(
+        f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest[joint]:.3g} Nm, the URDF allows "
+        f"{effort[joint]:g} Nm",
+        f"if the torques are mNm: {_unit_or_scale(described, 'tau_J', 'mNm', 1e-3, is_over | np.isinf(effort))}",
+        is_dead=not np.any(described.urdf.theta_full),  # else its masses say more
+    )
+
+
+def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, is_meant: NDArray[np.bool_]) -> str:
+    """Name the key that gives all joints another unit, or some of them."""
+    if is_meant.all():
+        return f'`units.{key}` = "{unit}", which the map has as "{getattr(described.units, key)}"'
+    scale = np.array(getattr(described.scale, key) or (1.0,) * described.joints)
+    values = np.where(is_meant, scale * factor, scale).tolist()
+    return f"`scale.{key}` = [{', '.join(f'{value:.6g}' for value in values)}]"
 
 
 def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
@@ -185,21 +195,20 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
             "check that encoder, and `columns.q`",
             is_dead=True,
         )
-    for joint in (joint for joint in range(n) if joint not in noise):
-        low, high = urdf.position_low[joint], urdf.position_high[joint]
-        is_known = np.isfinite(low) and np.isfinite(high) and high > low
-        bound = max(abs(low), abs(high)) if is_known else math.pi * 4.0
-        reach, speed = np.abs(columns.q[:, joint]).max(), np.quantile(np.abs(columns.dq[:, joint]), 0.99)
-        limit = urdf.velocity_limit[joint]
-        is_fast = np.isfinite(limit) and limit > 0.0 and speed > _BEYOND_LIMITS * limit
-        if described.urdf.chain.is_prismatic[joint] == 0.0 and (reach > _BEYOND_LIMITS * bound or is_fast):
-            much = f"goes to {reach:.3g} rad" if reach > _BEYOND_LIMITS * bound else f"turns at {speed:.3g} rad/s"
-            most = f"{bound:.3g} rad" if reach > _BEYOND_LIMITS * bound else f"{limit:g} rad/s"
-            yield ColumnFinding(
-                f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
-                f'if the positions are degrees: `units.q` = "deg", which the map has as "{described.units.q}"',
-            )
-            return
+    low, high, limit = urdf.position_low, urdf.position_high, urdf.velocity_limit
+    is_known = np.isfinite(low) & np.isfinite(high) & (high > low)
+    bound = np.where(is_known, np.maximum(np.abs(low), np.abs(high)), 4.0 * math.pi)
+    reach, speed = np.abs(columns.q).max(axis=0), np.quantile(np.abs(columns.dq), 0.99, axis=0)
+    goes_far = reach > _BEYOND_LIMITS * bound
+    is_fast = np.isfinite(limit) & (limit > 0.0) & (speed > _BEYOND_LIMITS * limit)
+    is_beyond = (goes_far | is_fast) & (urdf.chain.is_prismatic == 0.0) & ~np.isin(np.arange(n), noise)
+    for joint in np.flatnonzero(is_beyond)[:1].tolist():
+        much = f"goes to {reach[joint]:.3g} rad" if goes_far[joint] else f"turns at {speed[joint]:.3g} rad/s"
+        most = f"{bound[joint]:.3g} rad" if goes_far[joint] else f"{limit[joint]:g} rad/s"
+        yield ColumnFinding(
+            f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
+            f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
+        )
 
 
 def _is_noise(column: Vector, period_s: float) -> bool:

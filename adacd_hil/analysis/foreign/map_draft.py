@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.foreign.column_checks import largest_torque
+from adacd_hil.analysis.foreign.column_checks import largest_torques
 from adacd_hil.analysis.foreign.recording_map import ISO, TIME_S, UnitsSection, time_unit_of, units_by_slope
 from adacd_hil.analysis.foreign.table_guess import TableGuess, guess_table
 from adacd_hil.file_access import read_input
@@ -178,13 +178,14 @@ def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
 
 def _torque_unit(tau: Vector, arm: SerialArm) -> str:
     """Guess mNm where torques reach beyond the effort of the URDF, and would not in mNm."""
-    _, reach, effort = largest_torque(tau, arm)
-    return "mNm" if reach > _BEYOND_EFFORT * effort else "Nm"
+    largest, effort = largest_torques(tau, arm)
+    return "mNm" if np.any(largest > _BEYOND_EFFORT * effort) else "Nm"
 
 
 def _reach(tau: Vector, arm: SerialArm) -> str:
-    _, reach, effort = largest_torque(tau, arm)
-    return f"they reach {reach:.3g}, the effort of the URDF is {effort:g} Nm"
+    largest, effort = largest_torques(tau, arm)
+    joint = int(np.nanargmax(largest / effort))
+    return f"they reach {largest[joint]:.3g}, the effort of the URDF is {effort[joint]:g} Nm"
 
 
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:

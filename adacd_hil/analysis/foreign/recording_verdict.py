@@ -147,7 +147,7 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Colum
     is_good = not inertia and not wrong and all(joint.is_explained for joint in joints)
     if is_good and fit.certificate.margin >= 1.0:
         return [*scale, *remarks]
-    if not all(_is_noise(fit, joints)) and (readings := list(_of_readings(fit, joints, WHOLE if wrong else 0.0))):
+    if not all(_is_noise(fit, joints)) and (readings := list(_of_readings(fit, joints, WHOLE if columns else 0.0))):
         return [*readings, *remarks]
     if is_good:
         return [*scale, *remarks]
