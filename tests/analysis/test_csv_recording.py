@@ -249,6 +249,14 @@ def test_positions_that_jump_otherwise_stay_as_they_are(read: Callable[..., Fore
     assert jumping.notes == ()
 
 
+def test_times_that_jitter_are_a_note_with_the_period_that_replaces_them(read: Callable[..., ForeignRecording]) -> None:
+    late = lines(lambda k, q, tau: f"{0.005 * k + 0.002 * (k % 2):.3f},{q},{tau}")
+    (note,) = read("".join(late)).notes
+    assert note.startswith("rows are 3 to 7 ms apart")
+    assert "`sampling.period_s` = 0.005" in note
+    assert read("".join(lines(plain))).notes == ()
+
+
 def test_noise_is_at_least_that_of_rounding(read: Callable[..., ForeignRecording]) -> None:
     recording = read("".join(lines(lambda k, q, tau: f"{0.005 * k:.3f},{q},{round(tau / 0.5) * 0.5}")))
     assert recording.noise_Nm[0] == pytest.approx(0.5 / np.sqrt(12.0))

@@ -126,6 +126,12 @@ def bounded(motion: Motion) -> Motion:
     return replace(cut, tau=cut.tau + noise(cut.tau.shape))
 
 
+def spiked(motion: Motion) -> Motion:
+    tau = motion.tau.copy()
+    tau[[500, 501, 1400], 0] = [400.0, -400.0, 300.0]
+    return replace(motion, tau=tau)
+
+
 def short(motion: Motion) -> Motion:
     return Motion(*(values[:300] for values in (motion.t, motion.q, motion.dq, motion.tau)))
 
@@ -167,6 +173,11 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], tuple[str, ...], str]] 
         bounded,
         ("joint1: ", "% is explained, 99 % are needed", "of the time, as if clipped"),
         "range of that sensor",
+    ),
+    "single samples that were read wrong": (
+        spiked,
+        ("the torque of joint1 (tau1) jumps for single samples, 3 times, first to 400 Nm at 2.5 s",),
+        "empty these cells",
     ),
     "positions that are noise": (
         lambda m: replace(m, q=30.0 * noise(m.q.shape)),
@@ -499,6 +510,13 @@ def test_torques_of_a_third_of_what_the_masses_need_are_a_remark(tmp_path: Path,
     verdict = judged(tmp_path, replace(upright, tau=0.35 * upright.tau)).verdict
     assert any(remark.startswith("the torques are 0.3") and "a gain is wrong" in remark for remark in verdict.remarks)
     assert verdict.is_explained
+
+
+def test_torques_of_a_third_are_a_remark_where_they_are_not_explained_either(tmp_path: Path, upright: Motion) -> None:
+    late = np.roll(0.35 * upright.tau, 16, axis=0)
+    verdict = judged(tmp_path, replace(upright, tau=late)).verdict
+    assert not verdict.is_explained
+    assert any(remark.startswith("the torques are 0.3") for remark in verdict.remarks)
 
 
 def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path: Path, upright: Motion) -> None:

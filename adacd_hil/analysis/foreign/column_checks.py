@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.foreign.recording_import import MEDIAN_TO_SIGMA, ForeignRecording, derivative_window, derive
 from adacd_hil.analysis.foreign.recording_map import RecordingMap, units_by_slope
+from adacd_hil.analysis.score.wording import number_of
 from adacd_hil.records import Vector
 from adacd_hil.scheme.model.urdf import SerialArm
 
@@ -33,6 +34,8 @@ _FEWEST_LEVELS, _FINE_LEVELS = 50, 200
 """Of a sensor whose largest reading says anything, and of one that a sine leaves sooner, to half the time."""
 STILL_RAD: Final = 0.01
 """A joint that travels less is at rest."""
+_SPIKE_WINDOW, _SPIKE_SIGMAS, _SPIKE_SPAN, _SPIKES_SHARE = 5, 30.0, 1.0, 0.005
+"""Samples around one, its distance to their median by noise and by the usual span, and the most of all samples."""
 _NOISE_STEP: Final = 0.5
 """Mean square of the steps from sample to sample over twice the variance: 1 of white noise, 0.01 of a motion of 1 Hz at
 50 Hz."""
@@ -85,7 +88,7 @@ def find_faults(
         np.concatenate([getattr(stretch.record, name) for stretch in stretches]) for name in ("q", "dq", "tau_J")
     )
     columns = _Columns(np.concatenate(times), q, dq, tau_J, period_s)
-    found = [*_of_torques(described, columns), *_of_positions(described, columns)]
+    found = [*_of_torques(described, columns), *_of_positions(described, columns), *_of_spikes(described, columns)]
     still = np.ptp(q, axis=0) < STILL_RAD
     for part, records in (("fit", fitted), ("test", [tested])):
         found += _of_rest(described, part, records, still)
@@ -209,6 +212,32 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
             f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
             f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
         )
+
+
+def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+    """Name single samples that are far from their neighbours, as of a frame that was read wrong."""
+    for key, what, unit in (("tau_J", "torque", "Nm"), ("q", "position", "rad")):
+        for joint, column in enumerate(getattr(columns, key).T):
+            rows = _spikes(column)
+            if len(rows):
+                yield ColumnFinding(
+                    f"the {what} of {column_name(described, key, joint)} jumps for single samples, "
+                    f"{number_of(len(rows), 'time')}, first to {column[rows[0]]:.4g} {unit} at "
+                    f"{columns.time_s[rows[0]]:.4g} s",
+                    "empty these cells: a missing value parts the recording, and does no harm",
+                )
+
+
+def _spikes(column: Vector) -> NDArray[np.int64]:
+    """List the samples that are spikes, if they are few."""
+    if len(column) < _SPIKE_WINDOW:
+        return np.zeros(0, np.int64)
+    windows = np.lib.stride_tricks.sliding_window_view(column, _SPIKE_WINDOW)
+    apart = np.abs(column[2:-2] - np.median(windows, axis=1))
+    noise = MEDIAN_TO_SIGMA * np.median(np.abs(np.diff(column, 2)))
+    usual = np.ptp(np.quantile(column, (0.005, 0.995)))
+    rows = np.flatnonzero(apart > max(_SPIKE_SIGMAS * noise, _SPIKE_SPAN * usual)) + 2
+    return rows if len(rows) <= _SPIKES_SHARE * len(column) else rows[:0]
 
 
 def _is_noise(column: Vector, period_s: float) -> bool:

@@ -26,6 +26,8 @@ SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.1
 _LEAST_NOISE_NM = 1e-4
 _MOST_BESIDE_JUMP_RAD = 0.8
 """Motion in the time of a jump, 8 rad/s in the longest period."""
+_JITTER = 0.25
+"""Of a period, by which the times between rows vary: a derived velocity is off by as much."""
 _DEGREE = 3  # of the polynomial whose slope is a derived velocity
 MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white noise
 _STEP_TO_SIGMA = 1.0 / np.sqrt(12.0)  # of the rounding to a step
@@ -117,6 +119,8 @@ def recording_of(
     if len(time_s) < SHORTEST_SAMPLES:
         raise LogError(f"recording {path}: {number_of(len(time_s), 'row')} with all values, {SHORTEST_SAMPLES} needed")
     period_s = described.sampling.period_s or period_s or _period_s(path, time_s, described)
+    if described.columns.time and (jitter := _jitter(time_s, period_s)):
+        notes.append(jitter)
     values, idle = _without_idle_velocities(values, described)
     values, turned = _without_jumps(values, described)
     notes += [*idle, *turned]
@@ -169,6 +173,21 @@ def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
         f"recording {path}: rows are {period_s:g} s apart, {SHORTEST_PERIOD_S:g} to {LONGEST_PERIOD_S:g} s are "
         f"expected{remedy}"
     )
+
+
+def _jitter(time_s: Vector, period_s: float) -> str:
+    """Say by how much rows are apart where that varies; "" where it hardly does."""
+    short_s, long_s = np.quantile(np.diff(time_s), (0.05, 0.95)).tolist()
+    if long_s - short_s < _JITTER * period_s:
+        return ""
+    return (
+        f"rows are {1e3 * short_s:.3g} to {1e3 * long_s:.3g} ms apart: if they were sampled evenly, leave "
+        f"`columns.time` out and write `sampling.period_s` = {_even_period_s(time_s):.6g}"
+    )
+
+
+def _even_period_s(time_s: Vector) -> float:
+    return float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
 
 
 def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:

@@ -154,8 +154,8 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Colum
     lack = list(_of_lack(fit, joints))
     causes = wrong or [*map(_against, columns)]
     if causes:
-        return [*causes, *(found._replace(is_against=False) for found in lack)]
-    return list(_of_noise(fit, joints)) or inertia or lack
+        return [*causes, *scale, *(found._replace(is_against=False) for found in lack)]
+    return [*(list(_of_noise(fit, joints)) or inertia or lack), *scale]
 
 
 def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
