@@ -562,6 +562,13 @@ def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path: Path, upr
     assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in verdict.remarks)
 
 
+def test_joints_at_rest_are_named_in_one_reason(tmp_path: Path) -> None:
+    motion = record(urdf_text(3, AXES))
+    verdict = judged(tmp_path, still(still(motion, 0), 2), AXES).verdict
+    (reason,) = verdict.reasons
+    assert reason.startswith("the positions of joint1 (q1) and joint3 (q3) change by less than 0.01 rad: dead encoders")
+
+
 def test_a_stuck_sensor_makes_no_share_that_is_no_number(tmp_path: Path, upright: Motion) -> None:
     tau = upright.tau.copy()
     tau[len(tau) // 3 :, 0] = tau[len(tau) // 3, 0]

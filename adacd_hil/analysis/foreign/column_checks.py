@@ -174,20 +174,25 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
     still = [joint for joint in range(n) if travel[joint] < STILL_RAD]
     if len(still) == n:
         yield ColumnFinding("the arm does not move", "record motion of every joint, fast and slow", is_dead=True)
+    at_rest: list[int] = []
     for joint in still if len(still) < n else ():
-        name, always = column_name(described, "q", joint), columns.q[0, joint]
-        how = f"is always {always:g} rad" if travel[joint] == 0.0 else f"changes by less than {STILL_RAD:g} rad"
         turned = float(np.ptp(np.cumsum(columns.dq[:, joint]))) * columns.period_s
         if turned > _TURNS_THOUGH_STILL_RAD:
             yield ColumnFinding(
-                f"the position of {name} {how}, though by its velocity it turns: a dead encoder",
+                f"the position of {column_name(described, 'q', joint)} {_stays(columns.q[:, joint])}, though by its "
+                "velocity it turns: a dead encoder",
                 "check that encoder, and `columns.q`",
                 is_wrong=True,
             )
-            continue
+        else:
+            at_rest.append(joint)
+    if at_rest:
+        names = joined_names([column_name(described, "q", joint) for joint in at_rest], n)
+        said = f"the position of {names} {_stays(columns.q[:, at_rest[0]])}: a dead encoder, or a joint"
+        if len(at_rest) > 1:
+            said = f"the positions of {names} change by less than {STILL_RAD:g} rad: dead encoders, or joints"
         yield ColumnFinding(
-            f"the position of {name} {how}: a dead encoder, or a joint at rest, of which neither friction nor inertia "
-            "can be learnt",
+            f"{said} at rest, of which neither friction nor inertia can be learnt",
             "move every joint, name one that never moves in `arm.locked`, and check `columns.q`",
         )
     noise = [joint for joint in range(n) if joint not in still and _is_noise(columns.q[:, joint], columns.period_s)]
@@ -212,6 +217,10 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
             f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
             f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
         )
+
+
+def _stays(column: Vector) -> str:
+    return f"changes by less than {STILL_RAD:g} rad" if np.ptp(column) else f"is always {column[0]:g} rad"
 
 
 def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:

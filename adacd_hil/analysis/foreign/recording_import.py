@@ -119,12 +119,12 @@ def recording_of(
     if len(time_s) < SHORTEST_SAMPLES:
         raise LogError(f"recording {path}: {number_of(len(time_s), 'row')} with all values, {SHORTEST_SAMPLES} needed")
     period_s = described.sampling.period_s or period_s or _period_s(path, time_s, described)
-    if described.columns.time and (jitter := _jitter(time_s, period_s)):
-        notes.append(jitter)
     values, idle = _without_idle_velocities(values, described)
     values, turned = _without_jumps(values, described)
     notes += [*idle, *turned]
     has_dq = values.shape[1] > 2 * n
+    if described.columns.time and not has_dq and (jitter := _jitter(time_s, period_s)):
+        notes.append(jitter)
     longest_s = max(described.sampling.longest_gap_s, 1.5 * period_s)
     window = derivative_window(described, period_s)
     shortest = max(SHORTEST_SAMPLES, window)
