@@ -25,6 +25,7 @@ from adacd_hil.file_access import read_input
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus, BusError, Frame
 from adacd_hil.wire.contract_frames import NMT_ID, SDO_REQUEST_ID
+from adacd_hil.wire.eds_text import readable_eds
 
 ANSWER_TIMEOUT_S = 0.5
 """Longest wait for an answer. CiA 301 gives none; drives answer within 100 ms."""
@@ -46,6 +47,8 @@ _ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index: CiA 301
 _EDS_CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x19\x1b-\x1f\x7f]")
 """All but tab, the ends of lines and the end of a file under DOS."""
 _EDS_OBJECT = re.compile("[0-9A-Fa-f]{4}(?:[Ss]ub[0-9A-Fa-f]+)?")
+_MAKERS_OBJECTS = range(0x2000, 0x6000)
+"""Those that a profile names have a default or none; of the others no value matters."""
 _EDS_INTEGERS = {
     form
     for number in canopen.objectdictionary.INTEGER_TYPES
@@ -111,7 +114,7 @@ def read_eds(path: Path, node_id: int | None) -> Any:
     try:
         text = read_input(path).decode("utf-8", "replace").removeprefix("\ufeff")
         _check_eds(text)
-        stream = io.StringIO(text)
+        stream = io.StringIO(readable_eds(text))
         stream.name = "object dictionary.eds"
         return canopen.import_od(stream, node_id)
     except OSError as error:
@@ -123,7 +126,10 @@ def read_eds(path: Path, node_id: int | None) -> Any:
 
 
 def _check_eds(text: str) -> None:
-    """Refuse control characters, and values of integers that are no numbers. Raises ConfigError, configparser.Error."""
+    """Refuse control characters, and integers of standard objects that are no numbers.
+
+    Raises ConfigError, configparser.Error.
+    """
     if found := _EDS_CONTROL.search(text):
         line = text.count("\n", 0, found.start()) + 1
         raise ConfigError(f"line {line} has the control character 0x{ord(found[0]):02X}")
@@ -131,7 +137,7 @@ def _check_eds(text: str) -> None:
     eds.optionxform = str  # type: ignore[assignment,method-assign]
     eds.read_string(text, "object dictionary.eds")
     for section in eds.sections():
-        if not _EDS_OBJECT.fullmatch(section):
+        if not _EDS_OBJECT.fullmatch(section) or int(section[:4], 16) in _MAKERS_OBJECTS:
             continue
         entries = eds[section]
         if entries.get("DataType", "").strip().upper() not in _EDS_INTEGERS:

@@ -3,6 +3,7 @@
 The rules of a contract hold in `adacd_hil.wire.codec`, for the frames of a cycle.
 """
 
+from collections import Counter
 from pathlib import Path
 
 from cantools.database.can import Message
@@ -25,6 +26,8 @@ class MessageDecoder:
         self.senders = tuple(message.senders)
         self.units = {signal.name: signal.unit or "" for signal in message.signals}
         """Of each signal, by name, in the order of their places."""
+        self.partly_decoded: Counter[str] = Counter()
+        """Frames whose multiplexer has a value that the DBC doesn't list, by cantools' words for it."""
         self._message = message
         self._is_exact = is_exact
         plain = [signal for signal in message.signals if not signal.multiplexer_ids]
@@ -41,7 +44,8 @@ class MessageDecoder:
         """
         try:
             values = self._message.decode_simple(data, decode_choices=False, allow_truncated=True)
-        except DecodeError:
+        except DecodeError as error:
+            self.partly_decoded[str(error)] += 1
             values = decode_data(data, self._message.length, *self._plain, False, True, True, True)
         return {name: float(value) for name, value in values.items()}  # type: ignore[arg-type]
 

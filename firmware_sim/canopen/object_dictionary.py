@@ -25,6 +25,7 @@ from adacd_hil.records import JOINTS
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
 from adacd_hil.wire.contract_frames import move_contract
+from adacd_hil.wire.eds_text import readable_eds
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
 
 Send = Callable[[int, bytes], None]
@@ -208,7 +209,7 @@ def _compare_lengths(length: int, expected: int) -> None:
 @cache
 def _read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
     """Read an EDS or a DCF of any encoding and ending; nodes never change what was read."""
-    stream = io.StringIO(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff"))
+    stream = io.StringIO(readable_eds(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff")))
     stream.name = "object dictionary.eds"
     return canopen.import_od(stream, node_id)
 

@@ -136,6 +136,10 @@ REFUSED = {
         lambda: [message._replace(effort=[1.0, math.nan, 2.0]) for message in states()],
         "/joint_states has no effort of lift: without a torque nothing can be explained",
     ),
+    "joints in messages of their own": (
+        lambda: [state for pair in zip(states(NAMES[:2]), states(NAMES[2:]), strict=True) for state in pair],
+        "no message has all of pan, lift, elbow; record a topic that joins them",
+    ),
     "another arm": (
         lambda: changed(states(), names=("pan", "lift", "wrist")),
         "/joint_states has no joint 'elbow'; it has pan, lift, wrist (`columns.q` names them)",

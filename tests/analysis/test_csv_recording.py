@@ -197,6 +197,8 @@ REFUSED = {
     ),
     "no positions in the map": ("".join(lines(plain)), ['q = ["angle"]\n -> '], "missing key `columns.q`"),
     "a spreadsheet": (b"PK\x03\x04" + bytes(100), [], "is a spreadsheet or an archive: save it as CSV"),
+    "the URDF": (f"{ARM}\n", [], "is a URDF: the map names it, `arm.urdf`"),
+    "frames": (b"LOGG" + bytes(100), [], "log export --format csv --dbc"),
     "compressed": (b"\x1f\x8b\x08\x00" + bytes(100), [], "is compressed: gunzip it"),
     "no text": (b"t,angle,torque\n" + b"\xb0\xff\n" * 60, [], "is no text in UTF-8"),
     "UTF-16": ("".join(lines(plain)).encode("utf-16"), [], "is UTF-16: save it as UTF-8"),
@@ -224,6 +226,40 @@ def test_velocities_that_nobody_filled_in_are_derived(read: Callable[..., Foreig
     assert filled.notes == ()
     assert filled.has_velocities
     assert not idle.has_velocities
+
+
+@pytest.mark.parametrize(("unit", "turn"), [("rad", 2.0 * np.pi), ("deg", 360.0)])
+def test_a_position_that_jumps_by_a_turn_goes_on(read: Callable[..., ForeignRecording], unit: str, turn: float) -> None:
+    def angle(k: int) -> float:
+        return (0.6 + 0.04 * wave(k)[0]) * turn
+
+    def wrapped(k: int, _: float, torque: float) -> str:
+        return f"{0.005 * k:.3f},{(angle(k) + turn / 2.4) % turn - turn / 2.4:.9f},{torque}"
+
+    recording = read("".join(lines(wrapped)), f'[units]\nq = "{unit}"')
+    expected = np.array([angle(k) for k in range(COUNT)]) * 2.0 * np.pi / turn
+    q = recording.stretches[0].record.q[:, 0]
+    np.testing.assert_allclose(q - q[0], expected[: len(q)] - expected[0], atol=1e-6)
+    assert recording.notes == ("the position of hinge jumps by a turn 3 times: it goes on instead",)
+
+
+def test_positions_that_jump_otherwise_stay_as_they_are(read: Callable[..., ForeignRecording]) -> None:
+    jumping = read("".join(lines(lambda k, q, tau: f"{0.005 * k:.3f},{4.0 * (k % 20 == 0)},{tau}")))
+    assert jumping.stretches[0].record.q.max() == pytest.approx(4.0)
+    assert jumping.notes == ()
+
+
+def test_times_that_jitter_are_a_note_with_the_period_that_replaces_them(read: Callable[..., ForeignRecording]) -> None:
+    late = lines(lambda k, q, tau: f"{0.005 * k + 0.002 * (k % 2):.3f},{q},{tau}")
+    (note,) = read("".join(late)).notes
+    assert note.startswith("rows are 3 to 7 ms apart")
+    assert "`sampling.period_s` = 0.005" in note
+    assert read("".join(lines(plain))).notes == ()
+    measured = lines(
+        lambda k, q, tau: f"{0.005 * k + 0.002 * (k % 2):.3f},{q},{tau},{10.0 * np.cos(0.05 * k)}",
+        "t,angle,torque,speed\n",
+    )
+    assert read("".join(measured), 'time = "t" -> time = "t"\ndq = ["speed"]').notes == ()
 
 
 def test_noise_is_at_least_that_of_rounding(read: Callable[..., ForeignRecording]) -> None:

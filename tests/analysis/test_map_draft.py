@@ -68,6 +68,11 @@ HEADS = {
         ),
         {"tau_J": "A"},
     ),
+    "quoted, with commas": (
+        't,"position, 1","position, 2","velocity, 1","velocity, 2","torque, 1","torque, 2"',
+        ("t", ("position, 1", "position, 2"), ("velocity, 1", "velocity, 2"), ("torque, 1", "torque, 2")),
+        {},
+    ),
     "by the joints' names": (
         "stamp,joint1/position,joint2/position,joint1/velocity,joint2/velocity,joint1/effort,joint2/effort",
         (

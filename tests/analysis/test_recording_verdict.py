@@ -120,6 +120,18 @@ def clipped(motion: Motion) -> Motion:
     return replace(motion, tau=np.column_stack([np.clip(motion.tau[:, 0], -limit, limit), motion.tau[:, 1]]))
 
 
+def bounded(motion: Motion) -> Motion:
+    """Clip a torque before the sensor adds its noise, so that no two readings are equal."""
+    cut = clipped(motion)
+    return replace(cut, tau=cut.tau + noise(cut.tau.shape))
+
+
+def spiked(motion: Motion) -> Motion:
+    tau = motion.tau.copy()
+    tau[[500, 501, 1400], 0] = [400.0, -400.0, 300.0]
+    return replace(motion, tau=tau)
+
+
 def short(motion: Motion) -> Motion:
     return Motion(*(values[:300] for values in (motion.t, motion.q, motion.dq, motion.tau)))
 
@@ -157,6 +169,26 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], tuple[str, ...], str]] 
     "a stuck sensor": (stuck, ("the torque of joint1 (tau1) is stuck at", "for 0.99 s, from 4.5"), "--from"),
     "a clipped sensor": (clipped, ("the torque of joint1 (tau1) is clipped at -",), "range"),
     "a dead encoder": (lambda m: still(m, 1), ("the position of joint2 (q2) is always",), "`columns.q`"),
+    "a bound before the noise of the sensor": (
+        bounded,
+        ("joint1: ", "% is explained, 99 % are needed", "of the time, as if clipped"),
+        "range of that sensor",
+    ),
+    "single samples that were read wrong": (
+        spiked,
+        ("the torque of joint1 (tau1) jumps for single samples, 3 times, first to 400 Nm at 2.5 s",),
+        "empty these cells",
+    ),
+    "positions that are noise": (
+        lambda m: replace(m, q=30.0 * noise(m.q.shape)),
+        ("the position of joint1 (q1) and joint2 (q2) is noise",),
+        "`columns.q`",
+    ),
+    "an encoder that is noise": (
+        lambda m: replace(m, q=np.column_stack([m.q[:, 0], 30.0 * noise(len(m.q))])),
+        ("the position of joint2 (q2) is noise",),
+        "check that encoder",
+    ),
     "an arm at rest": (lambda m: still(still(m, 0), 1), ("the arm does not move",), "motion of every joint"),
     "too short": (short, ("too short: 0.9 s fitted and 0.6 s tested",), "record more"),
 }
@@ -294,6 +326,12 @@ SUMS = np.array([[1.0, 0.0], [1.0, 1.0]])
 """Columns that count from the base: q1, q1 + q2."""
 DEGREE = math.pi / 180.0
 
+
+def gravity_torque(motion: Motion, *gravity_m_s2: tuple[float, float, float]) -> np.ndarray:
+    arm = read_urdf(urdf_text(2, UPRIGHT), *gravity_m_s2)
+    return rigid_torque(arm, np.array([motion.q, 0.0 * motion.q, 0.0 * motion.q]))
+
+
 MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str, str]] = {
     "mNm": (lambda m: replace(m, tau=1e3 * m.tau), "", "they are mNm", '`units.tau_J` = "mNm"'),
     "mNm that are none": (lambda m: m, '[units]\ntau_J = "mNm"\n', "they are Nm", '`units.tau_J` = "Nm"'),
@@ -364,6 +402,18 @@ MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str, str]] = {
         "the column of joint2 has the sum of joint1 and joint2, and so do the torques:",
         "own positions",
     ),
+    "torques without gravity": (
+        lambda m: replace(m, tau=m.tau - gravity_torque(m)),
+        "",
+        "there is no gravity in the torques",
+        "`arm.gravity_m_s2` = [0, 0, 0]",
+    ),
+    "an arm that is mounted on its side": (
+        lambda m: replace(m, tau=m.tau - gravity_torque(m) + gravity_torque(m, (9.81, 0.0, 0.0))),
+        "",
+        "gravity acts along +x of the URDF's root:",
+        "`arm.gravity_m_s2` = [9.80665, 0, 0]",
+    ),
     "rotors": (
         lambda m: replace(m, tau=m.tau + np.array([0.9, 0.5]) * np.gradient(m.dq, m.t, axis=0)),
         "",
@@ -382,6 +432,29 @@ def test_a_common_mistake_is_named_with_its_key(tmp_path: Path, upright: Motion,
     assert said in verdict.reasons[0]
     assert verdict.remedy.startswith("in the map: ")
     assert remedy in verdict.remedy
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said", "remedy"),
+    [
+        (
+            lambda m: replace(m, tau=m.tau * [1.0, 1e3]),
+            "the torque of joint2 (tau2) reaches",
+            "if the torques are mNm: `scale.tau_J` = [1, 0.001]",
+        ),
+        (
+            lambda m: replace(m, q=m.q * [1.0, 57.29578]),
+            "joint2 (q2) goes to",
+            "if the positions are degrees: `scale.q` = [1, 0.0174533]",
+        ),
+    ],
+    ids=["mNm", "degrees"],
+)
+def test_the_unit_of_one_joint_alone_is_its_scale(tmp_path: Path, upright: Motion, spoil, said, remedy) -> None:
+    verdict = judged(tmp_path, spoil(upright)).verdict
+    assert not verdict.is_explained
+    assert verdict.reasons[0].startswith(said)
+    assert verdict.remedy == remedy
 
 
 def test_what_is_named_makes_the_recording_explained(tmp_path: Path, upright: Motion) -> None:
@@ -432,6 +505,20 @@ def test_an_arm_without_masses_in_its_urdf_is_judged_by_its_effort_and_by_its_re
     assert judged(tmp_path, upright, has_masses=False).verdict.is_explained
 
 
+def test_torques_of_a_third_of_what_the_masses_need_are_a_remark(tmp_path: Path, upright: Motion) -> None:
+    """As currents taken for torques, of motors with a few Nm/A behind their gears."""
+    verdict = judged(tmp_path, replace(upright, tau=0.35 * upright.tau)).verdict
+    assert any(remark.startswith("the torques are 0.3") and "a gain is wrong" in remark for remark in verdict.remarks)
+    assert verdict.is_explained
+
+
+def test_torques_of_a_third_are_a_remark_where_they_are_not_explained_either(tmp_path: Path, upright: Motion) -> None:
+    late = np.roll(0.35 * upright.tau, 16, axis=0)
+    verdict = judged(tmp_path, replace(upright, tau=late)).verdict
+    assert not verdict.is_explained
+    assert any(remark.startswith("the torques are 0.3") for remark in verdict.remarks)
+
+
 def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path: Path, upright: Motion) -> None:
     """Some have a thousandth of a kilogram to please a simulator."""
     verdict = judged(tmp_path, upright, density=1e-3).verdict
@@ -444,6 +531,11 @@ VELOCITIES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str, str]] = {
     "rpm": (lambda dq: dq * 30.0 / math.pi, "the velocity of joint1 (dq1) is 9.55 times", '`units.dq` = "rpm"'),
     "another sign": (lambda dq: dq * TURNED, "the velocity of joint2 (dq2) has the other sign", "`columns.dq`"),
     "exchanged": (lambda dq: dq[:, ::-1], "the velocity of joint1 (dq1) is in the column of joint2", "`columns.dq`"),
+    "exchanged, of joints that move much alike": (
+        lambda dq: (dq @ [[1.0, 0.7], [0.0, 0.7]])[:, ::-1],
+        "the velocity of joint1 (dq1) is in the column of joint2",
+        "`columns.dq`",
+    ),
 }
 
 
@@ -468,6 +560,22 @@ def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path: Path, upr
     noisy = replace(upright, dq=upright.dq + 1.0 * np.random.default_rng(5).standard_normal(upright.dq.shape))
     verdict = judged(tmp_path, noisy, has_dq=True).verdict
     assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in verdict.remarks)
+
+
+def test_joints_at_rest_are_named_in_one_reason(tmp_path: Path) -> None:
+    motion = record(urdf_text(3, AXES))
+    verdict = judged(tmp_path, still(still(motion, 0), 2), AXES).verdict
+    (reason,) = verdict.reasons
+    assert reason.startswith("the positions of joint1 (q1) and joint3 (q3) change by less than 0.01 rad: dead encoders")
+
+
+def test_a_stuck_sensor_makes_no_share_that_is_no_number(tmp_path: Path, upright: Motion) -> None:
+    tau = upright.tau.copy()
+    tau[len(tau) // 3 :, 0] = tau[len(tau) // 3, 0]
+    verdict = judged(tmp_path, replace(upright, tau=tau)).verdict
+    assert math.isnan(verdict.joints[0].share)
+    assert "is stuck at" in verdict.reasons[0]
+    assert not any(text.startswith("joint1:") for text in (*verdict.reasons, *verdict.remarks))
 
 
 # The command.

@@ -66,6 +66,25 @@ def put(opcode, place, form, value):
     return lambda parts: first(parts, opcode).put(place, form, value)
 
 
+def both(*edits):
+    def edit(parts):
+        for each in edits:
+            each(parts)
+
+    return edit
+
+
+def uncovered(every):
+    """Take the CRC of the data section and of all chunks, or of the first."""
+
+    def edit(parts):
+        put(Opcode.DATA_END, 0, "<I", 0)(parts)
+        for part in kinds(parts, Opcode.CHUNK)[: None if every else 1]:
+            part.put(24, "<I", 0)
+
+    return edit
+
+
 def at_top(record):
     return before(Opcode.CHUNK, new(record))
 
@@ -124,8 +143,8 @@ BROKEN = {
     "data-crc": (operated(put(Opcode.DATA_END, 0, "<I", 5), has_right_crcs=False), {"data-crc"}),
     "summary-crc": (operated(put(Opcode.FOOTER, 16, "<I", 5), has_right_crcs=False), {"summary-crc"}),
     "attachment-crc": (operated(spoiled_attachment), {"attachment-crc"}),
-    "no-crc": (operated(put(Opcode.CHUNK, 24, "<I", 0)), {"no-crc"}),
-    "no-crc, data": (operated(put(Opcode.DATA_END, 0, "<I", 0), has_right_crcs=False), {"no-crc"}),
+    "no-crc": (operated(uncovered(every=True), has_right_crcs=False), {"no-crc"}),
+    "some-crc": (operated(uncovered(every=False), has_right_crcs=False), {"some-crc", "no-crc"}),
     "no-crc, summary": (operated(put(Opcode.FOOTER, 16, "<I", 0), has_right_crcs=False), {"no-crc"}),
     "schema-id": (operated(at_top(Schema(id=0, name="x", encoding="x", data=b"x"))), {"schema-id", "statistics"}),
     "schema-encoding": (
@@ -151,10 +170,22 @@ BROKEN = {
         {"undefined-channel", "statistics", "unindexed-messages", "counts"},
     ),
     "summary-only": (
-        operated(before(Opcode.STATISTICS, new(Channel(9, "/z", "cdr", {}, 1)))),
-        {"summary-only", "statistics", "summary-offset"},
+        operated(
+            both(
+                before(Opcode.DATA_END, Part(Opcode.MESSAGE, message(9, 9_000_000, payload(0))[9:])),
+                before(Opcode.STATISTICS, new(Channel(9, "/z", "cdr", {}, 1))),
+            )
+        ),
+        None,
     ),
-    "unused-summary-only": (make_log(chunks=(), summary={**SUMMARY, "messages": "0"}), {"unused-summary-only"}),
+    "unused-summary-only": (
+        operated(before(Opcode.STATISTICS, new(Channel(9, "/z", "cdr", {}, 1)))),
+        {"unused-summary-only", "summary-offset"},
+    ),
+    "unused-summary-only, no message": (
+        make_log(chunks=(), summary={**SUMMARY, "messages": "0"}),
+        {"unused-summary-only"},
+    ),
     "chunk-record": (operated(chunk_with(new(Header("", "x")).data)), {"chunk-record", "chunk-index"}),
     "chunk-record, rest": (operated(chunk_with(b"rest of a record")), {"chunk-record", "chunk-index"}),
     "chunk-times": (operated(put(Opcode.CHUNK, 0, "<Q", 1)), {"chunk-times", "chunk-index"}),
@@ -230,6 +261,27 @@ def test_every_rule_is_in_the_document():
 def test_a_sound_log_breaks_no_rule(tmp_path):
     found = check(tmp_path / "log.mcap", WHOLE)
     assert (found.findings, found.files, found.messages) == ([], 1, 20)
+
+
+def test_the_earliest_message_may_be_the_first_later_than_zero_in_the_statistics(tmp_path):
+    """mcap's writer in C++, rosbag2's, takes 0 for no time yet."""
+    assert check(tmp_path / "log.mcap", operated(put(Opcode.STATISTICS, 26, "<Q", 1_000_000))).findings == []
+
+
+def test_an_event_of_a_service_has_a_schema_in_parts():
+    assert (
+        text_problem(b"ServiceEventInfo info\n---\nint64 a\n" + b"=" * 80 + b"\nMSG: x/ServiceEventInfo\nbyte a\n")
+        == ""
+    )
+
+
+@pytest.mark.parametrize(
+    ("edit", "has_right_crcs"),
+    [(put(Opcode.CHUNK, 24, "<I", 0), True), (put(Opcode.DATA_END, 0, "<I", 0), False)],
+    ids=["of the data section", "of the chunks"],
+)
+def test_one_crc_is_enough_to_vouch_for_the_messages(edit, has_right_crcs, tmp_path):
+    assert check(tmp_path / "log.mcap", operated(edit, has_right_crcs)).findings == []
 
 
 @pytest.mark.parametrize("compression", CompressionType)

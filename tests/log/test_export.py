@@ -305,9 +305,42 @@ def test_options_that_make_no_sense_together_are_wrong_usage(log, arguments, sai
 
 def test_a_recording_is_not_overwritten(tmp_path):
     (tmp_path / "x.log").write_text("(1.000000) can0 123#11 R\n")
-    done = command(tmp_path / "x.log", "--format", "candump")
+    done = command(tmp_path / "x.log", "--format", "candump", "--out", tmp_path / "x.log")
     assert (done.exit_code, "is the recording itself" in done.stderr) == (2, True)
     assert (tmp_path / "x.log").read_text() == "(1.000000) can0 123#11 R\n"
+
+
+def test_a_candump_log_without_out_is_written_beside_itself(tmp_path):
+    (tmp_path / "x.log").write_text("(1.000000) can0 123#11\n(2.000000) can0 124#22\n")
+    assert command(tmp_path / "x.log", "--format", "candump", "--id", "124").exit_code == 0
+    assert (tmp_path / "x.exported.log").read_text() == "(2.000000) can0 124#22\n"
+
+
+def test_candumps_form_on_a_screen_is_named_without_out_too(tmp_path):
+    (tmp_path / "x.log").write_text(" (000.001)  can0  181   [2]  00 01\n")
+    done = command(tmp_path / "x.log", "--format", "candump")
+    assert (done.exit_code, "`candump -l`" in done.stderr) == (1, True)
+    assert [path.name for path in tmp_path.iterdir()] == ["x.log"]
+
+
+def test_a_page_that_the_dbc_does_not_know_is_named(tmp_path):
+    (tmp_path / "x.dbc").write_text(
+        'VERSION ""\n\nBU_: A\n\nBO_ 291 Paged: 2 A\n SG_ page M : 0|8@1+ (1,0) [0|0] "" A\n'
+        ' SG_ value m3 : 8|8@1+ (1,0) [0|0] "" A\n'
+    )
+    (tmp_path / "x.log").write_text("".join(f"({second}.000000) can0 123#0{second}11\n" for second in (2, 3, 5, 5)))
+    done = command(tmp_path / "x.log", "--format", "csv", "--dbc", tmp_path / "x.dbc")
+    notes = [line.split(": ", 1)[1] for line in done.stderr.splitlines()]
+    decoded_in_part = "only the signals that are in every frame are decoded: expected multiplexer id 3, but got"
+    assert notes == [f"Paged: of 1 frames {decoded_in_part} 2", f"Paged: of 2 frames {decoded_in_part} 5"]
+    assert done.exit_code == 0
+    rows = (tmp_path / "x-tables" / "decoded_Paged.csv").read_text().splitlines()
+    assert [row.rsplit(",")[-2:] for row in rows[1:]] == [
+        ["2.0", "nan"],
+        ["3.0", "17.0"],
+        ["5.0", "nan"],
+        ["5.0", "nan"],
+    ]
 
 
 @pytest.mark.parametrize("kind", ["candump", "asc", "blf"])

@@ -127,10 +127,13 @@ def test_a_schema_that_makes_no_payload_is_one_line_and_its_messages_are_kept_ap
     path.write_bytes(make_log(text="# Written by adacd-hil.\n" + text, run=None))
     assert read_info(path).messages == 20
     assert check_log(path).messages == 20
-    told = ("", "a message is not as long as its schema says")  # by the names of fields in the channel, if not by it
-    assert read_log(path).problem in told
-    problem = export_tables(path, tmp_path / "tables", "csv", (), load_decoder()).problem
-    assert problem in (*told[1:], "messages of varying size are not exported: /a, /b")
+    problem = read_log(path).problem
+    assert problem in ("", "a message is not as long as its schema says")  # by the names of fields in the channel
+    if problem:
+        assert export_tables(path, tmp_path / "tables", "csv", (), load_decoder()).problem == problem
+    else:
+        with pytest.raises(LogError, match="messages of varying size are not exported: /a, /b"):
+            export_tables(path, tmp_path / "tables", "csv", (), load_decoder())
 
 
 def test_topics_of_strangers_become_files_of_their_own_in_the_folder(tmp_path):

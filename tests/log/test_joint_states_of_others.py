@@ -31,8 +31,7 @@ def tables(path: Path, out: Path) -> dict[str, list[dict[str, str]]]:
 def test_the_check_takes_them_for_what_they_are(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "r.mcap", states())
     status, said = command("log", "check", str(path))
-    assert status in (0, 3)  # 3: only warnings, as this file has no CRC of its data section
-    assert "0 errors" in said
+    assert status == 0
     assert "60 messages" in said
 
 
@@ -86,5 +85,6 @@ def test_topics_that_make_no_table_are_named(tmp_path: Path) -> None:
         writer.add_message(channel, 1, b"\0\1\0\0\3\0\0\0ab\0", 1)
         writer.finish()
     status, said = command("log", "export", str(path), "--format", "csv", "--out", str(tmp_path / "out"))
-    assert status == 3
-    assert "messages of varying size are not exported: /words" in said
+    assert status == 1
+    assert said.strip().endswith("r.mcap makes no table: messages of varying size are not exported: /words")
+    assert not any((tmp_path / "out").iterdir())

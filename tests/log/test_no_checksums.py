@@ -5,6 +5,7 @@ import struct
 from itertools import product
 
 import pytest
+from click.testing import CliRunner
 from made_log import HEAD, kinds, take_apart
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -13,7 +14,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from adacd_hil.cli.commands.log_command import info_as_text, recovery_as_text
+from adacd_hil.cli.commands.log_command import check, info_as_text, recovery_as_text
 from adacd_hil.log.check.log_check import check_log
 from adacd_hil.log.editing.log_info import read_info
 from adacd_hil.log.editing.recover import recover
@@ -75,6 +76,15 @@ def test_a_log_without_a_checksum_is_whole(compression, tail, use_chunking, tmp_
         reader = make_reader(file, validate_crcs=True)
         assert [message.data[-8] for _, _, message in reader.iter_messages()] == list(range(COUNT))
         assert [item.data for item in reader.iter_attachments()] == [NOTES]
+
+
+def test_a_sound_log_without_a_checksum_is_clean_and_one_note_says_so(tmp_path):
+    (tmp_path / "bag.mcap").write_bytes(make())
+    done = CliRunner().invoke(check, [str(tmp_path / "bag.mcap")])
+    note, verdict = done.stdout.splitlines()
+    assert (done.exit_code, ": clean;" in verdict) == (0, True)
+    assert note.startswith("note: bag.mcap: nothing vouches")
+    assert "5 chunks, the data section, the summary (no-crc)" in note
 
 
 def streamed(data):

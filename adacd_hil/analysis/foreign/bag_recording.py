@@ -99,7 +99,12 @@ class _States:
             raise LogError(f"{self._where} has no messages")
         if all(places is None for places in self._places.values()):
             there = dict.fromkeys(name for names in self._places for name in names)
-            lacking = next((name for name in self._wanted if name not in there), self._wanted[0])
+            lacking = next((name for name in self._wanted if name not in there), None)
+            if lacking is None:
+                raise LogError(
+                    f"{self._where}: no message has all of {', '.join(self._wanted)}; record a topic that joins them, "
+                    "as of joint_state_publisher with `source_list`"
+                )
             near = nearest_name(lacking, there)
             known = f"did you mean {near!r}?" if near else f"it has {', '.join(there) or 'no names'}"
             raise ConfigError(f"{self._where} has no joint {lacking!r}; {known} (`columns.q` names them)")

@@ -12,9 +12,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.foreign.recording_import import ForeignRecording, derivative_window, derive
+from adacd_hil.analysis.foreign.recording_import import MEDIAN_TO_SIGMA, ForeignRecording, derivative_window, derive
 from adacd_hil.analysis.foreign.recording_map import RecordingMap, units_by_slope
+from adacd_hil.analysis.score.wording import number_of
 from adacd_hil.records import Vector
+from adacd_hil.scheme.model.urdf import SerialArm
 
 _STUCK_S: Final = 0.5
 _STUCK_TRAVEL: Final = 0.2
@@ -24,10 +26,21 @@ _STUCK_TIMES: Final = 5.0
 _CLIPPED_SHARE, _CLIPPED_ROWS, _CLIPPED_RUN = 0.005, 10, 5
 _CLIPPED_BAND: Final = 0.05
 """Of the span below the largest reading, which a clipped sensor passes in less time than it stays at the bound."""
+_PLATEAU_SIGMAS: Final = 3.5
+_PLATEAU_WIDTH: Final = 0.1
+_PLATEAU_SHARE, _PLATEAU_TIMES = 0.02, 4.0
+"""A sine stays at its crest for 2.4 times as long as just below it."""
 _FEWEST_LEVELS, _FINE_LEVELS = 50, 200
 """Of a sensor whose largest reading says anything, and of one that a sine leaves sooner, to half the time."""
 STILL_RAD: Final = 0.01
 """A joint that travels less is at rest."""
+_SPIKE_WINDOW, _SPIKE_SIGMAS, _SPIKE_SPAN, _SPIKES_SHARE = 5, 30.0, 1.0, 0.005
+"""Samples around one, its distance to their median by noise and by the usual span, and the most of all samples."""
+_NOISE_STEP: Final = 0.5
+"""Mean square of the steps from sample to sample over twice the variance: 1 of white noise, 0.01 of a motion of 1 Hz at
+50 Hz."""
+_NOISE_PERIOD_S: Final = 0.02
+"""At longer periods a fast motion has such steps, too."""
 _TURNS_THOUGH_STILL_RAD: Final = 0.3
 """Travel by the velocities, of a joint at rest, that neither their noise nor their offset makes."""
 _WELL_CORRELATED: Final = 0.8
@@ -36,6 +49,8 @@ _BEYOND_LIMITS: Final = 3.0
 """Times the limits of a joint: no arm goes there, but degrees taken for radians are 57 times."""
 _BEYOND_EFFORT: Final = 30.0
 """Times the effort of the URDF: mNm taken for Nm are 1000 times."""
+
+CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 
 
 class ColumnFinding(NamedTuple):
@@ -73,7 +88,7 @@ def find_faults(
         np.concatenate([getattr(stretch.record, name) for stretch in stretches]) for name in ("q", "dq", "tau_J")
     )
     columns = _Columns(np.concatenate(times), q, dq, tau_J, period_s)
-    found = [*_of_torques(described, columns), *_of_positions(described, columns)]
+    found = [*_of_torques(described, columns), *_of_positions(described, columns), *_of_spikes(described, columns)]
     still = np.ptp(q, axis=0) < STILL_RAD
     for part, records in (("fit", fitted), ("test", [tested])):
         found += _of_rest(described, part, records, still)
@@ -119,26 +134,38 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFi
         if bounds := list(_clipped_at(torque)):
             yield ColumnFinding(
                 f"the torque of {name} is clipped at {' and '.join(f'{bound:g}' for bound in bounds)} Nm",
-                "move slower, or raise the range of that sensor",
+                CLIPPED_REMEDY,
             )
     yield from _against_effort(described, columns)
 
 
+def largest_torques(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
+    """Return the largest torque (n,) of each joint, but for outliers, and its effort (n,): inf where unknown."""
+    effort = np.where(np.isfinite(arm.torque_limit) & (arm.torque_limit > 0.0), arm.torque_limit, np.inf)
+    return np.nanquantile(np.abs(tau_J), 0.99, axis=0), effort
+
+
 def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
-    effort = described.urdf.torque_limit
-    known = np.isfinite(effort) & (effort > 0.0)
-    if not known.any() or "A" in described.units.tau_J:
+    largest, effort = largest_torques(columns.tau_J, described.urdf)
+    is_over = largest > _BEYOND_EFFORT * effort
+    if "A" in described.units.tau_J or not is_over.any():
         return
-    largest = np.quantile(np.abs(columns.tau_J), 0.99, axis=0)
-    over = np.where(known, largest / np.where(known, effort, 1.0), 0.0)
-    joint = int(np.argmax(over))
-    if over[joint] > _BEYOND_EFFORT:
-        yield ColumnFinding(
-            f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest[joint]:.3g} Nm, the URDF allows "
-            f"{effort[joint]:g} Nm",
-            f'if the torques are mNm: `units.tau_J` = "mNm", which the map has as "{described.units.tau_J}"',
-            is_dead=not np.any(described.urdf.theta_full),  # else its masses say more
-        )
+    joint = int(np.argmax(largest / effort))
+    yield ColumnFinding(
+        f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest[joint]:.3g} Nm, the URDF allows "
+        f"{effort[joint]:g} Nm",
+        f"if the torques are mNm: {_unit_or_scale(described, 'tau_J', 'mNm', 1e-3, is_over | np.isinf(effort))}",
+        is_dead=not np.any(described.urdf.theta_full),  # else its masses say more
+    )
+
+
+def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, is_meant: NDArray[np.bool_]) -> str:
+    """Name the key that gives all joints another unit, or some of them."""
+    if is_meant.all():
+        return f'`units.{key}` = "{unit}", which the map has as "{getattr(described.units, key)}"'
+    scale = np.array(getattr(described.scale, key) or (1.0,) * described.joints)
+    values = np.where(is_meant, scale * factor, scale).tolist()
+    return f"`scale.{key}` = [{', '.join(f'{value:.6g}' for value in values)}]"
 
 
 def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
@@ -147,37 +174,85 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
     still = [joint for joint in range(n) if travel[joint] < STILL_RAD]
     if len(still) == n:
         yield ColumnFinding("the arm does not move", "record motion of every joint, fast and slow", is_dead=True)
+    at_rest: list[int] = []
     for joint in still if len(still) < n else ():
-        name, always = column_name(described, "q", joint), columns.q[0, joint]
-        how = f"is always {always:g} rad" if travel[joint] == 0.0 else f"changes by less than {STILL_RAD:g} rad"
         turned = float(np.ptp(np.cumsum(columns.dq[:, joint]))) * columns.period_s
         if turned > _TURNS_THOUGH_STILL_RAD:
             yield ColumnFinding(
-                f"the position of {name} {how}, though by its velocity it turns: a dead encoder",
+                f"the position of {column_name(described, 'q', joint)} {_stays(columns.q[:, joint])}, though by its "
+                "velocity it turns: a dead encoder",
                 "check that encoder, and `columns.q`",
                 is_wrong=True,
             )
-            continue
+        else:
+            at_rest.append(joint)
+    if at_rest:
+        names = joined_names([column_name(described, "q", joint) for joint in at_rest], n)
+        said = f"the position of {names} {_stays(columns.q[:, at_rest[0]])}: a dead encoder, or a joint"
+        if len(at_rest) > 1:
+            said = f"the positions of {names} change by less than {STILL_RAD:g} rad: dead encoders, or joints"
         yield ColumnFinding(
-            f"the position of {name} {how}: a dead encoder, or a joint at rest, of which neither friction nor inertia "
-            "can be learnt",
+            f"{said} at rest, of which neither friction nor inertia can be learnt",
             "move every joint, name one that never moves in `arm.locked`, and check `columns.q`",
         )
-    for joint in range(n):
-        low, high = urdf.position_low[joint], urdf.position_high[joint]
-        is_known = np.isfinite(low) and np.isfinite(high) and high > low
-        bound = max(abs(low), abs(high)) if is_known else math.pi * 4.0
-        reach, speed = np.abs(columns.q[:, joint]).max(), np.quantile(np.abs(columns.dq[:, joint]), 0.99)
-        limit = urdf.velocity_limit[joint]
-        is_fast = np.isfinite(limit) and limit > 0.0 and speed > _BEYOND_LIMITS * limit
-        if described.urdf.chain.is_prismatic[joint] == 0.0 and (reach > _BEYOND_LIMITS * bound or is_fast):
-            much = f"goes to {reach:.3g} rad" if reach > _BEYOND_LIMITS * bound else f"turns at {speed:.3g} rad/s"
-            most = f"{bound:.3g} rad" if reach > _BEYOND_LIMITS * bound else f"{limit:g} rad/s"
-            yield ColumnFinding(
-                f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
-                f'if the positions are degrees: `units.q` = "deg", which the map has as "{described.units.q}"',
-            )
-            return
+    noise = [joint for joint in range(n) if joint not in still and _is_noise(columns.q[:, joint], columns.period_s)]
+    if noise:
+        names = joined_names([column_name(described, "q", joint) for joint in noise], n)
+        yield ColumnFinding(
+            f"the position of {names} is noise: from sample to sample it jumps as far as it goes at all",
+            "check that encoder, and `columns.q`",
+            is_dead=True,
+        )
+    low, high, limit = urdf.position_low, urdf.position_high, urdf.velocity_limit
+    is_known = np.isfinite(low) & np.isfinite(high) & (high > low)
+    bound = np.where(is_known, np.maximum(np.abs(low), np.abs(high)), 4.0 * math.pi)
+    reach, speed = np.abs(columns.q).max(axis=0), np.quantile(np.abs(columns.dq), 0.99, axis=0)
+    goes_far = reach > _BEYOND_LIMITS * bound
+    is_fast = np.isfinite(limit) & (limit > 0.0) & (speed > _BEYOND_LIMITS * limit)
+    is_beyond = (goes_far | is_fast) & (urdf.chain.is_prismatic == 0.0) & ~np.isin(np.arange(n), noise)
+    for joint in np.flatnonzero(is_beyond)[:1].tolist():
+        much = f"goes to {reach[joint]:.3g} rad" if goes_far[joint] else f"turns at {speed[joint]:.3g} rad/s"
+        most = f"{bound[joint]:.3g} rad" if goes_far[joint] else f"{limit[joint]:g} rad/s"
+        yield ColumnFinding(
+            f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
+            f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
+        )
+
+
+def _stays(column: Vector) -> str:
+    return f"changes by less than {STILL_RAD:g} rad" if np.ptp(column) else f"is always {column[0]:g} rad"
+
+
+def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+    """Name single samples that are far from their neighbours, as of a frame that was read wrong."""
+    for key, what, unit in (("tau_J", "torque", "Nm"), ("q", "position", "rad")):
+        for joint, column in enumerate(getattr(columns, key).T):
+            rows = _spikes(column)
+            if len(rows):
+                yield ColumnFinding(
+                    f"the {what} of {column_name(described, key, joint)} jumps for single samples, "
+                    f"{number_of(len(rows), 'time')}, first to {column[rows[0]]:.4g} {unit} at "
+                    f"{columns.time_s[rows[0]]:.4g} s",
+                    "empty these cells: a missing value parts the recording, and does no harm",
+                )
+
+
+def _spikes(column: Vector) -> NDArray[np.int64]:
+    """List the samples that are spikes, if they are few."""
+    if len(column) < _SPIKE_WINDOW:
+        return np.zeros(0, np.int64)
+    windows = np.lib.stride_tricks.sliding_window_view(column, _SPIKE_WINDOW)
+    apart = np.abs(column[2:-2] - np.median(windows, axis=1))
+    noise = MEDIAN_TO_SIGMA * np.median(np.abs(np.diff(column, 2)))
+    usual = np.ptp(np.quantile(column, (0.005, 0.995)))
+    rows = np.flatnonzero(apart > max(_SPIKE_SIGMAS * noise, _SPIKE_SPAN * usual)) + 2
+    return rows if len(rows) <= _SPIKES_SHARE * len(column) else rows[:0]
+
+
+def _is_noise(column: Vector, period_s: float) -> bool:
+    return period_s <= _NOISE_PERIOD_S and float(np.mean(np.diff(column) ** 2)) > _NOISE_STEP * 2.0 * float(
+        np.var(column)
+    )
 
 
 def _of_rest(
@@ -212,10 +287,9 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
     slopes = np.diag(products) / np.maximum(squares, 1e-12)
     alike = products / np.sqrt(np.maximum(np.outer(squares, own), 1e-24))
     moving = [joint for joint in range(n) if squares[joint] > 0.0]
-    strangers = [joint for joint in moving if abs(alike[joint, joint]) < 0.5]
-    for joint in strangers:
+    for joint in moving:
         other = int(np.argmax(np.abs(alike[joint])))
-        if other != joint and alike[joint, other] > _WELL_CORRELATED:
+        if abs(alike[joint, joint]) < _WELL_CORRELATED < alike[joint, other]:
             yield ColumnFinding(
                 f"the velocity of {column_name(described, 'dq', joint)} is in the column of "
                 f"{column_name(described, 'dq', other)}",
@@ -255,6 +329,26 @@ def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | 
     is_long = (last - first) * period_s >= _STUCK_S and last - first >= 20 and last - first > _STUCK_TIMES * usual
     is_moving = np.any(np.ptp(q[first:last], axis=0) > _STUCK_TRAVEL * np.ptp(q, axis=0))
     return (first, last) if is_long and is_moving else None
+
+
+def plateau(torque: Vector) -> tuple[float, float] | None:
+    """Find a bound at which a torque stays within its noise: the bound, and the share of the time; None: there is none.
+
+    The last stretch before its extreme reading, as wide as the noise, holds far more readings than the one before it.
+    A joint that overcomes nothing but friction is like that, too.
+    """
+    noise = float(MEDIAN_TO_SIGMA) * float(np.median(np.abs(np.diff(torque, 2))))
+    width, span = 2.0 * _PLATEAU_SIGMAS * noise, float(np.ptp(torque))
+    if not 0.0 < width < _PLATEAU_WIDTH * span:
+        return None
+    for sign in (1.0, -1.0):
+        if np.count_nonzero(torque == sign * np.max(sign * torque)) >= _CLIPPED_RUN:
+            continue  # cut off behind the noise, see `_clipped_at`
+        below = float(np.max(sign * torque)) - sign * torque
+        at, beside = np.count_nonzero(below < width), np.count_nonzero((below >= width) & (below < 2.0 * width))
+        if at > _PLATEAU_SHARE * len(torque) and at > _PLATEAU_TIMES * beside:
+            return float(np.median(torque[below < width])), at / len(torque)
+    return None
 
 
 def _clipped_at(torque: Vector) -> Iterator[float]:

@@ -7,9 +7,11 @@ row of units below the head is compared with the map.
 import csv
 import io
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Final, NamedTuple, TextIO
@@ -32,6 +34,10 @@ _KINDS_OF_FILE: Final = (
     (b"MATLAB", "a MATLAB file: adacd_hil.api.detect takes arrays"),
     (b"\x93NUMPY", "a numpy array: adacd_hil.api.detect takes arrays"),
     (b"\x89HDF", "an HDF5 file: adacd_hil.api.detect takes arrays"),
+    (b"PAR1", "a Parquet file: save it as CSV"),
+    (b"LOGG", "a BLF of frames: `adacd-hil log export --format csv --dbc` makes tables of it"),
+    (b"<?xml", "XML, no recording: if it is the URDF, the map names it, `arm.urdf`"),
+    (b"<robot", "a URDF: the map names it, `arm.urdf`"),
 )
 
 
@@ -73,11 +79,6 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
     return read.columns(described, names, has_touches=bool(described.columns.contact))
 
 
-def read_head(path: Path, described: RecordingMap) -> CsvHead:
-    """Read the first row. Raises LogError."""
-    return _head(path, next(_rows(path, described), (0, []))[1], described)
-
-
 def _head(path: Path, first: list[str], described: RecordingMap) -> CsvHead:
     while first and not first[-1].strip():  # as of a delimiter at the end of every row
         first = first[:-1]
@@ -94,30 +95,40 @@ def _head(path: Path, first: list[str], described: RecordingMap) -> CsvHead:
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
     """List the rows with their numbers from 1; empty ones, and comments below the first, are passed over."""
     form = described.csv
-    number = 0
+    with opened_text(path) as file:
+        for _ in range(form.skip_rows):
+            next(file, "")
+        for number, cells in enumerate(split_rows(path, file, form.delimiter), start=1 + form.skip_rows):
+            is_comment = bool(cells) and cells[0].startswith("#") and number > 1 + form.skip_rows
+            if not is_comment and any(map(str.strip, cells)):
+                yield number, cells
+
+
+@contextmanager
+def opened_text(path: Path) -> Iterator[TextIO]:
+    """Open a file of text. Raises LogError for what is of another kind, or can't be read."""
     try:
-        with open_text(path) as file:
-            for _ in range(form.skip_rows):
-                next(file, "")
-            lines: Iterator[list[str]]
-            if form.delimiter == " ":
-                lines = (line.split() for line in file)
-            else:
-                lines = csv.reader(file, delimiter=form.delimiter)
-            for number, cells in enumerate(lines, start=1 + form.skip_rows):
-                is_comment = bool(cells) and cells[0].startswith("#") and number > 1 + form.skip_rows
-                if not is_comment and any(map(str.strip, cells)):
-                    yield number, cells
+        with _open_text(path) as file:
+            yield file
     except UnicodeDecodeError:
         raise LogError(f"recording {path} is no text in UTF-8") from None
-    except csv.Error as error:
-        raise LogError(f"recording {path}, row {number + 1}: {error}") from None
     except OSError as error:
         raise LogError(f"recording {path}: {error.strerror or error}") from None
 
 
-def open_text(path: Path) -> TextIO:
-    """Open a file of text. Raises LogError for what is of another kind, OSError."""
+def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
+    """Split lines into cells. Raises LogError."""
+    if delimiter == " ":
+        yield from (line.split() for line in lines)
+        return
+    rows = csv.reader(lines, delimiter=delimiter)
+    try:
+        yield from rows
+    except csv.Error as error:
+        raise LogError(f"recording {path}, row {rows.line_num}: {error}") from None
+
+
+def _open_text(path: Path) -> TextIO:
     file = open_input(path)
     begin = file.peek(16)
     for magic, kind in _KINDS_OF_FILE:
@@ -130,7 +141,7 @@ def open_text(path: Path) -> TextIO:
 def _columns(path: Path, head: CsvHead, described: RecordingMap) -> list[_Column]:
     """Find the columns: time, positions, torques, velocities, touches. Raises ConfigError."""
     columns, units = described.columns, described.units
-    number = _comma_number if described.csv.decimal == "," else float
+    number = partial(read_number, decimal=",") if described.csv.decimal == "," else float
     time = _time_column(path, head, described)
     wanted = (
         *((name, units.q) for name in columns.q),
@@ -229,15 +240,16 @@ class _RowReader:
 
     def _remedy(self, text: str, column: _Column) -> str:
         """Name the key of the map with which a cell could be read."""
-        if self._described.csv.decimal == "." and text.count(",") == 1 and _is_number(text.replace(",", ".")):
+        if self._described.csv.decimal == "." and text.count(",") == 1 and is_number(text, ","):
             return ', no number: `csv.decimal` = "," reads it'
         if column is self._columns[0] and is_iso_time(text):
             return f', no number: `units.time` = "{ISO}" reads it'
         return ", no number"
 
 
-def _comma_number(text: str) -> float:
-    return float(text.replace(",", "."))
+def read_number(text: str, decimal: str) -> float:
+    """Read a number. Raises ValueError."""
+    return float(text.replace(",", ".") if decimal == "," else text)
 
 
 class _Times:
@@ -264,9 +276,10 @@ def _iso_seconds(text: str) -> Decimal:
     return since // timedelta(microseconds=1) * Decimal("1e-6")
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str, decimal: str) -> bool:
+    """Tell whether a text is a number with such a sign before its decimals."""
     try:
-        float(text)
+        read_number(text, decimal)
     except ValueError:
         return False
     return True

@@ -11,7 +11,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.foreign.recording_map import ISO, UnitsSection, time_unit_of, units_by_slope
+from adacd_hil.analysis.foreign.column_checks import largest_torques
+from adacd_hil.analysis.foreign.recording_map import ISO, TIME_S, UnitsSection, time_unit_of, units_by_slope
 from adacd_hil.analysis.foreign.table_guess import TableGuess, guess_table
 from adacd_hil.file_access import read_input
 from adacd_hil.log.formats.joint_state_bags import JOINT_STATES, is_bag, joint_state_topics, opened_bag
@@ -25,6 +26,7 @@ _FINGERS: Final = re.compile(r"finger|gripper|claw|knuckle|jaw", re.IGNORECASE)
 _DEGREES: Final = 180.0 / np.pi
 _BEYOND: Final = 1.5
 """Times the limits of the URDF, from which positions are degrees."""
+_BEYOND_EFFORT: Final = 5.0
 _SEEN_MESSAGES: Final = 20_000
 
 
@@ -125,7 +127,7 @@ def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
         if unit != "s":
             why = "" if "time" in guess.units else f"rows are {step:g} {unit} apart"
             keys.append(DraftedKey("units", "time", unit, why))
-        step *= {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[unit]
+        step *= TIME_S[unit]
     angle = guess.units.get("q") or _angle_unit(guess.of("q"), arm)
     if "q" in guess.units or angle != "rad":
         why = "" if "q" in guess.units else _span(guess.of("q"), arm)
@@ -176,22 +178,14 @@ def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
 
 def _torque_unit(tau: Vector, arm: SerialArm) -> str:
     """Guess mNm where torques reach beyond the effort of the URDF, and would not in mNm."""
-    reach, effort = _reach_over_effort(tau, arm)
-    return "mNm" if effort and reach > 5.0 else "Nm"
-
-
-def _reach_over_effort(tau: Vector, arm: SerialArm) -> tuple[float, float]:
-    known = np.isfinite(arm.torque_limit) & (arm.torque_limit > 0.0)
-    if not known.any():
-        return 0.0, 0.0
-    over = np.nanquantile(np.abs(tau[:, known]), 0.99, axis=0) / arm.torque_limit[known]
-    joint = int(np.argmax(over))
-    return float(over[joint]), float(arm.torque_limit[known][joint])
+    largest, effort = largest_torques(tau, arm)
+    return "mNm" if np.any(largest > _BEYOND_EFFORT * effort) else "Nm"
 
 
 def _reach(tau: Vector, arm: SerialArm) -> str:
-    over, effort = _reach_over_effort(tau, arm)
-    return f"they reach {over * effort:.3g}, the effort of the URDF is {effort:g} Nm"
+    largest, effort = largest_torques(tau, arm)
+    joint = int(np.nanargmax(largest / effort))
+    return f"they reach {largest[joint]:.3g}, the effort of the URDF is {effort[joint]:g} Nm"
 
 
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:

@@ -21,6 +21,7 @@ from adacd_hil.analysis.foreign.recording_map import RecordingMap
 from adacd_hil.records import Vector
 from adacd_hil.scheme.identify import offline
 from adacd_hil.scheme.identify.offline import ArmModel, OfflineSettings, Record
+from adacd_hil.scheme.model.urdf import STANDARD_GRAVITY_M_S2
 
 _MOST_S: Final = 10.0
 """Of fit and of test that is looked at."""
@@ -57,6 +58,7 @@ class _Motion(NamedTuple):
     joints: tuple[int, ...] = ()
     unit: str = ""
     has_rotors: bool | None = None  # None: as the map says
+    gravity_m_s2: tuple[float, ...] | None = None  # None: as the map says
     is_of_velocities: bool = True
 
     @property
@@ -112,7 +114,7 @@ def find_readings(
     settings = replace(settings, period_s=step * settings.period_s, fit_every=max(1, round(settings.fit_every / step)))
     judged: list[_Judged] = []
     for motion in _motions(described, model):
-        other = model if motion.has_rotors is None else offline.model_of(model.chain, motion.has_rotors)
+        other = _model_of(model, motion)
         fit, test = (_equations(other, part, settings, motion) for part in (fitted, tested))
         if fit is not None and test is not None:
             for torques in _torques(model.joints, most_turned=1 if motion.weight else model.joints):
@@ -129,6 +131,12 @@ def find_readings(
     simplest = min(each.weight for each in alike)
     named = sorted((each for each in alike if each.weight == simplest), key=lambda each: each.unexplained)
     return tuple(Reading(*_texts(described, each), 1.0 - each.unexplained) for each in named)
+
+
+def _model_of(model: ArmModel, motion: _Motion) -> ArmModel:
+    if motion.gravity_m_s2 is not None:
+        return offline.model_of(model.chain._replace(gravity_m_s2=np.array(motion.gravity_m_s2)), model.has_rotors)
+    return model if motion.has_rotors is None else offline.model_of(model.chain, motion.has_rotors)
 
 
 def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
@@ -244,6 +252,11 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
         for R in (None, np.linalg.inv(T).T.astype(np.float64)):
             yield _Motion("absolute", T, R)
     yield _Motion("rotors", straight, has_rotors=not model.has_rotors)
+    told = model.chain.gravity_m_s2
+    size = float(np.linalg.norm(told)) or float(np.linalg.norm(STANDARD_GRAVITY_M_S2))
+    for direction in (np.zeros(3), *np.eye(3), *-np.eye(3)):
+        if not np.allclose(size * direction, told):
+            yield _Motion("gravity", straight, gravity_m_s2=tuple((size * direction + 0.0).tolist()))
 
 
 def _exchanged(n: int, i: int, j: int) -> list[int]:
@@ -270,7 +283,15 @@ def _motion_texts(described: RecordingMap, motion: _Motion) -> tuple[str, str]:
     likewise = ", and so do the torques" if motion.R is not None else ""
     own = "record the joints' own positions and torques, or write them into new columns"
     columns = "`columns.q`, `columns.tau_J`"
+    gravity = motion.gravity_m_s2 or (0.0, 0.0, 0.0)
+    along = next(
+        (f"{'-' if value < 0.0 else '+'}{axis}" for axis, value in zip("xyz", gravity, strict=True) if value), ""
+    )
     texts = {
+        "gravity": (
+            f"gravity acts along {along} of the URDF's root" if along else "there is no gravity in the torques",
+            f"`arm.gravity_m_s2` = [{', '.join(f'{value:g}' for value in gravity)}]",
+        ),
         "unit": (f"the positions are {UNITS.get(motion.unit)}", f'`units.q` = "{motion.unit}"'),
         "turned": (f"the position of {both} counts the other way round", _scale(described, "q", motion.joints)),
         "exchanged": (f"the positions of {both} are exchanged", "exchange them in `columns.q`"),

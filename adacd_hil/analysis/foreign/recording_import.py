@@ -24,8 +24,12 @@ from adacd_hil.scheme.identify.offline import Record
 
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.1
 _LEAST_NOISE_NM = 1e-4
+_MOST_BESIDE_JUMP_RAD = 0.8
+"""Motion in the time of a jump, 8 rad/s in the longest period."""
+_JITTER = 0.25
+"""Of a period, by which the times between rows vary: a derived velocity is off by as much."""
 _DEGREE = 3  # of the polynomial whose slope is a derived velocity
-_MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white noise
+MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white noise
 _STEP_TO_SIGMA = 1.0 / np.sqrt(12.0)  # of the rounding to a step
 
 
@@ -116,8 +120,11 @@ def recording_of(
         raise LogError(f"recording {path}: {number_of(len(time_s), 'row')} with all values, {SHORTEST_SAMPLES} needed")
     period_s = described.sampling.period_s or period_s or _period_s(path, time_s, described)
     values, idle = _without_idle_velocities(values, described)
-    notes += idle
+    values, turned = _without_jumps(values, described)
+    notes += [*idle, *turned]
     has_dq = values.shape[1] > 2 * n
+    if described.columns.time and not has_dq and (jitter := _jitter(time_s, period_s)):
+        notes.append(jitter)
     longest_s = max(described.sampling.longest_gap_s, 1.5 * period_s)
     window = derivative_window(described, period_s)
     shortest = max(SHORTEST_SAMPLES, window)
@@ -168,6 +175,21 @@ def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
     )
 
 
+def _jitter(time_s: Vector, period_s: float) -> str:
+    """Say by how much rows are apart where that varies; "" where it hardly does."""
+    short_s, long_s = np.quantile(np.diff(time_s), (0.05, 0.95)).tolist()
+    if long_s - short_s < _JITTER * period_s:
+        return ""
+    return (
+        f"rows are {1e3 * short_s:.3g} to {1e3 * long_s:.3g} ms apart: if they were sampled evenly, leave "
+        f"`columns.time` out and write `sampling.period_s` = {_even_period_s(time_s):.6g}"
+    )
+
+
+def _even_period_s(time_s: Vector) -> float:
+    return float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
+
+
 def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
     """Drop velocities, as some drivers leave them empty, where one never changes though its joint moves."""
     n = described.joints
@@ -179,6 +201,20 @@ def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[V
     name, always = described.urdf.joint_names[joint], values[0, 2 * n + joint]
     note = f"the velocity of {name} is always {always:g} rad/s: velocities are derived from the positions"
     return values[:, : 2 * n], [note]
+
+
+def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
+    """Let positions go on where they jump by a turn, as those of joints without end do from +180 to -180 degrees."""
+    notes = []
+    values = values.copy()
+    for joint in np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist():
+        steps = np.abs(np.diff(values[:, joint]))
+        jumps = steps[steps > np.pi]
+        if len(jumps) and np.all(np.abs(jumps - 2.0 * np.pi) < _MOST_BESIDE_JUMP_RAD):
+            values[:, joint] = np.unwrap(values[:, joint])
+            name, times = described.urdf.joint_names[joint], number_of(len(jumps), "time")
+            notes.append(f"the position of {name} jumps by a turn {times}: it goes on instead")
+    return values, notes
 
 
 def derivative_window(described: RecordingMap, period_s: float) -> int:
@@ -198,7 +234,7 @@ def _noise(parts: list[Vector], given: Vector) -> Vector:
     """
     seconds = np.concatenate([np.abs(np.diff(part, 2, axis=0)) for part in parts])
     rounding = _STEP_TO_SIGMA * np.array([_step(column) for column in given.T])
-    return np.asarray(np.maximum(_MEDIAN_TO_SIGMA * np.median(seconds, axis=0), rounding))
+    return np.asarray(np.maximum(MEDIAN_TO_SIGMA * np.median(seconds, axis=0), rounding))
 
 
 def _step(column: Vector) -> float:

@@ -16,13 +16,13 @@ from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import read_toml
 
 ISO = "iso"
-_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, ISO: 1.0}
+TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, ISO: 1.0}
 _ANGLE = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
 _SPEED = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3, "A": 1.0, "mA": 1e-3}
 _USUAL_PERIOD_S = (2e-4, 0.1)
 _SPELLINGS = {
-    **{unit.casefold(): unit for units in (_TIME, _ANGLE, _SPEED, _TORQUE) for unit in units},
+    **{unit.casefold(): unit for units in (TIME_S, _ANGLE, _SPEED, _TORQUE) for unit in units},
     **{"sec": "s", "seconds": "s", "msec": "ms", "\N{MICRO SIGN}s": "us", "\N{GREEK SMALL LETTER MU}s": "us"},
     **{"°": "deg", "degree": "deg", "degrees": "deg", "°/s": "deg/s", "degs": "deg/s", "rads": "rad/s", "amp": "A"},
     **{f"{milli}n{times}m": f"{milli}Nm" for milli in ("", "m") for times in ("*", "·", " ", ".", "-")},
@@ -37,7 +37,7 @@ def unit_of(text: str) -> str:
 def time_unit_of(step: float) -> str:
     """Return the unit in which a time between two rows is one at which arms are recorded; "" if there is none."""
     low_s, high_s = _USUAL_PERIOD_S
-    return next((unit for unit in ("s", "ms", "us", "ns") if low_s <= step * _TIME[unit] <= high_s), "")
+    return next((unit for unit in ("s", "ms", "us", "ns") if low_s <= step * TIME_S[unit] <= high_s), "")
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class UnitsSection:
     """Units of the columns."""
 
     time: str = setting(
-        "s", choices=tuple(_TIME), meaning="of the time; iso: a date and time such as 2024-05-01T10:00:00.005"
+        "s", choices=tuple(TIME_S), meaning="of the time; iso: a date and time such as 2024-05-01T10:00:00.005"
     )
     q: str = setting("rad", choices=tuple(_ANGLE), meaning="of positions")
     dq: str = setting("rad/s", choices=tuple(_SPEED), meaning="of velocities")
@@ -153,7 +153,7 @@ class RecordingMap:
     @property
     def time_s(self) -> float:
         """One unit of the time, s."""
-        return _TIME[self.units.time]
+        return TIME_S[self.units.time]
 
     @property
     def q_rad(self) -> tuple[float, ...]:

@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.foreign.column_checks import ColumnFinding, find_faults, joined_names
+from adacd_hil.analysis.foreign.column_checks import CLIPPED_REMEDY, ColumnFinding, find_faults, joined_names, plateau
 from adacd_hil.analysis.foreign.other_readings import UNITS, find_readings
 from adacd_hil.analysis.foreign.recording_import import ForeignRecording
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
@@ -42,7 +42,7 @@ _UNKNOWN: Final = 0.3
 """Of the deviation before any motion: a parameter of which more is left was not excited."""
 _MILLI: Final = (300.0, 3000.0)
 """Times the masses of the URDF that torques ask for if they are mNm."""
-_ODD_SCALE: Final = 5.0
+_ODD_SCALE: Final = 2.0
 _ODD_MASSES: Final = 0.3
 """Share by which the parameters of a URDF may be off."""
 _HEAVIEST_KG, _LIGHTEST_KG = 300.0, 0.01
@@ -147,15 +147,15 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Colum
     is_good = not inertia and not wrong and all(joint.is_explained for joint in joints)
     if is_good and fit.certificate.margin >= 1.0:
         return [*scale, *remarks]
-    if not all(_is_noise(fit, joints)) and (readings := list(_of_readings(fit, joints, WHOLE if wrong else 0.0))):
+    if not all(_is_noise(fit, joints)) and (readings := list(_of_readings(fit, joints, WHOLE if columns else 0.0))):
         return [*readings, *remarks]
     if is_good:
         return [*scale, *remarks]
     lack = list(_of_lack(fit, joints))
     causes = wrong or [*map(_against, columns)]
     if causes:
-        return [*causes, *(found._replace(is_against=False) for found in lack)]
-    return list(_of_noise(fit, joints)) or inertia or lack
+        return [*causes, *scale, *(found._replace(is_against=False) for found in lack)]
+    return [*(list(_of_noise(fit, joints)) or inertia or lack), *scale]
 
 
 def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
@@ -463,14 +463,23 @@ def _of_excitation(fit: Fitted) -> Iterator[_Finding]:
 
 def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
     """Say which joints are not explained where nothing says why."""
-    unexplained = [i for i, joint in enumerate(joints) if not joint.is_explained]
-    for i in unexplained:
-        joint = joints[i]
+    for i, joint in enumerate(joints):
+        if joint.is_explained or math.isnan(joint.share):
+            continue
+        torque = np.concatenate(
+            [part.record.tau_J[:, i] for each in (*fit.fitted, fit.tested) for part in each.stretches]
+        )
+        bound = plateau(torque)
         largest, rms = fit.certificate.residual_max_Nm[i], fit.certificate.residual_rms_Nm[i]
         yield _Finding(
             f"{joint.name}: {percent(joint.share)} is explained, {100.0 * WHOLE:.0f} % are needed; the residual "
-            f"reaches {largest:.3g} Nm ({rms:.2g} rms), {_times_threshold(joint.margin)}",
-            _lack_remedy(fit),
+            f"reaches {largest:.3g} Nm ({rms:.2g} rms), {_times_threshold(joint.margin)}"
+            + (
+                f"; the torque stays at {bound[0]:.3g} Nm for {percent(bound[1])} of the time, as if clipped"
+                if bound
+                else ""
+            ),
+            CLIPPED_REMEDY if bound else _lack_remedy(fit),
             is_against=True,
         )
 

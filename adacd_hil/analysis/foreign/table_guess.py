@@ -10,12 +10,20 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.foreign.csv_recording import DELIMITERS, is_iso_time, open_text
+from adacd_hil.analysis.foreign.csv_recording import (
+    DELIMITERS,
+    is_iso_time,
+    is_number,
+    opened_text,
+    read_number,
+    split_rows,
+)
 from adacd_hil.analysis.foreign.recording_map import unit_of
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
@@ -85,9 +93,10 @@ class _Head(NamedTuple):
 
 def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     """Look at a CSV file of an arm with such joints. Raises LogError."""
-    lines = _first_lines(path, _SEEN_ROWS + _HEAD_ROWS)
+    with opened_text(path) as file:
+        lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
     form, first = _form(path, lines)
-    values, is_iso = _values(lines[first:], form)
+    values, is_iso = _values(_split(path, lines[first:], form.delimiter), form)
     guess = TableGuess(form, values, is_iso)
     if form.has_header:
         _by_heads(guess, joint_names)
@@ -96,33 +105,14 @@ def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     return guess
 
 
-def _first_lines(path: Path, count: int) -> list[str]:
-    try:
-        with open_text(path) as file:
-            return [line.rstrip("\r\n") for _, line in zip(range(count), file, strict=False)]
-    except UnicodeDecodeError:
-        raise LogError(f"recording {path} is no text in UTF-8") from None
-    except OSError as error:
-        raise LogError(f"recording {path}: {error.strerror or error}") from None
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    parts = line.split() if delimiter == " " else line.split(delimiter)
-    return [part.strip().strip('"') for part in parts]
-
-
-def _is_number(cell: str, decimal: str) -> bool:
-    try:
-        float(cell.replace(",", ".") if decimal == "," else cell)
-    except ValueError:
-        return False
-    return True
+def _split(path: Path, lines: list[str], delimiter: str) -> list[list[str]]:
+    return [[cell.strip() for cell in cells] for cells in split_rows(path, lines, delimiter)]
 
 
 def _is_full(cells: list[str], decimal: str) -> bool:
     """Tell whether a row has numbers, the first perhaps a date."""
-    return all(_is_number(cell, decimal) for cell in cells[1:]) and (
-        _is_number(cells[0], decimal) or is_iso_time(cells[0])
+    return all(is_number(cell, decimal) for cell in cells[1:]) and (
+        is_number(cells[0], decimal) or is_iso_time(cells[0])
     )
 
 
@@ -131,7 +121,7 @@ def _form(path: Path, lines: list[str]) -> tuple[TableForm, int]:
     best: tuple[int, TableForm, int] | None = None
     for delimiter in DELIMITERS:
         for decimal in (".", ",") if delimiter != "," else (".",):
-            rows = [_trimmed(_cells(line, delimiter)) for line in lines[:_HEAD_ROWS]]
+            rows = [_trimmed(cells) for cells in _split(path, lines[:_HEAD_ROWS], delimiter)]
             first = next((k for k in range(len(rows)) if _begins(rows[k : k + _FULL_ROWS], decimal)), None)
             if first is not None and (best is None or len(rows[first]) > best[0]):
                 best = (len(rows[first]), _form_at(rows, first, delimiter, decimal), first)
@@ -166,21 +156,20 @@ def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) ->
     return TableForm(delimiter, decimal, True, above[-1], tuple(heads), units)
 
 
-def _values(lines: list[str], form: TableForm) -> tuple[Vector, bool]:
+def _values(rows: list[list[str]], form: TableForm) -> tuple[Vector, bool]:
     """Read the data; whether the first column has dates, which are left as nan."""
     count = len(form.heads)
     table: list[list[float]] = []
     is_iso = False
-    for line in lines[:_SEEN_ROWS]:
-        cells = _cells(line, form.delimiter)[:count]
-        if len(cells) == count:
-            is_iso |= not table and not _is_number(cells[0], form.decimal)
-            table.append([_number(cell, form.decimal) for cell in cells])
+    for cells in rows[:_SEEN_ROWS]:
+        if len(cells) >= count:
+            is_iso |= not table and not is_number(cells[0], form.decimal)
+            table.append([_number(cell, form.decimal) for cell in cells[:count]])
     return np.array(table).reshape(-1, count), is_iso
 
 
 def _number(cell: str, decimal: str) -> float:
-    return float(cell.replace(",", ".") if decimal == "," else cell) if _is_number(cell, decimal) else math.nan
+    return read_number(cell, decimal) if is_number(cell, decimal) else math.nan
 
 
 # By heads.

@@ -209,7 +209,7 @@ def check_as_text(check: "LogCheck") -> str:
     for finding in check.findings:
         where = f"{finding.file}, byte {finding.offset}" if finding.offset >= 0 else finding.file
         lines.append(f"{finding.severity}: {where}: {finding.text} ({finding.rule})")
-    left_out = check.errors + check.warnings - len(check.findings)
+    left_out = check.errors + check.warnings + check.notes - len(check.findings)
     if left_out:
         lines.append(f"and {left_out} more of these")
     verdict = "clean" if not check.errors + check.warnings else f"{check.errors} errors, {check.warnings} warnings"
@@ -293,7 +293,7 @@ dbc_option = click.option(
 )
 @click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
 @click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Of the output.")
-@click.option("--out", type=WrittenPath(), help="Folder of the tables, or file of the frames.")
+@click.option("--out", type=WrittenPath(), help="Folder of the tables, or file of the frames; default: beside LOG.")
 @click.option(
     "--topic", "topics", multiple=True, metavar="TOPIC", help="For tables: a topic, or a pattern such as 'decoded/*'."
 )
@@ -336,7 +336,8 @@ def export(
     if kind in TABLES:
         described, problem = _export_tables(log, out or log.with_name(f"{log.stem}-tables"), kind, topics, decoder)
     else:
-        out = out or log.with_suffix(_SUFFIXES.get(kind, f".{kind}"))
+        suffix = _SUFFIXES.get(kind, f".{kind}")
+        out = out or log.with_suffix(suffix if log.suffix.lower() != suffix else f".exported{suffix}")
         described, problem = _export_frames(log, out, kind, only, can_ids, decoder, has_direction)
     if problem:
         print(in_line(f"warning: {problem}"), file=sys.stderr)
@@ -359,6 +360,8 @@ def _export_tables(
     from adacd_hil.log.formats.signal_tables import export_tables
 
     summary = export_tables(log, out, kind, topics, decoder, _Teller("rows"))
+    for note in summary.notes:
+        _tell(f"{kind}: {note}")
     lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
     described = {
         "files": {str(path): rows for path, rows in summary.rows.items()},

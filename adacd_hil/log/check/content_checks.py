@@ -2,9 +2,11 @@
 
 import contextlib
 import re
+from typing import Any
 
 import numpy as np
 from mcap.records import Channel, Schema
+from numpy.typing import NDArray
 
 from adacd_hil.log.check.findings import Findings
 from adacd_hil.log.log_files import LogError
@@ -39,10 +41,12 @@ class DefinitionCheck:
     def __init__(self, findings: Findings) -> None:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
+        self.all_channels: dict[int, Channel] = {}
+        """Those of the summary, too."""
         self.summary_schemas: set[int] = set()
         self.summary_channels: set[int] = set()
         self._findings = findings
-        self._summary_only: list[tuple[str, int]] = []
+        self._summary_only: list[tuple[str, int, int]] = []
         self._duplicates: set[str] = set()
 
     def schema(self, schema: Schema, offset: int, is_summary: bool) -> None:
@@ -58,7 +62,7 @@ class DefinitionCheck:
         if known is not None:
             pairs = (("name", "name"), ("encoding", "encoding"), ("data", "data"))
             self._compare(name, known, schema, pairs, offset)
-        self._place(name, schema.id in self.schemas, offset, is_summary)
+        self._place("schema", schema.id, schema.id in self.schemas, offset, is_summary)
         if is_summary:
             self.summary_schemas.add(schema.id)
         else:
@@ -80,11 +84,13 @@ class DefinitionCheck:
         if channel.schema_id and not is_defined:
             text = f"{name} ({channel.topic}) has the schema {channel.schema_id}, which is not defined"
             self._findings.add("undefined-schema", text, offset)
-        self._place(name, channel.id in self.channels, offset, is_summary)
+        self._place("channel", channel.id, channel.id in self.channels, offset, is_summary)
         if is_summary:
             self.summary_channels.add(channel.id)
+            self.all_channels.setdefault(channel.id, channel)
         else:
             self.channels.setdefault(channel.id, channel)
+            self.all_channels[channel.id] = channel
 
     def _compare(
         self, name: str, known: object, other: object, pairs: tuple[tuple[str, str], ...], offset: int
@@ -93,18 +99,27 @@ class DefinitionCheck:
         if different:
             self._findings.add("redefinition", f"{name} is defined again with another {', '.join(different)}", offset)
 
-    def _place(self, name: str, is_known: bool, offset: int, is_summary: bool) -> None:
+    def _place(self, kind: str, number: int, is_known: bool, offset: int, is_summary: bool) -> None:
+        name = f"{kind} {number}"
         if is_summary and not is_known:
-            self._summary_only.append((name, offset))
+            self._summary_only.append((kind, number, offset))
         elif not is_summary and is_known and name not in self._duplicates:
             self._duplicates.add(name)
             self._findings.add("duplicate", f"{name} is defined more than once in the data section", offset)
 
-    def finish(self, has_messages: bool) -> None:
-        """Judge what the summary alone defines."""
-        rule = "summary-only" if has_messages else "unused-summary-only"
-        for name, offset in self._summary_only:
-            self._findings.add(rule, f"{name} is defined in the summary only", offset)
+    def finish(self, counts: NDArray[Any]) -> None:
+        """Judge what the summary alone defines. counts: messages of each channel."""
+        used = {"channel": set(np.flatnonzero(counts).tolist())}
+        used["schema"] = {self.all_channels[number].schema_id for number in used["channel"] & set(self.all_channels)}
+        unused = []
+        for kind, number, offset in self._summary_only:
+            if number in used[kind]:
+                self._findings.add("summary-only", f"{kind} {number} is defined in the summary only", offset)
+            else:
+                unused.append(f"{kind} {number}")
+        if unused:
+            text = f"the summary alone defines what no message uses: {', '.join(unused)}"
+            self._findings.add("unused-summary-only", text)
 
 
 class ContentCheck:
@@ -223,6 +238,8 @@ _LINE = re.compile(
     r"(?P<type>[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){0,2})(<=\d+)?(?P<array>\[(<=)?\d*\])?"
     r"\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)"
 )
+_PARTS = "---"
+"""Between the parts of a service or an action, whose events rosbag2 records."""
 _CONSTANT = re.compile(r"=\s*\S.*")
 
 
@@ -248,7 +265,7 @@ def text_problem(data: bytes) -> str:
 
 
 def _line_problem(line: str, known: set[str]) -> str:
-    if not line or line.startswith("#"):
+    if not line or line.startswith("#") or line == _PARTS:
         return ""
     match = _LINE.fullmatch(line)
     if match is None:

@@ -10,10 +10,15 @@ _TOLD = 10
 
 
 class Severity(StrEnum):
-    """`error`: the file is damaged or written wrong. `warning`: it lacks something, or readers may stumble over it."""
+    """How bad a finding is.
+
+    `error`: the file is damaged or written wrong. `warning`: it lacks something, or readers may stumble over it.
+    `note`: it is sound, and a reader should know this.
+    """
 
     ERROR = "error"
     WARNING = "warning"
+    NOTE = "note"
 
 
 class LogFinding(NamedTuple):
@@ -34,6 +39,8 @@ class Findings:
     found: list[LogFinding] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
     """All findings by rule, those that aren't told too."""
+    without_crc: Counter[str] = field(default_factory=Counter)
+    """Parts of the file that have no CRC, by kind."""
 
     def add(self, rule: str, text: str, offset: int = -1) -> None:
         """Add a finding of a rule of `RULES`."""
@@ -54,7 +61,7 @@ class Rule(NamedTuple):
     origin: str = ""
 
 
-_ERROR, _WARNING = Severity.ERROR, Severity.WARNING
+_ERROR, _WARNING, _NOTE = Severity
 RULES: dict[str, Rule] = {
     # the file
     "magic": Rule(_ERROR, "the file begins and ends with MCAP's magic, and nothing follows", "doctor"),
@@ -71,7 +78,8 @@ RULES: dict[str, Rule] = {
     "data-crc": Rule(_ERROR, "the data section fits its CRC", "doctor"),
     "summary-crc": Rule(_ERROR, "the summary fits its CRC", "doctor"),
     "attachment-crc": Rule(_ERROR, "every attachment fits its CRC"),
-    "no-crc": Rule(_WARNING, "chunks, attachments, data section and summary have CRCs"),
+    "no-crc": Rule(_NOTE, "CRCs vouch for all messages, attachments and the summary"),
+    "some-crc": Rule(_WARNING, "without a CRC of the data section, all chunks have a CRC or none"),
     # definitions
     "schema-id": Rule(_ERROR, "no schema has the number 0", "doctor"),
     "schema-encoding": Rule(_ERROR, "a schema with data names its encoding", "doctor"),
@@ -80,8 +88,8 @@ RULES: dict[str, Rule] = {
     "duplicate": Rule(_WARNING, "the data section defines each number once", "doctor"),
     "undefined-schema": Rule(_ERROR, "the schema of a channel is defined before it", "doctor"),
     "undefined-channel": Rule(_ERROR, "the channel of a message is defined before it", "doctor"),
-    "summary-only": Rule(_ERROR, "what the summary defines, the data section defines too", "doctor"),
-    "unused-summary-only": Rule(_WARNING, "the same, in a file without messages"),
+    "summary-only": Rule(_ERROR, "what the summary defines and messages use, the data section defines too", "doctor"),
+    "unused-summary-only": Rule(_NOTE, "the data section defines what no message uses, too"),
     # chunks and indexes
     "chunk-record": Rule(_ERROR, "a chunk holds schemas, channels and messages, whole ones", "doctor"),
     "chunk-times": Rule(_ERROR, "a chunk's times are those of its earliest and latest message", "doctor"),

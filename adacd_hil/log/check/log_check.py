@@ -5,6 +5,7 @@ own. The check reads a file once, from front to back, in constant memory but for
 record to the rules that concern it.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -57,6 +58,7 @@ _SUMMARY = {
 }
 _PROFILES = ("", "ros1", "ros2")
 _FOOTER_CRC = 4
+_DATA_SECTION = "data section"
 
 
 class FileFacts(NamedTuple):
@@ -150,7 +152,7 @@ class _FileCheck:
         self._count(record)
         stored = int.from_bytes(record.body, "little")
         if not stored:
-            self._findings.add("no-crc", "the data section has no CRC", record.offset)
+            self._findings.without_crc[_DATA_SECTION] += 1
         elif stored != self._crc:
             self._findings.add("data-crc", "the data section fails its CRC", record.offset)
         self._is_summary = True
@@ -203,7 +205,7 @@ class _FileCheck:
         attachment = parse(record.opcode, record.body)
         self._summary.attachment(record, attachment)
         if record.body[-4:] == bytes(4):
-            self._findings.add("no-crc", f"the attachment {attachment.name} has no CRC", record.offset)
+            self._findings.without_crc["attachment"] += 1
         elif not attachment_crc_fits(record):
             self._findings.add("attachment-crc", f"the attachment {attachment.name} fails its CRC", record.offset)
 
@@ -218,8 +220,23 @@ class _FileCheck:
             self._findings.add("magic", "the file doesn't end with a Footer and MCAP's magic", size)
         elif end < size:
             self._findings.add("magic", f"{size - end} bytes follow the end", end)
-        self._definitions.finish(has_messages=bool(self._chunks.counts.any()))
+        self._definitions.finish(self._chunks.counts)
         self._summary.finish()
+        self._judge_missing_crcs()
+
+    def _judge_missing_crcs(self) -> None:
+        """Name what no CRC vouches for; that of the data section does so for all that is in it."""
+        missing, chunks = self._findings.without_crc, len(self._chunks.facts)
+        if not missing[_DATA_SECTION]:
+            missing = Counter(summary=missing["summary"])
+        elif 0 < missing["chunk"] < chunks:
+            text = f"{missing['chunk']} of {chunks} chunks have no CRC, nor has the data section"
+            self._findings.add("some-crc", text)
+        elif chunks and not missing["chunk"] and not self._chunks.has_outside:
+            missing = missing - Counter([_DATA_SECTION])  # each chunk has its own
+        parts = [f"{count} {part}s" if count > 1 else f"the {part}" for part, count in missing.items() if count]
+        if parts:
+            self._findings.add("no-crc", f"nothing vouches for these bytes, which have no CRC: {', '.join(parts)}")
 
 
 class LogCheck(NamedTuple):
@@ -231,6 +248,7 @@ class LogCheck(NamedTuple):
     findings: list[LogFinding]
     errors: int  # more than are in `findings` where a rule was broken often
     warnings: int
+    notes: int
 
 
 def find_logs(paths: Iterable[Path]) -> list[Path]:
@@ -270,6 +288,7 @@ def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> L
         [finding for findings in all_findings for finding in findings.found],
         sum(findings.count(Severity.ERROR) for findings in all_findings),
         sum(findings.count(Severity.WARNING) for findings in all_findings),
+        sum(findings.count(Severity.NOTE) for findings in all_findings),
     )
 
 

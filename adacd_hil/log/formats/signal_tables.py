@@ -12,7 +12,7 @@ import fnmatch
 import itertools
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from types import TracebackType
@@ -204,10 +204,11 @@ _RAW = tuple(name.removeprefix("/") for name in FRAME_TOPICS)
 
 
 class TableSummary(NamedTuple):
-    """The written rows of each file. `problem`: the missing part of the recording, one line."""
+    """The written rows of each file. `problem`: the missing part of the recording, one line. `notes`: a line each."""
 
     rows: Mapping[Path, int]
     problem: str
+    notes: Sequence[str] = ()
 
 
 def export_tables(
@@ -281,8 +282,9 @@ def _export_topics(
             if events := stream.events(piece):
                 tables.write(EVENTS.name, event_columns(events))
             progress(sum(tables.rows.values()))
-    varying = "" if tables.rows else f"messages of varying size are not exported: {', '.join(topics)}"
-    return TableSummary(tables.rows, stream.problem or varying)
+        if not tables.rows and not stream.problem:
+            raise LogError(f"{path} makes no table: messages of varying size are not exported: {', '.join(topics)}")
+    return TableSummary(tables.rows, stream.problem)
 
 
 def _export_frames(
@@ -298,7 +300,13 @@ def _export_frames(
                 if DECODED + name in chosen:
                     tables.write(DECODED + name, columns)
             progress(sum(tables.rows.values()))
-    return TableSummary(tables.rows, source.problem)
+    notes = [
+        f"{name}: of {count} frames only the signals that are in every frame are decoded: {reason}"
+        for name, message in decoder.messages.items()
+        if DECODED + name in chosen
+        for reason, count in message.partly_decoded.items()
+    ]
+    return TableSummary(tables.rows, source.problem, notes)
 
 
 def _topics(path: Path) -> list[str]:
