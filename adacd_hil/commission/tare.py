@@ -144,11 +144,11 @@ def _bound(quantity: str, values: Vector, bound: float | Sequence[float], settin
             )
 
 
-def gravity_columns(q: Vector) -> Vector:
+def gravity_columns(q: Vector, level_rad: float) -> Vector:
     """Return Y_g (2, 2): the torques at rest of a unit a4 and a unit a5, by the scheme's own regressor."""
     rest = np.zeros(JOINTS)
-    columns: Vector = regressor(q, rest, rest, len(PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES))[:, list(_GRAVITY)]
-    return columns
+    columns: Vector = regressor(q, rest, rest, len(PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES), level_rad)
+    return columns[:, list(_GRAVITY)]
 
 
 def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
@@ -174,7 +174,11 @@ def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
     if settings.estimator.gravity and not is_estimated:
         gravity = settings.cad_theta[list(_GRAVITY)]
     torque = np.array([pose.mean_Nm for pose in poses])
-    columns = np.array([gravity_columns(pose.q) for pose in poses]) if settings.estimator.gravity else None
+    columns = (
+        np.array([gravity_columns(pose.q, settings.level_rad) for pose in poses])
+        if settings.estimator.gravity
+        else None
+    )
     if columns is not None and not is_estimated:
         torque = torque - columns @ gravity
     offsets = np.tile(np.eye(JOINTS), (len(poses), 1))

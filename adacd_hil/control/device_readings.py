@@ -80,7 +80,14 @@ _OF_EXCHANGE: Final = tuple(place for place, reading in enumerate(READINGS) if r
 
 @compiled
 def add_block(
-    readings: Vector, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector, normals: Vector
+    readings: Vector,
+    q: Vector,
+    dq: Vector,
+    ddq: Vector,
+    tau_J: Vector,
+    dtau_J: Vector,
+    level_rad: float,
+    normals: Vector,
 ) -> None:
     """Add a block's means (2,) to the normal equations (h, k, k) of each of the readings (h, 6).
 
@@ -95,7 +102,7 @@ def add_block(
             position[i] = q[at] * readings[h, 2 + i]
             velocity[i] = dq[at] * readings[h, 2 + i]
             acceleration[i] = ddq[at] * readings[h, 2 + i]
-        W = regressor(position, velocity, acceleration, count)
+        W = regressor(position, velocity, acceleration, count, level_rad)
         for i in range(JOINTS):
             at = 1 - i if readings[h, 1] != 0.0 else i
             row[:] = 0.0
@@ -150,6 +157,7 @@ class DeviceReadings:
     def __init__(self, settings: Settings) -> None:
         """Begin without a block."""
         self._settings = settings
+        self._level_rad = settings.level_rad
         self._count = len(settings.estimator.parameter_names)
         self._rows = np.array([reading.row for reading in READINGS])
         self._normals = np.zeros((len(READINGS), self._count + 5, self._count + 5))
@@ -160,13 +168,13 @@ class DeviceReadings:
     def compile(self) -> None:
         """Compile what `add` calls."""
         zero = np.zeros(JOINTS)
-        add_block(self._rows, zero, zero, zero, zero, zero, self._normals.copy())
+        add_block(self._rows, zero, zero, zero, zero, zero, self._level_rad, self._normals.copy())
         solve_readings(self._normals, 1, self._shares.copy(), self._thetas.copy())
         is_positive_definite(self._thetas[0])
 
     def add(self, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector) -> None:
         """Take in the means of a block, (2,) each."""
-        add_block(self._rows, q, dq, ddq, tau_J, dtau_J, self._normals)
+        add_block(self._rows, q, dq, ddq, tau_J, dtau_J, self._level_rad, self._normals)
         self._blocks += 1
 
     def step(self) -> Reading | None:

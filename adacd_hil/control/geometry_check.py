@@ -8,8 +8,8 @@ so a link that is s times as long as told, its masses in their places, has
 
     link 1:  a2 → s a2,  a1 − a3 → s² (a1 − a3),  a3 as told        link 2:  a2 → s a2,  a3 → s² a3,  a1 − a3 as told
 
-of `arm.cad_theta`. Where gravity acts, a5 = m2 c2 g, and l1 = g a2 / a5 of an arm that moves upright; a base at a tilt
-makes it longer by the sine of it.
+of `arm.cad_theta`. Where gravity acts, a5 = m2 c2 g', and l1 = g' a2 / a5; g' = g sin(tilt) acts in the plane of
+motion, and a tilt that is smaller than told makes l1 longer.
 """
 
 from typing import Final
@@ -35,7 +35,7 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
     has_masses = any(cad[: A3 + 1])
     event = _by_cad(theta, cad, lengths) if has_masses else None
     if event is None and is_upright:
-        event = _by_gravity(theta, lengths[0])
+        event = _by_gravity(settings, theta)
     if event is not None or has_masses:
         return event
     unchecked = f"arm.link_length_m[1] = {lengths[1]:g} m" if is_upright else f"arm.link_length_m = {list(lengths)} m"
@@ -46,16 +46,21 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
     return Event("info", EVENT, text)
 
 
-def _by_gravity(theta: tuple[float, ...], told_m: float) -> Event | None:
+def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
+    told_m, told_tilt_deg = settings.arm.link_length_m[0], settings.mounting_deg[0]
     if theta[A2] == 0.0 or theta[A5] == 0.0:
         return None
-    found_m = GRAVITY_M_S2 * abs(theta[A2] / theta[A5])
+    gravity_m_s2 = GRAVITY_M_S2 * np.sin(settings.tilt_rad)
+    found_m = gravity_m_s2 * abs(theta[A2] / theta[A5])
     if 1.0 / (1.0 + _LONGER) <= found_m / told_m <= 1.0 + _LONGER:
         return None
     told = f"arm.link_length_m[0] = {told_m:g} m"
-    if found_m > told_m:  # a tilt looks like it, and nobody has told one
-        tilt_deg = np.degrees(np.arcsin(told_m / found_m))
-        text = f"{told} is right if the arm moves at {tilt_deg:.0f} deg to the level; upright, link 1 is"
+    if found_m > told_m:  # a smaller tilt looks like it
+        tilt_deg = np.degrees(np.arcsin(np.sin(settings.tilt_rad) * told_m / found_m))
+        text = (
+            f"{told} is right if the arm moves at {tilt_deg:.0f} deg to the level (arm.mounting_deg[0]); at "
+            f"{told_tilt_deg:g} deg link 1 is"
+        )
         return Event("info", EVENT, f"{text} {found_m:.3f} m long by inertia over gravity")
     text = f"link 1 is {found_m:.3f} m long by inertia over gravity, or shorter; {told}: measure it"
     return Event("warning", EVENT, f"{text}; places and forces of contacts are wrong by as much")

@@ -269,7 +269,7 @@ def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> Non
     """Fill Y_p, Y_h (2, p) and M (2, 2) of the 2R arm, offsets and further friction included."""
     base, first_coulomb, count = int(k["base"]), int(k["first_coulomb"]), q.shape[0]
     regressor.fill_momentum(q, dq, m["Y_p"][:, :base])
-    regressor.fill_remainder(q, dq, m["Y_h"][:, :base])
+    regressor.fill_remainder(q, dq, k["level_rad"], m["Y_h"][:, :base])
     for i in range(count):
         m["Y_h"][i, first_coulomb + i] = regressor.smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
         m["Y_h"][i, base + i] = 1.0

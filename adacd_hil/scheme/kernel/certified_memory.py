@@ -94,6 +94,7 @@ def constants_of(settings: Settings) -> Structured:
     kept = earlier.constants_of(settings, prior_std)
     values: dict[str, Any] = {
         "period_s": period_s,
+        "level_rad": settings.level_rad,
         "cutoff": cutoff,
         "decay": decay,
         "weight_old": weight_old,
