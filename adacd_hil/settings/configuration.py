@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from adacd_hil.file_access import exists
-from adacd_hil.records import JOINTS, POSITION_TERMS, Vector
+from adacd_hil.records import GRAVITY_M_S2, JOINTS, POSITION_TERMS, Vector
 from adacd_hil.remedies import nearest_name
 from adacd_hil.scheduling import RealtimeRequest
 from adacd_hil.settings.arm_settings import (
@@ -137,6 +137,11 @@ class Settings:
     def tilt_rad(self) -> float:
         """Tilt of the plane of motion, rad."""
         return math.radians(self.mounting_deg[0])
+
+    @property
+    def gravity_m_s2(self) -> float:
+        """Gravity in the plane of motion; 0 where it is not in the model."""
+        return GRAVITY_M_S2 * math.sin(self.tilt_rad) if self.estimator.gravity else 0.0
 
     @property
     def level_rad(self) -> float:

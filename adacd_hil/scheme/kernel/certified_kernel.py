@@ -96,7 +96,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     if is_payload:
         m["belief"][:] = m["certified"]
         m["P_belief"][:] = m["P_certified"]
-        belief.add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_inertia_std"], m["P_belief"])
+        belief.add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_rest_std"], m["P_belief"])
     else:
         belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
     _use_belief(m)

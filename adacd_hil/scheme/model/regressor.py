@@ -217,9 +217,11 @@ def put_position_columns(X: Vector, first_column: int, Y_h: Vector) -> None:
             Y_h[i, first_column + term * joints + i] = X[i, term]
 
 
-def payload_direction(link_length_m: tuple[float, float], count: int) -> Vector:
-    """Return what 1 kg at the tip of a 2R arm adds to its parameters (count,)."""
+def payload_direction(link_length_m: tuple[float, float], count: int, gravity_m_s2: float) -> Vector:
+    """Return what 1 kg at the tip of a 2R arm adds to its parameters (count,); gravity_m_s2: in the plane, 0: none."""
     l1, l2 = link_length_m
     direction = np.zeros(count)
     direction[:3] = l1**2 + l2**2, l1 * l2, l2**2
+    if gravity_m_s2:
+        direction[[A4, A5]] = gravity_m_s2 * l1, gravity_m_s2 * l2
     return direction
