@@ -97,6 +97,8 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
         m["belief"][:] = m["certified"]
         m["P_belief"][:] = m["P_certified"]
         belief.add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_rest_std"], m["P_belief"])
+        if int(k["base"]) > regressor.A5:
+            _begin_at_rest(m)
     else:
         belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
     _use_belief(m)
@@ -111,6 +113,18 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     termination.begin(m)
     m["excitation"] = 0.0
     m["condition"] = np.inf
+
+
+@compiled
+def _begin_at_rest(m: Any) -> None:
+    """Begin with filters that have seen this pose, and the torque that gravity makes there, for ever.
+
+    From 0, that torque would be a step: the columns of the lag would have its derivative.
+    """
+    m["X_f"][:] = m["X"]
+    for c in range(m["tau_f"].shape[0]):
+        m["W_f"][c] = m["Y_h"]
+        m["tau_f"][c] = m["tau_old"][c]
 
 
 @compiled
