@@ -28,17 +28,21 @@ adaptations = 1
 contacts = 2
 """
 HEAVIER = "[factor]\nmass = [1.25, 0.8]\n"
-UPSIDE_DOWN = "[mechanics]\ntilt_deg = 90.0\ntilt_direction_deg = 180.0\n"
 
 
-def play(folder: Path, mounting: tuple[str, ...], truth: str = "") -> str:
+def mounted(tilt_deg: float, hangs_deg: float) -> str:
+    """Return the truth of an arm that is mounted otherwise."""
+    return f"[mechanics]\ntilt_deg = {tilt_deg}\ntilt_direction_deg = {hangs_deg}\n"
+
+
+def play(folder: Path, mounting: tuple[str, ...], truth: str = "", scenario: str = "") -> str:
     """Draft an arm and play it; return what is said of the run."""
-    file, scenario, truth_file = folder / "arm.toml", folder / "touched.toml", folder / "truth.toml"
+    file, touched, truth_file = folder / "arm.toml", folder / "touched.toml", folder / "truth.toml"
     drafted = CliRunner().invoke(cli, ["init", str(file), *ARM, *STRENGTH, *mounting])
     assert drafted.exit_code == 0, drafted.stderr
-    scenario.write_text(TOUCHED)
+    touched.write_text(TOUCHED)
     truth_file.write_text(truth)
-    words = ["demo", "--config", str(file), "--scenario", str(scenario), "--out", str(folder / "run")]
+    words = ["demo", "--config", str(file), "--scenario", scenario or str(touched), "--out", str(folder / "run")]
     played = CliRunner().invoke(cli, [*words, *(["--truth", str(truth_file)] if truth else [])])
     return played.output
 
@@ -58,5 +62,35 @@ def test_a_mounted_arm_is_certified_and_its_touches_are_found(
 
 
 @pytest.mark.slow
-def test_an_arm_that_stands_and_is_told_to_hang_gets_no_certificate(tmp_path: Path) -> None:
-    assert "certified in" not in play(tmp_path, MOUNTINGS["hanging"], UPSIDE_DOWN)
+@pytest.mark.parametrize(
+    ("mounting", "hangs_deg"), [("hanging", -90.0), ("hanging", 40.0), ("standing", 90.0), ("tilted", 0.0)]
+)
+def test_a_wrong_mounting_is_named_before_a_certificate(tmp_path: Path, mounting: str, hangs_deg: float) -> None:
+    tilt_deg = 10.0 if mounting == "tilted" else 90.0
+    said = play(tmp_path, MOUNTINGS[mounting], mounted(tilt_deg, hangs_deg))
+    found = re.search(r"gravity acts as if link 1 hung at about q1 = (-?[0-9]+) deg: correct the mounting", said)
+    assert found is not None, said
+    assert abs(float(found[1]) - hangs_deg) < 25.0
+    assert "certified in" not in said
+
+
+@pytest.mark.slow
+def test_an_arm_that_stands_and_is_told_to_hang_is_named_with_its_certificate(tmp_path: Path) -> None:
+    said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 180.0))
+    assert re.search(
+        r"gravity acts against the mounting, arm.mounting_deg\[1\] = 0 deg; link 1 hangs at q1 = 180", said
+    )
+
+
+@pytest.mark.slow
+def test_the_weight_of_an_arm_that_is_told_to_be_flat_is_named_with_the_mounting(tmp_path: Path) -> None:
+    said = play(tmp_path, ("--mounting", "flat"), mounted(90.0, -90.0))
+    assert re.search(r"joint 1 is loaded: .* the mounting is not flat: estimator.gravity = true", said), said
+
+
+@pytest.mark.slow
+def test_a_payload_is_learnt_and_all_touches_are_found_in_gravity(tmp_path: Path) -> None:
+    said = play(tmp_path, MOUNTINGS["hanging"], scenario="paper")
+    assert re.search(r"certified in [0-9.]+ s and again in [01]\.", said), said
+    assert re.search(r"Contacts detected +8 of 8", said)
+    assert re.search(r"False alarms +0", said)

@@ -9,7 +9,7 @@ so a link that is s times as long as told, its masses in their places, has
     link 1:  a2 → s a2,  a1 − a3 → s² (a1 − a3),  a3 as told        link 2:  a2 → s a2,  a3 → s² a3,  a1 − a3 as told
 
 of `arm.cad_theta`. Where gravity acts, a5 = m2 c2 g', and l1 = g' a2 / a5; g' = g sin(tilt) acts in the plane of
-motion, and a tilt that is smaller than told makes l1 longer.
+motion, and a tilt that is smaller than told makes l1 longer. An a5 below 0 is gravity in the other direction.
 """
 
 from typing import Final
@@ -27,13 +27,18 @@ _ALIKE: Final = 0.08
 _LONGER: Final = 0.12
 """Share by which a length has to be off to be told."""
 
+_SEEN: Final = 0.1
+"""Share of the expected a5 from which on its sign is no error of an arm that gravity hardly turns."""
+
 
 def geometry_event(settings: Settings, certificate: Certificate) -> Event | None:
     """Compare the lengths with a certificate of the arm without a payload; None where they agree."""
     theta, lengths = certificate.parameters, settings.arm.link_length_m
     cad, is_upright = settings.arm.cad_theta, len(theta) > A5
     has_masses = any(cad[: A3 + 1])
-    event = _by_cad(theta, cad, lengths) if has_masses else None
+    event = _by_direction(settings, theta) if is_upright else None
+    if event is None and has_masses:
+        event = _by_cad(theta, cad, lengths)
     if event is None and is_upright:
         event = _by_gravity(settings, theta)
     if event is not None or has_masses:
@@ -44,6 +49,16 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
         "places and forces of contacts are wrong by as much as it is"
     )
     return Event("info", EVENT, text)
+
+
+def _by_direction(settings: Settings, theta: tuple[float, ...]) -> Event | None:
+    expected_Nm = settings.gravity_m_s2 * theta[A2] / settings.arm.link_length_m[0]
+    if theta[A5] >= -_SEEN * abs(expected_Nm) or expected_Nm <= 0.0:
+        return None
+    hangs_deg = settings.mounting_deg[1]
+    opposite_deg = hangs_deg - 180.0 if hangs_deg > 0.0 else hangs_deg + 180.0
+    text = f"a5 = {theta[A5]:.3g} Nm: gravity acts against the mounting, arm.mounting_deg[1] = {hangs_deg:g} deg"
+    return Event("warning", EVENT, f"{text}; link 1 hangs at q1 = {opposite_deg:g} deg")
 
 
 def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:

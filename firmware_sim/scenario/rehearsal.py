@@ -375,16 +375,16 @@ def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list
         mechanics["tilt_deg"], mechanics["tilt_direction_deg"] = settings.mounting_deg
         if settings.arm.mounting_deg is None:
             assumed.append("the arm moves upright, q1 = 0 level, since arm.mounting_deg is unset")
-        if holding is None and "holding_brake_Nm" not in mechanics:
-            (l1, _), (m1, m2), (c1, c2) = links.length_m, links.mass_kg, links.center_m
-            tilt_rad = math.radians(mechanics["tilt_deg"])
-            heavy = _HOLDING_SHARE * STANDARD_GRAVITY_M_S2 * math.sin(tilt_rad)
-            pair = heavy * (m1 * abs(c1) + m2 * (l1 + abs(c2))), heavy * m2 * abs(c2)
-            mechanics["holding_brake_Nm"] = list(pair)
-            assumed.append(
-                f"brakes that hold {pair[0]:.3g} and {pair[1]:.3g} Nm without power, since arm.holding_torque_Nm is "
-                "unset: 1.5 times gravity's"
-            )
+    tilt_rad = math.radians(mechanics.get("tilt_deg", 0.0))
+    if tilt_rad > 0.0 and holding is None and "holding_brake_Nm" not in mechanics:
+        (l1, _), (m1, m2), (c1, c2) = links.length_m, links.mass_kg, links.center_m
+        heavy = _HOLDING_SHARE * STANDARD_GRAVITY_M_S2 * math.sin(tilt_rad)
+        pair = heavy * (m1 * abs(c1) + m2 * (l1 + abs(c2))), heavy * m2 * abs(c2)
+        mechanics["holding_brake_Nm"] = list(pair)
+        assumed.append(
+            f"brakes that hold {pair[0]:.3g} and {pair[1]:.3g} Nm without power, since arm.holding_torque_Nm is "
+            "unset: 1.5 times gravity's"
+        )
     if holding is not None and any(holding) and "holding_brake_Nm" not in mechanics:
         mechanics["holding_brake_Nm"] = list(holding)
     if "stiffness_Nm_rad" not in mechanics and "rotor_inertia_kg_m2" not in mechanics:

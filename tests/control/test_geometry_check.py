@@ -98,3 +98,15 @@ def test_masses_tell_both_lengths_of_an_upright_arm_too(l1: float, l2: float, jo
     assert event is not None
     assert event.level == "warning"
     assert f"as if link {joint} were" in event.message
+
+
+@pytest.mark.parametrize(("direction", "is_named"), [(1.0, False), (-0.02, False), (-1.0, True)])
+@pytest.mark.parametrize("cad", [CAD, ()], ids=["masses", "no masses"])
+def test_gravity_that_acts_the_other_way_is_named_with_the_mounting(
+    cad: tuple[float, ...], direction: float, is_named: bool
+) -> None:
+    a1, a2, a3 = inertia(*LENGTHS)
+    a5 = direction * 9.80665 * a2 / LENGTHS[0]
+    event = event_of(told(cad, 90.0), a1, a2, a3, *FRICTION, 3.0 * a5, a5)
+    said = event is not None and "arm.mounting_deg[1] = -90 deg; link 1 hangs at q1 = 90 deg" in event.message
+    assert said is is_named
