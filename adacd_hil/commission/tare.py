@@ -157,12 +157,15 @@ def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
     tare = settings.tare
     if settings.estimator.gravity:
         for number, residual in enumerate(solution.residual_Nm, start=1):
-            remedy = "; something pushes on the arm there, or the gravity model is wrong"
+            remedy = "; something pushes on the arm there, or the mounting, arm.mounting_deg, is wrong"
             _bound(f"residual of pose {number}", residual, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
     else:
         remedy = "; friction, a cable or somebody pushes on the arm in one of them"
         _bound("spread between poses of tau_J", solution.spread_Nm, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
-    remedy = "; something pushes on the arm, or the sensor is damaged"
+    mounting = "the mounting, arm.mounting_deg, is wrong"
+    if not settings.estimator.gravity:
+        mounting = "the mounting is not flat (estimator.gravity)"
+    remedy = f"; something pushes on the arm, {mounting}, or the sensor is damaged"
     _bound("offset", solution.offset_Nm, tare.offset_limit_Nm, "tare.offset_limit_Nm", remedy)
     return solution
 
@@ -220,12 +223,14 @@ def _check_condition(matrix: NDArray[np.float64], poses: Sequence[Pose], setting
     # What hardly shows is an a4 with the offset of joint 1, or an a5 with the offset of joint 2.
     hidden = directions[-1] ** 2
     q = np.array([pose.q for pose in poses])
+    level = f" - {math.degrees(settings.level_rad):g} deg" * (settings.level_rad != 0.0)
     if hidden[0] + hidden[2] >= hidden[1] + hidden[3]:
-        angles, what, motion = q[:, 0], "cos(q1)", "move joint 1 further between the poses"
+        angles, what, motion = q[:, 0], f"cos(q1{level})", "move joint 1 further between the poses"
     else:
-        angles, what = q.sum(axis=1), "cos(q1 + q2)"
+        angles, what = q.sum(axis=1), f"cos(q1 + q2{level})"
         motion = "turn link 2 further between the poses, against the ground and not with link 1 only"
-    low, high = np.cos(angles).min(), np.cos(angles).max()
+    levers = np.cos(angles - settings.level_rad)
+    low, high = levers.min(), levers.max()
     raise TareRefusedError(
         f"condition number of {len(poses)} poses = {condition:.3g} exceeds tare.condition_limit = {bound:g}: "
         f"{what} only goes from {low:.2f} to {high:.2f}; {motion}"
