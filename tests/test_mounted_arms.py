@@ -35,14 +35,22 @@ def mounted(tilt_deg: float, hangs_deg: float) -> str:
     return f"[mechanics]\ntilt_deg = {tilt_deg}\ntilt_direction_deg = {hangs_deg}\n"
 
 
-def play(folder: Path, mounting: tuple[str, ...], truth: str = "", scenario: str = "") -> str:
-    """Draft an arm and play it; return what is said of the run."""
+def play(folder: Path, mounting: tuple[str, ...], truth: str = "", text: str = TOUCHED) -> str:
+    """Draft an arm and play it; return what is said of the run. text: of the scenario; "": `paper`."""
     file, touched, truth_file = folder / "arm.toml", folder / "touched.toml", folder / "truth.toml"
     drafted = CliRunner().invoke(cli, ["init", str(file), *ARM, *STRENGTH, *mounting])
     assert drafted.exit_code == 0, drafted.stderr
-    touched.write_text(TOUCHED)
+    touched.write_text(text)
     truth_file.write_text(truth)
-    words = ["demo", "--config", str(file), "--scenario", scenario or str(touched), "--out", str(folder / "run")]
+    words = [
+        "demo",
+        "--config",
+        str(file),
+        "--scenario",
+        str(touched) if text else "paper",
+        "--out",
+        str(folder / "run"),
+    ]
     played = CliRunner().invoke(cli, [*words, *(["--truth", str(truth_file)] if truth else [])])
     return played.output
 
@@ -83,6 +91,14 @@ def test_an_arm_that_stands_and_is_told_to_hang_is_named_with_its_certificate(tm
 
 
 @pytest.mark.slow
+def test_a_stop_before_the_first_motion_is_acknowledged_and_the_run_ends(tmp_path: Path) -> None:
+    still = TOUCHED.replace("[-20.0, 25.0]", "[0.0, 0.0]")
+    said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 20.0), still)
+    assert "touch: withdraws  [ENABLE -> REACT]" in said
+    assert "[STOPPED -> ENABLE]" in said
+
+
+@pytest.mark.slow
 def test_the_weight_of_an_arm_that_is_told_to_be_flat_is_named_with_the_mounting(tmp_path: Path) -> None:
     said = play(tmp_path, ("--mounting", "flat"), mounted(90.0, -90.0))
     assert re.search(r"joint 1 is loaded: .* the mounting is not flat: estimator.gravity = true", said), said
@@ -90,7 +106,7 @@ def test_the_weight_of_an_arm_that_is_told_to_be_flat_is_named_with_the_mounting
 
 @pytest.mark.slow
 def test_a_payload_is_learnt_and_all_touches_are_found_in_gravity(tmp_path: Path) -> None:
-    said = play(tmp_path, MOUNTINGS["hanging"], scenario="paper")
+    said = play(tmp_path, MOUNTINGS["hanging"], text="")
     assert re.search(r"certified in [0-9.]+ s and again in [01]\.", said), said
     assert re.search(r"Contacts detected +8 of 8", said)
     assert re.search(r"False alarms +0", said)
