@@ -113,7 +113,6 @@ def add_block(
             velocity[i] = dq[at] * readings[h, 2 + i]
             acceleration[i] = ddq[at] * readings[h, 2 + i]
         W = regressor(position, velocity, acceleration, count, level_rad)
-        turned = regressor(position, velocity, acceleration, count, level_rad + 0.5 * math.pi)
         for i in range(JOINTS):
             at = 1 - i if readings[h, 1] != 0.0 else i
             row[:] = 0.0
@@ -121,6 +120,7 @@ def add_block(
             row[count + i] = 1.0
             row[count + JOINTS + i] = dtau_J[at] * readings[h, 4 + i]
             if readings[h, 6] != 0.0:
+                turned = regressor(position, velocity, acceleration, count, level_rad + 0.5 * math.pi)
                 row[size - 3 : size - 1] = turned[i, A4 : A5 + 1]
             row[size - 1] = tau_J[at] * readings[h, 4 + i]
             for a in range(size):
