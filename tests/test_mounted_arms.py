@@ -13,6 +13,8 @@ STRENGTH = ("--rated-torque-nm", "30", "10", "--torque-limit-nm", "30", "10")
 MOUNTINGS = {
     "hanging": ("--mounting", "ceiling"),
     "standing": ("--mounting", "floor"),
+    "level": ("--mounting", "wall"),
+    "level, lowered by +q1": ("--mounting", "wall", "--at-zero", "90"),
     "tilted": ("--mounting", "10", "--at-zero", "level"),
 }
 TOUCHED = """
