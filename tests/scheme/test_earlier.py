@@ -10,9 +10,9 @@ from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme.identify import anchor, earlier, fit_check
+from adacd_hil.scheme.identify import anchor, certificate, earlier, fit_check
 from adacd_hil.scheme.kernel import certified_memory
-from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD
+from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD, CertificateWatch
 
 FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.1)
@@ -328,6 +328,15 @@ def test_where_gravity_acts_later_samples_may_differ_by_what_they_do_not_know(sh
     assert room * far.max() > 1.2 * earlier.LATER_NM
     fit.differ(0, share * room * np.eye(count)[1])
     assert earlier.is_borne_out(fit.k, fit.m) is is_borne_out
+
+
+@pytest.mark.parametrize(("settings", "has_mounting"), [(FREE, False), (UPRIGHT, True)], ids=["flat", "upright"])
+def test_a_fit_that_no_model_explains_names_the_mounting_where_gravity_acts(settings, has_mounting):
+    constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
+    memory[0]["withheld_by"] = certificate.CHANGED
+    said = CertificateWatch(constants, memory, "").refuse(is_reading=False)
+    assert "no one model explains the whole fit" in said.message
+    assert ("arm.mounting_deg" in said.message) is has_mounting
 
 
 def test_a_fit_with_noise_may_differ_by_more():

@@ -191,7 +191,7 @@ class CertificateWatch:
             case _Cause.ANCHOR:
                 lines = [*anchor.describe_refused(m, is_reading=False), *missing_torque.describe(m)]
             case _Cause.CHANGED:
-                lines = [_CHANGED + _OR_MOUNTING * (k["base"] > A5)]
+                lines = [_CHANGED + (_OR_MOUNTING if k["base"] > A5 else "")]
             case _Cause.MORE:
                 lines = [*earlier.describe_more(m), *missing_torque.describe(m)]
             case _Cause.BY_PLACE:
