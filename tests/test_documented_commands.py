@@ -357,7 +357,7 @@ def free_and_pushed_motion() -> dict[str, Any]:
     dq = np.sum(amplitude * rate[:, None, :] * np.cos(angle), axis=0)
     ddq = np.sum(-amplitude * rate[:, None, :] ** 2 * np.sin(angle), axis=0)
     theta = np.array([0.24, 0.034, 0.020, 0.030, 0.015, 0.0375, 0.020])
-    tau_J = np.array([inverse_dynamics(*row, theta) for row in zip(q, dq, ddq, strict=True)])
+    tau_J = np.array([inverse_dynamics(*row, theta, 0.0) for row in zip(q, dq, ddq, strict=True)])
     tau_J += np.random.default_rng(1).normal(0.0, 0.03, tau_J.shape)
     tau_J[13_000:13_300] -= 3.0, 2.0
     free = {"q": q[:12_000], "dq": dq[:12_000], "tau_J": tau_J[:12_000]}

@@ -333,7 +333,7 @@ def predicted_change(before: NDArray[np.float64], after: NDArray[np.float64], mo
     change = after - before
     largest = 0.0
     for k in range(0, len(motion.q_d), 20):
-        torque = inverse_dynamics(motion.q_d[k], motion.dq_d[k], motion.ddq_d[k], change[:7].copy())
+        torque = inverse_dynamics(motion.q_d[k], motion.dq_d[k], motion.ddq_d[k], change[:7].copy(), 0.0)
         offset = change[7:9] if len(change) >= 9 else np.zeros(2)
         largest = max(largest, float(np.abs(torque + offset).max()))
     return largest

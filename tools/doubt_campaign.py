@@ -67,7 +67,7 @@ class Armed:
     def __init__(self, seed: int, arm: str = "", kg: float = 0.0, is_foreign: bool = False) -> None:
         self.loop = HandLoop(seed, is_foreign)
         if arm:
-            self.loop.free = THETA[arm] + kg * payload_direction(self.loop.settings.arm.link_length_m, 7)
+            self.loop.free = THETA[arm] + kg * payload_direction(self.loop.settings.arm.link_length_m, 7, 0.0)
             self.loop.theta = self.loop.free
         for _ in range(20_000):
             if self.loop.step().state is SchemeState.MONITOR:
@@ -129,7 +129,7 @@ def play(seed: int, part: str, is_foreign: bool = False) -> Played:
     armed.begun = loop.cycle
     if part == "payload":
         size = SIZES_KG[seed % len(SIZES_KG)]
-        loop.free = loop.theta = loop.free + size * payload_direction(loop.settings.arm.link_length_m, 7)
+        loop.free = loop.theta = loop.free + size * payload_direction(loop.settings.arm.link_length_m, 7, 0.0)
         return armed.played(seed, f"{size:g} kg", size, armed.play(WITHIN_S))
     if part == "wrong":
         what, joint = ERRORS[seed % len(ERRORS)], int(armed.random.integers(2))

@@ -166,7 +166,7 @@ def _play(
             arm["viscous_Nm_s"][i] = viscous[i] * drift[k, 0]
             arm["coulomb_Nm"][i] = coulomb[i] * drift[k, 1]
         _lead_over(theta_ff, theta_cycles, k, handover, theta)
-        fill_torque(q[k], dq[k], q_d[k], dq_d[k], ddq_d[k], theta, Kp, Kd, tau_d)
+        fill_torque(q[k], dq[k], q_d[k], dq_d[k], ddq_d[k], theta, Kp, Kd, 0.0, tau_d)
         latched[:] = command
         _limit(tau_d, limits[0], limits[1], limits[2], command)
         tau_c[k] = command

@@ -229,7 +229,7 @@ def _foreign_csv(path: Path) -> Path:
         (factors[1] * np.cos(phase)).sum(axis=0),
         (-factors[2] * np.sin(phase)).sum(axis=0),
     )
-    tau_J = np.array([inverse_dynamics(*row, theta) for row in zip(q, dq, ddq, strict=True)])
+    tau_J = np.array([inverse_dynamics(*row, theta, 0.0) for row in zip(q, dq, ddq, strict=True)])
     turned = np.array([1.0, -1.0])
     touched = np.zeros(len(time_s))
     rows = np.column_stack([time_s * 1e3, np.degrees(q) * turned, tau_J * 1e3 * turned, touched])

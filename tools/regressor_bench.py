@@ -29,7 +29,7 @@ def closed_form(q, dq, Y_p, Y_h):
     """Fill the planar arm's columns for each state."""
     for k in range(q.shape[0]):
         regressor.fill_momentum(q[k], dq[k], Y_p)
-        regressor.fill_remainder(q[k], dq[k], Y_h)
+        regressor.fill_remainder(q[k], dq[k], 0.0, Y_h)
 
 
 @compiled

@@ -144,7 +144,7 @@ def draw_hand(random: np.random.Generator, kind: str = "") -> Hand:
     elif kind == "help":
         more["help_Nm"] = size * np.eye(2)[joint]
     elif kind == "payload":
-        added[:] = size * payload_direction(FREE.arm.link_length_m, 7)
+        added[:] = size * payload_direction(FREE.arm.link_length_m, 7, 0.0)
     else:
         more["tip_N" if kind == "tip force" else "spring_N_m"] = size * (sign if kind == "tip force" else 1.0)
     begins_s = 0.0 if random.random() < 0.25 else float(random.uniform(0.0, BEGINS_WITHIN_S))

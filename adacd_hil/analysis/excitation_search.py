@@ -95,9 +95,9 @@ class _Motion(NamedTuple):
 
 
 @compiled
-def _fill_regressors(q: Vector, dq: Vector, ddq: Vector, W: Vector) -> None:
+def _fill_regressors(q: Vector, dq: Vector, ddq: Vector, level_rad: float, W: Vector) -> None:
     for n in range(W.shape[0]):
-        W[n] = regressor(q[n], dq[n], ddq[n], W.shape[2])
+        W[n] = regressor(q[n], dq[n], ddq[n], W.shape[2], level_rad)
 
 
 class Search:
@@ -112,6 +112,7 @@ class Search:
                 "above 0 deg for each joint expected"
             )
         self.present = settings.excitation
+        self._level_rad = settings.level_rad
         self._period_s = settings.excitation.period_s or PERIOD_S
         counts = (
             [len(row) for row in settings.excitation.sine] if settings.excitation.period_s else [HARMONICS] * JOINTS
@@ -234,7 +235,7 @@ class Search:
     def _regressors(self, motion: _Motion) -> Vector:
         """Return the regressors of the dynamic parameters (N, 2, base)."""
         W = np.empty((len(motion.q), JOINTS, self._base))
-        _fill_regressors(*motion, W)
+        _fill_regressors(*motion, self._level_rad, W)
         return W
 
     def _used(self, motion: _Motion, W: Vector) -> list[Vector]:

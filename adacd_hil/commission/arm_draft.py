@@ -8,7 +8,9 @@ The parameters are those of the host's model, in the order of `records.PARAMETER
 centre of mass c_i from joint i on the line of the link and the inertia I_i about it,
 
     a1 = I₁ + m₁ c₁² + m₂ l₁² + a3    a2 = m₂ l₁ c₂    a3 = I₂ + m₂ c₂²        kg m²
-    a4 = g (m₁ c₁ + m₂ l₁)            a5 = g m₂ c₂                             Nm, where the axes are not vertical
+    a4 = g' (m₁ c₁ + m₂ l₁)           a5 = g' m₂ c₂                            Nm, where the axes are not vertical
+
+g' = g sin(tilt) acts in the plane of motion; `arm.mounting_deg` has the tilt and the q1 at which link 1 hangs.
 
 Friction is not known from a description; it is 0.
 """
@@ -20,9 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adacd_hil.records import GRAVITY_M_S2, JOINTS, Vector
-from adacd_hil.scheme.model.chain import PER_LINK
+from adacd_hil.scheme.model.chain import PER_LINK, Chain
 from adacd_hil.scheme.model.urdf import BASE, SerialArm, UrdfError, read_urdf
-from adacd_hil.settings.arm_settings import ArmSettings
+from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
 from adacd_hil.settings.configuration import known_keys, load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import toml_value
@@ -31,21 +33,26 @@ from adacd_hil.terminal import one_line
 Pair = tuple[float, float]
 _PARALLEL = math.cos(math.radians(2.0))
 """Least |cosine| between axes that count as parallel, and with the vertical for one that counts as vertical."""
-_BENT_RAD = math.radians(5.0)
+_BENT_DEG = 5.0
 """From here on the zero of joint 2 is not that of a stretched arm."""
+_LEAST_MOMENT_KG_M = 1e-6
+"""Of link 2 about its joint: less has no direction."""
+LEVEL_DEG: Pair = (0.0, 0.0)
+"""Mounting of an arm on which gravity does not act."""
 
 
 class PlanarArm(NamedTuple):
     """What a description says of an arm with two parallel axes.
 
-    cad_theta: parameters, empty where the masses are not known. The rest: None where nothing is said of it.
+    cad_theta: parameters, empty where the masses are not known. mounting_deg: as `arm.mounting_deg`. sign, zero_deg:
+    of drives that count as the description. The rest: None where nothing is said of it.
     mass_kg, center_m, inertia_kg_m2: of each link, about its centre of mass; the last two of no rod.
     doubts: what the model can't have as the description says, a line each.
     """
 
     link_length_m: Pair
     cad_theta: tuple[float, ...]
-    is_upright: bool
+    mounting_deg: Pair = LEVEL_DEG
     position_limit_deg: Pair | None = None
     velocity_limit_deg_s: Pair | None = None
     effort_Nm: Pair | None = None
@@ -56,21 +63,35 @@ class PlanarArm(NamedTuple):
     inertia_kg_m2: Pair | None = None
     viscous_Nm_s: Pair | None = None
     coulomb_Nm: Pair | None = None
+    sign: tuple[int, int] = (1, 1)
+    zero_deg: Pair = (0.0, 0.0)
+
+    @property
+    def has_gravity(self) -> bool:
+        """Whether gravity acts on the joints."""
+        return self.mounting_deg[0] > SLIGHT_TILT_DEG
 
 
-def uniform_rods(link_length_m: Pair, mass_kg: Pair, is_upright: bool) -> PlanarArm:
+def uniform_rods(link_length_m: Pair, mass_kg: Pair, mounting_deg: Pair) -> PlanarArm:
     """Describe an arm of two uniform rods: centre of mass in the middle, inertia m l² / 12 about it."""
     (l1, l2), (m1, m2) = link_length_m, mass_kg
     a3 = m2 * l2**2 / 3.0
     theta = [m1 * l1**2 / 3.0 + m2 * l1**2 + a3, m2 * l1 * l2 / 2.0, a3, 0.0, 0.0, 0.0, 0.0]
-    if is_upright:
-        theta += [GRAVITY_M_S2 * (m1 * l1 / 2.0 + m2 * l1), GRAVITY_M_S2 * m2 * l2 / 2.0]
-    return PlanarArm(link_length_m, _rounded(theta), is_upright, mass_kg=mass_kg)
+    arm = PlanarArm(link_length_m, (), mounting_deg, mass_kg=mass_kg)
+    if arm.has_gravity:
+        share = GRAVITY_M_S2 * math.sin(math.radians(mounting_deg[0]))
+        theta += [share * (m1 * l1 / 2.0 + m2 * l1), share * m2 * l2 / 2.0]
+    return arm._replace(cad_theta=_rounded(theta))
 
 
-def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
-    """Read an arm of two turning joints with parallel axes. Raises UrdfError for any other."""
-    arm = read_urdf(text, locked=locked)
+def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float = 0.0) -> PlanarArm:
+    """Read an arm of two turning joints with parallel axes. Raises UrdfError for any other.
+
+    pitch_deg: how far the URDF's root is turned about its y axis; 0: its z axis points up, 90: its x axis down.
+    """
+    pitch_rad = math.radians(pitch_deg)
+    gravity = GRAVITY_M_S2 * math.sin(pitch_rad), 0.0, -GRAVITY_M_S2 * math.cos(pitch_rad)
+    arm = read_urdf(text, gravity, locked)
     count = len(arm.joint_names)
     if count != JOINTS:
         names = ", ".join(arm.joint_names)
@@ -87,8 +108,7 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
             "the model is of two parallel axes; compare <axis> and <origin rpy> with the arm"
         )
     doubts = _mass_doubts(arm)
-    if cosine < 0.0:
-        doubts.append("joint 2 turns the other way than joint 1: its `arm.sign` is -1 if its drive does so, too")
+    sign = (1, -1) if cosine < 0.0 else (1, 1)
     offset = chain.translation[1]
     across = offset - (offset @ chain.axis[0]) * chain.axis[0]
     l1 = float(np.linalg.norm(across))
@@ -100,40 +120,87 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = ()) -> PlanarArm:
     is_tip_known = l2 > 1e-3
     if not is_tip_known:
         l2 = 2.0 * float(np.linalg.norm(moment)) / second[0] if second[0] > 0.0 and np.any(moment) else l1
-    vertical = abs(float((chain.rotation[0] @ chain.axis[0])[2]))
-    is_upright = vertical < _PARALLEL
-    if is_upright and vertical > math.sin(math.radians(2.0)):
-        doubts.append("the axes are neither vertical nor horizontal: gravity's part is smaller than with `gravity`")
+    along = across / l1
+    mounting_deg = _mounting(chain, along)
+    has_gravity = mounting_deg[0] > SLIGHT_TILT_DEG
+    bent_deg = 0.0
     theta: list[float] = []
     body: dict[str, Pair] = {}
     if first[0] > 0.0 and second[0] > 0.0:
         inertia = [_about(link, axis) for link, axis in zip((first, second), chain.axis, strict=True)]
-        along = across / l1
-        across_2 = chain.rotation[1] @ moment
-        bent_rad = math.atan2(float(np.linalg.norm(np.cross(along, across_2))), float(along @ across_2))
-        if np.linalg.norm(moment) > 1e-6 and bent_rad > _BENT_RAD:
-            doubts.append(
-                f"at q2 = 0 the centre of mass of link 2 is {math.degrees(bent_rad):.0f} deg off the line of link 1; "
-                "the model wants the drives' zero where the arm is stretched"
-            )
+        if np.linalg.norm(moment) > _LEAST_MOMENT_KG_M:
+            bent_deg = _angle_deg(along, chain.rotation[1] @ moment, chain.axis[0])
         turn = float(np.linalg.norm(moment))
         theta = [inertia[0] + second[0] * l1**2 + inertia[1], l1 * turn, inertia[1], 0.0, 0.0, 0.0, 0.0]
-        turn_1 = float(np.linalg.norm(first[1:4] - (first[1:4] @ chain.axis[0]) * chain.axis[0]))
-        if is_upright:
-            share = GRAVITY_M_S2 * math.sqrt(max(1.0 - vertical**2, 0.0))
-            theta += [share * (turn_1 + second[0] * l1), share * turn]
+        turn_1 = float(first[1:4] @ along)
+        if has_gravity:
+            share = GRAVITY_M_S2 * math.sin(math.radians(mounting_deg[0]))
+            theta += [share * max(turn_1 + second[0] * l1, 0.0), share * turn]
+            doubts += _gravity_doubts(first[1:4], along, chain.axis[0], turn_1 + second[0] * l1)
         body = _body(arm, (first[0], second[0]), (turn_1, turn), inertia)
+    zero_deg, limits = _straightened(arm, sign[1], bent_deg, doubts)
     return PlanarArm(
         (_short(l1), _short(l2)),
         _rounded(theta),
-        is_upright,
-        _plausible("position_limit_deg", _position_limits(arm), doubts),
+        mounting_deg,
+        _plausible("position_limit_deg", limits, doubts),
         _plausible("velocity_limit_deg_s", np.degrees(arm.velocity_limit).round(2), doubts),
         _plausible("rated_torque_Nm", arm.torque_limit, doubts),
         tuple(doubts),
         is_tip_known,
+        sign=sign,
+        zero_deg=zero_deg,
         **body,
     )
+
+
+def _angle_deg(start: Vector, end: Vector, axis: Vector) -> float:
+    """Return the angle about the axis from one direction to the other, deg."""
+    return math.degrees(math.atan2(float(np.cross(start, end) @ axis), float(start @ end)))
+
+
+def _mounting(chain: Chain, along: Vector) -> Pair:
+    """Return tilt of the plane of motion, and the q1 at which link 1, `along` (3,) in its own frame, hangs; deg."""
+    axis, gravity = chain.axis[0], chain.rotation[0].T @ chain.gravity_m_s2
+    downhill = gravity - (gravity @ axis) * axis
+    tilt_deg = math.degrees(math.asin(min(float(np.linalg.norm(downhill)) / GRAVITY_M_S2, 1.0)))
+    if tilt_deg <= SLIGHT_TILT_DEG:
+        return LEVEL_DEG
+    hangs_deg = round(_angle_deg(along, downhill, axis), 2)
+    return round(tilt_deg, 2), hangs_deg if hangs_deg > -180.0 else 180.0
+
+
+def _gravity_doubts(moment: Vector, along: Vector, axis: Vector, lever_kg_m: float) -> Iterator[str]:
+    """Say what of link 1's gravity the model can't have. moment (3,): of link 1, kg m."""
+    aside = abs(float(np.cross(axis, along) @ moment))
+    if lever_kg_m <= 0.0:
+        yield "link 1 has a counterweight heavier than link 2: the model has no gravity of that direction"
+    elif aside > math.sin(math.radians(_BENT_DEG)) * lever_kg_m:
+        yield "the centre of mass of link 1 is off the line to joint 2: gravity acts in another direction than modelled"
+
+
+def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str]) -> tuple[Pair, Vector]:
+    """Return the drives' positions at q = 0, deg, and the largest |q| (2,), deg, of an arm that is stretched at q2 = 0.
+
+    bent_deg: the model's q2 at the description's zero.
+    """
+    limits = _position_limits(arm)
+    if abs(bent_deg) <= _BENT_DEG:
+        return (0.0, 0.0), limits
+    straight = _limit_about(arm, sign, bent_deg)
+    if straight > 0.0:
+        return (0.0, round(-bent_deg, 2)), np.array((limits[0], straight))
+    doubts.append(
+        f"at the URDF's q2 = 0 the centre of mass of link 2 is {abs(bent_deg):.0f} deg off the line of link 1, and the "
+        "stretched arm, the model's q2 = 0, is not within the limits of joint 2"
+    )
+    return (0.0, 0.0), limits
+
+
+def _limit_about(arm: SerialArm, sign: int, bent_deg: float) -> float:
+    """Return the largest |q2| on both sides of the stretched arm within the limits of joint 2, deg; 0 or less: none."""
+    first, second = (math.degrees(sign * float(end[1])) + bent_deg for end in (arm.position_low, arm.position_high))
+    return round(min(-min(first, second), max(first, second)), 2)
 
 
 def _mass_doubts(arm: SerialArm) -> list[str]:
@@ -224,7 +291,9 @@ _MOST_SLOWER = _MOST_HALF_PERIOD_S / max(_HALF_PERIOD_S)
 """Beyond it the motion gets shorter, by steps of this factor."""
 _SHORTER = 0.95
 _UPRIGHT_DEG, _LEAST_UPRIGHT_DEG = (60.0, 60.0), 45.0
-"""Where gravity acts: amplitude, and that of joint 1 below which its offset is hardly seen beside gravity."""
+"""Of an arm that is level at q1 = 0: amplitude, and that of joint 1 below which gravity looks like an offset."""
+_LEVEL = math.sin(math.radians(45.0))
+"""From here on of |sin| of the q1 at which link 1 hangs, gravity hardly changes about q1 = 0, as an offset does not."""
 _PEAK_DEG_S = (100.0, 120.0)
 """Peak speed of the certified scheme's excitation at those amplitudes and that period, and of a withdrawal."""
 _FULL_ACCELERATION = 1.02
@@ -309,21 +378,30 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
     yield Entry("arm.torque_rate_limit_Nm_s", rate, "in proportion to the rated torque")
     yield _stated("arm.position_limit_deg", facts.position_limit_deg, "largest |q|; beyond it the run faults")
     yield _stated("arm.velocity_limit_deg_s", facts.velocity_limit_deg_s, "largest |dq|; beyond it the run faults")
-    yield Entry("arm.sign", (1, 1), "a guess: +1 where the device counts as the joint; `doctor --move` tells", True)
+    told = "+1 where the device counts as the joint"
+    if geometry.sign != (1, 1):
+        told = "joint 2 of the URDF turns against joint 1, and the drives as the URDF"
+    yield Entry("arm.sign", geometry.sign, f"a guess: {told}; `doctor --move` tells", True)
+    if any(geometry.zero_deg):
+        told = "a guess: drives that read the URDF's positions; at q2 = 0 the arm is stretched"
+        yield Entry("arm.zero_deg", geometry.zero_deg, told, True)
     yield Entry(
         "arm.holding_torque_Nm", None, "not known: what brakes, friction and cogging hold without power; 0: free", True
     )
     theta = geometry.cad_theta
     if theta:
-        names = "a1, a2, a3 in kg m², friction unknown" + (", a4, a5 in Nm" if geometry.is_upright else "")
+        names = "a1, a2, a3 in kg m², friction unknown" + (", a4, a5 in Nm" if geometry.has_gravity else "")
         yield _stated("arm.cad_theta", Fact(theta, facts.mass_source), names)
     else:
         yield Entry("arm.cad_theta", (), "not known: the masses; the scheme identifies the arm without them")
     for key in ("mass_kg", "center_m", "inertia_kg_m2", "viscous_Nm_s", "coulomb_Nm"):
         if (pair := getattr(geometry, key)) is not None:
             yield Entry(f"arm.{key}", pair, f"for the emulator; the host doesn't read it: {facts.mass_source}")
-    axes = "not vertical: gravity acts on them" if geometry.is_upright else "vertical: gravity doesn't act on them"
-    yield _stated("estimator.gravity", Fact(geometry.is_upright, facts.gravity_source), f"joint axes {axes}")
+    axes = "not vertical: gravity acts on them" if geometry.has_gravity else "vertical: gravity doesn't act on them"
+    yield _stated("estimator.gravity", Fact(geometry.has_gravity, facts.gravity_source), f"joint axes {axes}")
+    if geometry.has_gravity:
+        told = f"tilt of the plane of motion, and the q1 at which link 1 hangs; {draw_arm(geometry.mounting_deg)}"
+        yield _stated("arm.mounting_deg", Fact(geometry.mounting_deg, facts.gravity_source), told)
 
 
 def _devices(facts: ArmFacts) -> Iterator[Entry]:
@@ -341,11 +419,13 @@ def _devices(facts: ArmFacts) -> Iterator[Entry]:
 
 def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
     limit, speed = facts.position_limit_deg.value, facts.velocity_limit_deg_s.value
+    hangs_rad = math.radians(facts.geometry.mounting_deg[1])
+    is_level = facts.geometry.has_gravity and abs(math.sin(hangs_rad)) > _LEVEL
     wanted, told = _AMPLITUDE_DEG, f"±, within {_TRAVEL_SHARE:.0%} of the position limit"
-    if facts.geometry.is_upright:
+    if is_level:
         wanted, told = _UPRIGHT_DEG, f"{told}; wide, to tell gravity from the sensors' offsets"
     amplitude = tuple(_round(min(wanted[i], _TRAVEL_SHARE * limit[i])) for i in range(JOINTS))
-    if facts.geometry.is_upright and amplitude[0] < _LEAST_UPRIGHT_DEG:
+    if is_level and amplitude[0] < _LEAST_UPRIGHT_DEG:
         warnings.append(
             f"joint 1 may swing by ±{amplitude[0]:g} deg only, {_LEAST_UPRIGHT_DEG:g} deg tell gravity from the offset "
             "of its torque sensor: without a tare the arm may not be certified"
@@ -375,14 +455,15 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
         gain = tuple(_round(model[i] * inertia[i] / _MODEL_INERTIA[i]) for i in range(JOINTS))
         told = "the inertia" if has_masses else "the rated torque, as the masses are not known"
         yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {told}", not has_masses)
-    if facts.geometry.is_upright:
+    if facts.geometry.has_gravity:
         yield _rest_torque(facts)
     yield from _certified(facts)
 
 
 def _rest_torque(facts: ArmFacts) -> Entry:
     """Allow gravity to load the sensors of an arm that its brakes hold."""
-    free, gravity = load_settings("certified").safety.rest_torque_Nm, _gravity(facts)[0]
+    free = load_settings("certified").safety.rest_torque_Nm
+    gravity = _gravity(facts, facts.position_limit_deg.value)[0]
     load, told = 1.2 * gravity, f"gravity's {gravity:.3g} Nm on joint 1 and a fifth, which the arm's brakes hold"
     if not gravity:
         load = max(facts.torque_limit_Nm.value)
@@ -395,10 +476,10 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
     base = load_settings("certified")
     found, inertia, rated = base.certified, _inertia(facts), facts.rated_torque_Nm.value
     scale = _torque_scale(facts)
-    wanted = (2.0 * inertia[0], 0.0, 0.0, *(2.0 * g for g in _gravity(facts)[:1]), 0.0, 0.0, 0.0)
+    wanted = (2.0 * inertia[0], 0.0, 0.0, 2.0 * sum(facts.geometry.cad_theta[7:]), 0.0, 0.0, 0.0)
     prior = [max(values) for values in zip(found.prior_std, _scaled(found.prior_std, scale), wanted, strict=True)]
     entries: list[tuple[str, Any, Any, str]] = []
-    if facts.geometry.is_upright and scale == 1.0:
+    if facts.geometry.has_gravity and scale == 1.0:
         enough = [2.0 * value if kind == _OFFSET else value for kind, value in enumerate(found.enough_std)]
         reason = "offsets half as well as without gravity, which hides them; a tare shows them"
         entries.append(("certified.enough_std", enough, found.enough_std, reason))
@@ -449,7 +530,7 @@ def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) 
     Raises ConfigError where a joint has no torque.
     """
     limit_Nm, speed = facts.torque_limit_Nm.value, facts.velocity_limit_deg_s.value
-    inertia, gravity, slower = _inertia(facts), _gravity(facts), 1.0
+    inertia, gravity, slower = _inertia(facts), _gravity(facts, amplitude), 1.0
     for i in range(JOINTS):
         if limit_Nm[i] <= 0.0:
             raise ConfigError(f"`arm.torque_limit_Nm[{i}]` = 0 Nm: joint {i + 1} can't move without torque")
@@ -476,10 +557,38 @@ def _inertia(facts: ArmFacts) -> Pair:
     return first, second
 
 
-def _gravity(facts: ArmFacts) -> Pair:
-    """Return the largest torque of gravity on each joint, Nm; 0 where it is not known or does not act."""
-    theta = facts.geometry.cad_theta
-    return (theta[7] + theta[8], theta[8]) if facts.geometry.is_upright and theta else (0.0, 0.0)
+def _gravity(facts: ArmFacts, within_deg: Sequence[float]) -> Pair:
+    """Return gravity's largest torque on each joint within ± these positions, Nm; 0: not known, or does not act."""
+    geometry = facts.geometry
+    if not (geometry.has_gravity and geometry.cad_theta):
+        return 0.0, 0.0
+    a4, a5 = geometry.cad_theta[7:]
+    swing_1, swing_2 = (np.radians(np.linspace(-bound, bound, 73)) for bound in within_deg)
+    uphill = swing_1[:, np.newaxis] - math.radians(geometry.mounting_deg[1] + 90.0)
+    second = a5 * np.cos(uphill + swing_2)
+    return float(np.max(np.abs(a4 * np.cos(uphill) + second))), float(np.max(np.abs(second)))
+
+
+_ARROWS = "→↗↑↖←↙↓↘"
+"""Directions in steps of 45 deg, counter-clockwise."""
+_POSES = {
+    0: "the arm points down",
+    180: "the arm points up",
+    -90: "the arm is level and +q1 lifts it",
+    90: "the arm is level and +q1 lowers it",
+}
+"""What an arm does at q = 0, by the q1 at which link 1 hangs, deg."""
+
+
+def draw_arm(mounting_deg: Pair) -> str:
+    """Draw an arm at q = 0 in a line, joint 1 on the left, with the direction of gravity in the plane of motion."""
+    tilt_deg, hangs_deg = mounting_deg
+    arm = "at q = 0: [1]====[2]===>, +q counter-clockwise"
+    if tilt_deg <= SLIGHT_TILT_DEG:
+        return f"{arm}, seen from above; gravity does not act on the joints"
+    told = _POSES.get(round(hangs_deg), f"link 1 hangs at q1 = {hangs_deg:g} deg")
+    tilt = "" if tilt_deg > 89.9 else f" (plane tilted by {tilt_deg:g} deg)"
+    return f"{arm}, gravity {_ARROWS[round(hangs_deg / 45.0) % 8]}{tilt}: {told}"
 
 
 def _stated(key: str, fact: Fact, what: str) -> Entry:

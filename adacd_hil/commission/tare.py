@@ -144,11 +144,11 @@ def _bound(quantity: str, values: Vector, bound: float | Sequence[float], settin
             )
 
 
-def gravity_columns(q: Vector) -> Vector:
+def gravity_columns(q: Vector, level_rad: float) -> Vector:
     """Return Y_g (2, 2): the torques at rest of a unit a4 and a unit a5, by the scheme's own regressor."""
     rest = np.zeros(JOINTS)
-    columns: Vector = regressor(q, rest, rest, len(PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES))[:, list(_GRAVITY)]
-    return columns
+    columns: Vector = regressor(q, rest, rest, len(PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES), level_rad)
+    return columns[:, list(_GRAVITY)]
 
 
 def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
@@ -157,12 +157,15 @@ def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
     tare = settings.tare
     if settings.estimator.gravity:
         for number, residual in enumerate(solution.residual_Nm, start=1):
-            remedy = "; something pushes on the arm there, or the gravity model is wrong"
+            remedy = "; something pushes on the arm there, or the mounting, arm.mounting_deg, is wrong"
             _bound(f"residual of pose {number}", residual, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
     else:
         remedy = "; friction, a cable or somebody pushes on the arm in one of them"
         _bound("spread between poses of tau_J", solution.spread_Nm, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
-    remedy = "; something pushes on the arm, or the sensor is damaged"
+    mounting = "the mounting, arm.mounting_deg, is wrong"
+    if not settings.estimator.gravity:
+        mounting = "the mounting is not flat (estimator.gravity)"
+    remedy = f"; something pushes on the arm, {mounting}, or the sensor is damaged"
     _bound("offset", solution.offset_Nm, tare.offset_limit_Nm, "tare.offset_limit_Nm", remedy)
     return solution
 
@@ -174,7 +177,11 @@ def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
     if settings.estimator.gravity and not is_estimated:
         gravity = settings.cad_theta[list(_GRAVITY)]
     torque = np.array([pose.mean_Nm for pose in poses])
-    columns = np.array([gravity_columns(pose.q) for pose in poses]) if settings.estimator.gravity else None
+    columns = (
+        np.array([gravity_columns(pose.q, settings.level_rad) for pose in poses])
+        if settings.estimator.gravity
+        else None
+    )
     if columns is not None and not is_estimated:
         torque = torque - columns @ gravity
     offsets = np.tile(np.eye(JOINTS), (len(poses), 1))
@@ -216,12 +223,14 @@ def _check_condition(matrix: NDArray[np.float64], poses: Sequence[Pose], setting
     # What hardly shows is an a4 with the offset of joint 1, or an a5 with the offset of joint 2.
     hidden = directions[-1] ** 2
     q = np.array([pose.q for pose in poses])
+    level = f" - {math.degrees(settings.level_rad):g} deg" * (settings.level_rad != 0.0)
     if hidden[0] + hidden[2] >= hidden[1] + hidden[3]:
-        angles, what, motion = q[:, 0], "cos(q1)", "move joint 1 further between the poses"
+        angles, what, motion = q[:, 0], f"cos(q1{level})", "move joint 1 further between the poses"
     else:
-        angles, what = q.sum(axis=1), "cos(q1 + q2)"
+        angles, what = q.sum(axis=1), f"cos(q1 + q2{level})"
         motion = "turn link 2 further between the poses, against the ground and not with link 1 only"
-    low, high = np.cos(angles).min(), np.cos(angles).max()
+    levers = np.cos(angles - settings.level_rad)
+    low, high = levers.min(), levers.max()
     raise TareRefusedError(
         f"condition number of {len(poses)} poses = {condition:.3g} exceeds tare.condition_limit = {bound:g}: "
         f"{what} only goes from {low:.2f} to {high:.2f}; {motion}"

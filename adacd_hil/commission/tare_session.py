@@ -264,6 +264,8 @@ class TareSession:
             spread_Nm=_floats(solution.spread_Nm),
             old_offset_Nm=self.old_offset_Nm,
             sign=settings.arm.sign,
+            mounting_deg=settings.mounting_deg if settings.estimator.gravity else None,
+            zero_deg=settings.arm.zero_deg if settings.estimator.gravity else None,
             is_auto_zeroed=self.is_auto_zeroing,
             gravity_model=settings.tare.gravity_model if settings.estimator.gravity else "none",
             gravity_Nm=_floats(solution.gravity_Nm),

@@ -84,7 +84,7 @@ class PoseRecord:
     samples: int = setting(low=1, meaning="complete cycles")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Tare:
     """Offsets of both joint torque sensors and where they come from."""
 
@@ -94,6 +94,12 @@ class Tare:
     spread_Nm: tuple[float, float] = setting(unit="Nm", low=0.0, meaning="highest less lowest residual of the poses")
     old_offset_Nm: tuple[float, float] = setting(unit="Nm", meaning="offset that this one replaces")
     sign: tuple[int, int] = setting(low=-1, high=1, meaning="arm.sign that it was measured with")
+    mounting_deg: tuple[float, float] | None = setting(
+        None, unit="deg", meaning="tilt and q1 of hanging that gravity was subtracted with"
+    )
+    zero_deg: tuple[float, float] | None = setting(
+        None, unit="deg", meaning="arm.zero_deg that gravity was subtracted with"
+    )
     is_auto_zeroed: bool = setting(meaning="the sensors had just set their own zero, 0x6125")
     gravity_model: str = setting(choices=("none", "estimated", "cad"), meaning="where a4 and a5 come from")
     gravity_Nm: tuple[float, float] = setting(unit="Nm", meaning="a4 and a5, zeros with vertical joint axes")
@@ -221,6 +227,15 @@ def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
             f"tare {path} was measured with arm.sign = {list(tare.sign)}, but the configuration has "
             f"{list(settings.arm.sign)}; tare again"
         )
+    for name, tared, present in (
+        ("mounting_deg", tare.mounting_deg, settings.mounting_deg),
+        ("zero_deg", tare.zero_deg, settings.arm.zero_deg),
+    ):
+        if settings.estimator.gravity and tared is not None and tared != present:
+            raise ConfigError(
+                f"tare {path} was measured with arm.{name} = {list(tared)}, but the configuration has "
+                f"{list(present)}, which makes another gravity; tare again"
+            )
     bounds = settings.tare
     age_h = (now_ns - tare.measured_ns()) / _NS_PER_H
     if 0.0 < bounds.max_age_h < age_h:

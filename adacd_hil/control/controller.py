@@ -22,6 +22,7 @@ class Controller:
     def __init__(self, settings: Settings) -> None:
         self._Kp = np.array(settings.controller.Kp)
         self._Kd = np.array(settings.controller.Kd)
+        self._level_rad = settings.level_rad
         self._has_feedforward = settings.controller.feedforward
         self._handover_cycles = max(1, round(HANDOVER_S / settings.bus.period_s))
         none = np.zeros(len(settings.estimator.parameter_names))
@@ -31,7 +32,9 @@ class Controller:
     def compile(self) -> None:
         """Run the compiled part once, so that nothing compiles in the cycle."""
         zeros = np.zeros(JOINTS)
-        fill_torque(zeros, zeros, zeros, zeros, zeros, self._theta, self._Kp, self._Kd, np.zeros(JOINTS))
+        fill_torque(
+            zeros, zeros, zeros, zeros, zeros, self._theta, self._Kp, self._Kd, self._level_rad, np.zeros(JOINTS)
+        )
 
     def feed_forward(self, theta: Vector) -> None:
         """Use these parameters (p,) from now on; the same array again changes nothing."""
@@ -46,7 +49,7 @@ class Controller:
             self._cycles_left -= 1
             share = self._cycles_left / self._handover_cycles
             self._theta = share * self._old + (1.0 - share) * self._new
-        fill_torque(q, dq, q_d, dq_d, ddq_d, self._theta, self._Kp, self._Kd, tau_d)
+        fill_torque(q, dq, q_d, dq_d, ddq_d, self._theta, self._Kp, self._Kd, self._level_rad, tau_d)
 
 
 @compiled
@@ -59,10 +62,11 @@ def fill_torque(
     theta: Vector,
     Kp: Vector,
     Kd: Vector,
+    level_rad: float,
     tau_d: Vector,
 ) -> None:
     """Fill the desired torque tau_d (2,), Nm, of the law in the head of this file; theta (p,) is fed forward."""
-    feedforward = inverse_dynamics(q_d, dq_d, ddq_d, theta)
+    feedforward = inverse_dynamics(q_d, dq_d, ddq_d, theta, level_rad)
     for i in range(JOINTS):
         tau_d[i] = Kp[i] * (q_d[i] - q[i]) + Kd[i] * (dq_d[i] - dq[i]) + feedforward[i]
 
@@ -89,6 +93,7 @@ class Floating:
     def __init__(self, settings: Settings) -> None:
         wish = settings.reaction
         self._damping = wish.damping_Nm_s
+        self._level_rad = settings.level_rad
         self._share = wish.friction_share
         self._speed_limit = np.radians(wish.yield_limit_deg_s).tolist()
         self._bound = (settings.arm.position_limit_rad - np.radians(wish.position_margin_deg)).tolist()
@@ -101,7 +106,7 @@ class Floating:
 
     def torque(self, q: Vector, dq: Vector, tau_ext_hat: Vector, theta: Vector, tau_d: Vector) -> None:
         """Fill the desired torque; theta is the model of friction and gravity, zeros for none."""
-        tau_d[:] = regressor.inverse_dynamics(q, np.zeros(JOINTS), np.zeros(JOINTS), theta)
+        tau_d[:] = regressor.inverse_dynamics(q, np.zeros(JOINTS), np.zeros(JOINTS), theta, self._level_rad)
         friction = theta[regressor.F_V1 : regressor.F_C2 + 1]
         for i in range(JOINTS):
             speed = float(dq[i])

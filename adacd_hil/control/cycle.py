@@ -290,7 +290,7 @@ class Cycle:
 
     def _follow_state(self, state: SchemeState, cycle: int) -> None:
         self._state = state
-        if state is SchemeState.ADAPT and self._enabled_cycle is None:
+        if state in (SchemeState.ADAPT, SchemeState.REACT) and self._enabled_cycle is None:
             self._enabled_cycle = cycle
         if state is SchemeState.FAULT:
             self._faulted_cycle = cycle

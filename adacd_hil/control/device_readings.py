@@ -6,8 +6,9 @@ The equation of a 2R arm, linear in theta, is fitted to each reading, with offse
     tau_J = W(q, dq, ddq) theta + offset − l dtau_J/dt
 
 A reading of a share of unexplained squares that is far below that of the configuration's, and of an inertia that an arm
-can have, is how the devices are. Of 95 scenarios of the package, touched arms included, none comes below 0.5 times the
-share as told; of the mistakes below, each comes to 0.1 times or less.
+can have, is how the devices are. One reading is of the mounting: gravity acts in any direction of the plane of motion,
+so a4 and a5 have columns of sin(q1 - level_rad), too. Of 95 scenarios of the package, touched arms included, none comes
+below 0.5 times the share as told; of the mistakes below, each comes to 0.1 times or less, a mounting to 0.17.
 
 Not told apart: an arm without gravity is its own mirror image, so of two joints of which one is reversed nothing says
 which, nor that both are. Torques in one wrong scale make an arm that is as much heavier.
@@ -21,7 +22,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.model.regressor import is_positive_definite, regressor
+from adacd_hil.scheme.model.regressor import A4, A5, is_positive_definite, regressor
 from adacd_hil.settings.configuration import Settings
 
 _FEWEST_BLOCKS: Final = 15
@@ -39,17 +40,25 @@ _NEARLY: Final = 1.2
 """As `_BETTER`, of an arm that has run away and whose configuration no arm can have."""
 RIDGE: Final = 1e-9
 """Of the scaled equations, so that what a motion doesn't tell is 0."""
+_MOUNTING_BLOCKS: Final = 60
+"""Before, a small motion hardly tells gravity from an offset: two more parameters explain any torque."""
+_TURNED_DEG: Final = 10.0
+"""Least angle by which a mounting is wrong."""
 _SCALES: Final = (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
 
 
 class Reading(NamedTuple):
-    """One way. position, torque: factors on what is counted, by joint. kind: of the texts of `describe`."""
+    """One way. position, torque: factors on what is counted, by joint. kind: of the texts of `describe`.
+
+    is_turned: gravity acts in any direction.
+    """
 
     kind: str
     is_drive_exchanged: bool = False
     is_sensor_exchanged: bool = False
     position: tuple[float, float] = (1.0, 1.0)
     torque: tuple[float, float] = (1.0, 1.0)
+    is_turned: bool = False
 
     @property
     def joint(self) -> int:
@@ -59,7 +68,7 @@ class Reading(NamedTuple):
     @property
     def row(self) -> tuple[float, ...]:
         """The numbers of it, for compiled functions."""
-        return (self.is_drive_exchanged, self.is_sensor_exchanged, *self.position, *self.torque)
+        return (self.is_drive_exchanged, self.is_sensor_exchanged, *self.position, *self.torque, self.is_turned)
 
 
 READINGS: Final = (
@@ -75,19 +84,27 @@ READINGS: Final = (
     *(Reading("scale", position=(1.0, factor)) for factor in _SCALES),
     *(Reading("torque", torque=(1.0, factor)) for factor in (-1.0, *_SCALES)),
 )
+_MOUNTED: Final = Reading("mounting", is_turned=True)
 _OF_EXCHANGE: Final = tuple(place for place, reading in enumerate(READINGS) if reading.kind in ("drives", "sensors"))
 
 
 @compiled
 def add_block(
-    readings: Vector, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector, normals: Vector
+    readings: Vector,
+    q: Vector,
+    dq: Vector,
+    ddq: Vector,
+    tau_J: Vector,
+    dtau_J: Vector,
+    level_rad: float,
+    count: int,
+    normals: Vector,
 ) -> None:
-    """Add a block's means (2,) to the normal equations (h, k, k) of each of the readings (h, 6).
+    """Add a block's means (2,) to the normal equations (h, k, k) of each of the readings (h, 7).
 
-    k = p + 5: theta, two offsets, two lags, the torque.
+    k = p + 5, or p + 7 with gravity: theta (p = count), two offsets, two lags, a4 and a5 of another direction, torque.
     """
     size = normals.shape[1]
-    count = size - 1 - 2 * JOINTS
     position, velocity, acceleration, row = np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(size)
     for h in range(readings.shape[0]):
         for i in range(JOINTS):
@@ -95,13 +112,16 @@ def add_block(
             position[i] = q[at] * readings[h, 2 + i]
             velocity[i] = dq[at] * readings[h, 2 + i]
             acceleration[i] = ddq[at] * readings[h, 2 + i]
-        W = regressor(position, velocity, acceleration, count)
+        W = regressor(position, velocity, acceleration, count, level_rad)
         for i in range(JOINTS):
             at = 1 - i if readings[h, 1] != 0.0 else i
             row[:] = 0.0
             row[:count] = W[i]
             row[count + i] = 1.0
             row[count + JOINTS + i] = dtau_J[at] * readings[h, 4 + i]
+            if readings[h, 6] != 0.0:
+                turned = regressor(position, velocity, acceleration, count, level_rad + 0.5 * math.pi)
+                row[size - 3 : size - 1] = turned[i, A4 : A5 + 1]
             row[size - 1] = tau_J[at] * readings[h, 4 + i]
             for a in range(size):
                 for b in range(size):
@@ -109,12 +129,12 @@ def add_block(
 
 
 @compiled
-def solve_readings(normals: Vector, blocks: int, shares: Vector, thetas: Vector) -> None:
-    """Solve the normal equations (h, k, k) of so many blocks: unexplained share (h,) of squares, and theta (h, p).
+def solve_readings(normals: Vector, count: int, blocks: int, shares: Vector, solutions: Vector) -> None:
+    """Solve the normal equations (h, k, k) of so many blocks: unexplained share (h,) of squares, unknowns (h, k - 1).
 
     By Cholesky's factors of the equations, scaled to a diagonal of ones.
     """
-    count, size = thetas.shape[1], normals.shape[1] - 1
+    size = normals.shape[1] - 1
     L, x, unit = np.zeros((size, size)), np.zeros(size), np.zeros(size)
     for h in range(normals.shape[0]):
         N = normals[h]
@@ -137,7 +157,7 @@ def solve_readings(normals: Vector, blocks: int, shares: Vector, thetas: Vector)
             for c in range(a + 1, size):
                 x[a] -= L[c, a] * x[c]
             x[a] /= L[a, a]
-        thetas[h] = x[:count] / unit[:count]
+        solutions[h] = x / unit
         spread = N[size, size]
         for i in range(JOINTS):
             spread -= N[count + i, size] ** 2 / blocks
@@ -150,43 +170,48 @@ class DeviceReadings:
     def __init__(self, settings: Settings) -> None:
         """Begin without a block."""
         self._settings = settings
+        self._level_rad = settings.level_rad
         self._count = len(settings.estimator.parameter_names)
-        self._rows = np.array([reading.row for reading in READINGS])
-        self._normals = np.zeros((len(READINGS), self._count + 5, self._count + 5))
+        has_gravity = settings.estimator.gravity
+        self._readings = (*READINGS, _MOUNTED) if has_gravity else READINGS
+        self._rows = np.array([reading.row for reading in self._readings])
+        readings, unknowns = len(self._readings), self._count + 2 * JOINTS + (2 if has_gravity else 0)
+        self._normals = np.zeros((readings, unknowns + 1, unknowns + 1))
         self._blocks = 0
-        self._shares, self._thetas = np.ones(len(READINGS)), np.zeros((len(READINGS), self._count))
+        self._shares, self._solutions = np.ones(readings), np.zeros((readings, unknowns))
         self._agreed = (0, 0)  # which reading, how often in a row
 
     def compile(self) -> None:
         """Compile what `add` calls."""
         zero = np.zeros(JOINTS)
-        add_block(self._rows, zero, zero, zero, zero, zero, self._normals.copy())
-        solve_readings(self._normals, 1, self._shares.copy(), self._thetas.copy())
-        is_positive_definite(self._thetas[0])
+        add_block(self._rows, zero, zero, zero, zero, zero, self._level_rad, self._count, self._normals.copy())
+        solve_readings(self._normals, self._count, 1, self._shares.copy(), self._solutions.copy())
+        is_positive_definite(self._solutions[0])
 
     def add(self, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector) -> None:
         """Take in the means of a block, (2,) each."""
-        add_block(self._rows, q, dq, ddq, tau_J, dtau_J, self._normals)
+        add_block(self._rows, q, dq, ddq, tau_J, dtau_J, self._level_rad, self._count, self._normals)
         self._blocks += 1
 
     def step(self) -> Reading | None:
         """Judge every few blocks; return the right reading once it is certain that it isn't the configuration's."""
         if self._blocks < _FEWEST_BLOCKS or self._blocks % _JUDGED_EVERY:
             return None
-        best = self._solve(range(len(READINGS)))
+        best = self._solve(range(len(self._readings)))
         is_wrong = best != 0 and self._shares[0] >= _UNEXPLAINED
         is_better = is_wrong and self._rank(best) <= min(_BETTER * self._shares[0], _EXPLAINED)
         self._agreed = (best, self._agreed[1] + 1 if best == self._agreed[0] else 1) if is_better else (0, 0)
-        return READINGS[best] if self._agreed[1] >= _ROUNDS else None
+        return self._readings[best] if self._agreed[1] >= _ROUNDS else None
 
     def suspect(self) -> Reading | None:
         """Return the likeliest reading of an arm that has run away and that no arm is like as it was told, if any."""
         if self._blocks < _SUSPECT_BLOCKS:
             return None
-        best = self._solve([place for place, reading in enumerate(READINGS) if reading.kind not in ("scale", "torque")])
-        if is_positive_definite(self._thetas[0]):
+        unlikely = ("scale", "torque", "mounting")
+        best = self._solve([place for place, reading in enumerate(self._readings) if reading.kind not in unlikely])
+        if is_positive_definite(self._solutions[0]):
             return None
-        return READINGS[best] if self._rank(best) <= _NEARLY * self._shares[0] else None
+        return self._readings[best] if self._rank(best) <= _NEARLY * self._shares[0] else None
 
     def exchanged(self) -> str:
         """Say which of the devices are at each other's joint where it is the drives or the sensors."""
@@ -196,9 +221,10 @@ class DeviceReadings:
 
     def describe(self, reading: Reading) -> str:
         """Say what is wrong, how sure that is, and what to change."""
-        place = READINGS.index(reading)
+        place = self._readings.index(reading)
         told, so = 100.0 * np.sqrt(self._shares[[0, place]])
-        return f"{self._text(reading)} (unexplained of the torque: {told:.1f} % as told, {so:.1f} % so)"
+        text = self._mounting_text() if reading.is_turned else self._text(reading)
+        return f"{text} (unexplained of the torque: {told:.1f} % as told, {so:.1f} % so)"
 
     def _text(self, reading: Reading) -> str:
         sign, joint = list(self._settings.arm.sign), reading.joint
@@ -230,15 +256,33 @@ class DeviceReadings:
             "would: correct scale.torque_Nm of devices.sensor[0] or devices.sensor[1]"
         )
 
+    def _mounting_text(self) -> str:
+        hangs_deg = self._settings.mounting_deg[1]
+        found_deg = (hangs_deg + self._turned_deg + 180.0) % 360.0 - 180.0
+        return (
+            f"gravity acts as if link 1 hung at about q1 = {found_deg:.0f} deg: correct the mounting, "
+            f"arm.mounting_deg[1] = {hangs_deg:g} deg, or arm.zero_deg[0] if the angle is wrong"
+        )
+
     def _nodes(self, kind: str) -> list[int]:
         devices = self._settings.devices
         return list(devices.drive_node if kind == "drives" else devices.sensor_node)
 
     def _rank(self, place: int) -> float:
-        """Return the share that a reading leaves, infinite where it is no arm's."""
-        return float(self._shares[place]) if is_positive_definite(self._thetas[place]) else math.inf
+        """Return the share that a reading leaves, infinite where it is no arm's, or too early to be known."""
+        is_early = self._readings[place].is_turned and self._blocks < _MOUNTING_BLOCKS
+        if is_early or not is_positive_definite(self._solutions[place]):
+            return math.inf
+        is_as_told = self._readings[place].is_turned and abs(self._turned_deg) < _TURNED_DEG
+        return math.inf if is_as_told else float(self._shares[place])
+
+    @property
+    def _turned_deg(self) -> float:
+        """By how much gravity is turned, deg, in the direction of +q."""
+        mounted = self._solutions[-1]
+        return math.degrees(math.atan2(mounted[-2:].sum(), mounted[A4 : A5 + 1].sum()))
 
     def _solve(self, among: Iterable[int]) -> int:
         """Solve for all readings; return the best of some."""
-        solve_readings(self._normals, max(self._blocks, 1), self._shares, self._thetas)
+        solve_readings(self._normals, self._count, max(self._blocks, 1), self._shares, self._solutions)
         return min(among, key=self._rank)

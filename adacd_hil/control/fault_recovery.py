@@ -205,6 +205,11 @@ class CommissionReport:
         speed, torque = settings.safety.rest_velocity_rad_s, settings.safety.rest_torque_Nm
         self._speed = _RestBound("moves: |dq|", "safety.rest_velocity_rad_s", speed, "rad/s")
         self._torque = _RestBound("is loaded: |tau_J|", "safety.rest_torque_Nm", torque, "Nm")
+        tilt_deg, hangs_deg = settings.mounting_deg
+        self._weight = f"correct the mounting, arm.mounting_deg = [{tilt_deg:g}, {hangs_deg:g}]"
+        if not settings.estimator.gravity:
+            self._weight = "the mounting is not flat: estimator.gravity = true and arm.mounting_deg"
+        self._weight += f", and safety.rest_torque_Nm = {torque:g} Nm"
         self._cycles = 0
         self._causes: Counter[str | _Unrest] = Counter()
         self._worst: dict[_Unrest, float] = {}
@@ -227,9 +232,12 @@ class CommissionReport:
 
     def describe(self) -> list[str]:
         """Name the causes, the most frequent first, one line each; empty when nothing was wrong in any cycle."""
-        return [
+        lines = [
             f"{self._text(cause)} in {count} of {self._cycles} cycles" for cause, count in self._causes.most_common()
         ]
+        if any(isinstance(cause, _Unrest) and cause.over is self._torque for cause in self._causes):
+            lines.append(f"if that is the arm's own weight: {self._weight}")
+        return lines
 
     def _text(self, cause: str | _Unrest) -> str:
         if isinstance(cause, str):

@@ -8,8 +8,8 @@ so a link that is s times as long as told, its masses in their places, has
 
     link 1:  a2 → s a2,  a1 − a3 → s² (a1 − a3),  a3 as told        link 2:  a2 → s a2,  a3 → s² a3,  a1 − a3 as told
 
-of `arm.cad_theta`. Where gravity acts, a5 = m2 c2 g, and l1 = g a2 / a5 of an arm that moves upright; a base at a tilt
-makes it longer by the sine of it.
+of `arm.cad_theta`. Where gravity acts, a5 = m2 c2 g', and l1 = g' a2 / a5; g' = g sin(tilt) acts in the plane of
+motion, and a tilt that is smaller than told makes l1 longer. An a5 below 0 is gravity in the other direction.
 """
 
 from typing import Final
@@ -27,15 +27,20 @@ _ALIKE: Final = 0.08
 _LONGER: Final = 0.12
 """Share by which a length has to be off to be told."""
 
+_SEEN: Final = 0.1
+"""Share of the expected a5 from which on its sign is no error of an arm that gravity hardly turns."""
+
 
 def geometry_event(settings: Settings, certificate: Certificate) -> Event | None:
     """Compare the lengths with a certificate of the arm without a payload; None where they agree."""
     theta, lengths = certificate.parameters, settings.arm.link_length_m
     cad, is_upright = settings.arm.cad_theta, len(theta) > A5
     has_masses = any(cad[: A3 + 1])
-    event = _by_cad(theta, cad, lengths) if has_masses else None
+    event = _by_direction(settings, theta) if is_upright else None
+    if event is None and has_masses:
+        event = _by_cad(theta, cad, lengths)
     if event is None and is_upright:
-        event = _by_gravity(theta, lengths[0])
+        event = _by_gravity(settings, theta)
     if event is not None or has_masses:
         return event
     unchecked = f"arm.link_length_m[1] = {lengths[1]:g} m" if is_upright else f"arm.link_length_m = {list(lengths)} m"
@@ -46,16 +51,31 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
     return Event("info", EVENT, text)
 
 
-def _by_gravity(theta: tuple[float, ...], told_m: float) -> Event | None:
+def _by_direction(settings: Settings, theta: tuple[float, ...]) -> Event | None:
+    expected_Nm = settings.gravity_m_s2 * theta[A2] / settings.arm.link_length_m[0]
+    if theta[A5] >= -_SEEN * abs(expected_Nm) or expected_Nm <= 0.0:
+        return None
+    hangs_deg = settings.mounting_deg[1]
+    opposite_deg = hangs_deg - 180.0 if hangs_deg > 0.0 else hangs_deg + 180.0
+    text = f"a5 = {theta[A5]:.3g} Nm: gravity acts against the mounting, arm.mounting_deg[1] = {hangs_deg:g} deg"
+    return Event("warning", EVENT, f"{text}; link 1 hangs at q1 = {opposite_deg:g} deg")
+
+
+def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
+    told_m, told_tilt_deg = settings.arm.link_length_m[0], settings.mounting_deg[0]
     if theta[A2] == 0.0 or theta[A5] == 0.0:
         return None
-    found_m = GRAVITY_M_S2 * abs(theta[A2] / theta[A5])
+    gravity_m_s2 = GRAVITY_M_S2 * np.sin(settings.tilt_rad)
+    found_m = gravity_m_s2 * abs(theta[A2] / theta[A5])
     if 1.0 / (1.0 + _LONGER) <= found_m / told_m <= 1.0 + _LONGER:
         return None
     told = f"arm.link_length_m[0] = {told_m:g} m"
-    if found_m > told_m:  # a tilt looks like it, and nobody has told one
-        tilt_deg = np.degrees(np.arcsin(told_m / found_m))
-        text = f"{told} is right if the arm moves at {tilt_deg:.0f} deg to the level; upright, link 1 is"
+    if found_m > told_m:  # a smaller tilt looks like it
+        tilt_deg = np.degrees(np.arcsin(np.sin(settings.tilt_rad) * told_m / found_m))
+        text = (
+            f"{told} is right if the arm moves at {tilt_deg:.0f} deg to the level (arm.mounting_deg[0]); at "
+            f"{told_tilt_deg:g} deg link 1 is"
+        )
         return Event("info", EVENT, f"{text} {found_m:.3f} m long by inertia over gravity")
     text = f"link 1 is {found_m:.3f} m long by inertia over gravity, or shorter; {told}: measure it"
     return Event("warning", EVENT, f"{text}; places and forces of contacts are wrong by as much")

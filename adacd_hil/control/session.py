@@ -307,9 +307,11 @@ class Session:
     def _live_setup(self, robot: str) -> LiveSetup | None:
         if self.live is None:
             return None
-        arm, is_upright = self.settings.arm, self.settings.estimator.gravity
+        settings, length_m = self.settings, self.settings.arm.link_length_m
         host, port, origins, names, most_viewers = self.live
-        return LiveSetup(host, port, robot, arm.link_length_m, is_upright, origins, names, most_viewers)
+        return LiveSetup(
+            host, port, robot, length_m, settings.tilt_rad, settings.level_rad, origins, names, most_viewers
+        )
 
     def _metadata(self, grant: RealtimeGrant) -> dict[str, str]:
         settings = self.settings

@@ -1,6 +1,6 @@
 """The arm: two drives and two torque sensors joined into `ArmState`, and `ArmCommand` turned into frames.
 
-The only place of sign, zero offset and torque ratio. Every value carries its age in cycles.
+The only place of sign, zeros and torque ratio. Every value carries its age in cycles.
 """
 
 import math
@@ -56,6 +56,8 @@ class Arm:
         self._is_pipelined = settings.bus.is_pipelined
         self._pending: _Command | None = None
         self.sign = settings.arm.sign
+        zero1, zero2 = settings.arm.zero_rad.tolist()
+        self.zero_rad = zero1, zero2
         self._offset_Nm = settings.arm.torque_offset_Nm
         self.limits = settings.arm
         self._permille_per_Nm = tuple(
@@ -371,6 +373,7 @@ class Arm:
         """Make the state of values sampled in given cycles; `ordinal`: of the SYNC of a complete sample."""
         (q1, dq1), (q2, dq2), (tau1,), (tau2,) = values
         sign1, sign2 = self.sign
+        zero1, zero2 = self.zero_rad
         offset1, offset2 = self._offset_Nm
         cycle = self._cycle
         steps, sampled_ns = 0, self._t_ns
@@ -383,7 +386,7 @@ class Arm:
             cycle=cycle,
             t_ns=self._t_ns,
             periods=self._periods,
-            q=np.array((sign1 * q1, sign2 * q2)),
+            q=np.array((sign1 * q1 - zero1, sign2 * q2 - zero2)),
             dq=np.array((sign1 * dq1, sign2 * dq2)),
             tau_J=np.array((sign1 * tau1 - offset1, sign2 * tau2 - offset2)),
             age_q=(cycle - sampled[0], cycle - sampled[1]),

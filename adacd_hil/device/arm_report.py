@@ -220,10 +220,15 @@ class ArmReport:
         lines = []
         for joint, (drive, sign) in enumerate(zip(self._arm.drives, self._arm.sign, strict=True)):
             for quantity, value, bound, unit in (
-                ("position", drive.position_rad, self._arm.limits.position_limit_deg[joint], "deg"),
-                ("velocity", drive.velocity_rad_s, self._arm.limits.velocity_limit_deg_s[joint], "deg/s"),
+                (
+                    "position",
+                    sign * drive.position_rad - self._arm.zero_rad[joint],
+                    self._arm.limits.position_limit_deg[joint],
+                    "deg",
+                ),
+                ("velocity", sign * drive.velocity_rad_s, self._arm.limits.velocity_limit_deg_s[joint], "deg/s"),
             ):
-                value_deg = math.degrees(sign * value)
+                value_deg = math.degrees(value)
                 if abs(value_deg) > bound:
                     text = f"joint {joint + 1}: {quantity} {value_deg:.2f} {unit}, ±{bound:g} {unit} allowed"
                     if quantity == "position" and abs(value_deg) > _REVOLUTION_DEG:

@@ -133,6 +133,7 @@ class OrdinaryCycles:
             raise NotOrdinaryError("SYNC is received")
         self._arm, self._heartbeats = arm, heartbeats
         self._period_s = settings.bus.period_s
+        self._zero_rad = settings.arm.zero_rad
         self._sign, self._torque_offset_Nm = np.array(settings.arm.sign), np.array(settings.arm.torque_offset_Nm)
         self._messages, self._rows = lay_out_frames([device.cyclic_frame for device in arm.devices], is_brief=True)
         self._lengths = [0] * (2 * _DEVICES)
@@ -326,7 +327,7 @@ class OrdinaryCycles:
 
     def _fill(self, batch: ArmBatch, read: slice, is_enabled: bool) -> None:
         values = self._values[:, : read.stop - read.start]
-        batch.q[read] = self._sign * values[:JOINTS, :, 0].T
+        batch.q[read] = self._sign * values[:JOINTS, :, 0].T - self._zero_rad
         batch.dq[read] = self._sign * values[:JOINTS, :, 1].T
         batch.tau_J[read] = self._sign * values[JOINTS:, :, 0].T - self._torque_offset_Nm
         batch.age_q[read] = batch.age_tau_J[read] = 0

@@ -10,6 +10,11 @@ import numpy as np
 from adacd_hil.records import Vector
 from adacd_hil.settings.schema import ConfigError, setting
 
+UPRIGHT_DEG = 90.0
+"""Tilt of a plane of motion in which all of gravity acts."""
+SLIGHT_TILT_DEG = 2.0
+"""Tilt below which gravity may be left out of the model: 3 % of it acts, and `arm.position_torque_Nm` covers it."""
+
 
 @dataclass(frozen=True)
 class ArmSettings:
@@ -25,6 +30,20 @@ class ArmSettings:
         meaning="rated torque of each drive at its joint: 0x6076, by gear and unit",
     )
     sign: tuple[int, int] = setting((1, 1), low=-1, high=1, meaning="+1 or -1: device direction to joint direction")
+    zero_deg: tuple[float, float] = setting(
+        (0.0, 0.0),
+        unit="deg",
+        low=-720.0,
+        high=720.0,
+        meaning="drive's position at q = 0, subtracted after the sign; at q2 = 0 the arm is stretched",
+    )
+    mounting_deg: tuple[float, float] | None = setting(
+        None,
+        unit="deg",
+        low=-360.0,
+        high=360.0,
+        meaning="tilt of the plane of motion, 90: upright; q1 at which link 1 points down; absent: [90, -90]",
+    )
     torque_offset_Nm: tuple[float, float] = setting(
         (0.0, 0.0), unit="Nm", low=-50.0, high=50.0, meaning="zero of each torque sensor, subtracted after the sign"
     )
@@ -84,6 +103,13 @@ class ArmSettings:
                 raise ConfigError(f"`arm.{key}` needs `arm.mass_kg` beside it")
         if any(sign == 0 for sign in self.sign):
             raise ValueError(f"sign = {self.sign} must be +1 or -1 for each joint")
+        if self.mounting_deg is not None and not 0.0 <= self.mounting_deg[0] <= UPRIGHT_DEG:
+            raise ConfigError(f"`arm.mounting_deg[0]` = {self.mounting_deg[0]:g} deg must be within 0 to 90 deg")
+
+    @property
+    def zero_rad(self) -> Vector:
+        """Drive's position at q = 0, after the sign, rad (2,)."""
+        return _radians(self.zero_deg)
 
     @property
     def position_limit_rad(self) -> Vector:

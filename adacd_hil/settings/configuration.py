@@ -19,10 +19,18 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from adacd_hil.file_access import exists
-from adacd_hil.records import JOINTS, POSITION_TERMS, Vector
+from adacd_hil.records import GRAVITY_M_S2, JOINTS, POSITION_TERMS, Vector
 from adacd_hil.remedies import nearest_name
 from adacd_hil.scheduling import RealtimeRequest
-from adacd_hil.settings.arm_settings import ArmSettings, BusSettings, DataSettings, DevicesSettings, LockstepSettings
+from adacd_hil.settings.arm_settings import (
+    SLIGHT_TILT_DEG,
+    UPRIGHT_DEG,
+    ArmSettings,
+    BusSettings,
+    DataSettings,
+    DevicesSettings,
+    LockstepSettings,
+)
 from adacd_hil.settings.run_settings import (
     ControllerSettings,
     ExcitationSettings,
@@ -119,13 +127,42 @@ class Settings:
         return np.array(self.arm.cad_theta, dtype=np.float64)
 
     @property
+    def mounting_deg(self) -> tuple[float, float]:
+        """Tilt of the plane of motion, and the q1 at which link 1 hangs; see `arm.mounting_deg`."""
+        if self.arm.mounting_deg is not None:
+            return self.arm.mounting_deg
+        return (UPRIGHT_DEG, -90.0) if self.estimator.gravity else (0.0, 0.0)
+
+    @property
+    def tilt_rad(self) -> float:
+        """Tilt of the plane of motion, rad."""
+        return math.radians(self.mounting_deg[0])
+
+    @property
+    def gravity_m_s2(self) -> float:
+        """Gravity in the plane of motion; 0 where it is not in the model."""
+        return GRAVITY_M_S2 * math.sin(self.tilt_rad) if self.estimator.gravity else 0.0
+
+    @property
+    def level_rad(self) -> float:
+        """The q1 at which link 1 is level and q1 grows uphill, rad; 0 where gravity is not in the model."""
+        return math.radians(self.mounting_deg[1] + 90.0) if self.estimator.gravity else 0.0
+
+    @property
     def realtime_request(self) -> RealtimeRequest:
         """What the control process asks of the operating system."""
         wish = self.realtime
         return RealtimeRequest(wish.scheduler, wish.priority, wish.cpu, wish.lock_memory, self.bus.period_ns)
 
     def __post_init__(self) -> None:
-        names = self.estimator.parameter_names
+        tilt_deg, names = self.mounting_deg[0], self.estimator.parameter_names
+        if self.estimator.gravity and tilt_deg == 0.0:
+            raise ConfigError("`arm.mounting_deg[0]` = 0 deg: gravity does not act, but `estimator.gravity` = true")
+        if tilt_deg > SLIGHT_TILT_DEG and not self.estimator.gravity:
+            raise ConfigError(
+                f"`arm.mounting_deg[0]` = {tilt_deg:g} deg: gravity acts on the joints; `estimator.gravity` = true "
+                f"expected above {SLIGHT_TILT_DEG:g} deg"
+            )
         if len(self.arm.cad_theta) not in (0, len(names)):
             gravity = " (`estimator.gravity` adds a4 and a5, Nm)" if self.estimator.gravity else ""
             raise ConfigError(

@@ -20,6 +20,7 @@ Places 1 and 2 are those of the contract's names, Drive1 and Drive2, Sensor1 and
 place where they are about devices.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -28,7 +29,7 @@ import numpy as np
 from adacd_hil.records import Vector
 from adacd_hil.settings.schema import ConfigError, setting
 from firmware_sim.arm.plant import ARM_NUMBERS, CURRENT_LOOP_RAD_S
-from firmware_sim.arm.sensing import Measurement
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, Measurement
 
 STOP_STIFFNESS_NM_RAD: Final = (3000.0, 1000.0)
 STOP_DAMPING_NM_S: Final = (10.0, 2.0)
@@ -143,6 +144,9 @@ class OwnArmSettings:
     drive_sign: Joints = setting((1, 1), low=-1, high=1, meaning="+1 or -1: joint direction to drive direction")
     motor_sign: Joints = setting((1, 1), low=-1, high=1, meaning="-1: the drive's torque counts against its position")
     sensor_sign: Joints = setting((1, 1), low=-1, high=1, meaning="+1 or -1: joint direction to sensor direction")
+    zero_deg: Pair = setting(
+        (0.0, 0.0), unit="deg", low=-720.0, high=720.0, meaning="position of each drive at q = 0, before its sign"
+    )
     increments_per_joint_rev: Pair = setting(
         (0.0, 0.0), low=0.0, high=2.0**41, meaning="position counts per revolution of the joint; 0: 2^20"
     )
@@ -185,26 +189,32 @@ class OwnArmSettings:
         """How the devices are at the joints."""
         drive, sensor = (tuple(joint - 1 for joint in places) for places in (self.drive_joint, self.sensor_joint))
         torque = tuple(turn * up for turn, up in zip(self.drive_sign, self.motor_sign, strict=True))
-        return Wiring(drive, sensor, self.drive_sign, self.sensor_sign, torque)  # type: ignore[arg-type]
+        zero = tuple(round(math.radians(zero_deg) / POSITION_LSB_RAD) for zero_deg in self.zero_deg)
+        return Wiring(drive, sensor, self.drive_sign, self.sensor_sign, torque, zero)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class Wiring:
-    """Which joint (0, 1) the device at each place is at, and which way it counts; torque_sign: a drive's torque."""
+    """Which joint (0, 1) the device at each place is at, and which way it counts.
+
+    torque_sign: a drive's torque. zero_counts: position of each drive at q = 0, before its sign.
+    """
 
     drive_joint: Joints = (0, 1)
     sensor_joint: Joints = (0, 1)
     drive_sign: Joints = (1, 1)
     sensor_sign: Joints = (1, 1)
     torque_sign: Joints = (1, 1)
+    zero_counts: Joints = (0, 0)
 
     def read(self, measured: Measurement) -> Measurement:
         """Order the samples of the joints by the devices' places, each counted the device's way."""
         positions, velocities, torques = measured
         (d1, d2), (s1, s2) = self.drive_joint, self.sensor_joint
         (up1, up2), (turn1, turn2) = self.drive_sign, self.sensor_sign
+        zero1, zero2 = self.zero_counts
         return Measurement(
-            (up1 * positions[d1], up2 * positions[d2]),
+            (up1 * (positions[d1] + zero1), up2 * (positions[d2] + zero2)),
             (up1 * velocities[d1], up2 * velocities[d2]),
             (turn1 * torques[s1], turn2 * torques[s2]),
         )

@@ -151,6 +151,7 @@ def compose_scenario(
         "brake_damping_Nm_s": braking,
         "stop_deg": stops,
         **_wire(arm.sign, truth),
+        "zero_deg": _by_place(truth, "drives", arm.zero_deg),
         "increments_per_joint_rev": _times(increments, _by_place(truth, "drives", factor.position_counts)),
         "velocity_factor": _times(gear, _by_place(truth, "drives", factor.velocity_counts)),
         "rated_count_Nm": _times(gear, _by_place(truth, "drives", counts.rated_count_Nm)),
@@ -367,21 +368,23 @@ def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: l
 
 
 def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
-    """Stand the arm upright where the host estimates gravity, and let its brakes hold it."""
+    """Mount the arm as the host is told, and let its brakes hold it."""
     mechanics, settings = dict(said), told.settings
     holding = settings.arm.holding_torque_Nm
-    if settings.estimator.gravity and "tilt_deg" not in mechanics:
-        mechanics["tilt_deg"], mechanics["tilt_direction_deg"] = 90.0, -90.0
-        assumed.append("the arm moves upright, q1 = 0 level, since estimator.gravity = true")
-        if holding is None and "holding_brake_Nm" not in mechanics:
-            (l1, _), (m1, m2), (c1, c2) = links.length_m, links.mass_kg, links.center_m
-            heavy = _HOLDING_SHARE * STANDARD_GRAVITY_M_S2
-            pair = heavy * (m1 * abs(c1) + m2 * (l1 + abs(c2))), heavy * m2 * abs(c2)
-            mechanics["holding_brake_Nm"] = list(pair)
-            assumed.append(
-                f"brakes that hold {pair[0]:.3g} and {pair[1]:.3g} Nm without power, since arm.holding_torque_Nm is "
-                "unset: 1.5 times gravity's"
-            )
+    if settings.mounting_deg[0] > 0.0 and "tilt_deg" not in mechanics:
+        mechanics["tilt_deg"], mechanics["tilt_direction_deg"] = settings.mounting_deg
+        if settings.arm.mounting_deg is None:
+            assumed.append("the arm moves upright, q1 = 0 level, since arm.mounting_deg is unset")
+    tilt_rad = math.radians(mechanics.get("tilt_deg", 0.0))
+    if tilt_rad > 0.0 and holding is None and "holding_brake_Nm" not in mechanics:
+        (l1, _), (m1, m2), (c1, c2) = links.length_m, links.mass_kg, links.center_m
+        heavy = _HOLDING_SHARE * STANDARD_GRAVITY_M_S2 * math.sin(tilt_rad)
+        pair = heavy * (m1 * abs(c1) + m2 * (l1 + abs(c2))), heavy * m2 * abs(c2)
+        mechanics["holding_brake_Nm"] = list(pair)
+        assumed.append(
+            f"brakes that hold {pair[0]:.3g} and {pair[1]:.3g} Nm without power, since arm.holding_torque_Nm is "
+            "unset: 1.5 times gravity's"
+        )
     if holding is not None and any(holding) and "holding_brake_Nm" not in mechanics:
         mechanics["holding_brake_Nm"] = list(holding)
     if "stiffness_Nm_rad" not in mechanics and "rotor_inertia_kg_m2" not in mechanics:

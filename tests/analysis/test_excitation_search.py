@@ -68,7 +68,7 @@ def test_what_a_motion_shows_is_what_the_scheme_counts() -> None:
     for n, at_s in enumerate(elapsed_s):
         q, dq, ddq = np.zeros((3, 2))
         played.evaluate(at_s, q, dq, ddq)
-        W[n, :, :7] = regressor(q, dq, ddq, 7)
+        W[n, :, :7] = regressor(q, dq, ddq, 7, 0.0)
     W[:, :, 7:9] = np.eye(2)
     W[:, :, 9:] = np.einsum("ni,ij->nij", np.gradient(W[:, :, :7] @ settings.cad_theta, 1e-3, axis=0), np.eye(2))
     rows = [lsim(([10.0], [1.0, 10.0]), column, elapsed_s)[1] * each for column, each in columns(W, scale)]

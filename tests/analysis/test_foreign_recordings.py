@@ -43,7 +43,7 @@ def table(seconds: float, start_s: float = 0.0, touch=None):
     """Return time ms, q deg, tau mNm, touched, elbow turned, as the example's map wants it."""
     time_s = start_s + PERIOD_S * np.arange(round(seconds / PERIOD_S))
     q, dq, ddq = motion(time_s)
-    tau_J = np.array([inverse_dynamics(*row, THETA) for row in zip(q, dq, ddq, strict=True)])
+    tau_J = np.array([inverse_dynamics(*row, THETA, 0.0) for row in zip(q, dq, ddq, strict=True)])
     tau_J += NOISE_NM * np.random.default_rng(7).standard_normal(tau_J.shape)
     touched = np.zeros(len(time_s))
     if touch:
@@ -81,7 +81,7 @@ def test_units_and_signs_are_those_of_the_map(free: Path, example) -> None:
     q, dq, ddq = motion(PERIOD_S * np.arange(len(stretch.record.q)))
     assert_allclose(stretch.record.q, q, atol=1e-7)
     assert_allclose(stretch.record.dq[20:-20], dq[20:-20], atol=2e-3)
-    expected = np.array([inverse_dynamics(*row, THETA) for row in zip(q[:200], dq[:200], ddq[:200], strict=True)])
+    expected = np.array([inverse_dynamics(*row, THETA, 0.0) for row in zip(q[:200], dq[:200], ddq[:200], strict=True)])
     assert_allclose(stretch.record.tau_J[:200], expected, atol=6 * NOISE_NM)
 
 

@@ -32,6 +32,13 @@ SETTLING_ROWS = 1000
 """10/a at a = 10 rad/s and 1 kHz."""
 
 
+def upright(run):
+    """Let gravity act on the arm of a run."""
+    arm, estimator = replace(run.settings.arm, cad_theta=()), run.settings.estimator
+    settings = replace(run.settings, arm=arm, estimator=replace(estimator, gravity=True, P0=(1.0,) * 9))
+    return replace(run, settings=settings, theta_hat=np.pad(run.theta_hat, ((0, 0), (0, 2))))
+
+
 def test_time_counts_from_the_first_cycle_in_adapt():
     assert make_run().time_s()[ZERO_ROW] == 0.0
 
@@ -269,6 +276,24 @@ def test_an_arm_that_is_held_because_its_host_is_late_is_no_false_alarm():
     assert evaluate(replace(run, contact_joints=joints)).false_alarms == 0
     joints[2000] = 1
     assert evaluate(replace(run, contact_joints=joints)).false_alarms == 1
+
+
+@pytest.mark.parametrize(
+    ("payload_from", "has_gravity", "false_alarms"),
+    [(5100, True, 0), (5100, False, 1), (0, True, 1), (5300, True, 1)],
+    ids=["its weight", "no weight", "no other payload", "fitted later"],
+)
+def test_the_weight_of_a_payload_that_is_fitted_is_no_false_alarm(payload_from, has_gravity, false_alarms):
+    run = react(make_run(), 5200)
+    run = upright(run) if has_gravity else run
+    run.truth.payload_kg[payload_from:] = 1.0
+    assert evaluate(run).false_alarms == false_alarms
+
+
+def test_an_alarm_about_a_payload_that_was_not_announced_is_false():
+    run = upright(react(make_run(), 3000))
+    run.truth.payload_kg[2900:] = 1.0
+    assert evaluate(run).false_alarms == 1
 
 
 def test_a_false_alarm_has_its_time():

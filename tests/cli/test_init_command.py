@@ -1,6 +1,7 @@
 """`init` writes the configuration of one's own arm: from a bus, a URDF, a log, options, or answers on a terminal."""
 
 import json
+import math
 import re
 import shlex
 from collections.abc import Callable
@@ -162,12 +163,72 @@ def test_a_urdf_gives_lengths_masses_limits_and_gravity(tmp_path: Path, out: Pat
     assert "arm.link_length_m" not in settings.assumed
 
 
+@pytest.mark.parametrize(
+    ("axis", "root_rpy", "mounting", "mounting_deg"),
+    [
+        ("0 1 0", "0 0 0", (), (90.0, 90.0)),
+        ("0 -1 0", "0 0 0", (), (90.0, -90.0)),
+        ("0 1 0", "0 1.5707963 0", (), (90.0, 0.0)),
+        ("0 1 0", "0 -1.5707963 0", (), (90.0, 180.0)),
+        ("0 0 1", "0.5 0 0", (), (28.65, -90.0)),
+        ("0 1 0", "0 0 0", ("--mounting", "ceiling"), (90.0, -90.0)),
+        ("0 1 0", "0 0 0", ("--mounting", "wall"), (90.0, 0.0)),
+        ("0 0 1", "0 0 0", ("--mounting", "10"), (10.0, 0.0)),
+        ("0 0 1", "0 0 0", ("--mounting", "180"), None),
+    ],
+)
+def test_gravity_comes_from_the_root_of_the_urdf_and_its_mounting(
+    tmp_path: Path, out: Path, axis: str, root_rpy: str, mounting: tuple[str, ...], mounting_deg: tuple[float, float]
+) -> None:
+    file = urdf(tmp_path, axis)
+    text = file.read_text()
+    shoulder = text[text.index('name="shoulder"') :]
+    assert "<origin" not in shoulder[: shoulder.index("</joint>")]
+    file.write_text(text.replace('<child link="upper"/>', f'<child link="upper"/><origin rpy="{root_rpy}"/>'))
+    assert init(out, *NO_BUS, "--urdf", str(file), *mounting).exit_code == 0
+    settings = written(out)
+    assert settings.arm.mounting_deg == (None if mounting_deg is None else pytest.approx(mounting_deg, abs=0.01))
+    share = 0.0 if mounting_deg is None else math.sin(math.radians(mounting_deg[0]))
+    expected = (9.80665 * share * (3.0 * 0.2 + 1.5 * 0.35), 9.80665 * share * 1.5 * 0.13) if share else ()
+    assert settings.arm.cad_theta[7:] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "mounting_deg"),
+    [
+        (("--upright",), (90.0, -90.0)),
+        (("--mounting", "floor"), (90.0, 180.0)),
+        (("--mounting", "ceiling"), (90.0, 0.0)),
+        (("--mounting", "wall", "--at-zero", "90"), (90.0, 90.0)),
+        (("--mounting", "10", "--at-zero", "down"), (10.0, 0.0)),
+        (("--flat",), None),
+    ],
+)
+def test_words_say_how_an_arm_without_a_urdf_is_mounted(
+    out: Path, options: tuple[str, ...], mounting_deg: tuple[float, float] | None
+) -> None:
+    assert init(out, *NO_BUS, "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", *options).exit_code == 0
+    settings = written(out)
+    assert settings.arm.mounting_deg == mounting_deg
+    assert settings.estimator.gravity == (mounting_deg is not None)
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [(("--mounting", "flor"), "'flor' must be flat, floor"), (("--mounting", "100"), "0 to 90 deg")],
+)
+def test_a_mounting_that_is_none_is_refused(out: Path, options: tuple[str, ...], line: str) -> None:
+    result = init(out, *NO_BUS, *options)
+    assert result.exit_code == USAGE
+    assert line in result.stderr
+
+
 def test_rods_of_a_urdf_and_of_lengths_and_masses_are_the_same_arm() -> None:
     text = URDF.format(axis="0 1 0", wrist="fixed").replace("0.2 0 0", "0.175 0 0").replace("0.13 0 0", "0.15 0 0")
     for inertia, mass, length_m in (("0.04", 3.0, 0.35), ("0.015", 1.5, 0.3)):
         text = text.replace(f'"{inertia}"', f'"{mass * length_m**2 / 12.0!r}"')
     arm = planar_from_urdf(text.encode())
-    rods = uniform_rods((0.35, 0.3), (3.0, 1.5), True)
+    rods = uniform_rods((0.35, 0.3), (3.0, 1.5), (90.0, 90.0))
     np.testing.assert_allclose(arm.cad_theta, rods.cad_theta, rtol=1e-5)
     assert arm.link_length_m == rods.link_length_m
 
@@ -195,8 +256,11 @@ def test_crossed_axes_are_refused_and_a_bent_zero_is_doubted() -> None:
     with pytest.raises(UrdfError, match="90 deg apart"):
         planar_from_urdf(crossed.encode())
     bent = planar_from_urdf(text.replace('<origin xyz="0.13 0 0"/>', '<origin xyz="0 0.13 0"/>').encode())
-    (doubt,) = bent.doubts
-    assert "90 deg off the line of link 1" in doubt
+    assert bent.zero_deg == (0.0, -90.0)  # q2 = 0 is the stretched arm
+    assert bent.position_limit_deg == (68.75, 24.59)
+    low = text.replace('<origin xyz="0.13 0 0"/>', '<origin xyz="-0.13 0.001 0"/>')
+    (doubt,) = planar_from_urdf(low.encode()).doubts
+    assert "180 deg off the line of link 1" in doubt
 
 
 @pytest.mark.parametrize(
@@ -473,7 +537,9 @@ def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out: Path, mo
         "-",
         "350 300",  # mm
         "0.4, 0.25",
-        "no",
+        "floor",
+        "90 down",  # no word, no number
+        "",  # link 1 at q1 = 0: up, as usual on the floor
         "2 1",
         "",  # rated torque: as proposed
         "10 5",
@@ -490,6 +556,8 @@ def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out: Path, mo
     assert settings.arm.link_length_m == (0.4, 0.25)
     assert settings.arm.torque_limit_Nm == (10.0, 5.0)
     assert settings.arm.position_limit_deg == (60.0, 100.0)
+    assert settings.arm.mounting_deg == (90.0, 180.0)
+    assert "gravity ←: the arm points up" in result.stderr
     assert settings.arm.cad_theta[0] == pytest.approx(2.0 * 0.16 / 3.0 + 0.16 + 0.0625 / 3.0, rel=1e-5)
     assert "arm.rated_torque_Nm" in settings.assumed
     assert "arm.torque_limit_Nm" not in settings.assumed
@@ -514,7 +582,7 @@ def test_a_question_mark_and_a_mistyped_path_lose_no_answer(
         "rpm",
         str(tmp_path / "lap.urdf"),
         str(urdf(tmp_path)),
-        *[""] * 4,
+        *[""] * 5,
         "n",
     ]
     result = init(out, "--eds", str(eds), typed="\n".join(answers) + "\n")

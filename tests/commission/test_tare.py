@@ -186,6 +186,18 @@ def test_poses_that_cant_tell_gravity_from_offsets_are_refused_with_the_motion_t
     assert "exceeds tare.condition_limit = 30" in str(refusal.value)
 
 
+def test_poses_of_a_hanging_arm_are_judged_by_how_far_it_is_from_the_level() -> None:
+    hanging = tare_settings(NINE, {"cad_theta": (), "mounting_deg": (90.0, 0.0)})
+    poses = gravity_poses([(60.0, 60.0), (60.0, -20.0), (60.5, 5.0)])
+    with pytest.raises(TareRefusedError, match=r"cos\(q1 - 90 deg\) only goes from 0.87 to 0.87; move joint 1 further"):
+        solve_tare(poses, hanging)
+
+
+def test_a_weight_that_a_flat_arm_has_not_is_named_with_the_mounting() -> None:
+    with pytest.raises(TareRefusedError, match=r"offset\[joint1\] = .* the mounting is not flat"):
+        solve_tare(gravity_poses([(10.0, 20.0)]), tare_settings())
+
+
 def test_one_pose_twice_has_no_finite_condition() -> None:
     with pytest.raises(TareRefusedError, match="condition number of 3 poses = "):
         solve_tare(gravity_poses([(10.0, 20.0)] * 3), tare_settings(NINE, {"cad_theta": ()}))
@@ -208,6 +220,7 @@ def test_the_offset_is_in_joint_direction_and_the_configured_one_is_not_subtract
     tare = TareRig(settings, torque_offset_Nm=OFFSET, noise=False).session.run()
     np.testing.assert_allclose(tare.offset_Nm, [0.3, 0.2], atol=1e-3)
     assert tare.sign == (1, -1)
+    assert tare.mounting_deg is None
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ def test_a_model_is_fed_forward_after_the_handover() -> None:
     controller = Controller(SETTINGS)
     controller.feed_forward(THETA)
     reached = [torque(controller) for _ in range(round(HANDOVER_S / SETTINGS.bus.period_s))][-1]
-    np.testing.assert_allclose(reached, inverse_dynamics(Q, DQ, DDQ, THETA), rtol=1e-12)
+    np.testing.assert_allclose(reached, inverse_dynamics(Q, DQ, DDQ, THETA, 0.0), rtol=1e-12)
 
 
 def test_a_new_model_never_steps_the_torque() -> None:
@@ -40,7 +40,7 @@ def test_a_new_model_never_steps_the_torque() -> None:
         controller.feed_forward(theta)
         course += [torque(controller) for _ in range(300)]
     largest = np.abs(np.diff(course, axis=0)).max(axis=0)
-    assert np.all(largest <= np.abs(inverse_dynamics(Q, DQ, DDQ, 2.0 * THETA)) / 250)
+    assert np.all(largest <= np.abs(inverse_dynamics(Q, DQ, DDQ, 2.0 * THETA, 0.0)) / 250)
 
 
 def test_the_same_model_again_does_not_restart_the_handover() -> None:
@@ -48,4 +48,4 @@ def test_the_same_model_again_does_not_restart_the_handover() -> None:
     for _ in range(round(HANDOVER_S / SETTINGS.bus.period_s)):
         controller.feed_forward(THETA)
         reached = torque(controller)
-    np.testing.assert_allclose(reached, inverse_dynamics(Q, DQ, DDQ, THETA), rtol=1e-12)
+    np.testing.assert_allclose(reached, inverse_dynamics(Q, DQ, DDQ, THETA, 0.0), rtol=1e-12)

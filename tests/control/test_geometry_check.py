@@ -20,9 +20,14 @@ def inertia(l1: float, l2: float) -> tuple[float, float, float]:
     return m1 * l1**2 / 3.0 + m2 * l1**2 + a3, m2 * l1 * l2 / 2.0, a3
 
 
-def told(cad: tuple[float, ...]) -> Settings:
+def told(cad: tuple[float, ...], tilt_deg: float = 0.0) -> Settings:
     settings = load_settings("certified")
-    return dataclasses.replace(settings, arm=dataclasses.replace(settings.arm, link_length_m=LENGTHS, cad_theta=cad))
+    estimator, mounting_deg = settings.estimator, None
+    if tilt_deg:
+        estimator = dataclasses.replace(estimator, gravity=True, P0=(*estimator.P0, 50.0, 50.0))
+        mounting_deg, cad = (tilt_deg, -90.0), (*cad, 0.0, 0.0) if cad else ()
+    arm = dataclasses.replace(settings.arm, link_length_m=LENGTHS, cad_theta=cad, mounting_deg=mounting_deg)
+    return dataclasses.replace(settings, arm=arm, estimator=estimator)
 
 
 def event_of(settings: Settings, *parameters: float) -> Event | None:
@@ -61,11 +66,11 @@ def test_without_a_cad_model_the_lengths_are_told_as_an_assumption() -> None:
 
 
 @pytest.mark.parametrize(
-    ("length_m", "said"), [(0.4, None), (0.5, "upright, link 1 is 0.500 m long"), (0.32, "link 1 is 0.320 m long")]
+    ("length_m", "said"), [(0.4, None), (0.5, "at 90 deg link 1 is 0.500 m long"), (0.32, "link 1 is 0.320 m long")]
 )
 def test_gravity_tells_the_length_of_link_1(length_m: float, said: str | None) -> None:
     a5 = MASSES[1] * LENGTHS[1] / 2.0 * 9.80665
-    event = event_of(told(()), *inertia(length_m, LENGTHS[1]), *FRICTION, 3.0, a5)
+    event = event_of(told((), 90.0), *inertia(length_m, LENGTHS[1]), *FRICTION, 3.0, a5)
     assert event is not None
     if said is None:
         assert event.message.startswith("assumed: arm.link_length_m[1] = 0.25 m, which nothing checks")
@@ -76,13 +81,32 @@ def test_gravity_tells_the_length_of_link_1(length_m: float, said: str | None) -
     assert ("is right if the arm moves at 53 deg to the level" in event.message) == is_longer
 
 
+def test_a_tilt_that_is_told_is_no_longer_link() -> None:
+    a5 = MASSES[1] * LENGTHS[1] / 2.0 * 9.80665 * 0.5
+    event = event_of(told((), 30.0), *inertia(*LENGTHS), *FRICTION, 3.0, a5)
+    assert event is not None
+    assert event.message.startswith("assumed: arm.link_length_m[1] = 0.25 m, which nothing checks")
+
+
 @pytest.mark.parametrize(("l1", "l2", "joint"), [(0.4, 0.25, 0), (0.4, 0.3125, 2), (0.5, 0.25, 1)])
 def test_masses_tell_both_lengths_of_an_upright_arm_too(l1: float, l2: float, joint: int) -> None:
     a5 = MASSES[1] * l2 / 2.0 * 9.80665
-    event = event_of(told(CAD), *inertia(l1, l2), *FRICTION, 13.7, a5)
+    event = event_of(told(CAD, 90.0), *inertia(l1, l2), *FRICTION, 13.7, a5)
     if joint == 0:
         assert event is None
         return
     assert event is not None
     assert event.level == "warning"
     assert f"as if link {joint} were" in event.message
+
+
+@pytest.mark.parametrize(("direction", "is_named"), [(1.0, False), (-0.02, False), (-1.0, True)])
+@pytest.mark.parametrize("cad", [CAD, ()], ids=["masses", "no masses"])
+def test_gravity_that_acts_the_other_way_is_named_with_the_mounting(
+    cad: tuple[float, ...], direction: float, is_named: bool
+) -> None:
+    a1, a2, a3 = inertia(*LENGTHS)
+    a5 = direction * 9.80665 * a2 / LENGTHS[0]
+    event = event_of(told(cad, 90.0), a1, a2, a3, *FRICTION, 3.0 * a5, a5)
+    said = event is not None and "arm.mounting_deg[1] = -90 deg; link 1 hangs at q1 = 90 deg" in event.message
+    assert said is is_named

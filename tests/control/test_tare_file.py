@@ -170,6 +170,28 @@ def test_another_sign_than_the_one_it_was_measured_with_is_refused(tmp_path: Pat
         use_tare(stored(tmp_path), dataclasses.replace(SETTINGS, arm=arm), DATE_NS)
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"mounting_deg": (90.0, -90.0), "zero_deg": (0.0, 0.0)}, ""),
+        ({}, ""),
+        ({"mounting_deg": (90.0, 0.0)}, r"arm.mounting_deg = \[90.0, 0.0\], but the configuration has \[90.0, -90.0\]"),
+        ({"zero_deg": (45.0, 0.0)}, r"arm.zero_deg = \[45.0, 0.0\], but the configuration has \[0.0, 0.0\]"),
+    ],
+    ids=["as measured", "of an earlier version", "turned", "another zero"],
+)
+def test_a_tare_of_another_gravity_is_refused(tmp_path: Path, changes: dict[str, object], words: str) -> None:
+    estimator = dataclasses.replace(SETTINGS.estimator, gravity=True, P0=(*SETTINGS.estimator.P0, 50.0, 50.0))
+    arm = dataclasses.replace(SETTINGS.arm, cad_theta=())
+    upright, path = dataclasses.replace(SETTINGS, estimator=estimator, arm=arm), stored(tmp_path, **changes)
+    if words:
+        with pytest.raises(ConfigError, match=words):
+            use_tare(path, upright, DATE_NS)
+    else:
+        assert use_tare(path, upright, DATE_NS).tare.offset_Nm == TARE.offset_Nm
+    assert use_tare(path, SETTINGS, DATE_NS).tare.offset_Nm == TARE.offset_Nm
+
+
 @pytest.mark.parametrize(("age_h", "words"), [(24.0, None), (24.1, "is 24.1 h old"), (-0.2, "0.2 h in the future")])
 def test_an_old_tare_is_warned_of(tmp_path: Path, age_h: float, words: str | None) -> None:
     warnings = use_tare(stored(tmp_path), SETTINGS, DATE_NS + int(age_h * HOUR_NS)).warnings

@@ -1,5 +1,7 @@
 """Drives and sensors joined into one arm."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -76,6 +78,15 @@ def test_sign_and_offset_are_applied_here_and_only_here() -> None:
     devices.answer()
     state = devices.arm.state()
     np.testing.assert_allclose([*state.q, *state.dq, *state.tau_J], [0.1, 0.2, 0.01, 0.02, 1.0, 2.25], atol=3e-6)
+
+
+def test_the_zero_of_a_drive_is_subtracted_after_the_sign() -> None:
+    devices = Devices({"sign": [1, -1], "zero_deg": [30.0, -20.0]})
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer()
+    state = devices.arm.state()
+    np.testing.assert_allclose(state.q, [0.1 - math.radians(30.0), 0.2 + math.radians(20.0)], atol=3e-6)
+    np.testing.assert_allclose([*state.dq, *state.tau_J], [0.01, 0.02, 1.5, 2.5], atol=3e-6)
 
 
 def test_ages_count_cycles_since_the_sample() -> None:

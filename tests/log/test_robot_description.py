@@ -19,7 +19,11 @@ from adacd_hil.settings.configuration import load_settings
 LENGTHS_M = (0.42, 0.27)
 
 
-def settings_of(is_upright, cad_theta=()):
+FLAT = None
+MOUNTINGS_DEG = [FLAT, (90.0, -90.0), (90.0, 0.0), (90.0, 180.0), (90.0, 90.0), (10.0, 35.0), (60.0, -140.0)]
+
+
+def settings_of(mounting_deg, cad_theta=()):
     settings = load_settings("paper")
     arm = replace(
         settings.arm,
@@ -28,9 +32,10 @@ def settings_of(is_upright, cad_theta=()):
         velocity_limit_deg_s=(250.0, 300.0),
         torque_limit_Nm=(12.0, 6.0),
         cad_theta=cad_theta,
+        mounting_deg=mounting_deg,
     )
-    P0 = settings.estimator.P0 + ((0.5, 0.5) if is_upright else ())
-    estimator = replace(settings.estimator, gravity=is_upright, P0=P0)
+    P0 = settings.estimator.P0 + ((0.5, 0.5) if mounting_deg else ())
+    estimator = replace(settings.estimator, gravity=mounting_deg is not FLAT, P0=P0)
     return replace(settings, arm=arm, estimator=estimator)
 
 
@@ -62,21 +67,23 @@ def tip_by_transforms(transforms):
     return place
 
 
-@pytest.mark.parametrize("is_upright", [False, True])
-def test_the_urdf_places_the_tip_as_the_arm_does_and_as_the_transforms_do(is_upright):
-    arm = read_urdf(robot_description(settings_of(is_upright)))
+@pytest.mark.parametrize("mounting_deg", MOUNTINGS_DEG)
+def test_the_urdf_places_the_tip_as_the_arm_does_and_as_the_transforms_do(mounting_deg):
+    arm = read_urdf(robot_description(settings_of(mounting_deg)))
     assert arm.chain.axis.tolist() == [[0.0, 0.0, 1.0]] * 2
-    shape = Shape(LENGTHS_M, is_upright)
+    tilt_rad, uphill_rad = (0.0, 0.0) if mounting_deg is FLAT else np.radians(np.add(mounting_deg, (0.0, 90.0)))
+    shape = Shape(LENGTHS_M, tilt_rad, uphill_rad)
     for q in np.random.default_rng(3).uniform(-2.0, 2.0, (20, 2)):
-        along = LENGTHS_M[0] * math.cos(q[0]) + LENGTHS_M[1] * math.cos(q.sum())
-        across = LENGTHS_M[0] * math.sin(q[0]) + LENGTHS_M[1] * math.sin(q.sum())
-        expected = [along, 0.0, across] if is_upright else [along, across, 0.0]
+        first, both = q[0] - uphill_rad, q.sum() - uphill_rad
+        along = LENGTHS_M[0] * math.cos(first) + LENGTHS_M[1] * math.cos(both)
+        across = LENGTHS_M[0] * math.sin(first) + LENGTHS_M[1] * math.sin(both)
+        expected = [along, across * math.cos(tilt_rad), across * math.sin(tilt_rad)]
         assert tip_by_urdf(arm, q) == pytest.approx(expected, abs=1e-12)
         assert tip_by_transforms(transforms_of(shape, q)) == pytest.approx(expected, abs=1e-12)
 
 
 def test_the_urdf_has_the_limits_of_the_settings_and_the_names_of_the_log():
-    arm = read_urdf(robot_description(settings_of(False)))
+    arm = read_urdf(robot_description(settings_of(FLAT)))
     assert arm.joint_names == ("joint1", "joint2")
     assert arm.link_names == ("link1", "link2")
     assert np.degrees(arm.position_high) == pytest.approx([75.0, 120.0])
@@ -85,15 +92,16 @@ def test_the_urdf_has_the_limits_of_the_settings_and_the_names_of_the_log():
     assert arm.torque_limit.tolist() == [12.0, 6.0]
 
 
-def random_theta(generator, is_upright):
+def random_theta(generator, mounting_deg):
     """Draw the parameters of two links of any masses; link 1 may carry a counterweight."""
     m, inertia = generator.uniform(0.2, 5.0, 2), generator.uniform(0.001, 0.1, 2)
     c1, c2 = generator.uniform(0.0, 0.4), generator.uniform(0.0, 0.3)
     l1 = LENGTHS_M[0]
     alpha, beta, gamma = inertia[0] + m[0] * c1**2 + m[1] * l1**2, l1 * m[1] * c2, inertia[1] + m[1] * c2**2
-    gravity = (GRAVITY_M_S2 * (m[0] * generator.uniform(-0.9, 1.0) * c1 + m[1] * l1), GRAVITY_M_S2 * m[1] * c2)
+    share = 0.0 if mounting_deg is FLAT else GRAVITY_M_S2 * math.sin(math.radians(mounting_deg[0]))
+    gravity = (share * (m[0] * generator.uniform(-0.9, 1.0) * c1 + m[1] * l1), share * m[1] * c2)
     friction = generator.uniform(0.0, 0.2, 4)
-    return tuple(map(float, (alpha + gamma, beta, gamma, *friction, *(gravity if is_upright else ()))))
+    return tuple(map(float, (alpha + gamma, beta, gamma, *friction, *(gravity if mounting_deg else ()))))
 
 
 def mujoco_torque(model, q, dq, ddq):
@@ -104,18 +112,19 @@ def mujoco_torque(model, q, dq, ddq):
     return data.qfrc_inverse + model.dof_frictionloss * np.sign(dq)
 
 
-@pytest.mark.parametrize("is_upright", [False, True])
-@pytest.mark.parametrize("seed", range(10))
-def test_the_urdf_moves_in_mujoco_as_the_cad_model_says(seed, is_upright):
+@pytest.mark.parametrize("mounting_deg", MOUNTINGS_DEG)
+@pytest.mark.parametrize("seed", range(4))
+def test_the_urdf_moves_in_mujoco_as_the_cad_model_says(seed, mounting_deg):
     generator = np.random.default_rng(seed)
-    theta = random_theta(generator, is_upright)
-    model = mujoco.MjModel.from_xml_string(robot_description(settings_of(is_upright, theta)))
+    theta, settings = random_theta(generator, mounting_deg), settings_of(mounting_deg)
+    settings = replace(settings, arm=replace(settings.arm, cad_theta=theta))
+    model = mujoco.MjModel.from_xml_string(robot_description(settings))
     model.opt.gravity[:] = (0.0, 0.0, -GRAVITY_M_S2)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # friction as a constraint, joint limits
     assert (model.nq, model.body_mass[1:].min() > 0.0) == (2, True)
     for _ in range(5):
         q, dq, ddq = generator.uniform(-1.0, 1.0, (3, 2)) * [[1.2], [3.0], [30.0]]
-        expected = inverse_dynamics(q, dq, ddq, np.array(theta))
+        expected = inverse_dynamics(q, dq, ddq, np.array(theta), settings.level_rad)
         assert mujoco_torque(model, q, dq, ddq) == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
@@ -137,7 +146,7 @@ def test_the_built_in_arms_load_in_mujoco(profile):
     ],
 )
 def test_what_the_cad_model_does_not_tell_is_not_made_up(theta, said):
-    text = robot_description(settings_of(False, theta))
+    text = robot_description(settings_of(FLAT, theta))
     assert f"no inertia: {'' if not theta else 'arm.cad_theta: '}" in text
     assert said in text
     assert "<inertial>" not in text
@@ -147,19 +156,19 @@ def test_what_the_cad_model_does_not_tell_is_not_made_up(theta, said):
 
 
 def test_gravity_that_does_not_fit_the_inertia_is_said():
-    theta = list(random_theta(np.random.default_rng(0), True))
+    theta = list(random_theta(np.random.default_rng(0), (90.0, -90.0)))
     theta[8] *= 1.05
-    assert "but a2 = " in robot_description(settings_of(True, tuple(theta)))
+    assert "but a2 = " in robot_description(settings_of((90.0, -90.0), tuple(theta)))
 
 
 def test_a_link_whose_centre_is_on_its_joint_has_a_body_too():
-    model = mujoco.MjModel.from_xml_string(robot_description(settings_of(False, (0.2, 0.0, 0.02, 0.0, 0.0, 0.0, 0.0))))
+    model = mujoco.MjModel.from_xml_string(robot_description(settings_of(FLAT, (0.2, 0.0, 0.02, 0.0, 0.0, 0.0, 0.0))))
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     assert mujoco_torque(model, [0.3, 0.7], [0.0, 0.0], [1.0, 0.0]) == pytest.approx([0.2, 0.02])
 
 
 def test_the_layout_holds_the_urdf_and_shows_every_panel_once():
-    urdf = robot_description(settings_of(False)).encode()
+    urdf = robot_description(settings_of(FLAT)).encode()
     layout = json.loads(viewer_layout(urdf))
     arm = layout["configById"]["3D!arm"]["layers"]["arm"]
     assert base64.b64decode(arm["url"].removeprefix("data:text/xml;base64,")) == urdf
@@ -184,7 +193,7 @@ VIEWERS_KEYS = {
 
 
 def test_every_panel_has_a_title_and_the_keys_that_its_viewer_reads():
-    layout = json.loads(viewer_layout(robot_description(settings_of(False)).encode()))
+    layout = json.loads(viewer_layout(robot_description(settings_of(FLAT)).encode()))
     for name, panel in layout["configById"].items():
         titles = {panel.pop("lichtblickPanelTitle"), panel.pop("foxglovePanelTitle")}
         assert len(titles) == 1

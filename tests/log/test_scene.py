@@ -154,6 +154,6 @@ def test_a_force_is_drawn_on_the_link(lever_m, drawn_m):
 
 
 def test_an_upright_arm_has_its_y_axis_up():
-    payload = pack_transforms(TIME_NS, transforms_of(Shape((0.35, 0.3), is_upright=True), np.zeros(2)))
+    payload = pack_transforms(TIME_NS, transforms_of(Shape((0.35, 0.3), tilt_rad=math.pi / 2.0), np.zeros(2)))
     rotation = decode(TRANSFORMS, payload).transforms[0].transform.rotation
     assert (rotation.x, rotation.y, rotation.z, rotation.w) == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))

@@ -133,7 +133,7 @@ class ClosedLoop:
         self.tau = self.tau_next
         self.tau_next = self.settings.controller.Kp * (q_d - arm.q) + self.settings.controller.Kd * (dq_d - arm.dq)
         if output.is_model_valid:
-            self.tau_next = self.tau_next + inverse_dynamics(q_d, dq_d, ddq_d, output.theta_ff)
+            self.tau_next = self.tau_next + inverse_dynamics(q_d, dq_d, ddq_d, output.theta_ff, 0.0)
         advance(
             self.q,
             self.dq,

@@ -33,7 +33,7 @@ def smooth_motion(t_s, speed=1.0):
 
 def torque_of(q, dq, ddq, theta, tau_ext=None):
     """Return the joint torque (n, 2) that makes the arm move like this against the external torque (n, 2)."""
-    tau = np.array([inverse_dynamics(*row, theta) for row in zip(q, dq, ddq, strict=True)])
+    tau = np.array([inverse_dynamics(*row, theta, 0.0) for row in zip(q, dq, ddq, strict=True)])
     return tau if tau_ext is None else tau - tau_ext
 
 

@@ -125,17 +125,24 @@ def test_samples_that_wait_are_thrown_away_when_they_turn_out_to_be_a_touch():
 
 def test_a_payload_widens_the_belief_along_one_direction():
     P = np.zeros((COUNT, COUNT))
-    direction = regressor.payload_direction((0.35, 0.30), COUNT)
-    belief.add_payload(direction, 3.0, 0.0, P)
+    direction = regressor.payload_direction((0.35, 0.30), COUNT, 0.0)
+    belief.add_payload(direction, 3.0, np.zeros(COUNT), P)
     np.testing.assert_allclose(direction[:7], PAYLOAD_1KG)
     np.testing.assert_allclose(P, 9.0 * np.outer(direction, direction))
     assert np.linalg.matrix_rank(P) == 1
 
 
-def test_a_payload_that_is_no_point_mass_touches_the_inertia_only():
-    P, direction = np.zeros((COUNT, COUNT)), regressor.payload_direction((0.35, 0.30), COUNT)
-    belief.add_payload(direction, 0.0, 0.02, P)
-    np.testing.assert_allclose(np.diag(P), np.where(np.arange(COUNT) < 3, 0.02**2, 0.0))
+def test_a_payload_that_is_no_point_mass_widens_each_parameter_by_its_own_rest():
+    P, direction = np.zeros((COUNT, COUNT)), regressor.payload_direction((0.35, 0.30), COUNT, 0.0)
+    rest_std = np.where(np.arange(COUNT) < 3, 0.02, 0.0)
+    belief.add_payload(direction, 0.0, rest_std, P)
+    np.testing.assert_allclose(np.diag(P), rest_std**2)
+
+
+def test_a_payload_pulls_where_gravity_acts():
+    direction = regressor.payload_direction((0.35, 0.30), 9, 9.80665)
+    np.testing.assert_allclose(direction[:3], [0.35**2 + 0.30**2, 0.35 * 0.30, 0.30**2])
+    np.testing.assert_allclose(direction[3:], [0.0, 0.0, 0.0, 0.0, 9.80665 * 0.35, 9.80665 * 0.30])
 
 
 def test_a_wandering_parameter_becomes_less_certain_with_time():

@@ -111,6 +111,27 @@ def test_a_push_on_the_arm_itself_is_seen_with_its_sign_and_size(free):
     assert first <= 20
 
 
+@pytest.mark.parametrize("lag_s", [0.0, 0.002])
+def test_the_weight_of_a_payload_at_rest_is_no_contact_as_the_arm_begins_to_learn_it(lag_s):
+    arm = replace(SETTINGS.arm, cad_theta=(), mounting_deg=(90.0, -90.0))
+    settings = replace(SETTINGS, arm=arm, estimator=replace(SETTINGS.estimator, gravity=True, P0=(1.0,) * 9))
+    kernel = Kernel(settings)
+    m, names = kernel.m, certified_memory.parameter_names(settings)
+    m["certified"][:9] = *THETA["P"], 8.0, 1.5
+    m["certified"][[names.index("lag1"), names.index("lag2")]] = lag_s
+    m["P_certified"][:] = np.diag(kernel.constants[0]["enough_std"] ** 2) * 0.01
+    m["theta"][:], m["P"][:] = m["certified"], m["P_certified"]
+    l1, l2 = arm.link_length_m
+    weight = 9.80665 * np.array([l1 + l2, l2])
+    rest = np.zeros(2), np.zeros(2), np.array([9.5, 1.5]) + weight
+    for _ in range(600):
+        seen = kernel.step(*rest, mode=certified_kernel.WATCH)
+    assert seen & Observation.CONTACT
+    certified_kernel.begin_adaptation(kernel.constants, kernel.memory, True, True)
+    learning = certified_kernel.WATCH | certified_kernel.LEARN
+    assert not any(kernel.step(*rest, mode=learning) & Observation.CONTACT for _ in range(300))
+
+
 def test_a_gap_is_cut_out_of_time(smooth):
     q, dq, tau_J = smooth
     kernel = Kernel(theta=SMOOTH)

@@ -28,7 +28,7 @@ def full_parts(arm, q, dq):
 def closed_parts(q, dq, count):
     Y_p, Y_h = np.zeros((2, count)), np.zeros((2, count))
     regressor.fill_momentum(q, dq, Y_p)
-    regressor.fill_remainder(q, dq, Y_h)
+    regressor.fill_remainder(q, dq, 0.0, Y_h)
     return Y_p, Y_h
 
 

@@ -150,7 +150,7 @@ def moving_arm(lag_s=0.0):
     def at(s):
         return 0.5 * np.sin(np.outer(s, w)), 0.5 * w * np.cos(np.outer(s, w)), -0.5 * w**2 * np.sin(np.outer(s, w))
 
-    tau = np.array([inverse_dynamics(*row, THETA) for row in zip(*at(t_s), strict=True)])
+    tau = np.array([inverse_dynamics(*row, THETA, 0.0) for row in zip(*at(t_s), strict=True)])
     return at(t_s)[0], at(t_s - lag_s)[1], tau
 
 

@@ -10,9 +10,9 @@ from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme.identify import anchor, earlier, fit_check
+from adacd_hil.scheme.identify import anchor, certificate, earlier, fit_check
 from adacd_hil.scheme.kernel import certified_memory
-from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD
+from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD, CertificateWatch
 
 FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.1)
@@ -262,12 +262,17 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
         assert (m["kept"][0] == 0.1).all()
 
 
+UPRIGHT = replace(
+    FREE, arm=replace(FREE.arm, cad_theta=()), estimator=replace(FREE.estimator, gravity=True, P0=(1.0,) * 9)
+)
+
+
 class Halves:
     """A fit whose steps had each half of its information, or less; all its samples are of parameters 0 and 1 alone."""
 
-    def __init__(self, steps_used=2):
-        self.k, self.m = certified_memory.constants_of(FREE)[0], certified_memory.new_memory(FREE)[0]
-        count = len(NAMES)
+    def __init__(self, steps_used=2, settings=FREE):
+        self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
+        count = len(certified_memory.parameter_names(settings))
         random = np.random.default_rng(5)
         root = random.standard_normal((count, count))
         self.m["P_belief"] = 0.01**2 * (np.eye(count) + root @ root.T / count)
@@ -310,6 +315,28 @@ def test_later_samples_that_come_to_another_torque_do_not_bear_the_fit_out(share
     assert fit.m["kept_count"] == (0.0 if is_borne_out else min(steps_used - earlier.YOUNG_STEPS, earlier.STEPS))
     fit.m["is_payload"] = 1.0
     assert earlier.is_borne_out(fit.k, fit.m)
+
+
+@pytest.mark.parametrize(("share", "is_borne_out"), [(0.97, True), (1.03, False)])
+def test_where_gravity_acts_later_samples_may_differ_by_what_they_do_not_know(share, is_borne_out):
+    fit, count = Halves(settings=UPRIGHT), len(certified_memory.parameter_names(UPRIGHT))
+    P, P_0 = fit.m["P_belief"], (1.0 + fit_check.REGULAR) * fit.m["steps_P"][0]
+    variance = np.diag(np.linalg.inv(np.linalg.inv(P) - np.linalg.inv(P_0)) - P)[:2]
+    unknown_Nm = np.sqrt(earlier.SMALLEST_UNIT * variance)
+    far = np.abs(Halves(settings=UPRIGHT).differ(0, np.eye(count)[1])[:2])
+    room = np.min((earlier.LATER_NM + unknown_Nm) / far)
+    assert room * far.max() > 1.2 * earlier.LATER_NM
+    fit.differ(0, share * room * np.eye(count)[1])
+    assert earlier.is_borne_out(fit.k, fit.m) is is_borne_out
+
+
+@pytest.mark.parametrize(("settings", "has_mounting"), [(FREE, False), (UPRIGHT, True)], ids=["flat", "upright"])
+def test_a_fit_that_no_model_explains_names_the_mounting_where_gravity_acts(settings, has_mounting):
+    constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
+    memory[0]["withheld_by"] = certificate.CHANGED
+    said = CertificateWatch(constants, memory, "").refuse(is_reading=False)
+    assert "no one model explains the whole fit" in said.message
+    assert ("arm.mounting_deg" in said.message) is has_mounting
 
 
 def test_a_fit_with_noise_may_differ_by_more():

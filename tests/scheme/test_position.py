@@ -98,7 +98,8 @@ def test_only_a_torque_by_place_that_counts_is_evidence(cable_Nm, is_found):
         assert memory[0]["missing_rms_Nm"] == pytest.approx((0.02, 0.02), abs=0.015)
         assert re.fullmatch(
             r"a torque that depends on where the arm is, 0\.0\d\d Nm rms in joint 1 and 0\.0\d\d Nm rms in joint 2, is "
-            r"missing in the model: a cable, a base that is not level, or a hand's spring",
+            r"missing in the model: a cable, a base that is not mounted as arm.mounting_deg says \(flat: not level\), "
+            r"or a hand's spring",
             *missing_torque.describe(memory[0]),
         )
 

@@ -22,20 +22,20 @@ def random_state(seed):
 
 
 def test_the_golden_vector_is_met():
-    tau = inverse_dynamics(np.array([0.3, -0.7]), np.array([1.1, -0.6]), np.array([2.0, -3.0]), THETA["M"])
+    tau = inverse_dynamics(np.array([0.3, -0.7]), np.array([1.1, -0.6]), np.array([2.0, -3.0]), THETA["M"], 0.0)
     np.testing.assert_allclose(tau, [0.9391413364143529, -0.10515014859197394], rtol=1e-14)
 
 
 def test_the_golden_vector_with_payload_is_met():
     theta = THETA["M"] + PAYLOAD_1KG
-    tau = inverse_dynamics(np.array([0.3, -0.7]), np.array([1.1, -0.6]), np.array([2.0, -3.0]), theta)
+    tau = inverse_dynamics(np.array([0.3, -0.7]), np.array([1.1, -0.6]), np.array([2.0, -3.0]), theta, 0.0)
     np.testing.assert_allclose(tau, [1.109512623205665, -0.11638114642578004], rtol=1e-14)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_model_torque_accelerates_a_lagrangian_arm_as_wanted(seed):
     q, dq, ddq = random_state(seed)
-    tau = inverse_dynamics(q, dq, ddq, THETA["M"])
+    tau = inverse_dynamics(q, dq, ddq, THETA["M"], 0.0)
     np.testing.assert_allclose(acceleration(q, dq, tau, THETA["M"]), ddq, rtol=1e-11, atol=1e-11)
 
 
@@ -49,9 +49,9 @@ def test_momentum_and_remainder_make_up_the_torque(seed, parameter_count):
     for side, sign in enumerate((-1.0, 1.0)):
         fill_momentum(q + sign * h * dq + 0.5 * h * h * ddq, dq + sign * h * ddq, Y_p[side])
     Y_h = np.zeros((2, parameter_count))
-    fill_remainder(q, dq, Y_h)
+    fill_remainder(q, dq, 0.0, Y_h)
     W = (Y_p[1] - Y_p[0]) / (2.0 * h) + Y_h
-    np.testing.assert_allclose(W, regressor(q, dq, ddq, parameter_count), atol=1e-7)
+    np.testing.assert_allclose(W, regressor(q, dq, ddq, parameter_count, 0.0), atol=1e-7)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -70,7 +70,7 @@ def test_coriolis_torque_does_no_work_on_the_changing_mass(seed):
     theta[3:] = 0.0
     h = 1e-5
     Mdot = (mass_matrix(q + h * dq, theta) - mass_matrix(q - h * dq, theta)) / (2.0 * h)
-    coriolis = inverse_dynamics(q, dq, np.zeros(2), theta)
+    coriolis = inverse_dynamics(q, dq, np.zeros(2), theta, 0.0)
     assert abs(dq @ Mdot @ dq - 2.0 * dq @ coriolis) < 1e-9
 
 
@@ -93,7 +93,7 @@ def test_the_paper_coriolis_matrix_is_in_the_regressor(seed):
     q, dq, _ = random_state(seed)
     theta = np.array([0.0, 1.3, 0.0, 0.0, 0.0, 0.0, 0.0])
     np.testing.assert_allclose(
-        inverse_dynamics(q, dq, np.zeros(2), theta), coriolis_matrix(q, dq, 1.3) @ dq, rtol=1e-12, atol=1e-14
+        inverse_dynamics(q, dq, np.zeros(2), theta, 0.0), coriolis_matrix(q, dq, 1.3) @ dq, rtol=1e-12, atol=1e-14
     )
 
 

@@ -514,6 +514,38 @@ def test_hands_that_change_the_payload_do_not_make_the_arm_forget_that_it_was_ch
     assert run.step(observation=Observation.AT_REST, cycles=2) is SchemeState.ADAPT
 
 
+UPRIGHT = replace(
+    SETTINGS,
+    arm=replace(SETTINGS.arm, cad_theta=()),
+    estimator=replace(SETTINGS.estimator, gravity=True, P0=(*SETTINGS.estimator.P0, 50.0, 50.0)),
+)
+
+
+@pytest.mark.parametrize("observation", [CONTACT, COLLISION])
+def test_the_weight_of_a_changed_payload_does_not_hold_an_upright_arm(observation):
+    pulled = observation | Observation.AT_REST
+    for settings, is_learnt in ((UPRIGHT, True), (SETTINGS, False)):
+        run = Run(settings).to(SchemeState.PAYLOAD)
+        run.step(observation=pulled, cycles=10)
+        run.step(observation=pulled, request=Request.PAYLOAD_CHANGED)
+        states = {run.step(observation=pulled) for _ in range(2 * REST_CYCLES)}
+        assert (SchemeState.ADAPT in states) is is_learnt
+
+
+def test_the_weight_of_a_payload_holds_an_upright_arm_until_somebody_says_that_it_was_changed():
+    run = Run(UPRIGHT).to(SchemeState.PAYLOAD)
+    run.step(observation=CONTACT | Observation.AT_REST, cycles=12_000)
+    assert run.step(observation=CONTACT | Observation.AT_REST, request=Request.ACKNOWLEDGE) is SchemeState.STOPPED
+    assert run.step(observation=CONTACT | Observation.AT_REST, request=Request.PAYLOAD_CHANGED) is SchemeState.ADAPT
+
+
+def test_a_touch_outside_of_a_payload_change_still_wants_to_be_acknowledged_of_an_upright_arm():
+    run = Run(UPRIGHT).to(SchemeState.MONITOR)
+    run.step(observation=COLLISION | Observation.AT_REST, cycles=REST_CYCLES)
+    run.step(observation=Observation.AT_REST, request=Request.PAYLOAD_CHANGED)
+    assert run.step(observation=Observation.AT_REST, cycles=12_000) is SchemeState.STOPPED
+
+
 def test_a_blow_may_throw_the_arm_faster_than_its_limit_for_a_moment():
     run = run_in(SchemeState.MONITOR)
     run.step(observation=COLLISION)

@@ -46,7 +46,7 @@ def test_a_record_is_what_the_emulator_measures_under_the_same_host():
         sample = body.sample()
         measured.append((sample.q, sample.dq, sample.tau_J))
         motion_d = motion.q_d[k], motion.dq_d[k], motion.ddq_d[k]
-        fill_torque(sample.q, sample.dq, *motion_d, np.zeros(7), np.array(arm.Kp), np.array(arm.Kd), tau_d)
+        fill_torque(sample.q, sample.dq, *motion_d, np.zeros(7), np.array(arm.Kp), np.array(arm.Kd), 0.0, tau_d)
         body.advance(command, (DriveMode.TORQUE, DriveMode.TORQUE))
         command = np.rint(tau_d / (1e-3 * rated_Nm)) * 1e-3 * rated_Nm
     q, dq, tau_J = (np.array(values) for values in zip(*measured, strict=True))

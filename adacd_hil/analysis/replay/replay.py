@@ -336,7 +336,7 @@ class _Decoders:
 def _decoding_key(settings: Settings) -> Any:
     """Return what of the settings the arm goes by."""
     arm = settings.arm
-    shape = (arm.sign, arm.torque_offset_Nm, arm.rated_torque_Nm, arm.torque_limit_Nm)
+    shape = (arm.sign, arm.zero_deg, arm.torque_offset_Nm, arm.rated_torque_Nm, arm.torque_limit_Nm)
     return (*shape, settings.bus, settings.devices, settings.realtime)
 
 

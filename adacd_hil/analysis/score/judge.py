@@ -8,7 +8,8 @@ A true contact explains alarms from its onset until it is forgotten: until one t
 filtered, is back within the threshold (`forgotten_after_s`). An alarm is about the last contact that began
 before it, as long as that contact, or one before it, is not forgotten; so an alarm is about one contact at most. The
 first alarm about a contact finds it. An alarm about none is *false*, in whatever state it was raised, unless the
-emulator did not record what was true then: nobody knows about such an alarm.
+emulator did not record what was true then: nobody knows about such an alarm. Where gravity acts, an alarm in PAYLOAD
+about a payload that is not that of the last MONITOR is about its weight, and not false.
 
 A contact is *armed* if detection was armed in the logged cycle before its onset. It is *missed* if it is armed and
 nothing found it. A contact that began before the log did is not armed.
@@ -426,4 +427,13 @@ def judge_run(run: Run, touches: Sequence[TruthTouch], detections: Sequence[Logg
     """Judge the alarms of a run's own scheme."""
     armed = run.state == SchemeState.MONITOR
     windows = [touch_window(run, touch, run.a_rad_s, threshold_at(run, touch.onset_s), armed) for touch in touches]
-    return judge(windows, [detection.raised for detection in detections])
+    return judge(windows, [detection.raised for detection in detections if not is_of_weight(run, detection.row)])
+
+
+def is_of_weight(run: Run, row: int) -> bool:
+    """Tell whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet."""
+    truth, armed = run.truth, np.flatnonzero(run.state[:row] == SchemeState.MONITOR)
+    if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:
+        return False
+    known, now = (truth.model_row(int(run.cycle[place])) for place in (armed[-1] if len(armed) else row, row))
+    return known is not None and now is not None and bool(truth.payload_kg[known] != truth.payload_kg[now])

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from adacd_hil.analysis.logged_run import Milestones, Progress
+from adacd_hil.analysis.logged_run import Milestones, Progress, settings_of
+from adacd_hil.log.editing.log_info import attachment
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
-from adacd_hil.records import SchemeState, Vector
+from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
 from adacd_hil.scheme.detect import detectors
 
 APART_S: Final = 0.6
@@ -40,7 +41,7 @@ Watch = Callable[[Series], None]
 class Motion:
     """A recording of n samples; `is_free` (n,) where nobody touched the arm and the model was frozen."""
 
-    q: Vector
+    q: Vector  # q1 from the level
     dq: Vector
     tau_J: Vector
     theta: Vector  # (n, p)
@@ -54,13 +55,17 @@ _COLUMNS: Final = ("q", "dq", "tau_J", "theta", "interval_s")
 
 @dataclass(frozen=True)
 class LoggedMotion:
-    """The motion in a log, or in a stretch of it: N samples at `period_s`, with p parameters; is_free (N,)."""
+    """The motion in a log, or in a stretch of it: N samples at `period_s`, with p parameters; is_free (N,).
+
+    level_rad: q1 at which link 1 is level; 0 where gravity does not act.
+    """
 
     path: Path
     period_s: float
     parameters: int
     is_free: Mask
     bounds_ns: tuple[int, int] | None = None
+    level_rad: float = 0.0
 
     def pieces(self) -> Iterator[Motion]:
         """Read the samples, in order. Raises LogError."""
@@ -69,7 +74,7 @@ class LoggedMotion:
             end = place + len(scheme)
             cycle = scheme["cycle"].astype(np.int64).reshape(-1)
             yield Motion(
-                q=scheme["q"],
+                q=scheme["q"] - np.array((self.level_rad, 0.0)),
                 dq=scheme["dq"],
                 tau_J=scheme["tau_J"],
                 theta=scheme["theta_hat"],
@@ -123,7 +128,13 @@ def read_motion(
     is_free = ~_spread(~np.concatenate(parts), round(APART_S / period_s))
     if not is_free.any():
         raise LogError(f"log {path} has no motion in MONITOR that is free of contact{where}")
-    return LoggedMotion(path, period_s, parameters, is_free, bounds_ns)
+    level_rad = _level_rad(path) if parameters > len(PARAMETER_NAMES) else 0.0
+    return LoggedMotion(path, period_s, parameters, is_free, bounds_ns, level_rad)
+
+
+def _level_rad(path: Path) -> float:
+    text = attachment(path, "config.toml")
+    return 0.0 if text is None else settings_of(path, {"config.toml": text}).level_rad
 
 
 def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:

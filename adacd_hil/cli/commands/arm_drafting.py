@@ -13,10 +13,12 @@ from adacd_hil.cli.interview import Interview, Proposal
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, format_date, wall_ns
 from adacd_hil.commission.arm_draft import (
+    LEVEL_DEG,
     ArmFacts,
     Fact,
     PlanarArm,
     draft_arm,
+    draw_arm,
     planar_from_urdf,
     uniform_rods,
     write_draft,
@@ -41,7 +43,7 @@ from adacd_hil.device.survey import survey
 from adacd_hil.file_access import read_input, replace_file
 from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.scheme.model.urdf import UrdfError
-from adacd_hil.settings.arm_settings import ArmSettings
+from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
 from adacd_hil.settings.configuration import known_keys
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.terminal import in_line
@@ -66,6 +68,8 @@ class InitOptions:
     length_m: Pair | None = None
     mass_kg: Pair | None = None
     is_upright: bool | None = None
+    mounting: str | None = None
+    at_zero: str | None = None
     rated_torque_nm: Pair | None = None
     torque_limit_nm: Pair | None = None
     position_limit_deg: Pair | None = None
@@ -505,6 +509,11 @@ class Drafting:
         if urdf is not None:
             if options.length_m is not None or options.mass_kg is not None:
                 raise CommandError("--urdf says lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE)
+            if options.at_zero is not None or options.is_upright is not None:
+                raise CommandError(
+                    "--urdf says where gravity acts; --mounting floor, wall or ceiling says how its root is mounted",
+                    ExitCode.USAGE,
+                )
             try:
                 arm = _read_urdf(urdf, options.locked)
             except ConfigError as error:
@@ -520,7 +529,9 @@ class Drafting:
             if not arm.is_tip_known:
                 self.warnings.append(f"{urdf} has no frame at the tip: the length of link 2 is a guess")
             source = f"URDF {urdf.name}"
-            return arm, source if arm.is_tip_known else "", source, source
+            arm, mounted = self._mount(urdf, arm)
+            interview.say(draw_arm(arm.mounting_deg))
+            return arm, source if arm.is_tip_known else "", source, f"{source}, {mounted}"
         if options.locked:
             raise CommandError("--lock names a joint of --urdf", ExitCode.USAGE)
         length_m, length_source = interview.ask(
@@ -530,22 +541,57 @@ class Drafting:
             lambda value: _checked("link_length_m", _numbers(value, float, "--length-m")),
             Proposal((0.35, 0.30)),
         )
-        is_upright, gravity_source = interview.ask(
-            "--upright or --flat",
-            None if options.is_upright is None else ("yes" if options.is_upright else "no"),
-            "Does gravity act on the joints (yes or no)",
-            _yes_or_no,
-            Proposal("no"),
-        )
+        mounting_deg, gravity_source = self._ask_mounting()
         mass_kg = options.mass_kg
         if mass_kg is None and interview.is_asking:
             question = "Masses of the links in kg, - for unknown"
             mass_kg, _ = interview.ask("--mass-kg", None, question, _masses, Proposal("-"))
         if mass_kg is None:
-            return PlanarArm(length_m, (), is_upright), length_source, "", gravity_source
-        arm = uniform_rods(length_m, _masses(mass_kg) or (0.0, 0.0), is_upright)
+            return PlanarArm(length_m, (), mounting_deg), length_source, "", gravity_source
+        arm = uniform_rods(length_m, _masses(mass_kg) or (0.0, 0.0), mounting_deg)
         self.warnings.append("inertia is that of uniform rods, without motors and gears")
         return arm, length_source, "given masses, as uniform rods", gravity_source
+
+    def _ask_mounting(self) -> tuple[Pair, str]:
+        """Return tilt of the plane of motion and the q1 at which link 1 hangs, deg, and who says so."""
+        options, interview = self.options, self.interview
+        given = options.mounting
+        if options.is_upright is not None and given is None:
+            given = "wall" if options.is_upright else "flat"
+        (mounting, tilt_deg), source = interview.ask(
+            "--mounting or --flat",
+            given,
+            "Mounting of the base: flat (joint axes vertical), floor, wall, ceiling, or the tilt of the plane in deg",
+            lambda text: (text.casefold(), _tilt(text)),
+            Proposal("flat"),
+            "on floor, wall and ceiling the joint axes are level and all of gravity acts; a tilt of 0 is flat",
+        )
+        if tilt_deg <= SLIGHT_TILT_DEG:
+            return LEVEL_DEG, source
+        usual = _USUAL_POSES.get(mounting)
+        hangs_deg, at_zero_source = interview.ask(
+            "--at-zero",
+            options.at_zero,
+            "Link 1 at q1 = 0 points down, up, level (+q1 lifts it), or down only at q1 = (deg)",
+            _hanging,
+            Proposal(usual or "level", f"as usual of an arm on {mounting}" if usual else ""),
+            "q1 = 0 is where the drive reads 0, or `arm.zero_deg`; 90: level, and +q1 lowers it",
+        )
+        interview.say(draw_arm((tilt_deg, hangs_deg)))
+        return (tilt_deg, hangs_deg), source if at_zero_source else ""
+
+    def _mount(self, urdf: Path, arm: PlanarArm) -> tuple[PlanarArm, str]:
+        """Turn a URDF's root as it is mounted; return the arm, and how that is."""
+        interview, given = self.interview, self.options.mounting
+        if given is None and not interview.is_asking:
+            return arm, "its root's z axis up"
+        question = "Mounting of the URDF's root: floor (z up), wall (x down), ceiling (z down), or its pitch in deg"
+        try:
+            pitch_deg, _ = interview.ask("--mounting", given, question, _pitch, Proposal("floor"))
+        except ConfigError as error:
+            raise CommandError(str(error), ExitCode.USAGE) from None
+        mounted = "its root's z axis up" if pitch_deg == 0.0 else f"its root pitched by {pitch_deg:g} deg"
+        return _read_urdf(urdf, self.options.locked, pitch_deg), mounted
 
     def _rated(
         self, ratings: Sequence[DeviceRatings], profiles: Sequence[ProfileSettings], geometry: PlanarArm
@@ -602,10 +648,38 @@ def _checked(key: str, value: tuple[Any, Any]) -> Any:
     return getattr(parse(ArmSettings, {key: list(value)}, "arm."), key)
 
 
-def _yes_or_no(text: str) -> bool:
-    if text.casefold() not in ("yes", "y", "no", "n"):
-        raise ConfigError(f"{text!r} must be yes or no")
-    return text.casefold().startswith("y")
+_PITCHES_DEG = {"floor": 0.0, "wall": 90.0, "ceiling": 180.0}
+"""Of a URDF's root about its y axis, by what its base is on."""
+_TILTS_DEG = {"flat": 0.0, "floor": 90.0, "wall": 90.0, "ceiling": 90.0}
+"""Of the plane of motion, by what the base of an arm with level axes is on."""
+_HANGING_DEG = {"down": 0.0, "up": 180.0, "level": -90.0}
+"""The q1 at which link 1 hangs, by where it points at q1 = 0."""
+_USUAL_POSES = {"floor": "up", "wall": "level", "ceiling": "down"}
+
+
+def _tilt(text: str) -> float:
+    return _word_or_deg("--mounting", text, _TILTS_DEG, 0.0, 90.0)
+
+
+def _pitch(text: str) -> float:
+    return _word_or_deg("--mounting", text, _PITCHES_DEG, -180.0, 180.0)
+
+
+def _hanging(text: str) -> float:
+    return _word_or_deg("--at-zero", text, _HANGING_DEG, -180.0, 180.0)
+
+
+def _word_or_deg(option: str, text: str, words: dict[str, float], low: float, high: float) -> float:
+    """Read a word, or an angle within bounds, deg. Raises ConfigError."""
+    if text.casefold() in words:
+        return words[text.casefold()]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise ConfigError(f"{option} {text!r} must be {', '.join(words)}, or {low:g} to {high:g} deg")
+    return value
 
 
 def _masses(value: Any) -> Pair | None:
@@ -618,10 +692,10 @@ def _masses(value: Any) -> Pair | None:
     return masses
 
 
-def _read_urdf(path: Path, locked: Sequence[str]) -> PlanarArm:
-    """Read a URDF. Raises ConfigError."""
+def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> PlanarArm:
+    """Read a URDF whose root is turned by so much about its y axis. Raises ConfigError."""
     try:
-        return planar_from_urdf(read_input(path), locked)
+        return planar_from_urdf(read_input(path), locked, pitch_deg)
     except FileNotFoundError:
         raise ConfigError(f"URDF {path} does not exist") from None
     except OSError as error:

@@ -30,7 +30,11 @@ def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:
 @click.option("--lock", "locked", multiple=True, metavar="JOINT", help="A joint of the URDF that stays where it is.")
 @_pair("--length-m", "Joint to joint, joint to tip.")
 @_pair("--mass-kg", "Masses of the links; they are taken to be uniform rods.")
-@click.option("--upright/--flat", "is_upright", default=None, help="Whether gravity acts on the joints.")
+@click.option("--upright/--flat", "is_upright", default=None, help="The same as --mounting wall, and --mounting flat.")
+@click.option(
+    "--mounting", metavar="WORD|DEG", help="Base on floor, wall or ceiling, flat, or the tilt of the plane of motion."
+)
+@click.option("--at-zero", metavar="WORD|DEG", help="Link 1 at q1 = 0: down, up, level, or the q1 where it is down.")
 @_pair("--rated-torque-nm", "Rated torque of each drive at its joint.")
 @_pair("--torque-limit-nm", "Largest commanded torque.")
 @_pair("--position-limit-deg", "Largest |q|.")

@@ -24,15 +24,17 @@ from adacd_hil.wire.codec_columns import MessageTable
 class LiveSetup:
     """Where the live view is served (port 0: any that is free), and the arm that it draws.
 
-    robot_description: a URDF. is_upright: gravity acts on the joints. origins, names: of web pages that may watch, and
-    of this machine, beside those of log/viewer/admission.py. most_viewers: at a time.
+    robot_description: a URDF. tilt_rad: of the plane of motion. level_rad: the q1 at which link 1 is level. origins,
+    names: of web pages that may watch, and of this machine, beside those of log/viewer/admission.py. most_viewers: at
+    a time.
     """
 
     host: str
     port: int
     robot_description: str
     link_length_m: tuple[float, float]
-    is_upright: bool = False
+    tilt_rad: float = 0.0
+    level_rad: float = 0.0
     origins: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     most_viewers: int = MOST_VIEWERS

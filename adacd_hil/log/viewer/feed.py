@@ -238,7 +238,7 @@ class LiveTopics:
         """`ids`: the file's number of each channel, by ours. `start_ns`: log time before the first record."""
         channels = tuple(channels)
         self.latest_ns = start_ns
-        self._shape = Shape(setup.link_length_m, setup.is_upright)
+        self._shape = Shape(setup.link_length_m, setup.tilt_rad, setup.level_rad)
         self._decimators = {ids[channel.id]: Decimator(rate_of(channel.topic)) for channel in channels}
         self._scene_decimator = Decimator(rate_of(SCENE_TOPIC))
         self._joint_states, self._scheme, self._contact = (

@@ -1,7 +1,8 @@
 """The arm as a URDF of two links and a tip, made from the settings: for viewers, and for physics engines.
 
 Frames: `base` stands still, `link1` and `link2` begin at their joints with x along the link, `tip` is at the end. Joint
-axes are z. Where gravity acts on the joints the plane of motion is upright: `world` carries `base` with y up.
+axes are z. `world` carries `base` turned about x by the tilt of the plane of motion, so that y points uphill; q1 = 0 is
+where `arm.mounting_deg` has it.
 
 Masses and friction are those of the CAD model, `arm.cad_theta`, without payload. It knows inertia about the joint axes
 only; about the link's own axis it is that of a bar of LINK_WIDTH_M. Without a CAD model the links have no inertia, and
@@ -46,8 +47,13 @@ class ModelError(ValueError):
     """Parameters that belong to no rigid links; one line."""
 
 
-def find_bodies(theta: Sequence[float], length1_m: float) -> tuple[LinkBody, LinkBody]:
-    """Find two links with these parameters (p,), 7 or 9 of them. Raises ModelError when there are none."""
+def find_bodies(
+    theta: Sequence[float], length1_m: float, gravity_m_s2: float = GRAVITY_M_S2
+) -> tuple[LinkBody, LinkBody]:
+    """Find two links with these parameters (p,), 7 or 9 of them. Raises ModelError when there are none.
+
+    gravity_m_s2: in the plane of motion.
+    """
     alpha, beta, gamma = theta[_A1] - theta[_A3], theta[_A2], theta[_A3]
     if not (gamma > 0.0 and alpha * gamma > beta * beta):
         raise ModelError(f"a1 = {theta[_A1]:g}, a2 = {beta:g}, a3 = {gamma:g} kg m² belong to no rigid links")
@@ -61,10 +67,10 @@ def find_bodies(theta: Sequence[float], length1_m: float) -> tuple[LinkBody, Lin
     if len(theta) <= _A5:
         mass1_kg = left / ((_ROD_C**2 + _ROD_I) * length1_m**2)
         return LinkBody(mass1_kg, _ROD_C * length1_m, _ROD_I * mass1_kg * length1_m**2), second
-    expected_Nm = GRAVITY_M_S2 * mass2_kg * center2_m
+    expected_Nm = gravity_m_s2 * mass2_kg * center2_m
     if abs(theta[_A5] - expected_Nm) > _AGREEMENT * max(expected_Nm, theta[_A5]):
         raise ModelError(f"a5 = {theta[_A5]:g} Nm, but a2 = {beta:g} kg m² makes it {expected_Nm:g} Nm")
-    moment = theta[_A4] / GRAVITY_M_S2 - mass2_kg * length1_m
+    moment = theta[_A4] / gravity_m_s2 - mass2_kg * length1_m
     if moment == 0.0:
         return LinkBody(3.0 * left / length1_m**2, 0.0, left), second
     center1_m = math.copysign(min(_ROD_C * length1_m, 0.5 * left / abs(moment)), moment)
@@ -82,11 +88,12 @@ _COLORS = {"link": "0.35 0.45 0.6 1", "joint": "0.25 0.27 0.3 1"}
 
 def robot_description(settings: Settings) -> str:
     """Write the URDF of the configured arm: lengths, limits, shapes, and the CAD model's masses and friction."""
-    arm = settings.arm
+    arm, tilt_rad = settings.arm, settings.tilt_rad
     robot = Element("robot", name="adacd")
     bodies: tuple[LinkBody, ...] = ()
     try:
-        bodies = find_bodies(arm.cad_theta, arm.link_length_m[0]) if arm.cad_theta else ()
+        gravity_m_s2 = GRAVITY_M_S2 * math.sin(tilt_rad)
+        bodies = find_bodies(arm.cad_theta, arm.link_length_m[0], gravity_m_s2) if arm.cad_theta else ()
         reason = "arm.cad_theta is not given"
     except ModelError as error:
         reason = f"arm.cad_theta: {error}"
@@ -95,13 +102,14 @@ def robot_description(settings: Settings) -> str:
     for color, rgba in _COLORS.items():
         SubElement(SubElement(robot, "material", name=color), "color", rgba=rgba)
     SubElement(robot, "link", name=WORLD)
-    _add_joint(robot, "mount", "fixed", WORLD, BASE, roll_rad=mount_roll_rad(settings.estimator.gravity))
+    _add_joint(robot, "mount", "fixed", WORLD, BASE, rpy=(tilt_rad, 0.0, 0.0))
     base = SubElement(robot, "link", name=BASE)
     _add_shape(base, "joint", "cylinder", radius=_JOINT_RADIUS_M, length=2.0 * LINK_WIDTH_M)
     reach_m = 0.0
     parent = BASE
     for index, (joint_name, link_name) in enumerate(zip(JOINT_NAMES, LINK_NAMES, strict=True)):
-        joint = _add_joint(robot, joint_name, "revolute", parent, link_name, x_m=reach_m)
+        yaw_rad = 0.0 if index else -settings.level_rad
+        joint = _add_joint(robot, joint_name, "revolute", parent, link_name, x_m=reach_m, rpy=(0.0, 0.0, yaw_rad))
         SubElement(joint, "axis", xyz="0 0 1")
         limit_rad = float(arm.position_limit_rad[index])
         SubElement(
@@ -128,18 +136,19 @@ def robot_description(settings: Settings) -> str:
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
 
 
-def mount_roll_rad(is_upright: bool) -> float:
-    """Return how far `base` is turned about the x axis of `world`."""
-    return 0.5 * math.pi if is_upright else 0.0
-
-
 def _add_joint(
-    robot: Element, name: str, kind: str, parent: str, child: str, x_m: float = 0.0, roll_rad: float = 0.0
+    robot: Element,
+    name: str,
+    kind: str,
+    parent: str,
+    child: str,
+    x_m: float = 0.0,
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Element:
     joint = SubElement(robot, "joint", name=name, type=kind)
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
-    SubElement(joint, "origin", xyz=f"{_text(x_m)} 0 0", rpy=f"{_text(roll_rad)} 0 0")
+    SubElement(joint, "origin", xyz=f"{_text(x_m)} 0 0", rpy=" ".join(map(_text, rpy)))
     return joint
 
 

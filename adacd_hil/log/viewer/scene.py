@@ -11,7 +11,7 @@ import struct
 from typing import Any, NamedTuple
 
 from adacd_hil.log.types.message_types import ENCAPSULATION, MessageType, foreign_type
-from adacd_hil.log.viewer.robot_description import BASE, LINK_NAMES, TIP, WORLD, mount_roll_rad
+from adacd_hil.log.viewer.robot_description import BASE, LINK_NAMES, TIP, WORLD
 from adacd_hil.records import JOINT_NAMES, ContactLevel, ContactReport, Location, SchemeState, Vector
 
 TRANSFORMS_TOPIC, SCENE_TOPIC, DESCRIPTION_TOPIC = "/tf", "/scene", "/robot_description"
@@ -166,10 +166,11 @@ _ABOVE_M = 0.16
 
 
 class Shape(NamedTuple):
-    """The arm as it is drawn. `is_upright`: gravity acts on its joints."""
+    """The arm as it is drawn: tilt of its plane of motion, and the q1 at which link 1 is level, rad."""
 
     link_length_m: tuple[float, float]
-    is_upright: bool = False
+    tilt_rad: float = 0.0
+    level_rad: float = 0.0
 
 
 def about_z(angle_rad: float) -> Quaternion:
@@ -179,12 +180,12 @@ def about_z(angle_rad: float) -> Quaternion:
 
 def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
     """Place all frames of the robot description for the joint positions q (2,)."""
-    half_rad = 0.5 * mount_roll_rad(shape.is_upright)
+    half_rad = 0.5 * shape.tilt_rad
     origin = (0.0, 0.0, 0.0)
     elbow, end = ((length_m, 0.0, 0.0) for length_m in shape.link_length_m)
     return (
         Transform(WORLD, BASE, origin, (math.sin(half_rad), 0.0, 0.0, math.cos(half_rad))),
-        Transform(BASE, LINK_NAMES[0], origin, about_z(q[0])),
+        Transform(BASE, LINK_NAMES[0], origin, about_z(q[0] - shape.level_rad)),
         Transform(LINK_NAMES[0], LINK_NAMES[1], elbow, about_z(q[1])),
         Transform(LINK_NAMES[1], TIP, end, UPRIGHT),
     )

@@ -362,7 +362,8 @@ def stream(
     """Fill the stream and the friction that may hold (N, 2) of a recording; theta (N, p), interval_s (N,).
 
     The first sample, and one whose interval is not positive (nobody knows what happened before it), has z = 0. Both
-    ends of an interval are judged by the theta of its end, so that a change of theta is no torque.
+    ends of an interval are judged by the theta of its end, so that a change of theta is no torque. q1 counts from the
+    level, which says where gravity points; nothing else depends on its zero.
     """
     count, joints = q.shape
     Y_p = np.zeros((2, joints, theta.shape[1]))
@@ -370,7 +371,7 @@ def stream(
     for k in range(count):
         new, old = k % 2, (k + 1) % 2
         regressor.fill_momentum(q[k], dq[k], Y_p[new])
-        regressor.fill_remainder(q[k], dq[k], Y_h[new])
+        regressor.fill_remainder(q[k], dq[k], 0.0, Y_h[new])
         for i in range(joints):
             stands = abs(dq[k, i]) < standstill_rad_s
             if stands:
@@ -397,7 +398,8 @@ def make_stream(
 ) -> tuple[Vector, Vector]:
     """Give the stream z and the friction that may hold, both (N, 2), Nm.
 
-    q, dq, tau_J (N, 2); theta (p,) or (N, p), p = 7 or 9; interval_s (N,), 0 or less where samples are missing before.
+    q, dq, tau_J (N, 2), q1 from the level; theta (p,) or (N, p), p = 7 or 9; interval_s (N,), 0 or less where
+    samples are missing before.
     """
     z, held_Nm = np.zeros(q.shape), np.zeros(q.shape)
     every = np.ascontiguousarray(np.broadcast_to(theta, (q.shape[0], np.shape(theta)[-1])))

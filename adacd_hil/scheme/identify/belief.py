@@ -56,13 +56,12 @@ def begin(prior: Vector, prior_std: Vector, theta: Vector, P: Vector) -> None:
 
 
 @compiled
-def add_payload(direction: Vector, payload_std_kg: float, inertia_std: float, P: Vector) -> None:
-    """Widen P (p, p) in place by a payload: mass along `direction` (p,), and a rest in each of its parameters."""
+def add_payload(direction: Vector, payload_std_kg: float, rest_std: Vector, P: Vector) -> None:
+    """Widen P (p, p) in place by a payload: mass along `direction` (p,), and a rest, `rest_std` (p,)."""
     for j in range(direction.shape[0]):
         for k in range(direction.shape[0]):
             P[j, k] += payload_std_kg**2 * direction[j] * direction[k]
-        if direction[j] != 0.0:
-            P[j, j] += inertia_std**2
+        P[j, j] += rest_std[j] ** 2
 
 
 @compiled

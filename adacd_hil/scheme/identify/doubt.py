@@ -78,7 +78,7 @@ def constants_of(settings: Settings, count: int) -> dict[str, Vector]:
     """Return `causes` (h, p): a payload of 1 kg, then by joint Coulomb and viscous friction."""
     unit = np.eye(count)
     first = PARAMETER_NAMES.index("F_c1"), PARAMETER_NAMES.index("F_v1")
-    rows = [regressor.payload_direction(settings.arm.link_length_m, count)]
+    rows = [regressor.payload_direction(settings.arm.link_length_m, count, settings.gravity_m_s2)]
     rows += [unit[place + i] for i in range(JOINTS) for place in first]
     return {"causes": np.array(rows)}
 

@@ -179,3 +179,37 @@ def find_later(m: Any, theta_0: Vector, P_0: Vector, theta: Vector, P: Vector) -
         for n in range(x.shape[0]):
             later[j] += P[j, n] * x[n] / np.sqrt(P_0[n, n])
     return True
+
+
+@compiled
+def later_share(m: Any, P_0: Vector, P: Vector, limit_Nm: float, unit: float) -> float:
+    """Return the largest |W_f later| of the samples over limit_Nm, beyond which its standard deviation is allowed, too.
+
+    After `find_later` of the same beliefs. unit: of their variances.
+    """
+    largest = 0.0
+    for s in range(int(m["samples_kept"])):
+        for i in range(m["samples_tau"].shape[1]):
+            w, torque, allowed_Nm = m["samples_W"][s, i], 0.0, limit_Nm
+            for j in range(w.shape[0]):
+                torque += w[j] * m["later"][j]
+            if abs(torque) > limit_Nm:
+                allowed_Nm += np.sqrt(unit * _later_variance(m, w, P_0, P))
+            largest = max(largest, abs(torque) / allowed_Nm)
+    return float(largest)
+
+
+@compiled
+def _later_variance(m: Any, w: Vector, P_0: Vector, P: Vector) -> float:
+    """Return w P (P_0 - P)^-1 P w', with what `distance` has left in `scratch`."""
+    L, x, variance = m["scratch"], m["v"], 0.0
+    for j in range(w.shape[0]):
+        x[j] = 0.0
+        for n in range(w.shape[0]):
+            x[j] += P[j, n] * w[n]
+        x[j] /= np.sqrt(P_0[j, j])
+        for n in range(j):
+            x[j] -= L[j, n] * x[n]
+        x[j] /= L[j, j]
+        variance += x[j] * x[j]
+    return float(variance)

@@ -303,5 +303,5 @@ def describe(m: Any) -> list[str]:
     torques = " and ".join(f"{rms:.3f} Nm rms in joint {i + 1}" for i, rms in enumerate(missing_Nm))
     return [
         f"a torque that depends on where the arm is, {torques}, is missing in the model: a cable, a base that is not "
-        "level, or a hand's spring"
+        "mounted as arm.mounting_deg says (flat: not level), or a hand's spring"
     ]

@@ -96,7 +96,9 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     if is_payload:
         m["belief"][:] = m["certified"]
         m["P_belief"][:] = m["P_certified"]
-        belief.add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_inertia_std"], m["P_belief"])
+        belief.add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_rest_std"], m["P_belief"])
+        if int(k["base"]) > regressor.A5:
+            _begin_at_rest(m)
     else:
         belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
     _use_belief(m)
@@ -111,6 +113,18 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     termination.begin(m)
     m["excitation"] = 0.0
     m["condition"] = np.inf
+
+
+@compiled
+def _begin_at_rest(m: Any) -> None:
+    """Begin with filters that have seen this pose, and the torque that gravity makes there, for ever.
+
+    From 0, that torque would be a step: the columns of the lag would have its derivative.
+    """
+    m["X_f"][:] = m["X"]
+    for c in range(m["tau_f"].shape[0]):
+        m["W_f"][c] = m["Y_h"]
+        m["tau_f"][c] = m["tau_old"][c]
 
 
 @compiled
@@ -269,7 +283,7 @@ def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> Non
     """Fill Y_p, Y_h (2, p) and M (2, 2) of the 2R arm, offsets and further friction included."""
     base, first_coulomb, count = int(k["base"]), int(k["first_coulomb"]), q.shape[0]
     regressor.fill_momentum(q, dq, m["Y_p"][:, :base])
-    regressor.fill_remainder(q, dq, m["Y_h"][:, :base])
+    regressor.fill_remainder(q, dq, k["level_rad"], m["Y_h"][:, :base])
     for i in range(count):
         m["Y_h"][i, first_coulomb + i] = regressor.smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
         m["Y_h"][i, base + i] = 1.0

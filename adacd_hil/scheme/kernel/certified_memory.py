@@ -78,6 +78,16 @@ def _enough_std_of(settings: Settings) -> Vector:
     return std
 
 
+def _payload_rest_std_of(settings: Settings, count: int) -> Vector:
+    """Return what of a payload's parameters (p,) its mass at the tip doesn't say; of gravity, by the same shift."""
+    inertia_std, arm = settings.certified.payload_inertia_std, settings.arm
+    std = np.zeros(count)
+    std[:3] = inertia_std
+    if settings.estimator.gravity:
+        std[[regressor.A4, regressor.A5]] = settings.gravity_m_s2 * inertia_std / np.array(arm.link_length_m)
+    return std
+
+
 def constants_of(settings: Settings) -> Structured:
     """Put the settings into the form that the compiled step reads."""
     certified, names = settings.certified, parameter_names(settings)
@@ -94,6 +104,7 @@ def constants_of(settings: Settings) -> Structured:
     kept = earlier.constants_of(settings, prior_std)
     values: dict[str, Any] = {
         "period_s": period_s,
+        "level_rad": settings.level_rad,
         "cutoff": cutoff,
         "decay": decay,
         "weight_old": weight_old,
@@ -115,9 +126,9 @@ def constants_of(settings: Settings) -> Structured:
         "enough_std": _enough_std_of(settings),
         "drift_std": _drift_std_of(settings),
         "model_error": _by_kind(certified.model_error, names),
-        "payload_direction": regressor.payload_direction(settings.arm.link_length_m, len(names)),
+        "payload_direction": regressor.payload_direction(settings.arm.link_length_m, len(names), settings.gravity_m_s2),
         "payload_std_kg": certified.payload_std_kg,
-        "payload_inertia_std": certified.payload_inertia_std,
+        "payload_rest_std": _payload_rest_std_of(settings, len(names)),
         "correlated": max(correlated, 1.0),
         "residual_Nm": certified.residual_Nm,
         "learn_every": certified.learn_every,

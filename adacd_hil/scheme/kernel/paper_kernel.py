@@ -71,6 +71,7 @@ def constants_of(settings: Settings) -> Structured:
     scale = (inertia,) * 3 + (viscous,) * 2 + (coulomb,) * 2 + (gravity,) * 2
     values: dict[str, Any] = {
         "period_s": period_s,
+        "level_rad": settings.level_rad,
         "a_rad_s": settings.filter.a_rad_s,
         "b_rad_s": settings.filter.b_rad_s,
         "dc_gain": settings.filter.b_rad_s / settings.filter.a_rad_s,
@@ -206,7 +207,7 @@ def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
     else:
         period_s = nominal_s
         regressor.fill_momentum(q, dq, m["Y_p"])
-        regressor.fill_remainder(q, dq, m["Y_h"])
+        regressor.fill_remainder(q, dq, c["level_rad"], m["Y_h"])
         filter_bank.resume(a, b, m["Y_p"], m["Y_h"], tau_J, m["input_old"], m["tau_old"], m["S"], m["W_f"])
         m["has_gap"] = 0.0
         _compare(c, m, dq, c["decay"], out)
@@ -221,7 +222,7 @@ def _advance(
     """Take the filters over one period to a sample."""
     a, b = c["a_rad_s"], c["b_rad_s"]
     regressor.fill_momentum(q, dq, m["Y_p"])
-    regressor.fill_remainder(q, dq, m["Y_h"])
+    regressor.fill_remainder(q, dq, c["level_rad"], m["Y_h"])
     filter_bank.advance_torque(hold, m["tau_old"], tau_J, tau_f)
     filter_bank.advance_regressor(hold, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"])
 

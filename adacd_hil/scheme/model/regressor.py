@@ -3,7 +3,11 @@
     tau = M(q) ddq + C(q, dq) dq + g(q) + F_v dq + F_c sgn(dq) = W(q, dq, ddq) theta
 
 theta is ordered as `PARAMETER_NAMES`, with `GRAVITY_PARAMETER_NAMES` appended where the joint axes are not vertical;
-p = 7 or 9. Split as the filter needs it, without acceleration:
+p = 7 or 9. With level_rad, the q1 at which link 1 is level (`Settings.level_rad`),
+
+    g = (a4 cos(q1 - level_rad) + a5 cos(q1 + q2 - level_rad),  a5 cos(q1 + q2 - level_rad))
+
+Split as the filter needs it, without acceleration:
 
     tau = d/dt (Y_p theta) + Y_h theta,    Y_p theta = M dq,    Y_h theta = -C' dq + g + F_v dq + F_c sgn(dq)
 
@@ -58,7 +62,7 @@ def fill_momentum(q: Vector, dq: Vector, Y_p: Vector) -> None:
 
 
 @compiled
-def fill_remainder(q: Vector, dq: Vector, Y_h: Vector) -> None:
+def fill_remainder(q: Vector, dq: Vector, level_rad: float, Y_h: Vector) -> None:
     """Fill Y_h (2, p) of -C' dq + g + F_v dq + F_c sgn(dq). Entries that are always zero are left as they are."""
     Y_h[1, A2] = np.sin(q[1]) * dq[0] * (dq[0] + dq[1])  # (-Mdot + C) dq = -C' dq
     Y_h[0, F_V1] = dq[0]
@@ -66,13 +70,12 @@ def fill_remainder(q: Vector, dq: Vector, Y_h: Vector) -> None:
     Y_h[0, F_C1] = np.sign(dq[0])
     Y_h[1, F_C2] = np.sign(dq[1])
     if Y_h.shape[1] > A5:
-        Y_h[0, A4] = np.cos(q[0])
-        Y_h[0, A5] = np.cos(q[0] + q[1])
-        Y_h[1, A5] = np.cos(q[0] + q[1])
+        Y_h[0, A4] = np.cos(q[0] - level_rad)
+        Y_h[0, A5] = Y_h[1, A5] = np.cos(q[0] + q[1] - level_rad)
 
 
 @compiled
-def regressor(q: Vector, dq: Vector, ddq: Vector, parameter_count: int) -> Vector:
+def regressor(q: Vector, dq: Vector, ddq: Vector, parameter_count: int, level_rad: float) -> Vector:
     """Return W (2, p) of eq. (17)."""
     W = np.zeros((JOINTS, parameter_count))
     c2 = np.cos(q[1])
@@ -93,16 +96,15 @@ def regressor(q: Vector, dq: Vector, ddq: Vector, parameter_count: int) -> Vecto
     W[1, F_C2] = np.sign(dq[1])
     # gravity
     if parameter_count > A5:
-        W[0, A4] = np.cos(q[0])
-        W[0, A5] = np.cos(q[0] + q[1])
-        W[1, A5] = np.cos(q[0] + q[1])
+        W[0, A4] = np.cos(q[0] - level_rad)
+        W[0, A5] = W[1, A5] = np.cos(q[0] + q[1] - level_rad)
     return W
 
 
 @compiled
-def inverse_dynamics(q: Vector, dq: Vector, ddq: Vector, theta: Vector) -> Vector:
+def inverse_dynamics(q: Vector, dq: Vector, ddq: Vector, theta: Vector, level_rad: float) -> Vector:
     """Return tau (2,) = W theta, the torque that the model needs for this motion, Nm."""
-    W = regressor(q, dq, ddq, theta.shape[0])
+    W = regressor(q, dq, ddq, theta.shape[0], level_rad)
     tau = np.zeros(JOINTS)
     for i in range(JOINTS):
         for j in range(theta.shape[0]):
@@ -215,9 +217,11 @@ def put_position_columns(X: Vector, first_column: int, Y_h: Vector) -> None:
             Y_h[i, first_column + term * joints + i] = X[i, term]
 
 
-def payload_direction(link_length_m: tuple[float, float], count: int) -> Vector:
-    """Return what 1 kg at the tip of a 2R arm adds to its parameters (count,)."""
+def payload_direction(link_length_m: tuple[float, float], count: int, gravity_m_s2: float) -> Vector:
+    """Return what 1 kg at the tip of a 2R arm adds to its parameters (count,); gravity_m_s2: in the plane, 0: none."""
     l1, l2 = link_length_m
     direction = np.zeros(count)
     direction[:3] = l1**2 + l2**2, l1 * l2, l2**2
+    if gravity_m_s2:
+        direction[[A4, A5]] = gravity_m_s2 * l1, gravity_m_s2 * l2
     return direction

@@ -11,6 +11,7 @@ from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.identify import anchor, certificate, earlier, missing_torque
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import CommonCause
+from adacd_hil.scheme.model.regressor import A5
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
@@ -24,6 +25,7 @@ _CHANGED = (
     "no one model explains the whole fit: something has touched the arm or let go while it was learnt, or the arm does "
     "what the model doesn't know"
 )
+_OR_MOUNTING = ", such as gravity that acts otherwise than arm.mounting_deg says"
 _BEGINS_ANEW = "no certificate, learning begins anew"
 _POSITION_REMEDY = "if it is the arm's, `arm.position_torque_Nm` lets the model have it, from the next start on"
 
@@ -189,7 +191,7 @@ class CertificateWatch:
             case _Cause.ANCHOR:
                 lines = [*anchor.describe_refused(m, is_reading=False), *missing_torque.describe(m)]
             case _Cause.CHANGED:
-                lines = [_CHANGED]
+                lines = [_CHANGED + (_OR_MOUNTING if k["base"] > A5 else "")]
             case _Cause.MORE:
                 lines = [*earlier.describe_more(m), *missing_torque.describe(m)]
             case _Cause.BY_PLACE:

@@ -200,7 +200,7 @@ class Pipeline:
 
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
-        inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._policy.theta_ff)
+        inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._policy.theta_ff, 0.0)
         self._policy.contacts.compile()
         self._policy.compile()
         if self.detectors is not None:

@@ -163,6 +163,7 @@ class Supervisor:
     def __init__(self, settings: Settings) -> None:
         period_s = settings.bus.period_s
         self._max_age_cycles = settings.bus.max_age_cycles
+        self._has_gravity = settings.estimator.gravity
         self._blind_limit = settings.blind_cycles
         self._commission_cycles = settings.commission_cycles
         self._rest_cycles = round(REST_HOLD_S / period_s)
@@ -280,6 +281,8 @@ class Supervisor:
                 expected |= CONTACT
             case SchemeState.PAYLOAD:
                 waits_for_rest = bool(self._pending)
+            case SchemeState.REACT if self._is_told_of_payload and not self._is_latched:
+                cycles = 0
             case SchemeState.REACT if self._is_latched:
                 waits_for_rest = not is_reporting
             case SchemeState.REACT:
@@ -311,7 +314,8 @@ class Supervisor:
 
     def _has_grown(self, arm: ArmState, observation: int) -> bool:
         """Tell whether a contact that would clear itself has become one to be acknowledged."""
-        return bool(observation & COLLISION) or arm.is_late or self._phase_cycles >= self._patience_cycles
+        is_over = bool(observation & COLLISION) or arm.is_late or self._phase_cycles >= self._patience_cycles
+        return is_over or self._is_told_of_payload
 
     def _take(self, request: Request) -> None:
         """Keep a request if this state serves it sooner or later."""
@@ -326,7 +330,9 @@ class Supervisor:
 
     @property
     def _is_told_of_payload(self) -> bool:
-        return self._is_doubted and Request.PAYLOAD_CHANGED in self._pending
+        """Whether the user has said that what looks like a contact is the payload: its weight, where gravity acts."""
+        is_weight = self._has_gravity and self._origin is SchemeState.PAYLOAD
+        return (self._is_doubted or is_weight) and Request.PAYLOAD_CHANGED in self._pending
 
     def _keeps(self, request: Request, state: SchemeState) -> bool:
         """Tell whether a request waits in a state; hands that change a payload may touch the arm."""

@@ -111,7 +111,8 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
             SchemeEvent.CLEARED: Back.TO_ORIGIN,
         },
         # Holds its place. Out: acknowledged while nothing pushes; the announcement of a payload change; a payload that
-        # contacts looked like; with the certificate taken back, even while something seems to push.
+        # contacts looked like, or whose weight is one; with the certificate taken back, even while something seems to
+        # push.
         SchemeState.STOPPED: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.ACKNOWLEDGED: Back.TO_ORIGIN,
