@@ -12,6 +12,7 @@ from adacd_hil.analysis.replay.replay import replay
 from adacd_hil.api import LoadedRun, load
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.control import first_motion
+from adacd_hil.control.device_readings import READINGS, TorqueRatio, may_be_arm
 from adacd_hil.control.first_motion import FirstMotion
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.records import ArmState, FaultReason, SchemeState
@@ -188,8 +189,12 @@ def check(line: str, pattern: str, joint: int, value: float) -> None:
 def test_a_wrong_sign_or_scale_of_a_torque_sensor_is_named(feed: Feed, joint: int, factor: float) -> None:
     feed.tau_J[:, joint - 1] *= factor
     line = feed.judged().line
+    if factor < 0.0:
+        assert "either " in line  # a turned encoder looks almost the same at first
+        assert f"torque sensor of joint {joint} reversed (devices.sensor_node[{joint - 1}])" in line
+        return
     check(line, TORQUE, joint, factor)
-    assert f"devices.sensor{'_node' if factor < 0.0 else ''}[{joint - 1}]" in line
+    assert f"devices.sensor[{joint - 1}]" in line
 
 
 @pytest.mark.parametrize("joint", [1, 2])
@@ -204,8 +209,8 @@ def test_a_position_that_is_not_its_velocity_s_is_named(feed: Feed, joint: int, 
 @pytest.mark.parametrize(
     ("exchanged", "said"),
     [
-        (("tau_J",), "the sensors of joints 1 and 2 are exchanged: exchange devices.sensor_node = [3, 4]"),
-        (("q", "dq", "tau_c"), "the drives of joints 1 and 2 are exchanged: exchange devices.drive_node = [1, 2]"),
+        (("tau_J",), "either torque sensors exchanged (devices.sensor_node)"),
+        (("q", "dq", "tau_c"), "either drives exchanged (devices.drive_node)"),
         (
             ("q", "dq", "tau_c", "tau_J"),
             "joints 1 and 2 are exchanged, drives and sensors: exchange devices.drive_node",
@@ -241,15 +246,49 @@ def test_a_gear_that_was_told_wrongly_is_named(feed: Feed, joint: int, counted: 
     feed.q[:, joint - 1] *= counted
     feed.dq[:, joint - 1] *= counted
     line = feed.judged().line
-    check(line, r"joint (\d) turns about ([+-]?[\d.]+) times as far as position and velocity say", joint, turns)
-    assert f"scale.velocity_rad_s of devices.drive[{joint - 1}]" in line
+    check(line, r"joint (\d)(?: wrong, it)? turns about ([+-]?[\d.]+) times as far", joint, turns)
+    assert f"devices.drive[{joint - 1}]" in line
 
 
 @pytest.mark.parametrize("joint", [1, 2])
 def test_a_position_that_counts_against_the_torques_is_named(feed: Feed, joint: int) -> None:
     feed.q[:, joint - 1] *= -1.0
     feed.dq[:, joint - 1] *= -1.0
-    assert f"joint {joint}: its position counts against its torques" in feed.judged().line
+    assert f"either encoder of joint {joint} reversed (devices.drive_node[{joint - 1}])" in feed.judged().line
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+def test_a_motor_that_counts_the_other_way_is_certain_once_its_rivals_are_refuted(feed: Feed, joint: int) -> None:
+    feed.tau_c[:, joint - 1] *= -1.0
+    line = feed.judged().line
+    check(line, TORQUE, joint, -1.0)
+    assert f"reverse the motor of devices.drive_node[{joint - 1}]" in line
+    assert "either " not in line
+
+
+def test_sensors_that_both_measure_the_reaction_are_not_blamed_on_one_joint(feed: Feed) -> None:
+    feed.tau_J *= -1.0
+    assert "both torque sensors" in feed.judged().line
+
+
+def test_two_mistakes_at_once_are_not_one_certain_cause(feed: Feed) -> None:
+    feed.tau_J = feed.tau_J[:, ::-1] * (-1.0, 1.0)
+    line = feed.judged().line
+    assert "the drives or the sensors are exchanged" in line
+
+
+def test_a_reading_is_refuted_by_torques_only_as_far_as_they_are_known() -> None:
+    reversed_sensor = next(reading for reading in READINGS if reading.kind == "sensor" and reading.joint == 1)
+    measured = TorqueRatio(own=1.0, other=0.0, own_std=0.1, other_std=0.1)
+    assert not reversed_sensor.allows((None, measured), 0.3)
+    assert reversed_sensor.allows((None, measured._replace(own_std=0.4)), 0.3)
+    assert reversed_sensor.allows((measured, None), 0.3)
+
+
+def test_an_inertia_that_the_motion_leaves_open_refutes_nothing() -> None:
+    theta = np.array([0.3, 0.05, -0.01, 0.0, 0.0, 0.0, 0.0])
+    assert not may_be_arm(theta, np.full(7, 0.005))
+    assert may_be_arm(theta, np.full(7, 0.03))
 
 
 def test_a_torque_constant_that_is_off_by_a_fifth_is_a_warning(feed: Feed) -> None:
@@ -284,8 +323,8 @@ def test_a_mistake_that_would_be_certified_stops_the_arm_first_and_replays_to_th
 
 
 RUN_AWAY = {
-    "wrong-motor-sign": "perhaps joint 2: it accelerates against the commanded torque",
-    "swapped-joints": "perhaps joints 1 and 2 are exchanged, drives and sensors: exchange devices.drive_node",
+    "wrong-motor-sign": "perhaps motor of joint 2 reversed (devices.drive_node[1])",
+    "swapped-joints": "perhaps a node, sign or scale of the devices is wrong",
 }
 
 
@@ -296,6 +335,54 @@ def test_an_arm_that_runs_away_in_its_first_motion_is_told_what_is_likely(tmp_pa
     assert summary.result.fault is FaultReason.LIMIT
     [line] = [event.message for event in load(tmp_path / "run").events if "-> FAULT" in event.message]
     assert RUN_AWAY[truth] in line
+
+
+UPRIGHT = """
+extends = "certified"
+
+[arm]
+link_length_m = [0.4, 0.25]
+rated_torque_Nm = [12.0, 12.0]
+torque_limit_Nm = [12.0, 6.0]
+position_limit_deg = [75.0, 120.0]
+velocity_limit_deg_s = [250.0, 300.0]
+cad_theta = [0.2875, 0.05, 0.0208333, 0.0, 0.0, 0.0, 0.0, 7.84532, 1.22583]
+mass_kg = [2.0, 1.0]
+
+[devices]
+contract = ""
+
+[estimator]
+gravity = true
+
+[certified]
+prior_std = [1.0, 0.5, 0.5, 18.14, 0.3, 0.001, 0.2]
+
+[trajectory]
+amplitude_deg = [60.0, 60.0]
+half_period_s = [2.606, 10.42]
+
+[excitation]
+period_s = 5.559
+
+[controller]
+Kp = [402.4, 21.97]
+Kd = [20.12, 0.8239]
+
+[safety]
+rest_torque_Nm = 11.89
+"""
+
+
+@pytest.mark.parametrize(
+    ("truth", "cause"), [("swapped-sensors", "sensors"), ("wrong-sensor-sign", "torque sensor of joint 2 reversed")]
+)
+def test_gravity_does_not_make_a_wrong_cause_certain(tmp_path: Path, truth: str, cause: str) -> None:
+    rehearse(tmp_path, truth, UPRIGHT)
+    [line] = [event.message for event in load(tmp_path / "run").events if "-> FAULT" in event.message]
+    assert "MISCONFIGURED" in line
+    assert cause in line
+    assert "either " in line or f"the {cause}" in line
 
 
 def test_a_wrong_length_is_certified_with_a_warning_that_names_the_link(right_run: LoadedRun, tmp_path: Path) -> None:

@@ -5,24 +5,32 @@ The equation of a 2R arm, linear in theta, is fitted to each reading, with offse
 
     tau_J = W(q, dq, ddq) theta + offset − l dtau_J/dt
 
-A reading of a share of unexplained squares that is far below that of the configuration's, and of an inertia that an arm
-can have, is how the devices are. One reading is of the mounting: gravity acts in any direction of the plane of motion,
-so a4 and a5 have columns of sin(q1 - level_rad), too. Of 95 scenarios of the package, touched arms included, none comes
-below 0.5 times the share as told; of the mistakes below, each comes to 0.1 times or less, a mounting to 0.17.
+The configuration is refuted when a reading leaves a far smaller share of the squares unexplained and has an inertia
+that an arm can have. Of 95 scenarios of the package, touched arms included, none comes below 0.5 times the share as
+told; of the mistakes below, each comes to 0.1 times or less, a mounting to 0.17. That says that something is wrong, not
+yet what. One reading is of the mounting: gravity acts in any direction of the plane of motion, so a4 and a5 have
+columns of sin(q1 - level_rad), too. A reading is refuted
+
+    by the equation   where it leaves 1 / `_BETTER` times the least share of all, at a likelihood that is at least
+                      exp(`_LOG_ODDS`) times smaller, or where its inertia is no arm's by `_DEVIATIONS` standard
+                      deviations: gravity and a short motion leave the inertia open
+    by the torques    where sensed over commanded torque isn't what it predicts, as far as that ratio is known
+
+`left` returns the readings that neither refutes. One alone is certain.
 
 Not told apart: an arm without gravity is its own mirror image, so of two joints of which one is reversed nothing says
 which, nor that both are. Torques in one wrong scale make an arm that is as much heavier.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.model.regressor import A4, A5, is_positive_definite, regressor
+from adacd_hil.scheme.model.regressor import A1, A2, A3, A4, A5, is_positive_definite, regressor
 from adacd_hil.settings.configuration import Settings
 
 _FEWEST_BLOCKS: Final = 15
@@ -36,8 +44,31 @@ _JUDGED_EVERY: Final = 4
 _ROUNDS: Final = 3
 """Verdicts in a row that have to agree."""
 _SUSPECT_BLOCKS: Final = 6
-_NEARLY: Final = 1.2
-"""As `_BETTER`, of an arm that has run away and whose configuration no arm can have."""
+_CORRELATED: Final = 4.0
+"""Blocks that count as one: what the equation lacks lasts longer than a block."""
+_DEVIATIONS: Final = 5.0
+_LOG_ODDS: Final = 7.0
+"""Of 1000 to 1, for blocks of normal errors: n / 2 times the logarithm of the ratio of shares."""
+_OTHERS: Final = 0.4
+"""Largest difference of a sensor's share of the other joint's command from the predicted one."""
+_MOST_NAMED: Final = 8
+"""Causes in one line; if more are left, the motion has told nothing."""
+_SHORT: Final = {
+    "reversed": "one of the joints reversed (arm.sign)",
+    "joints": "joints exchanged (devices.drive_node and devices.sensor_node)",
+    "drives": "drives exchanged (devices.drive_node)",
+    "sensors": "torque sensors exchanged (devices.sensor_node)",
+    "position": "encoder of joint {joint} reversed (devices.drive_node[{place}])",
+    "sensor": "torque sensor of joint {joint} reversed (devices.sensor_node[{place}])",
+    "motor": "motor of joint {joint} reversed (devices.drive_node[{place}])",
+    "reaction": "both torque sensors reversed (devices.sensor_node)",
+    "encoders": "both encoders reversed (devices.drive_node)",
+    "drive": "encoder and motor of joint {joint} reversed (devices.drive_node[{place}])",
+    "scale": "gear of joint {joint} wrong, it turns about {turns:g} times as far (devices.drive[{place}])",
+    "torque": "scale of a torque sensor wrong (devices.sensor[0] or devices.sensor[1])",
+    "mounting": "mounting wrong, link 1 hangs at about q1 = {hangs:.0f} deg (arm.mounting_deg[1] or arm.zero_deg[0])",
+}
+"""A cause beside others, by kind."""
 RIDGE: Final = 1e-9
 """Of the scaled equations, so that what a motion doesn't tell is 0."""
 _MOUNTING_BLOCKS: Final = 60
@@ -47,8 +78,17 @@ _TURNED_DEG: Final = 10.0
 _SCALES: Final = (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
 
 
+class TorqueRatio(NamedTuple):
+    """What a sensor measures of the torque that its own joint's drive is commanded, and of the other's."""
+
+    own: float
+    other: float
+    own_std: float
+    other_std: float
+
+
 class Reading(NamedTuple):
-    """One way. position, torque: factors on what is counted, by joint. kind: of the texts of `describe`.
+    """One way. position, torque, motor: factors on what is counted and commanded, by joint. kind: of its text.
 
     is_turned: gravity acts in any direction.
     """
@@ -58,12 +98,34 @@ class Reading(NamedTuple):
     is_sensor_exchanged: bool = False
     position: tuple[float, float] = (1.0, 1.0)
     torque: tuple[float, float] = (1.0, 1.0)
+    motor: tuple[float, float] = (1.0, 1.0)
     is_turned: bool = False
 
     @property
     def joint(self) -> int:
-        """The joint whose position is read otherwise, 0 or 1."""
-        return 0 if self.position[0] != 1.0 else 1
+        """The joint that is read otherwise, 0 or 1."""
+        return 0 if (self.position[0], self.torque[0], self.motor[0]) != (1.0, 1.0, 1.0) else 1
+
+    def allows(self, found: Sequence[TorqueRatio | None], error: float) -> bool:
+        """Tell whether it predicts sensed over commanded torque as found, by node; None: not known.
+
+        error: by how much a torque constant or a scale may be off, 0 to 1.
+        """
+        for i in range(JOINTS):
+            drive, sensor = 1 - i if self.is_drive_exchanged else i, 1 - i if self.is_sensor_exchanged else i
+            ratio = found[sensor]
+            if ratio is None:
+                continue
+            sign = math.copysign(1.0, self.motor[i] * self.torque[i])
+            own, other, own_std, other_std = ratio
+            own, other = sign * own, sign * other
+            if drive != sensor:
+                own, other, own_std, other_std = other, own, other_std, own_std
+            low, high = (0.0, math.inf) if self.kind == "torque" else (1.0 - error, 1.0 / (1.0 - error))
+            slack, cross_slack = _DEVIATIONS * own_std, _DEVIATIONS * other_std
+            if own + slack < low or own - slack > high or abs(other) > _OTHERS + cross_slack:
+                return False
+        return True
 
     @property
     def row(self) -> tuple[float, ...]:
@@ -73,19 +135,26 @@ class Reading(NamedTuple):
 
 READINGS: Final = (
     Reading("told"),
-    Reading("reversed", position=(1.0, -1.0), torque=(1.0, -1.0)),
+    Reading("reversed", position=(1.0, -1.0), torque=(1.0, -1.0), motor=(1.0, -1.0)),
     Reading("joints", True, True),
-    Reading("joints", True, True, (1.0, -1.0), (1.0, -1.0)),
+    Reading("joints", True, True, (1.0, -1.0), (1.0, -1.0), (1.0, -1.0)),
     Reading("drives", is_drive_exchanged=True),
     Reading("sensors", is_sensor_exchanged=True),
     Reading("position", position=(-1.0, 1.0)),
     Reading("position", position=(1.0, -1.0)),
+    Reading("sensor", torque=(-1.0, 1.0)),
+    Reading("sensor", torque=(1.0, -1.0)),
+    Reading("motor", motor=(-1.0, 1.0)),
+    Reading("motor", motor=(1.0, -1.0)),
+    Reading("reaction", torque=(-1.0, -1.0)),
+    Reading("encoders", position=(-1.0, -1.0)),
+    Reading("drive", position=(-1.0, 1.0), motor=(-1.0, 1.0)),
+    Reading("drive", position=(1.0, -1.0), motor=(1.0, -1.0)),
     *(Reading("scale", position=(factor, 1.0)) for factor in _SCALES),
     *(Reading("scale", position=(1.0, factor)) for factor in _SCALES),
-    *(Reading("torque", torque=(1.0, factor)) for factor in (-1.0, *_SCALES)),
+    *(Reading("torque", torque=(1.0, factor)) for factor in _SCALES),
 )
 _MOUNTED: Final = Reading("mounting", is_turned=True)
-_OF_EXCHANGE: Final = tuple(place for place, reading in enumerate(READINGS) if reading.kind in ("drives", "sensors"))
 
 
 @compiled
@@ -179,7 +248,7 @@ class DeviceReadings:
         self._normals = np.zeros((readings, unknowns + 1, unknowns + 1))
         self._blocks = 0
         self._shares, self._solutions = np.ones(readings), np.zeros((readings, unknowns))
-        self._agreed = (0, 0)  # which reading, how often in a row
+        self._refuted = 0  # times in a row
 
     def compile(self) -> None:
         """Compile what `add` calls."""
@@ -193,88 +262,144 @@ class DeviceReadings:
         add_block(self._rows, q, dq, ddq, tau_J, dtau_J, self._level_rad, self._count, self._normals)
         self._blocks += 1
 
-    def step(self) -> Reading | None:
-        """Judge every few blocks; return the right reading once it is certain that it isn't the configuration's."""
+    def step(self, is_torque_known: bool) -> bool:
+        """Judge every few blocks; return whether the configuration is certainly not how the devices are.
+
+        is_torque_known: a scale of the torques is judged only where the commanded ones have confirmed it.
+        """
         if self._blocks < _FEWEST_BLOCKS or self._blocks % _JUDGED_EVERY:
-            return None
-        best = self._solve(range(len(self._readings)))
-        is_wrong = best != 0 and self._shares[0] >= _UNEXPLAINED
-        is_better = is_wrong and self._rank(best) <= min(_BETTER * self._shares[0], _EXPLAINED)
-        self._agreed = (best, self._agreed[1] + 1 if best == self._agreed[0] else 1) if is_better else (0, 0)
-        return self._readings[best] if self._agreed[1] >= _ROUNDS else None
+            return False
+        best = self._solve(range(1, len(self._readings)))
+        bound = min(_BETTER * float(self._shares[0]), _EXPLAINED)
+        is_refuted = self._shares[0] >= _UNEXPLAINED and self._rank(best) <= bound
+        self._refuted = self._refuted + 1 if is_refuted else 0
+        return self._refuted >= _ROUNDS and (is_torque_known or self._readings[best].kind != "torque")
 
-    def suspect(self) -> Reading | None:
-        """Return the likeliest reading of an arm that has run away and that no arm is like as it was told, if any."""
+    def left(self, found: Sequence[TorqueRatio | None], error: float) -> list[Reading]:
+        """Return the readings that neither equation nor torques refute, best first; of each kind and joint the best.
+
+        Nothing where the best reading of all, which is refuted, explains far more than the others: the right one isn't
+        among them.
+        """
         if self._blocks < _SUSPECT_BLOCKS:
-            return None
-        unlikely = ("scale", "torque", "mounting")
-        best = self._solve([place for place, reading in enumerate(self._readings) if reading.kind not in unlikely])
-        if is_positive_definite(self._solutions[0]):
-            return None
-        return self._readings[best] if self._rank(best) <= _NEARLY * self._shares[0] else None
+            return []
+        self._solve(())
+        allowed = [
+            place
+            for place, reading in enumerate(self._readings)
+            if self._is_distinct(place) and reading.allows(found, error)
+        ]
+        possible = [place for place, is_arm in zip(allowed, self._may_be_arms(allowed), strict=True) if is_arm]
+        possible.sort(key=lambda place: float(self._shares[place]))
+        least = min(self._shares[place] for place in range(len(self._readings)) if self._is_distinct(place))
+        odds = math.exp(min(2.0 * _LOG_ODDS * _CORRELATED / self._freedom, 50.0))
+        left = [place for place in possible if self._shares[place] <= max(1.0 / _BETTER, odds) * least]
+        texts: dict[tuple[str, int], Reading] = {}
+        for place in left:
+            texts.setdefault((self._readings[place].kind, self._readings[place].joint), self._readings[place])
+        return list(texts.values())
 
-    def exchanged(self) -> str:
-        """Say which of the devices are at each other's joint where it is the drives or the sensors."""
-        self._solve(_OF_EXCHANGE)
-        drives, sensors = self._shares[list(_OF_EXCHANGE)]
-        return "drives" if drives < sensors else "sensors"
+    def is_unlike_an_arm(self) -> bool:
+        """Whether no arm has the inertia that the motion has as it was told, or too little of a motion is known."""
+        self._solve(())
+        return 0 < self._blocks < _SUSPECT_BLOCKS or not is_positive_definite(self._solutions[0])
 
-    def describe(self, reading: Reading) -> str:
-        """Say what is wrong, how sure that is, and what to change."""
-        place = self._readings.index(reading)
-        told, so = 100.0 * np.sqrt(self._shares[[0, place]])
-        text = self._mounting_text() if reading.is_turned else self._text(reading)
-        return f"{text} (unexplained of the torque: {told:.1f} % as told, {so:.1f} % so)"
+    def describe(self, left: Sequence[Reading]) -> str:
+        """Name the causes that are left, how well each explains the torque, and what to change; empty: no cause.
+
+        Where even the best explains little, the cause is not among the readings, or they are several at once.
+        """
+        wrong = [reading for reading in left if reading.kind != "told"]
+        places = [self._readings.index(reading) for reading in wrong]
+        if not wrong or len(wrong) > _MOST_NAMED or min(self._shares[places]) > _EXPLAINED:
+            return ""
+        shares = 100.0 * np.sqrt(self._shares[[0, *places]])
+        told = f"unexplained of the torque: {shares[0]:.1f} % as told"
+        if len(wrong) == 1:
+            return f"{self._text(wrong[0])} ({told}, {shares[1]:.1f} % so)"
+        names = [
+            _SHORT[reading.kind].format(
+                joint=reading.joint + 1,
+                place=reading.joint,
+                turns=reading.position[reading.joint],
+                hangs=self._hangs_deg,
+            )
+            for reading in wrong
+        ]
+        texts = " or ".join(f"{name}: {so:.1f} %" for name, so in zip(names, shares[1:], strict=True))
+        return f"either {texts}; the motion doesn't say which ({told})"
 
     def _text(self, reading: Reading) -> str:
+        """Say what is wrong, and what to change."""
         sign, joint = list(self._settings.arm.sign), reading.joint
-        if reading.kind == "joints":
-            return (
+        drives, sensors = list(self._settings.devices.drive_node), list(self._settings.devices.sensor_node)
+        drive, sensor = f"devices.drive_node[{joint}]", f"devices.sensor_node[{joint}]"
+        return {
+            "joints": (
                 "joints 1 and 2 are exchanged, drives and sensors: exchange devices.drive_node and devices.sensor_node"
-            )
-        if reading.kind in ("drives", "sensors"):
-            key = f"devices.{reading.kind[:-1]}_node"
-            return f"the {reading.kind} of joints 1 and 2 are exchanged: exchange {key} = {self._nodes(reading.kind)}"
-        if reading.kind == "reversed":
-            return (
+            ),
+            "drives": f"the drives of joints 1 and 2 are exchanged: exchange devices.drive_node = {drives}",
+            "sensors": f"the sensors of joints 1 and 2 are exchanged: exchange devices.sensor_node = {sensors}",
+            "reversed": (
                 f"joint 2 turns the other way than arm.sign = {sign} says, if joint 1 is right: arm.sign = "
                 f"{[sign[0], -sign[1]]}, or {[-sign[0], sign[1]]} if it is joint 1"
-            )
-        if reading.kind == "position":
-            return (
-                f"joint {joint + 1}: its position counts against its torques: reverse the encoder of "
-                f"devices.drive_node[{joint}], or its motor and torque sensor and arm.sign[{joint}] = {sign[joint]}"
-            )
-        if reading.kind == "scale":
-            return (
+            ),
+            "position": (
+                f"joint {joint + 1}: its position counts against its torques: reverse the encoder of {drive}, or its "
+                f"motor and torque sensor and arm.sign[{joint}] = {sign[joint]}"
+            ),
+            "sensor": f"joint {joint + 1}: its torque sensor counts against its drive: reverse the sensor of {sensor}",
+            "reaction": (
+                f"both torque sensors count against their drives: reverse those of devices.sensor_node = {sensors}, "
+                "and both of arm.sign if it is the drives"
+            ),
+            "encoders": f"both positions count against their torques: reverse those of devices.drive_node = {drives}",
+            "motor": (
+                f"joint {joint + 1}: its motor counts against its encoder and sensor: reverse the motor of {drive}, or "
+                f"its encoder and torque sensor and arm.sign[{joint}] = {sign[joint]}"
+            ),
+            "drive": (
+                f"joint {joint + 1}: its encoder and motor count against its torque sensor: reverse both of {drive}, "
+                f"or the sensor of {sensor} and arm.sign[{joint}] = {sign[joint]}"
+            ),
+            "scale": (
                 f"joint {joint + 1} turns about {reading.position[joint]:g} times as far as position and velocity say: "
                 "correct its gear: scale.gear_ratio, scale.increments_per_joint_rev and scale.velocity_rad_s of "
                 f"devices.drive[{joint}]"
-            )
-        return (
-            f"the torque sensor of joint 2 measures about {1.0 / reading.torque[1]:+.2g} times what that of joint 1 "
-            "would: correct scale.torque_Nm of devices.sensor[0] or devices.sensor[1]"
-        )
+            ),
+            "torque": (
+                f"the torque sensor of joint 2 measures about {1.0 / reading.torque[1]:+.2g} times what that of joint "
+                "1 would: correct scale.torque_Nm of devices.sensor[0] or devices.sensor[1]"
+            ),
+            "mounting": self._mounting_text(),
+        }[reading.kind]
 
     def _mounting_text(self) -> str:
-        hangs_deg = self._settings.mounting_deg[1]
-        found_deg = (hangs_deg + self._turned_deg + 180.0) % 360.0 - 180.0
         return (
-            f"gravity acts as if link 1 hung at about q1 = {found_deg:.0f} deg: correct the mounting, "
-            f"arm.mounting_deg[1] = {hangs_deg:g} deg, or arm.zero_deg[0] if the angle is wrong"
+            f"gravity acts as if link 1 hung at about q1 = {self._hangs_deg:.0f} deg: correct the mounting, "
+            f"arm.mounting_deg[1] = {self._settings.mounting_deg[1]:g} deg, or arm.zero_deg[0] if the angle is wrong"
         )
 
-    def _nodes(self, kind: str) -> list[int]:
-        devices = self._settings.devices
-        return list(devices.drive_node if kind == "drives" else devices.sensor_node)
+    @property
+    def _hangs_deg(self) -> float:
+        """The q1 at which link 1 points down, deg, by the reading of the mounting."""
+        return (self._settings.mounting_deg[1] + self._turned_deg + 180.0) % 360.0 - 180.0
+
+    @property
+    def _freedom(self) -> int:
+        """Torques beyond the unknowns of the equation, 1 at least."""
+        return max(JOINTS * self._blocks - (self._normals.shape[1] - 1), 1)
 
     def _rank(self, place: int) -> float:
-        """Return the share that a reading leaves, infinite where it is no arm's, or too early to be known."""
-        is_early = self._readings[place].is_turned and self._blocks < _MOUNTING_BLOCKS
-        if is_early or not is_positive_definite(self._solutions[place]):
-            return math.inf
-        is_as_told = self._readings[place].is_turned and abs(self._turned_deg) < _TURNED_DEG
-        return math.inf if is_as_told else float(self._shares[place])
+        """Return the share that a reading leaves, infinite where it is no arm's or not distinct."""
+        is_right = self._is_distinct(place) and is_positive_definite(self._solutions[place])
+        return float(self._shares[place]) if is_right else math.inf
+
+    def _is_distinct(self, place: int) -> bool:
+        """Whether a reading is another one than as told: not gravity of a small motion, or turned by little."""
+        if not self._readings[place].is_turned:
+            return True
+        return self._blocks >= _MOUNTING_BLOCKS and abs(self._turned_deg) >= _TURNED_DEG
 
     @property
     def _turned_deg(self) -> float:
@@ -282,7 +407,25 @@ class DeviceReadings:
         mounted = self._solutions[-1]
         return math.degrees(math.atan2(mounted[-2:].sum(), mounted[A4 : A5 + 1].sum()))
 
+    def _may_be_arms(self, places: Sequence[int]) -> list[bool]:
+        """Tell of each reading whether an arm has its inertia, or one that the motion doesn't tell from it."""
+        normals = self._normals[list(places), :-1, :-1]
+        size = np.sqrt(np.maximum(np.diagonal(normals, axis1=1, axis2=2), 1e-12))
+        scaled = normals / (size[:, :, np.newaxis] * size[:, np.newaxis, :])
+        inverse = np.diagonal(np.linalg.inv(scaled + RIDGE * np.eye(scaled.shape[1])), axis1=1, axis2=2)
+        spread = self._normals[list(places), -1, -1]
+        left = np.maximum(self._shares[list(places)] * spread, 1e-12) / self._freedom * _CORRELATED
+        slack = _DEVIATIONS * np.sqrt(left[:, np.newaxis] * np.maximum(inverse, 0.0)) / size
+        return [may_be_arm(self._solutions[place], slack[row]) for row, place in enumerate(places)]
+
     def _solve(self, among: Iterable[int]) -> int:
-        """Solve for all readings; return the best of some."""
+        """Solve for all readings; return the best of some, 0 of none."""
         solve_readings(self._normals, self._count, max(self._blocks, 1), self._shares, self._solutions)
-        return min(among, key=self._rank)
+        return min(among, key=self._rank, default=0)
+
+
+def may_be_arm(theta: Vector, slack: Vector) -> bool:
+    """Tell whether M(q) is positive definite for some parameters within `slack` of theta."""
+    a1, a2 = theta[A1] + slack[A1], max(abs(theta[A2]) - slack[A2], 0.0)
+    a3 = min(max(0.5 * a1, theta[A3] - slack[A3]), theta[A3] + slack[A3])
+    return bool(a3 > 0.0 and a3 * (a1 - a3) > a2**2)

@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.control.device_readings import RIDGE, DeviceReadings
+from adacd_hil.control.device_readings import RIDGE, DeviceReadings, Reading, TorqueRatio
 from adacd_hil.control.geometry_check import EVENT as GEOMETRY
 from adacd_hil.control.geometry_check import geometry_event
 from adacd_hil.device.arm import Arm
@@ -58,6 +58,14 @@ _ALIGNED: Final = 0.7
 """Correlation of torque and acceleration from which on one is along the other, or against it."""
 _FAR: Final = 2.5
 """Sensed over commanded torque from which on scales are the likeliest reason of an arm that runs away or lags."""
+_EXCHANGES: Final = ("drives", "sensors", "joints")
+_NO_CAUSE: Final = (
+    "the motion contradicts the arm as it was told, and doesn't say why: check nodes, signs and scales of the devices"
+)
+_TOO_SHORT: Final = (
+    "perhaps a node, sign or scale of the devices is wrong, or something pushed the arm; the motion was too short to "
+    "say which"
+)
 _OWN, _OTHER = 0, 1
 _COLUMNS: Final = 7
 
@@ -81,8 +89,9 @@ class FirstMotion:
         self._long, self._short = (_Blocks(span_s, self._period_s) for span_s in (BLOCK_S, SHORT_BLOCK_S))
         self._blocks = self._powered = 0  # powered: cycles
         self._readings: DeviceReadings | None = DeviceReadings(settings) if self._error > 0.0 else None
-        # Over short blocks, Σ of ddq², tau_c², tau_J², tau_c ddq, tau_J ddq, tau_c dq, tau_c tau_J.
-        self._pushed = np.zeros((7, JOINTS))
+        # Over short blocks, Σ of ddq², tau_c², tau_J², tau_c ddq, tau_J ddq, tau_c dq, tau_c tau_J, and the same with
+        # the other joint's tau_c.
+        self._pushed = np.zeros((8, JOINTS))
         self._normal = np.zeros((JOINTS, _COLUMNS + 1, _COLUMNS + 1))
         self._moving = [0] * JOINTS
         self._path = np.zeros((3, JOINTS))  # Σ Δq ∫ dq dt, Σ (∫ dq dt)², Σ Δq²
@@ -141,10 +150,10 @@ class FirstMotion:
             readings.add(block.q, block.dq, block.ddq, block.tau_J, block.dtau_J)
             ddq, tau_c, tau_J = block.ddq, block.tau_c, block.tau_J
             squares = ddq * ddq, tau_c * tau_c, tau_J * tau_J
-            self._pushed += *squares, tau_c * ddq, tau_J * ddq, tau_c * block.dq, tau_c * tau_J
-            reading = readings.step()
-            if reading is not None and (reading.kind != "torque" or not self._open):
-                self.line = readings.describe(reading)
+            crossed = tau_c[::-1] * tau_J
+            self._pushed += *squares, tau_c * ddq, tau_J * ddq, tau_c * block.dq, tau_c * tau_J, crossed
+            if readings.step(is_torque_known=not self._open):
+                self.line = readings.describe(self._left()) or _NO_CAUSE
 
     def certify(self, certificates: tuple[Certificate, ...]) -> None:
         """Compare the first certificate of the run, if there is one, with the lengths that the host was told."""
@@ -159,27 +168,37 @@ class FirstMotion:
             return ""
         if scales := self._suspect_scales():
             return scales
-        ddq, tau_c, tau_J, commanded, sensed, power, _ = self._pushed
+        left = [reading for reading in self._left() if reading.kind not in ("scale", "torque", "mounting")]
+        ddq, tau_c, tau_J, commanded, sensed, power, *_ = self._pushed
         joint = int(np.argmin(power))  # it drives the other, which is dragged and takes less
         along_c = commanded[joint] / math.sqrt(max(ddq[joint] * tau_c[joint], 1e-12))
         along_J = sensed[joint] / math.sqrt(max(ddq[joint] * tau_J[joint], 1e-12))
         if along_c < -_ALIGNED and abs(along_J) > _ALIGNED:
-            what = "motor" if along_J > 0.0 else "position"
-            return (
-                f"perhaps joint {joint + 1}: it accelerates against the commanded torque (correlation {along_c:+.2f}, "
-                f"with the sensed torque {along_J:+.2f}): its {what}, of devices.drive_node[{joint}], counts the other "
-                "way"
-            )
-        reading = self._readings.suspect()
-        return "" if reading is None else f"perhaps {self._readings.describe(reading)}"
+            kinds = ("motor",) if along_J > 0.0 else ("position", "drive")
+            left = [r for r in left if r.kind in _EXCHANGES or (r.kind in kinds and r.joint == joint)]
+        elif not self._readings.is_unlike_an_arm():
+            return ""
+        text = self._readings.describe(left)
+        return f"perhaps {text.removeprefix('either ')}" if text else _TOO_SHORT
+
+    def _left(self) -> list[Reading]:
+        """Return how the devices may be, by the arm's equation and by the commanded torques."""
+        return [] if self._readings is None else self._readings.left(self._ratios(), self._error)
+
+    def _ratios(self) -> list[TorqueRatio | None]:
+        return [
+            ratio_of(self._normal[joint], self._moving[joint]) if self._moving[joint] >= _FEWEST_BLOCKS else None
+            for joint in range(JOINTS)
+        ]
 
     def _suspect_scales(self) -> str:
-        """Name the joint whose sensor measures far more or less than is commanded, though along it."""
-        _, tau_c, tau_J, _, _, _, both = self._pushed
+        """Name the joint whose sensor measures far more or less than is commanded, though along it and no other."""
+        _, tau_c, tau_J, _, _, _, both, crossed = self._pushed
         found = [
             (abs(math.log(ratio)), joint, ratio)
             for joint in range(JOINTS)
             if both[joint] > _ALIGNED * math.sqrt(tau_c[joint] * tau_J[joint])
+            and both[joint] * math.sqrt(tau_c[1 - joint]) > abs(crossed[joint]) * math.sqrt(tau_c[joint])
             and not 1.0 / _FAR < (ratio := both[joint] / tau_c[joint]) < _FAR
         ]
         if not found:
@@ -237,17 +256,12 @@ class FirstMotion:
         return ""
 
     def _judge_torque(self) -> str:
-        found = [
-            ratio_of(self._normal[joint], self._moving[joint]) if self._moving[joint] >= _FEWEST_BLOCKS else None
-            for joint in range(JOINTS)
-        ]
+        found = self._ratios()
         first, second = found
-        if first is not None and second is not None and first.is_of_other and second.is_of_other:
-            what = "sensors" if self._readings is None else self._readings.exchanged()
-            return (
-                "joints 1 and 2: each torque sensor measures what the drive of the other joint is commanded; by the "
-                f"arm's motion the {what} are exchanged: exchange devices.{what[:-1]}_node"
-            )
+        if first is not None and second is not None and is_of_other(first) and is_of_other(second):
+            head = "joints 1 and 2: each torque sensor measures what the drive of the other joint is commanded: "
+            causes = "" if self._readings is None else self._readings.describe(self._left())
+            return head + (causes or "the drives or the sensors are exchanged")
         for joint, ratio in enumerate(found):
             if ratio is None or joint not in self._open or ratio.own_std > _SURE:
                 continue
@@ -289,10 +303,11 @@ class FirstMotion:
                 f"this joint and measures, and {self._scales(joint)}"
             )
         if ratio.own < 0.0:
-            return (
-                f"{head}, +1 expected: one of the two counts the other way than arm.sign[{joint}] says; reverse the "
-                f"sensor of devices.sensor_node[{joint}] by its maker's tool"
+            causes = "" if self._readings is None else self._readings.describe(self._left())
+            either = (
+                f"either the sensor of devices.sensor_node[{joint}] or devices.drive_node[{joint}] counts the other way"
             )
+            return f"{head}, +1 expected: {causes or either}"
         low, high = 1.0 - self._error, 1.0 / (1.0 - self._error)
         return f"{head}, {low:.2f} to {high:.2f} allowed by safety.first_motion_error; correct {self._scales(joint)}"
 
@@ -346,19 +361,10 @@ class _Blocks:
         return _Block(q, dq, tau_J, tau_c, ddq / span_s, dtau_J / span_s, dtau_c / span_s, travel, way, least_speed)
 
 
-class TorqueRatio(NamedTuple):
-    """What a sensor measures of the torque that its own joint's drive is commanded, and of the other's."""
-
-    own: float
-    other: float
-    own_std: float
-    other_std: float
-
-    @property
-    def is_of_other(self) -> bool:
-        """Whether the sensor measures the other joint's torque and not its own."""
-        is_known = max(self.own_std, self.other_std) < 2.0 * _SURE
-        return is_known and abs(self.own) < 0.4 and abs(self.other) > 0.6
+def is_of_other(ratio: TorqueRatio) -> bool:
+    """Tell whether the sensor measures the other joint's torque and not its own."""
+    is_known = max(ratio.own_std, ratio.other_std) < 2.0 * _SURE
+    return is_known and abs(ratio.own) < 0.4 and abs(ratio.other) > 0.6
 
 
 def ratio_of(normal: NDArray[np.float64], blocks: int) -> TorqueRatio:
