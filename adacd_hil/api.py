@@ -11,22 +11,6 @@ Everything else may move; these names stay. docs/api.md has examples.
 | `SchemeState`, `ContactReport`, `Certificate`, `LogError` | what the results are made of |
 """
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from adacd_hil.analysis.foreign.recording_verdict import Verdict
-    from adacd_hil.analysis.library.array_detection import ArrayContact, ArrayError, detect, fit
-    from adacd_hil.analysis.library.array_detection import ArrayDetection as Detection
-    from adacd_hil.analysis.library.array_detection import FittedModel as Model
-    from adacd_hil.analysis.library.array_detection import OfflineArm as Arm
-    from adacd_hil.analysis.library.loaded_run import LoadedRun, RunContact, RunEvent, load
-    from adacd_hil.log.log_files import LogError
-    from adacd_hil.records import ContactReport, SchemeState
-    from adacd_hil.scheme.detect.detector_registry import StreamDetector as Detector
-    from adacd_hil.scheme.detect.detectors import register as register_detector
-    from adacd_hil.scheme.identify.certificate import Certificate
-    from adacd_hil.wire.bus import Bus, Frame
-
 __all__ = [
     "Arm",
     "ArrayContact",
@@ -50,7 +34,7 @@ __all__ = [
     "register_detector",
 ]
 
-_LIBRARY = "adacd_hil.analysis.library"
+_LIBRARY = "adacd_hil.lab.library"
 _PLACES = {
     "Arm": (f"{_LIBRARY}.array_detection", "OfflineArm"),
     "ArrayContact": (f"{_LIBRARY}.array_detection", "ArrayContact"),
@@ -67,7 +51,7 @@ _PLACES = {
     "RunContact": (f"{_LIBRARY}.loaded_run", "RunContact"),
     "RunEvent": (f"{_LIBRARY}.loaded_run", "RunEvent"),
     "SchemeState": ("adacd_hil.records", "SchemeState"),
-    "Verdict": ("adacd_hil.analysis.foreign.recording_verdict", "Verdict"),
+    "Verdict": ("adacd_hil.lab.offline.recording_verdict", "Verdict"),
     "detect": (f"{_LIBRARY}.array_detection", "detect"),
     "fit": (f"{_LIBRARY}.array_detection", "fit"),
     "load": (f"{_LIBRARY}.loaded_run", "load"),

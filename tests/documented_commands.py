@@ -21,12 +21,12 @@ import can
 import click
 from documents import ROOT
 
-from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli as host_cli
 from adacd_hil.control.arm_records import Tare, read_tare
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.device.profile import ProfileSettings, load_profile
 from adacd_hil.given_path import WrittenPath
+from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.settings.configuration import Settings, apply_settings, load_settings, parse_changes, parse_variations
 from adacd_hil.settings.schema import ConfigError, find_problems, parse
 from adacd_hil.wire.codec import CodecError, load_codec

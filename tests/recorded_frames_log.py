@@ -1,6 +1,6 @@
 """A short recording with a frame of every kind that a playback meets, 1 ms apart."""
 
-from adacd_hil.log.formats.mcap_frames import FrameWriter, RecordedFrame
+from adacd_hil.log.frames.mcap_frames import FrameWriter, RecordedFrame
 
 KINDS = (
     {"can_id": 0x000, "data": b"\x01\x00", "is_tx": True},

@@ -45,7 +45,7 @@ def test_the_key_has_the_text_of_the_package_itself() -> None:
     assert b"def step(" in sources["adacd_hil.scheme.kernel.paper_kernel"]
     assert b"class Layout" in sources["adacd_hil.records"]
     assert b"def source_digest" in sources["adacd_hil.compiled"]
-    assert not [name for name in sources if name.startswith(("adacd_hil.cli", "adacd_hil.analysis.report"))]
+    assert not [name for name in sources if name.startswith(("adacd_hil.cli", "adacd_hil.lab.report"))]
     assert not [name for name in sources if name.startswith("adacd_hil.scheme.pipeline.")]
 
 

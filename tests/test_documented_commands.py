@@ -19,7 +19,7 @@ import pytest
 from documents import PAGES, ROOT, Document, Piece, read_document
 
 from adacd_hil.api import load
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import FRAME_DTYPE
 from adacd_hil.records import SchemeState

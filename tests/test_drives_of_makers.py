@@ -9,11 +9,11 @@ from click.testing import CliRunner, Result
 from eds_variants import EdsVariant
 
 from adacd_hil.api import load
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import ExitCode, exit_code
 from adacd_hil.device.profile import load_profile
-from adacd_hil.log.editing.log_info import attachment
+from adacd_hil.log.log_info import attachment
 from adacd_hil.settings.configuration import load_settings
 
 pytestmark = pytest.mark.slow

@@ -8,14 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from adacd_hil.analysis.replay.replay import replay
 from adacd_hil.api import LoadedRun, load
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control import first_motion
 from adacd_hil.control.device_readings import READINGS, TorqueRatio, may_be_arm
 from adacd_hil.control.first_motion import FirstMotion
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.records import ArmState, FaultReason, SchemeState
+from adacd_hil.replay.replay import replay
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import RequestSettings
 

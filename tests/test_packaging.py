@@ -57,7 +57,7 @@ def test_the_wheel_holds_the_contracts_and_electronic_data_sheets(wheel: Path) -
     assert held == {path.name for path in (ROOT / "dbc").iterdir()}
 
 
-@pytest.mark.parametrize("name", ["LICENSE", "NOTICE", "adacd_hil/analysis/report/assets/uplot-1.6.32.LICENSE"])
+@pytest.mark.parametrize("name", ["LICENSE", "NOTICE", "adacd_hil/lab/report/assets/uplot-1.6.32.LICENSE"])
 def test_the_wheel_holds_the_licence(wheel: Path, name: str) -> None:
     with zipfile.ZipFile(wheel) as archive:
         [held] = [each for each in archive.namelist() if each.endswith(f".dist-info/licenses/{name}")]

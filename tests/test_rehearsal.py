@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 from own_arm import describe_arm
 
-from adacd_hil.cli.commands.demo_command import resolve
+from adacd_hil.cli.embedded_run import resolve
 from adacd_hil.cli.main import cli
-from adacd_hil.commission.configuration_check import examine_configuration
+from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.profile import load_profile
 from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
 from adacd_hil.settings.configuration import load_settings

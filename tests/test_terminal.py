@@ -17,7 +17,7 @@ from experiment_runs import BIN, PAPER
 from hang import HANG_S
 from long_cases import long_but
 
-from adacd_hil.cli.commands.monitor_command import Screen
+from adacd_hil.lab.cli.monitor_command import Screen
 from adacd_hil.log.reader import read_log
 from adacd_hil.progress_lines import Progress
 from adacd_hil.table_layout import fit_table

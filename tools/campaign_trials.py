@@ -29,8 +29,8 @@ from lab import (
 )
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.score.judge import begins_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics
+from adacd_hil.score.judge import begins_of
 
 PAYLOAD_KG = 1.0
 SETTLE_S = 0.6

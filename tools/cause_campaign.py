@@ -29,7 +29,7 @@ import numpy as np
 from campaign_loop import add_jobs, add_seeds, play_trials
 
 from adacd_hil.api import load
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.cli.output import format_table
 from adacd_hil.records import FaultReason
 from adacd_hil.settings.run_settings import RequestSettings

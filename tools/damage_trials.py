@@ -19,8 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "log")
 
 import recorded_run
 
-from adacd_hil.log.check.log_check import check_log
-from adacd_hil.log.editing.recover import recover
+from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LogError
 
 KINDS = ("cut", "flip", "flips", "zeros", "cut and flip")

@@ -26,13 +26,13 @@ from lab import PERIOD_S, Motion, cut, join, profile_arm, random_motion, record,
 from numpy.typing import NDArray
 from played_record import play_record
 
-from adacd_hil.analysis.score.judge import begins_of
 from adacd_hil.cli.output import format_table
 from adacd_hil.compiled import compiled
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.sensitivity import AGREES
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
+from adacd_hil.score.judge import begins_of
 from adacd_hil.settings.configuration import Settings, apply_settings, load_settings, parse_changes
 from firmware_sim.arm.arms import ArmProfile
 from firmware_sim.arm.hardware_settings import MechanicsSettings, SensorSettings

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from damage_trials import messages_of
 
-from adacd_hil.log.check.log_check import check_log
-from adacd_hil.log.editing.recover import recover
+from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from adacd_hil.lab.live.client import LiveMessage, live_client
+from adacd_hil.lab.live.feed import EVERY_RECORD, rate_of
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.viewer.client import LiveMessage, live_client
-from adacd_hil.log.viewer.feed import EVERY_RECORD, rate_of
 
 WALL_NS = 1_000_000_000_000_000_000
 """Log times below this, the year 2001, are those of lockstep: they have no age."""

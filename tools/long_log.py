@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from mcap.records import Attachment
 
-from adacd_hil.log.editing.cut_and_merge import IntactLog
+from adacd_hil.lab.logs.cut_and_merge import IntactLog
 from adacd_hil.log.log_files import (
     CONTINUED,
     DROPPED_KEY,

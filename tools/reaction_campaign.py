@@ -22,9 +22,9 @@ import numpy as np
 from campaign_loop import add_jobs, play_trials
 from contact_rig import Rig, Sample, rig_settings
 
-from adacd_hil.analysis import drawing
 from adacd_hil.cli.output import format_table
 from adacd_hil.control.motions import corner_to_corner
+from adacd_hil.lab import drawing
 from adacd_hil.records import Reaction, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError

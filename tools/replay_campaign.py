@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 from campaign_loop import add_jobs, play_trials
 
-from adacd_hil.analysis.replay.replay import replay
-from adacd_hil.analysis.replay.replayed_outcome import Replay
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
+from adacd_hil.replay.replay import replay
+from adacd_hil.replay.replayed_outcome import Replay
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.scenario.scenario import builtin_scenarios
 

@@ -23,8 +23,8 @@ import numpy as np
 from kill_trials import LOSS_BOUND_S
 from side_by_side import BIN, CHANNEL, TimingError, host_run, patient_config, running, wait_for
 
-from adacd_hil.log.check.log_check import check_log
-from adacd_hil.log.editing.recover import recover
+from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import SchemeState

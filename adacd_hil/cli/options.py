@@ -5,9 +5,10 @@ import functools
 import math
 import socket
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -19,7 +20,7 @@ from adacd_hil.remedies import install_command
 from adacd_hil.settings.toml_files import builtin_names
 
 if TYPE_CHECKING:
-    from adacd_hil.control.session import LiveAddress
+    from adacd_hil.control.session import LiveView
 
 config_option = click.option(
     "--config",
@@ -143,6 +144,8 @@ def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[
     return decorated
 
 
+LIVE_ENTRY_POINTS: Final = "adacd_hil.live"
+"""The group of the one that makes a `LiveView` of host, port, origins, names and most viewers."""
 PORT = 8765
 """What viewers suggest."""
 HOST = "127.0.0.1"
@@ -181,7 +184,7 @@ def require_extra(asked_for: str, *modules: str) -> None:
 
 
 def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
-    """Give a command the options of the live view; it takes them as `live`, a LiveAddress or None."""
+    """Give a command the options of the live view; it takes them as `live`, a LiveView or None."""
 
     @functools.wraps(command)
     def run(
@@ -194,7 +197,7 @@ def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
         live_viewers: int,
         **own: Any,
     ) -> ExitCode:
-        live = _address(live_host, live_port, live_origin, live_name, live_viewers) if is_live else None
+        live = _live_view(live_host, live_port, live_origin, live_name, live_viewers) if is_live else None
         return command(*args, live=live, **own)
 
     decorated: Callable[..., ExitCode] = run
@@ -203,19 +206,18 @@ def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
     return decorated
 
 
-def _address(
-    host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int
-) -> "LiveAddress":
+def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> "LiveView":
     require_extra("--live", "websockets")
-    from adacd_hil.control.session import LiveAddress
-    from adacd_hil.log.viewer.admission import normal_origin
-
     try:
-        allowed = tuple(map(normal_origin, origins))
+        (view,) = entry_points(group=LIVE_ENTRY_POINTS)
+    except ValueError:
+        raise CommandError("--live: no package that serves a live view is installed", ExitCode.USAGE) from None
+    try:
+        live: LiveView = view.load()(host, port, origins, names, most_viewers)
     except ValueError as error:
         raise CommandError(f"--live-origin: {error}", ExitCode.USAGE) from None
     _check_port(host, port)
-    return LiveAddress(host, port, allowed, names, most_viewers)
+    return live
 
 
 def _check_port(host: str, port: int) -> None:

@@ -5,7 +5,7 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
@@ -23,12 +23,12 @@ from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.profile import enable_timeout_s, place_devices
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import place_file
-from adacd_hil.log.log_files import LOG_NAME, MOST_VIEWERS, arithmetic
-from adacd_hil.log.recording.processes import LiveSetup
+from adacd_hil.log.log_files import LOG_NAME, arithmetic
+from adacd_hil.log.recording.processes import LiveService
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
+from adacd_hil.log.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
-from adacd_hil.log.viewer.robot_description import ROBOT_NAME, robot_description
-from adacd_hil.log.viewer.scene import LAYOUT_NAME, viewer_layout
+from adacd_hil.log.viewer_layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import Event, FaultReason, SchemeState
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
 from adacd_hil.scheme.detect.live_detectors import describe_code
@@ -61,14 +61,11 @@ class SessionSummary:
     identities: tuple[Identity, ...]
 
 
-class LiveAddress(NamedTuple):
-    """Where the live view is served, and to whom; port 0: any that is free. The rest as in LiveSetup."""
+class LiveView(Protocol):
+    """A live view that was asked for."""
 
-    host: str
-    port: int
-    origins: tuple[str, ...] = ()
-    names: tuple[str, ...] = ()
-    most_viewers: int = MOST_VIEWERS
+    def server(self, settings: Settings, robot: str) -> LiveService:
+        """Return what serves it, for an arm; robot: its URDF."""
 
 
 class Attempt(NamedTuple):
@@ -111,7 +108,7 @@ class Session:
     progress: Callable[[str], None] = lambda _: None
     tare: UsedTare | None = None
     history: UsedHistory | None = None
-    live: LiveAddress | None = None
+    live: LiveView | None = None
     on_started: Callable[[], None] = lambda: None
     touched_ns: Callable[[], int | None] = lambda: None
     _cycle: Cycle | None = None
@@ -286,7 +283,7 @@ class Session:
                 blocking=is_lockstep,
                 settings=self.settings.log,
                 robot=robot.encode(),
-                live=self._live_setup(robot),
+                live=None if self.live is None else self.live.server(self.settings, robot),
             )
         self._write_beside(robot.encode(), recorder)
         return recorder
@@ -303,15 +300,6 @@ class Session:
             except OSError as error:
                 self.progress(f"beside the log: {error}")
                 recorder.event(self.clock.now_ns(), Event("warning", "log", f"beside the log: {error}"))
-
-    def _live_setup(self, robot: str) -> LiveSetup | None:
-        if self.live is None:
-            return None
-        settings, length_m = self.settings, self.settings.arm.link_length_m
-        host, port, origins, names, most_viewers = self.live
-        return LiveSetup(
-            host, port, robot, length_m, settings.tilt_rad, settings.level_rad, origins, names, most_viewers
-        )
 
     def _metadata(self, grant: RealtimeGrant) -> dict[str, str]:
         settings = self.settings

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.log.formats.frame_log import open_frames
+from adacd_hil.log.frames.frame_log import open_frames
 from adacd_hil.records import Vector
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync

@@ -16,8 +16,8 @@ from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.compiled import compiling
 from adacd_hil.file_access import in_words, tidied
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
-from adacd_hil.log.editing.log_info import run_metadata
 from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError
+from adacd_hil.log.log_info import run_metadata
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import freeze_garbage, request_realtime

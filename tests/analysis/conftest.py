@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from analysis.replay_rig import record
 
-from adacd_hil.analysis.replay.replay import replay
-from adacd_hil.analysis.replay.replayed_outcome import Replay
 from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.replay.replay import replay
+from adacd_hil.replay.replayed_outcome import Replay
 
 
 @pytest.fixture(scope="session")

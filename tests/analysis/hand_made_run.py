@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.logged_run import CertifiedStream, CycleColumns, PaperStream, Run, Truth
+from adacd_hil.log.logged_run import CertifiedStream, CycleColumns, PaperStream, Run, Truth
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
 from adacd_hil.records import (

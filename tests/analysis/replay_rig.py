@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.analysis.replay.log_source import LogSource
-from adacd_hil.cli.commands.demo_command import Cast, run_embedded
-from adacd_hil.log.formats.frame_log import read_frames
+from adacd_hil.cli.embedded_run import Cast, run_embedded
+from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.reader import Piece, Series
+from adacd_hil.replay.log_source import LogSource
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import RequestSettings
 from firmware_sim.scenario.scenario import load_scenario

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from adacd_hil.analysis.replay.log_source import AttemptSplitter
 from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, Piece, Series
 from adacd_hil.log.types.record_arrays import record_dtype
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import SchemeState
+from adacd_hil.replay.log_source import AttemptSplitter
 
 DTYPES = {channel.topic: record_dtype(channel.type.dtype) for channel in run_channels(7) if channel.type.fields}
 M, F, N = SchemeState.MONITOR, SchemeState.FAULT, SchemeState.INIT

@@ -9,8 +9,8 @@ import pytest
 from joint_state_bags import State, write_mcap, write_rosbag1, write_rosbag2
 from rosbags.rosbag2 import StoragePlugin
 
-from adacd_hil.analysis.foreign.recording_import import ForeignRecording, read_recording
-from adacd_hil.analysis.foreign.recording_map import RecordingMap, read_map
+from adacd_hil.lab.offline.recording_import import ForeignRecording, read_recording
+from adacd_hil.lab.offline.recording_map import RecordingMap, read_map
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.settings.schema import ConfigError
 

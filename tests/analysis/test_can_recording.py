@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from analysis.replay_rig import settings_of_run, write_candump
 
-from adacd_hil.analysis.replay.can_recording import RecordingAgainstLog, RecordingAlone, load_recording
-from adacd_hil.analysis.replay.replay import replay_source
-from adacd_hil.analysis.replay.replayed_outcome import Replay
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.log_files import LogError
+from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone, load_recording
+from adacd_hil.replay.replay import replay_source
+from adacd_hil.replay.replayed_outcome import Replay
 from adacd_hil.wire.codec import load_codec
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]

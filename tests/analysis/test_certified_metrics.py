@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from hand_made_run import A, C, M, P, R, S, contact_report, make_certified_run, make_run, react, touch
 
-from adacd_hil.analysis.logged_run import split_sections
-from adacd_hil.analysis.report.report_files import Report
-from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.judge import FilterChannel, two_pole_delay_s
-from adacd_hil.analysis.score.metrics import ReportSource
+from adacd_hil.lab.report.report_files import Report
+from adacd_hil.lab.report.run_page import report_page
+from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.log.logged_run import split_sections
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction
+from adacd_hil.score.judge import FilterChannel, two_pole_delay_s
+from adacd_hil.score.metrics import ReportSource
 
 
 def kinds(*stays):

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adacd_hil.analysis.foreign.recording_import import ForeignRecording, read_recording
-from adacd_hil.analysis.foreign.recording_map import read_map
+from adacd_hil.lab.offline.recording_import import ForeignRecording, read_recording
+from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.log.log_files import LogError
 from adacd_hil.settings.schema import ConfigError
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hand_made_run import EPOCH_NS, A, M, make_certified_run, make_run, with_columns
 
-from adacd_hil.analysis.logged_run import CheckCounts, CycleColumns
-from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.run_faults import CyclicDataGatherer, find_faults, gather_data
-from adacd_hil.analysis.score.verdict import data_text
-from adacd_hil.analysis.score.wording import percent_text
+from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_faults, gather_data
+from adacd_hil.lab.score.verdict import data_text
+from adacd_hil.log.logged_run import CheckCounts, CycleColumns
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
+from adacd_hil.score.wording import percent_text
 
 ZERO = EPOCH_NS + 100_000_000
 """When the first cycle of a hand-made run is, ns."""

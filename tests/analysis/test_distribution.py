@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adacd_hil.analysis.score.distribution import Distribution, low_percentiles, percentiles
+from adacd_hil.score.distribution import Distribution, low_percentiles, percentiles
 
 FINEST = 2.0**-12
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from adacd_hil.analysis.drawing import envelope
+from adacd_hil.lab.drawing import envelope
 
 SERIES = arrays(np.float64, st.integers(1, 400), elements=st.floats(-10.0, 10.0))
 

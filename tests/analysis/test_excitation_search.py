@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 from scipy.signal import lsim
 
-from adacd_hil.analysis.excitation_search import TOLERANCE, NoExcitationError, Search
 from adacd_hil.cli.main import cli
 from adacd_hil.control.motions import Excitation
+from adacd_hil.lab.tune.excitation_search import TOLERANCE, NoExcitationError, Search
 from adacd_hil.scheme.kernel.certified_memory import constants_of
 from adacd_hil.scheme.model.regressor import regressor
 from adacd_hil.settings.configuration import Settings, load_settings

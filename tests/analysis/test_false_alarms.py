@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 import scipy.stats
 
-from adacd_hil.analysis.thresholds.false_alarms import (
+from adacd_hil.lab.thresholds.false_alarms import (
     Sensing,
     Tail,
     TooLittleMotionError,

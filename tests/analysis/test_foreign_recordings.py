@@ -8,11 +8,11 @@ import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
-from adacd_hil.analysis.foreign import recorded_columns
-from adacd_hil.analysis.foreign.recording_identification import identify
-from adacd_hil.analysis.foreign.recording_import import read_recording
-from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli
+from adacd_hil.lab.offline import recorded_columns
+from adacd_hil.lab.offline.recording_identification import identify
+from adacd_hil.lab.offline.recording_import import read_recording
+from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.scheme.identify.offline import model_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from hand_made_run import record, record_truth, touched_run
 
-from adacd_hil.analysis.logged_run import Run
-from adacd_hil.analysis.report.report_files import write_report
-from adacd_hil.analysis.report.run_reading import read_run
-from adacd_hil.analysis.score import emulator_truth
-from adacd_hil.analysis.score.emulator_truth import TruthTable, config_digest, contacts_beside, foreign_truth
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
+from adacd_hil.lab.report.report_files import write_report
+from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
+from adacd_hil.log.logged_run import Run
 from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.score import emulator_truth
+from adacd_hil.score.emulator_truth import TruthTable, config_digest, contacts_beside, foreign_truth
 from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.scenario.scenario import load_scenario
@@ -85,7 +85,7 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(
     rows: slice, false_alarms: int, unjudged: str, full_cycles: int, tmp_path: Path
 ) -> None:
     run, gathered, source = read_run(*recorded(tmp_path, with_truth_of(touched_run(), rows)), full_cycles=full_cycles)
-    from adacd_hil.analysis.score.evaluation import evaluate
+    from adacd_hil.lab.score.evaluation import evaluate
 
     assert evaluate(run, gathered).false_alarms == false_alarms
     said = f"the truth doesn't cover {unjudged}, not judged" if unjudged else ""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adacd_hil.analysis.score.distribution import bar_chart, doubling_bins, log_histogram, low_percentiles, percentiles
+from adacd_hil.score.distribution import bar_chart, doubling_bins, log_histogram, low_percentiles, percentiles
 
 INF = float("inf")
 

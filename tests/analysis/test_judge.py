@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from adacd_hil.analysis.logged_run import enters_react
-from adacd_hil.analysis.score.judge import (
+from adacd_hil.log.logged_run import enters_react
+from adacd_hil.records import SchemeState
+from adacd_hil.score.judge import (
     Alarm,
     Score,
     StreamJudge,
@@ -14,7 +15,6 @@ from adacd_hil.analysis.score.judge import (
     explained_until,
     judge,
 )
-from adacd_hil.records import SchemeState
 
 MS = 1_000_000
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from adacd_hil import api
-from adacd_hil.analysis.library.array_detection import ArrayError, OfflineArm, detect, fit
-from adacd_hil.analysis.library.loaded_run import load
+from adacd_hil.lab.library.array_detection import ArrayError, OfflineArm, detect, fit
+from adacd_hil.lab.library.loaded_run import load
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import SchemeState

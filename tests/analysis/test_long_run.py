@@ -11,18 +11,16 @@ from click.testing import CliRunner
 from hand_made_run import make_certified_run, make_run, react, touch
 from test_run_report import record_truth
 
-from adacd_hil.analysis.report import run_reading
-from adacd_hil.analysis.report.outline import Facts, TruthClock
-from adacd_hil.analysis.report.page import left_out_text, shown_contacts
-from adacd_hil.analysis.report.report_files import write_run_report
-from adacd_hil.analysis.report.report_json import report_json
-from adacd_hil.analysis.report.run_reading import read_run
-from adacd_hil.analysis.report.timeline import timeline_of
-from adacd_hil.analysis.score import emulator_truth
-from adacd_hil.analysis.score.emulator_truth import TruthTable, read_truth
-from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.verdict import identified_text
 from adacd_hil.cli.main import cli
+from adacd_hil.lab.report import run_reading
+from adacd_hil.lab.report.outline import Facts, TruthClock
+from adacd_hil.lab.report.page import left_out_text, shown_contacts
+from adacd_hil.lab.report.report_files import write_run_report
+from adacd_hil.lab.report.report_json import report_json
+from adacd_hil.lab.report.run_reading import read_run
+from adacd_hil.lab.report.timeline import timeline_of
+from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.verdict import identified_text
 from adacd_hil.log import reader
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import Series, start_of_log
@@ -30,6 +28,8 @@ from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme
 from adacd_hil.records import CycleRecord, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import layout_of
+from adacd_hil.score import emulator_truth
+from adacd_hil.score.emulator_truth import TruthTable, read_truth
 from adacd_hil.settings.toml_files import to_toml
 
 PIECE = 333

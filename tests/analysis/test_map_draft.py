@@ -10,9 +10,9 @@ from click.testing import CliRunner
 from foreign_arms import AXES, Motion, record, urdf_text
 from joint_state_bags import State, write_mcap
 
-from adacd_hil.analysis.foreign.map_draft import MapDraft, draft_map
-from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli
+from adacd_hil.lab.offline.map_draft import MapDraft, draft_map
+from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.log.log_files import LogError
 from adacd_hil.settings.schema import ConfigError
 

@@ -16,19 +16,19 @@ from hand_made_run import make_certified_run, react, touch, touched_run
 from jinja2 import UndefinedError
 from parsed_page import Page
 
-from adacd_hil.analysis.drawing import Drawing
-from adacd_hil.analysis.logged_run import MeasuredMotion, Run
-from adacd_hil.analysis.report import page
-from adacd_hil.analysis.report.page import Heading, render, render_page
-from adacd_hil.analysis.report.report_tables import timing_tables
-from adacd_hil.analysis.report.run_figures import draw
-from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.report.timing_figures import draw_timing
-from adacd_hil.analysis.runs.run_pages import ListedRun, runs_page, trend_page
-from adacd_hil.analysis.runs.run_summary import BROKEN, CERTIFIED, GOOD, CertificateState, RunSummary
-from adacd_hil.analysis.runs.run_trend import trends
-from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.metrics import ReportSource
+from adacd_hil.lab.drawing import Drawing
+from adacd_hil.lab.report import page
+from adacd_hil.lab.report.page import Heading, render, render_page
+from adacd_hil.lab.report.report_tables import timing_tables
+from adacd_hil.lab.report.run_figures import draw
+from adacd_hil.lab.report.run_page import report_page
+from adacd_hil.lab.report.timing_figures import draw_timing
+from adacd_hil.lab.runs.run_pages import ListedRun, runs_page, trend_page
+from adacd_hil.lab.runs.run_summary import BROKEN, CERTIFIED, GOOD, CertificateState, RunSummary
+from adacd_hil.lab.runs.run_trend import trends
+from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.log.logged_run import MeasuredMotion, Run
+from adacd_hil.score.metrics import ReportSource
 
 pytestmark = pytest.mark.slow
 
@@ -149,7 +149,7 @@ TAGS = (
 )
 MARKUP = re.compile(rf"(?<!\?P)</?(?:{TAGS.replace(' ', '|')})(?=[\s/>])|</\0|<!DOCTYPE|&(?:nbsp|lt|gt|quot);")
 """An element of a page, also one whose name is filled in."""
-OTHERS_MARKUP = {Path("adacd_hil/analysis/drawing.py")}
+OTHERS_MARKUP = {Path("adacd_hil/lab/drawing.py")}
 """Takes apart what matplotlib wrote."""
 
 

@@ -11,11 +11,11 @@ import pytest
 from click.testing import CliRunner
 from foreign_arms import AXES, Motion, record, rigid_torque, urdf_text, write_recording
 
-from adacd_hil.analysis.foreign.other_readings import is_possible
-from adacd_hil.analysis.foreign.recording_identification import Identified, identify
-from adacd_hil.analysis.foreign.recording_import import read_recording
-from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli
+from adacd_hil.lab.offline.other_readings import is_possible
+from adacd_hil.lab.offline.recording_identification import Identified, identify
+from adacd_hil.lab.offline.recording_import import read_recording
+from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.scheme.identify.offline import model_of
 from adacd_hil.scheme.model.urdf import read_urdf
 

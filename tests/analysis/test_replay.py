@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records, without_cycles, writable
 
-from adacd_hil.analysis.replay.log_source import LogSource
-from adacd_hil.analysis.replay.replay import replay, replay_many, replay_source
-from adacd_hil.analysis.replay.replayed_outcome import Replay, side_by_side
-from adacd_hil.analysis.report.run_reading import read_run
-from adacd_hil.analysis.score.emulator_truth import contacts_beside
-from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.judge import Score
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.device.profile import enable_timeout_s
+from adacd_hil.lab.report.run_reading import read_run
+from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import begin_of_log, read_log
 from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.replay.log_source import LogSource
+from adacd_hil.replay.replay import replay, replay_many, replay_source
+from adacd_hil.replay.replayed_outcome import Replay, side_by_side
+from adacd_hil.score.emulator_truth import contacts_beside
+from adacd_hil.score.judge import Score
 from adacd_hil.settings.configuration import apply_settings
 from firmware_sim.bench.bench_time import TruthLog
 

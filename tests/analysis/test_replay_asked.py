@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from analysis.replay_rig import record, settings_of_run
 
-from adacd_hil.analysis.replay.replay import replay
-from adacd_hil.analysis.replay.scheme_comparison import RequestCheck
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import Request
+from adacd_hil.replay.replay import replay
+from adacd_hil.replay.scheme_comparison import RequestCheck
 from adacd_hil.settings.run_settings import RequestSettings
 
 

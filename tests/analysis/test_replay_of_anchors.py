@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.analysis.replay.log_source import LogSource
-from adacd_hil.analysis.replay.replay import replay, replay_many
-from adacd_hil.analysis.replay.replayed_outcome import side_by_side
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import CERTIFICATE_EVENTS
+from adacd_hil.replay.log_source import LogSource
+from adacd_hil.replay.replay import replay, replay_many
+from adacd_hil.replay.replayed_outcome import side_by_side
 from adacd_hil.scheme.identify import anchor
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
 from adacd_hil.settings.configuration import apply_settings

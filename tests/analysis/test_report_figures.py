@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hand_made_run import make_certified_run, make_run, react, touch, touched_run
 
-from adacd_hil.analysis.drawing import COLOURS
-from adacd_hil.analysis.report.run_figures import CLOSE_UPS, draw, parameter_label, residuals
-from adacd_hil.analysis.report.timing_figures import draw_timing
-from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.lab.drawing import COLOURS
+from adacd_hil.lab.report.run_figures import CLOSE_UPS, draw, parameter_label, residuals
+from adacd_hil.lab.report.timing_figures import draw_timing
+from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.records import SchemeState
 
 pytestmark = pytest.mark.slow
@@ -188,13 +188,13 @@ def test_a_fragments_colours_are_the_pages_own(name, fragments):
 
 
 def test_every_colour_is_a_variable_of_the_page_in_light_and_dark():
-    css = resources.files("adacd_hil.analysis.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
+    css = resources.files("adacd_hil.lab.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
     counts = {name: len(re.findall(rf"--{name}:", css)) for name in (*COLOURS, "paper")}
     assert counts == dict.fromkeys((*COLOURS, "paper"), 2)
 
 
 def test_the_page_is_as_light_as_the_printed_figures():
-    css = resources.files("adacd_hil.analysis.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
+    css = resources.files("adacd_hil.lab.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
     light = {name: re.search(rf"--{name}: (#[0-9a-f]+)", css)[1] for name in COLOURS}
     assert light == COLOURS
 

@@ -8,18 +8,18 @@ from importlib import resources
 import pytest
 from hand_made_run import A, M, make_certified_run, make_run, touched_run
 
-from adacd_hil.analysis.logged_run import Run
-from adacd_hil.analysis.report.next_steps import NextStep, next_steps, origin_words
-from adacd_hil.analysis.report.page import has_paper
-from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.metrics import ReportSource
-from adacd_hil.analysis.score.wording import STATE_WORDS, uncertain_text
+from adacd_hil.lab.report.next_steps import NextStep, next_steps, origin_words
+from adacd_hil.lab.report.page import has_paper
+from adacd_hil.lab.report.run_page import report_page
+from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.log.logged_run import Run
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
+from adacd_hil.score.metrics import ReportSource
+from adacd_hil.score.wording import STATE_WORDS, uncertain_text
 
 SOURCE = ReportSource("run.mcap")
-CSS = resources.files("adacd_hil.analysis.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
+CSS = resources.files("adacd_hil.lab.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
 LIGHT, DARK = (
     dict(re.findall(r"--(\w+): (#[0-9a-f]{6})", block))
     for block in re.findall(r":root[^{]*\{([^}]*--page[^}]*)\}", CSS)

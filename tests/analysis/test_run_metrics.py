@@ -23,10 +23,10 @@ from hand_made_run import (
     touched_run,
 )
 
-from adacd_hil.analysis.logged_run import columns_of_records, section_label, split_sections
-from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.judge import detection_delay_s, filtered
+from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.log.logged_run import columns_of_records, section_label, split_sections
 from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.score.judge import detection_delay_s, filtered
 
 SETTLING_ROWS = 1000
 """10/a at a = 10 rad/s and 1 kHz."""

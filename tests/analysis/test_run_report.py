@@ -15,15 +15,15 @@ import pytest
 from hand_made_run import A, M, like_an_old_log, make_run, react, record, record_truth, touched_run
 from parsed_page import Page
 
-from adacd_hil.analysis.report.page import render
-from adacd_hil.analysis.report.report_files import write_report, write_run_report
-from adacd_hil.analysis.report.report_json import report_json
-from adacd_hil.analysis.report.report_tables import timing_tables
-from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.metrics import ReportSource
+from adacd_hil.lab.report.page import render
+from adacd_hil.lab.report.report_files import write_report, write_run_report
+from adacd_hil.lab.report.report_json import report_json
+from adacd_hil.lab.report.report_tables import timing_tables
+from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
+from adacd_hil.score.metrics import ReportSource
 from adacd_hil.settings.toml_files import to_toml
 
 pytestmark = pytest.mark.slow

@@ -13,9 +13,11 @@ import pytest
 from click.testing import CliRunner, Result
 from hand_made_run import A, M, make_certified_run, make_run, record
 
-from adacd_hil.analysis.report.report_json import report_json
-from adacd_hil.analysis.report.run_reading import read_run
-from adacd_hil.analysis.runs.run_summary import (
+from adacd_hil.cli.main import cli
+from adacd_hil.file_access import create_file
+from adacd_hil.lab.report.report_json import report_json
+from adacd_hil.lab.report.run_reading import read_run
+from adacd_hil.lab.runs.run_summary import (
     BROKEN,
     CERTIFIED,
     GOOD,
@@ -28,11 +30,9 @@ from adacd_hil.analysis.runs.run_summary import (
     reported,
     summarise,
 )
-from adacd_hil.analysis.runs.run_trend import trends
-from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.metrics import ReportSource
-from adacd_hil.cli.main import cli
-from adacd_hil.file_access import create_file
+from adacd_hil.lab.runs.run_trend import trends
+from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.score.metrics import ReportSource
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.toml_files import to_toml
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.analysis.replay.replayed_outcome import Replay
-from adacd_hil.analysis.sweep.sweep import Plan, SweepStore, plan_logs, plan_scenarios, replay_task, run_sweep
 from adacd_hil.cli.main import cli
+from adacd_hil.lab.tune.sweep import Plan, SweepStore, plan_logs, plan_scenarios, replay_task, run_sweep
 from adacd_hil.log.log_files import LogError
+from adacd_hil.replay.replayed_outcome import Replay
 
 distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")

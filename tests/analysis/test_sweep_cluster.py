@@ -10,8 +10,8 @@ from click.testing import CliRunner
 from hang import HANG_S
 from made_certificates import Authority
 
-from adacd_hil.analysis.sweep.cluster import NO_FILES, TlsFiles, connect
 from adacd_hil.cli.main import cli
+from adacd_hil.lab.tune.cluster import NO_FILES, TlsFiles, connect
 from adacd_hil.log.log_files import LogError
 
 distributed = pytest.importorskip("distributed")
@@ -136,7 +136,7 @@ def test_the_scheduler_of_a_sweep_on_this_machine_takes_nothing_from_others(tmp_
 
 
 def test_an_open_scheduler_is_called_open(tmp_path: Path, log: Path, monkeypatch) -> None:
-    monkeypatch.setattr("adacd_hil.analysis.sweep.cluster._TIMEOUT_S", 0.1)
+    monkeypatch.setattr("adacd_hil.lab.tune.cluster._TIMEOUT_S", 0.1)
     words = ["sweep", str(log), "--scheduler", "tcp://127.0.0.1:1", "--out", str(tmp_path / "out")]
     refused = CliRunner().invoke(cli, words)
     assert refused.exit_code == 1

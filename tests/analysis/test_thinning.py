@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adacd_hil.analysis.score.emulator_truth import extreme_rows
+from adacd_hil.score.emulator_truth import extreme_rows
 
 
 def values_of(seed, count):

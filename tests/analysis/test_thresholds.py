@@ -11,8 +11,9 @@ import pytest
 from click.testing import CliRunner
 from numpy.lib.stride_tricks import sliding_window_view
 
-from adacd_hil.analysis.thresholds import free_motion as module
-from adacd_hil.analysis.thresholds.detector_comparison import (
+from adacd_hil.cli.main import cli
+from adacd_hil.lab.thresholds import free_motion as module
+from adacd_hil.lab.thresholds.detector_comparison import (
     STEPS_NM,
     Comparison,
     DelayRow,
@@ -20,9 +21,8 @@ from adacd_hil.analysis.thresholds.detector_comparison import (
     step_shape,
     write_comparison,
 )
-from adacd_hil.analysis.thresholds.free_motion import read_motion, sample_of
-from adacd_hil.analysis.thresholds.recorded_thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
-from adacd_hil.cli.main import cli
+from adacd_hil.lab.thresholds.free_motion import read_motion, sample_of
+from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.detectors import DetectorBankSettings, register, unregister

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hand_made_run import A, M, make_run, react, touch, touched_run
 
-from adacd_hil.analysis.logged_run import MeasuredMotion
-from adacd_hil.analysis.report.page import render
-from adacd_hil.analysis.report.run_page import CARDS, Push, contact_cards, draw_arm
-from adacd_hil.analysis.report.timeline import notices_of, state_key, stays_of, timeline_of
-from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.lab.report.page import render
+from adacd_hil.lab.report.run_page import CARDS, Push, contact_cards, draw_arm
+from adacd_hil.lab.report.timeline import notices_of, state_key, stays_of, timeline_of
+from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.log.logged_run import MeasuredMotion
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, Location, SchemeState
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hand_made_run import A, M, R, S, like_an_old_log, make_run, with_columns
 
-from adacd_hil.analysis.logged_run import COMPUTE, CycleColumns, columns_of_records, columns_of_series
-from adacd_hil.analysis.report.timing_figures import draw_timing
-from adacd_hil.analysis.score.evaluation import OLDEST_CYCLES, collect_evidence, evaluate, find_reactions
+from adacd_hil.lab.report.timing_figures import draw_timing
+from adacd_hil.lab.score.evaluation import OLDEST_CYCLES, collect_evidence, evaluate, find_reactions
+from adacd_hil.log.logged_run import COMPUTE, CycleColumns, columns_of_records, columns_of_series
 from adacd_hil.log.reader import Series
 from adacd_hil.records import CycleRecord
 

@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from adacd_hil.analysis.logged_run import MeasuredMotion
-from adacd_hil.analysis.report.page import render
-from adacd_hil.analysis.report.timeline import traces_of
-from adacd_hil.analysis.report.traces import noise_of, pack, panels_of, step_of
-from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.lab.report.page import render
+from adacd_hil.lab.report.timeline import traces_of
+from adacd_hil.lab.report.traces import noise_of, pack, panels_of, step_of
+from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.log.logged_run import MeasuredMotion
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event
 

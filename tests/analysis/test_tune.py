@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.analysis.replay.log_source import LogSource
-from adacd_hil.analysis.score.emulator_truth import contacts_beside
-from adacd_hil.analysis.score.judge import least_rate_per_h, rate_bound_per_h, share_bounds
-from adacd_hil.analysis.sweep import tune_roc
-from adacd_hil.analysis.sweep.tune import _best, _problems, base_of, suggested_toml, write_tuning
-from adacd_hil.analysis.sweep.tune_candidates import _Shown, candidates, observe_candidates, thresholds_as_changes
-from adacd_hil.analysis.sweep.tune_roc import (
+from adacd_hil.cli.embedded_run import Cast, run_embedded
+from adacd_hil.cli.main import cli
+from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
+from adacd_hil.lab.tune import tune_roc
+from adacd_hil.lab.tune.tune import _best, _problems, base_of, suggested_toml, write_tuning
+from adacd_hil.lab.tune.tune_candidates import _Shown, candidates, observe_candidates, thresholds_as_changes
+from adacd_hil.lab.tune.tune_roc import (
     FACTORS,
     Candidate,
     Observed,
@@ -32,13 +32,13 @@ from adacd_hil.analysis.sweep.tune_roc import (
     read_logs,
     rising,
 )
-from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
-from adacd_hil.cli.commands.demo_command import Cast, run_embedded
-from adacd_hil.cli.main import cli
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import begin_of_log, read_log
 from adacd_hil.records import SchemeState
+from adacd_hil.replay.log_source import LogSource
 from adacd_hil.scheme.pipeline.pipeline import layout_of
+from adacd_hil.score.emulator_truth import contacts_beside
+from adacd_hil.score.judge import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.settings.configuration import apply_settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import ConfigError

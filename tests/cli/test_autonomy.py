@@ -12,11 +12,11 @@ import can
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.cli.commands.demo_command import USER, resolve
-from adacd_hil.cli.commands.play_command import may_move_an_arm
 from adacd_hil.cli.connection import check_autonomy, check_clock, on_interrupt
+from adacd_hil.cli.embedded_run import USER, resolve
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.lab.cli.play_command import may_move_an_arm
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings

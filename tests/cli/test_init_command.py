@@ -16,12 +16,12 @@ from own_arm import write_sensor_eds
 from rig import Rig, SessionRig
 
 from adacd_hil.cli.main import cli
-from adacd_hil.commission.arm_draft import planar_from_urdf, uniform_rods
-from adacd_hil.commission.configuration_check import configuration_checks, examine_configuration
-from adacd_hil.commission.host_checks import Status, diagnose
-from adacd_hil.commission.profile_draft import DeviceRatings, draft_profile
+from adacd_hil.control.configuration_check import configuration_checks, examine_configuration
+from adacd_hil.control.host_checks import Status, diagnose
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
+from adacd_hil.lab.commission.arm_draft import planar_from_urdf, uniform_rods
+from adacd_hil.lab.commission.profile_draft import DeviceRatings, draft_profile
 from adacd_hil.scheme.model.urdf import UrdfError
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.wire.codec import contract_folder, load_codec
@@ -438,8 +438,8 @@ def on_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Rig]:
 
     def attach(**parts: object) -> Rig:
         rig = Rig(is_wall=True, **parts)  # type: ignore[arg-type]
-        monkeypatch.setattr("adacd_hil.cli.commands.arm_drafting.open_bus", lambda *_: rig.bus)
-        monkeypatch.setattr("adacd_hil.cli.commands.arm_drafting.MonotonicClock", lambda: rig.clock)
+        monkeypatch.setattr("adacd_hil.lab.cli.arm_drafting.open_bus", lambda *_: rig.bus)
+        monkeypatch.setattr("adacd_hil.lab.cli.arm_drafting.MonotonicClock", lambda: rig.clock)
         return rig
 
     return attach
@@ -530,7 +530,7 @@ def test_a_log_leaves_nothing_to_be_given(tmp_path: Path, out: Path) -> None:
 
 
 def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("adacd_hil.cli.interview.is_terminal", lambda: True)
+    monkeypatch.setattr("adacd_hil.lab.cli.interview.is_terminal", lambda: True)
     monkeypatch.setattr("adacd_hil.wire.can_interface.can_interfaces", list)
     answers = [
         "none",
@@ -566,7 +566,7 @@ def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out: Path, mo
 def test_a_question_mark_and_a_mistyped_path_lose_no_answer(
     tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("adacd_hil.cli.interview.is_terminal", lambda: True)
+    monkeypatch.setattr("adacd_hil.lab.cli.interview.is_terminal", lambda: True)
     monkeypatch.setattr("adacd_hil.wire.can_interface.can_interfaces", list)
     eds = EdsVariant().without("6091", "608F").write(tmp_path / "drive.eds")
     answers = [
@@ -597,7 +597,7 @@ def test_a_question_mark_and_a_mistyped_path_lose_no_answer(
 
 
 def test_who_ends_the_questions_gets_no_file(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("adacd_hil.cli.interview.is_terminal", lambda: True)
+    monkeypatch.setattr("adacd_hil.lab.cli.interview.is_terminal", lambda: True)
     result = init(out, typed="none\n")
     assert result.exit_code != 0
     assert not out.exists()

@@ -6,9 +6,9 @@ import pytest
 from click.testing import CliRunner
 from rig import CODEC, Rig
 
-from adacd_hil.cli.commands.monitor_command import Monitor, Screen, as_text
 from adacd_hil.cli.connection import Connection
 from adacd_hil.cli.main import cli
+from adacd_hil.lab.cli.monitor_command import Monitor, Screen, as_text
 from adacd_hil.wire.bus import Frame
 
 

@@ -7,8 +7,8 @@ import pytest
 from click.testing import CliRunner
 from recorded_frames_log import write_frames
 
-from adacd_hil.cli.commands import play_command as play_module
-from adacd_hil.cli.commands.play_command import play
+from adacd_hil.lab.cli import play_command as play_module
+from adacd_hil.lab.cli.play_command import play
 from adacd_hil.scheduling import RealtimeGrant
 
 CHANNEL = "test_play"

@@ -8,8 +8,8 @@ import pytest
 from bus_lab import BUS_MISSING, SHORT_RUN, Lab, complaints
 from click.testing import CliRunner
 
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.cli.commands.run_command import as_text, ask_without_anchor, next_of_run, summarise
+from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.scheme.identify.anchor import unanchored_joints
 from adacd_hil.settings.configuration import load_settings

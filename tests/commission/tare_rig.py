@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rig import CODEC, Rig
 
-from adacd_hil.commission.tare_session import TareSession
+from adacd_hil.lab.commission.tare_session import TareSession
 from adacd_hil.settings.configuration import Settings, load_settings
 from firmware_sim.scenario.scenario import load_scenario
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from rig import PERIOD_NS, Rig
 
-from adacd_hil.commission.communication_test import (
+from adacd_hil.device.drive import DISABLE_CYCLES
+from adacd_hil.lab.commission.communication_test import (
     CommunicationReport,
     CommunicationTest,
     Verdict,
     ZeroTorqueLoop,
     judge,
 )
-from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.records import FaultReason
 from adacd_hil.wire.bus import QueueBytes
 from adacd_hil.wire.codec import load_codec

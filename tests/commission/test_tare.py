@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tare_rig import CODEC, SETTLED_CYCLE, WINDOW_S, Hand, TareRig, tare_settings
 
-from adacd_hil.commission.tare import Pose, TareRefusedError, measure_pose, solve_tare
 from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.lab.commission.tare import Pose, TareRefusedError, measure_pose, solve_tare
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Frame
 

@@ -6,8 +6,8 @@ import pytest
 from click.testing import CliRunner
 
 from adacd_hil.cli.main import cli
-from adacd_hil.commission.arm_draft import planar_from_urdf
-from adacd_hil.commission.configuration_check import examine_configuration
+from adacd_hil.control.configuration_check import examine_configuration
+from adacd_hil.lab.commission.arm_draft import planar_from_urdf
 
 INERTIA = '<inertia ixx="0.03" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.03"/>'
 BODY = f'<inertial><origin xyz="0.2 0 0"/><mass value="2"/>{INERTIA}</inertial>'

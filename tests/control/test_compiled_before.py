@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from numba import config
 from numba.core.dispatcher import Dispatcher
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control.cycle import Cycle
 
 def versions():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.log.reader import read_log
 
 

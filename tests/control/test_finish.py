@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rig import SessionRig
 
-from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control.cycle import FINISH_S
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.records import FaultReason, Request, SchemeState

@@ -20,8 +20,8 @@ from rig import (
 
 from adacd_hil.control.gate import GateFlag
 from adacd_hil.control.session import LiveAddress
-from adacd_hil.log.viewer.robot_description import ROBOT_NAME
-from adacd_hil.log.viewer.scene import LAYOUT_NAME
+from adacd_hil.log.robot_description import ROBOT_NAME
+from adacd_hil.log.viewer_layout import LAYOUT_NAME
 from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState
 from adacd_hil.scheme.model.urdf import read_urdf
 from adacd_hil.wire.bus import Frame

@@ -9,13 +9,13 @@ from mcap.reader import make_reader
 from recorded_run import CODEC, Run
 from reference_writer import MemorySink
 
+from adacd_hil.lab.live.client import LiveClient, LiveMessage
+from adacd_hil.lab.live.feed import LiveFeed
 from adacd_hil.log.recording.log_file import McapFile
 from adacd_hil.log.recording.packet import ROOM, pack_cycle, pack_event
 from adacd_hil.log.recording.packet_writer import PacketWriter
 from adacd_hil.log.recording.processes import LiveSetup, WriterSetup
 from adacd_hil.log.types.topics import run_channels
-from adacd_hil.log.viewer.client import LiveClient, LiveMessage
-from adacd_hil.log.viewer.feed import LiveFeed
 from adacd_hil.records import Event
 from adacd_hil.wire.codec_columns import plain_tables
 

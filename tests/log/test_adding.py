@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from adacd_hil.log.check.log_check import check_log
-from adacd_hil.log.formats.signal_tables import export_tables
+from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.signal_tables import export_tables
 from adacd_hil.log.reader import LogStream, read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types import topics

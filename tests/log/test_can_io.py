@@ -17,8 +17,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 
-from adacd_hil.log.formats.can_io import McapReader, McapWriter, TimedMessage, to_messages
-from adacd_hil.log.formats.frame_log import read_frames
+from adacd_hil.log.frames.can_io import McapReader, McapWriter, TimedMessage, to_messages
+from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.message_types import CAN_FRAME, ENCAPSULATION, FD_FRAME

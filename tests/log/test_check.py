@@ -23,9 +23,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Schema, Statistics
 from mcap.writer import CompressionType, Writer
 
-from adacd_hil.log.check.content_checks import text_problem
-from adacd_hil.log.check.findings import RULES
-from adacd_hil.log.check.log_check import check_log, find_logs
+from adacd_hil.lab.logs.check.content_checks import text_problem
+from adacd_hil.lab.logs.check.findings import RULES
+from adacd_hil.lab.logs.check.log_check import check_log, find_logs
 from adacd_hil.log.log_files import LogError
 
 WHOLE = make_log()

@@ -6,8 +6,8 @@ from made_log import ATTACHMENTS, MILLISECOND, RUN, SUMMARY, kinds, make_log, pu
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
-from adacd_hil.log.check.log_check import check_log
-from adacd_hil.log.editing.cut_and_merge import TimeWindow, contacts_begun, cut, find_contact, log_names, merge
+from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.cut_and_merge import TimeWindow, contacts_begun, cut, find_contact, log_names, merge
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedContact, read_log
 from adacd_hil.records import ContactReport

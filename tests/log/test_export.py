@@ -14,11 +14,11 @@ from click.testing import CliRunner
 from recorded_run import CODEC, make_run, record
 from test_can_io import all_kinds, content, write
 
-from adacd_hil.cli.commands.log_command import export
-from adacd_hil.log.formats.can_io import TimedMessage, to_messages
-from adacd_hil.log.formats.frame_export import FrameChoice, export_frames, sides
-from adacd_hil.log.formats.frame_log import open_frames, read_frames
-from adacd_hil.log.formats.signal_tables import choose_topics, export_tables
+from adacd_hil.lab.cli.log_command import export
+from adacd_hil.lab.logs.frame_export import FrameChoice, export_frames, sides
+from adacd_hil.lab.logs.signal_tables import choose_topics, export_tables
+from adacd_hil.log.frames.can_io import TimedMessage, to_messages
+from adacd_hil.log.frames.frame_log import open_frames, read_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunked_file import MAGIC
 from adacd_hil.log.reader import read_log

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from recorded_run import make_run, record
 
-from adacd_hil.log.formats.frame_log import read_frames
+from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.record_arrays import as_logged

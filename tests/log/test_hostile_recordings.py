@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from made_log import make_log
 
-from adacd_hil.log.check.log_check import check_log
-from adacd_hil.log.editing.log_info import read_info
-from adacd_hil.log.formats.can_io import to_messages
-from adacd_hil.log.formats.frame_log import read_frames
-from adacd_hil.log.formats.signal_tables import Tables, export_tables
+from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.signal_tables import Tables, export_tables
+from adacd_hil.log.frames.can_io import to_messages
+from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError, find_parts
+from adacd_hil.log.log_info import read_info
 from adacd_hil.log.mcap.chunks import MOST_BYTES
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.message_types import TIME_TEXT, payload_dtype

@@ -31,6 +31,8 @@ from recorded_run import CODEC, feed, make_run, start
 from websockets.sync.client import connect
 
 from adacd_hil.clock import VirtualClock
+from adacd_hil.lab.live.client import LiveClient, live_client
+from adacd_hil.lab.live.feed import Decimator, rate_of
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.log_file import Sink
@@ -40,8 +42,6 @@ from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.ring import Ring, RingReader
 from adacd_hil.log.recording.writer import SHOW_PERIOD_NS, WriterProcess
 from adacd_hil.log.types.topics import run_channels
-from adacd_hil.log.viewer.client import LiveClient, live_client
-from adacd_hil.log.viewer.feed import Decimator, rate_of
 from adacd_hil.records import Event
 
 STATED_HZ = {
@@ -276,7 +276,7 @@ def test_no_server_is_one_line():
 
 def test_a_viewer_that_leaves_amid_what_it_has_not_read_leaves_at_once(run, monkeypatch):
     endless = functools.partial(connect, close_timeout=2 * HANG_S)  # one that waited for it would meet the time limit
-    monkeypatch.setattr("adacd_hil.log.viewer.client.connect", endless)
+    monkeypatch.setattr("adacd_hil.lab.live.client.connect", endless)
     fed = Feed()
     with live_client(fed.live.url) as client:
         fed.cycles(run, 100)

@@ -13,13 +13,13 @@ from hang import HANG_S
 from live_rig import Feed, receive_until_last
 from recorded_run import make_run
 
-from adacd_hil.cli.commands.live_monitor import TOPICS, LiveMonitor, as_text
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.options import live_options
 from adacd_hil.control.session import LiveAddress
+from adacd_hil.lab.cli.live_monitor import TOPICS, LiveMonitor, as_text
+from adacd_hil.lab.live.client import LiveMessage, live_client
 from adacd_hil.log.types.message_types import payload_dtype
 from adacd_hil.log.types.topics import run_channels
-from adacd_hil.log.viewer.client import LiveMessage, live_client
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactKind,
@@ -168,7 +168,7 @@ def test_the_monitor_ends_with_the_run(words, monkeypatch):
         is_subscribed.wait(HANG_S)
         fed.close()
 
-    monkeypatch.setattr("adacd_hil.cli.commands.live_monitor.LiveMonitor", Seen)
+    monkeypatch.setattr("adacd_hil.lab.cli.live_monitor.LiveMonitor", Seen)
     thread = threading.Thread(target=end)
     thread.start()
     result = CliRunner().invoke(cli, ["monitor", "--url", fed.live.url, "--seconds", "600", *words])
@@ -255,7 +255,7 @@ def test_a_server_of_something_else_is_one_line_and_status_1(monkeypatch, messag
     def strange(url, topics):
         yield StrangeClient(message)
 
-    monkeypatch.setattr("adacd_hil.cli.commands.live_monitor.live_client", strange)
+    monkeypatch.setattr("adacd_hil.lab.cli.live_monitor.live_client", strange)
     result = CliRunner().invoke(cli, ["monitor", "--url", "ws://x:1", "--seconds", "0.1"])
     assert (result.exit_code, result.stderr) == (1, "adacd-hil: it does not serve a log of adacd-hil\n")
 

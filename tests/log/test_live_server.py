@@ -21,15 +21,15 @@ from recorded_run import CODEC, feed, make_run, start
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from adacd_hil.lab.live import server as server_module
+from adacd_hil.lab.live.admission import FULL, NOTICES, Admission
+from adacd_hil.lab.live.client import live_client
+from adacd_hil.lab.live.feed import ServerSetup
+from adacd_hil.lab.live.server import listen, make_server, url_of
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.processes import LiveSetup
 from adacd_hil.log.recording.ring import Ring, RingReader
 from adacd_hil.log.types.topics import run_channels
-from adacd_hil.log.viewer import server as server_module
-from adacd_hil.log.viewer.admission import FULL, NOTICES, Admission
-from adacd_hil.log.viewer.client import live_client
-from adacd_hil.log.viewer.feed import ServerSetup
-from adacd_hil.log.viewer.server import listen, make_server, url_of
 
 SDK = "foxglove.sdk.v1"
 OLD = "foxglove.websocket.v1"

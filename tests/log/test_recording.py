@@ -18,7 +18,7 @@ from adacd_hil import __version__
 from adacd_hil.log.reader import read_log, topic_bytes
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_truth, run_channels
-from adacd_hil.log.viewer.scene import LAYOUT_NAME
+from adacd_hil.log.viewer_layout import LAYOUT_NAME
 from adacd_hil.records import CONTROL_LAYOUT, TRUTH_LAYOUT, Event, scheme_layout
 from adacd_hil.wire.bus import Frame
 

@@ -21,8 +21,8 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Metadata
 
-from adacd_hil.log.check.log_check import check_log
-from adacd_hil.log.editing.recover import recover
+from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 

@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from adacd_hil.log.viewer.robot_description import robot_description
-from adacd_hil.log.viewer.scene import Shape, transforms_of, viewer_layout
+from adacd_hil.lab.live.scene import Shape, transforms_of
+from adacd_hil.log.robot_description import robot_description
+from adacd_hil.log.viewer_layout import viewer_layout
 from adacd_hil.records import GRAVITY_M_S2
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.model.urdf import read_urdf

@@ -13,10 +13,10 @@ from mcap_ros2.decoder import DecoderFactory
 from recorded_run import fd_contract, make_run, record
 from rosbags.highlevel import AnyReader, AnyReaderError
 
-from adacd_hil.log.check.log_check import check_log
-from adacd_hil.log.editing.cut_and_merge import TimeWindow, cut, merge
-from adacd_hil.log.editing.recover import recover
-from adacd_hil.log.formats.mcap_frames import FrameWriter, RecordedFrame
+from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.cut_and_merge import TimeWindow, cut, merge
+from adacd_hil.lab.logs.recover import recover
+from adacd_hil.log.frames.mcap_frames import FrameWriter, RecordedFrame
 from adacd_hil.log.reader import read_log
 from adacd_hil.wire.codec import load_codec
 

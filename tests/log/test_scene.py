@@ -7,8 +7,7 @@ import pytest
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from adacd_hil.log.types.topics import pack_contact, unpack_contact
-from adacd_hil.log.viewer.scene import (
+from adacd_hil.lab.live.scene import (
     ARROW_LIFETIME_NS,
     GREEN,
     GREY,
@@ -27,6 +26,7 @@ from adacd_hil.log.viewer.scene import (
     share_of_threshold,
     transforms_of,
 )
+from adacd_hil.log.types.topics import pack_contact, unpack_contact
 from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Location, Reaction, SchemeState
 
 SHAPE = Shape((0.35, 0.30))

@@ -17,8 +17,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from recorded_run import make_run, record
 
+from adacd_hil.lab.logs.signal_tables import export_tables
 from adacd_hil.log import log_walk
-from adacd_hil.log.formats.signal_tables import export_tables
 from adacd_hil.log.log_files import FIELDS_KEY, LogError, find_parts, part_path
 from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, LogStream, read_log
 from adacd_hil.log.types.message_types import LOG, pack_log, unpack_log

@@ -12,14 +12,14 @@ from click.testing import CliRunner
 from documents import ROOT
 from planar_arm import THETA, ClosedLoop
 
-from adacd_hil.analysis.replay.replay import replay
-from adacd_hil.cli.commands.demo_command import Cast, run_embedded
+from adacd_hil.cli.embedded_run import Cast, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import ExitCode
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.control.pacing import DetectorTiming
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import FaultReason, Request, SchemeState
+from adacd_hil.replay.replay import replay
 from adacd_hil.scheme.detect import detector_registry
 from adacd_hil.scheme.detect.detectors import (
     DetectorBank,

@@ -5,10 +5,10 @@ import pytest
 from excited_arm import PERIOD_S, SETTINGS, Record, play, record
 from planar_arm import THETA
 
-from adacd_hil.analysis.score.margins import PushGatherer
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.margin import WITHIN_S
 from adacd_hil.scheme.supervisor.transitions import Observation
+from adacd_hil.score.margins import PushGatherer
 
 SECONDS = 9.0
 

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from adacd_hil.commission.arm_draft import draw_arm
+from adacd_hil.lab.commission.arm_draft import draw_arm
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError, parse
 

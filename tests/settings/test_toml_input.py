@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.control.arm_records import read_tare
 from adacd_hil.device.profile import load_profile
+from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml, read_toml

@@ -17,7 +17,7 @@ from judged_log import judged_log
 from run_rules import Violation
 from vcan_kills import VcanKill
 
-from adacd_hil.cli.commands.demo_command import Cast, run_embedded
+from adacd_hil.cli.embedded_run import Cast, run_embedded
 from adacd_hil.log.reader import Series
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.configuration import load_settings

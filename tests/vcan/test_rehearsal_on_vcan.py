@@ -4,8 +4,8 @@ import pytest
 from experiment_runs import Played, adacd_hil, emulator, run_on_vcan
 from own_arm import EIGHT_TOUCHES, describe_arm, describe_geared_arm
 
-from adacd_hil.analysis.report.run_reading import read_run
-from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.lab.report.run_reading import read_run
+from adacd_hil.lab.score.evaluation import evaluate
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 

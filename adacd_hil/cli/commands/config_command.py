@@ -57,7 +57,7 @@ def show_settings(
 
 def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
     """Give the settings in force with value and default as TOML, and origin. Raises ConfigError, CommandError."""
-    from adacd_hil.commission.configuration_check import origins_of
+    from adacd_hil.control.configuration_check import origins_of
     from adacd_hil.settings.configuration import (
         Settings,
         apply_settings,
@@ -93,7 +93,7 @@ def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tupl
 @explained
 def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCode:
     """Say everything that is wrong with configurations at once, a line each, and what is likely a mistake."""
-    from adacd_hil.commission.configuration_check import examine_configuration
+    from adacd_hil.control.configuration_check import examine_configuration
 
     findings = {name: examine_configuration(name, profile) for name in names}
     if as_json:

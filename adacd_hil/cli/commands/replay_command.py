@@ -15,9 +15,9 @@ from adacd_hil.progress_lines import Progress
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.replay.log_source import ReplaySource
-    from adacd_hil.analysis.replay.replayed_outcome import Replay
     from adacd_hil.log.log_files import TimeWindow
+    from adacd_hil.replay.log_source import ReplaySource
+    from adacd_hil.replay.replayed_outcome import Replay
     from adacd_hil.settings.configuration import Settings
 
 _EPILOG = (
@@ -108,9 +108,9 @@ def _replay_one(
     stretch: "TimeWindow",
     progress: Any,
 ) -> _Result:
-    from adacd_hil.analysis.replay.replay import replay_source
-    from adacd_hil.analysis.score.emulator_truth import contacts_beside
     from adacd_hil.control.operator import ScriptedOperator
+    from adacd_hil.replay.replay import replay_source
+    from adacd_hil.score.emulator_truth import contacts_beside
     from adacd_hil.settings.configuration import (
         apply_settings,
         keep_facts,
@@ -143,9 +143,9 @@ def _open(
     given: Path, configured: tuple[str | None, str | None, Path | None], against: Path | None
 ) -> "tuple[ReplaySource, bool]":
     """Open a log or a recording; also say whether it is a recording alone."""
-    from adacd_hil.analysis.replay.can_recording import RecordingAgainstLog, RecordingAlone
-    from adacd_hil.analysis.replay.log_source import LogSource
     from adacd_hil.device.contract import load_contract
+    from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone
+    from adacd_hil.replay.log_source import LogSource
     from adacd_hil.settings.configuration import load_settings
     from adacd_hil.wire.codec import load_codec
 
@@ -186,7 +186,7 @@ def _verdict(own: "Replay") -> str:
 
 
 def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow") -> str:
-    from adacd_hil.analysis.replay.replayed_outcome import NOTE, side_by_side
+    from adacd_hil.replay.replayed_outcome import NOTE, side_by_side
 
     own = replays[0]
     attempts = f" in {own.attempts} attempts" if own.attempts > 1 else ""
@@ -214,7 +214,7 @@ def _counts(own: "Replay") -> str:
 def _as_json(
     path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow"
 ) -> dict[str, Any]:
-    from adacd_hil.analysis.replay.replayed_outcome import as_json
+    from adacd_hil.replay.replayed_outcome import as_json
     from adacd_hil.settings.configuration import changed_keys
 
     own = replays[0]

@@ -24,10 +24,10 @@ from adacd_hil.cli.connection import (
 )
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
 from adacd_hil.clock import format_date, wall_ns
-from adacd_hil.commission.configuration_check import guesses_in_brief
 from adacd_hil.control.arm_records import TARED, Origin, UsedHistory, use_history, use_tare
+from adacd_hil.control.configuration_check import guesses_in_brief
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
-from adacd_hil.control.session import LiveAddress, Session, SessionSummary
+from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.progress_lines import Progress
@@ -56,7 +56,7 @@ def check_budget_of(codec: Codec, settings: Settings) -> None:
 
 def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
     """Resolve a configuration as `demo` does, with a scenario's user. Raises ConfigError, CodecError, CommandError."""
-    from adacd_hil.cli.commands.demo_command import resolve
+    from adacd_hil.cli.embedded_run import resolve
 
     check_rehearsal(scenario, connection.interface, connection.channel)
     return connection.with_contract(resolve(connection.config, scenario, connection.profile, None).settings)
@@ -76,7 +76,7 @@ def run_on_bus(
     clock_name: str,
     out: Path | None,
     tare_path: Path | None = None,
-    live: LiveAddress | None = None,
+    live: LiveView | None = None,
     history_path: Path | None = None,
     scenario: str | None = None,
     without_anchor: bool = False,

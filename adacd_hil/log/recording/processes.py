@@ -13,31 +13,41 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from adacd_hil.log.log_files import MOST_VIEWERS
+import numpy as np
+from numpy.typing import NDArray
+
 from adacd_hil.log.types.topics import LogChannel
 from adacd_hil.wire.codec_columns import MessageTable
 
 
-@dataclass(frozen=True)
-class LiveSetup:
-    """Where the live view is served (port 0: any that is free), and the arm that it draws.
+class LiveFeed(Protocol):
+    """A live view of what is logged, open. `url`: where it is served; is_watched: whether somebody looks."""
 
-    robot_description: a URDF. tilt_rad: of the plane of motion. level_rad: the q1 at which link 1 is level. origins,
-    names: of web pages that may watch, and of this machine, beside those of log/viewer/admission.py. most_viewers: at
-    a time.
-    """
+    url: str
 
-    host: str
-    port: int
-    robot_description: str
-    link_length_m: tuple[float, float]
-    tilt_rad: float = 0.0
-    level_rad: float = 0.0
-    origins: tuple[str, ...] = ()
-    names: tuple[str, ...] = ()
-    most_viewers: int = MOST_VIEWERS
+    @property
+    def is_watched(self) -> bool: ...  # noqa: D102
+
+    def show(
+        self,
+        records: NDArray[np.uint8],
+        channels: NDArray[np.uint16],
+        log_ns: NDArray[np.int64],
+        ends: NDArray[np.int64],
+    ) -> None:
+        """Take message records (b,) that follow each other; channels, log_ns, ends (n,), a record each."""
+
+    def close(self) -> None:
+        """End it, and wait for nobody."""
+
+
+class LiveService(Protocol):
+    """A live view to be opened by the writer, in whose process it arrives pickled."""
+
+    def open(self, setup: "WriterSetup", ids: dict[int, int], start_ns: int) -> LiveFeed:
+        """Serve. ids: the file's number of each channel; start_ns: before the first record. Raises LogError."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +67,7 @@ class WriterSetup:
     part_ns: int
     attachments: dict[str, bytes]
     metadata: dict[str, str]
-    live: LiveSetup | None = None
+    live: LiveService | None = None
 
 
 def start_module(

@@ -17,12 +17,12 @@ from typing import NamedTuple
 from adacd_hil.file_access import create_file
 from adacd_hil.log.log_files import LogError, LogExistsError, find_parts
 from adacd_hil.log.recording import packet, processes
-from adacd_hil.log.recording.processes import LiveSetup, WriterSetup, start_module
+from adacd_hil.log.recording.processes import LiveService, WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring, room_of
 from adacd_hil.log.recording.run_folder import check_free, make_room
+from adacd_hil.log.robot_description import ROBOT_NAME
 from adacd_hil.log.types.topics import run_channels, truth_channels
-from adacd_hil.log.viewer.robot_description import ROBOT_NAME
-from adacd_hil.log.viewer.scene import LAYOUT_NAME, viewer_layout
+from adacd_hil.log.viewer_layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame
@@ -70,7 +70,7 @@ class Recorder:
         is_truth: bool = False,
         settings: LogSettings | None = None,
         robot: bytes = b"",
-        live: LiveSetup | None = None,
+        live: LiveService | None = None,
     ) -> None:
         """Create the file, which must not be there (see run_folder.py), and start the writer.
 

@@ -66,7 +66,7 @@ def _is_failed_start(path: Path) -> bool:
         raise LogExistsError(f"{error}; choose another folder with --out") from None
     if path.is_symlink() or not path.is_file() or list(find_parts(path)) != [0]:
         return False
-    from adacd_hil.log.editing.log_info import read_info  # only where there is something to look at
+    from adacd_hil.log.log_info import read_info  # only where there is something to look at
 
     try:
         info = read_info(path)

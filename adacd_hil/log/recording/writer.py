@@ -28,10 +28,9 @@ from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS
 from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.log_file import McapFile, Sink
 from adacd_hil.log.recording.packet_writer import Numbers, PacketWriter, Rows
-from adacd_hil.log.recording.processes import WriterSetup, read_setup
+from adacd_hil.log.recording.processes import LiveFeed, LiveService, WriterSetup, read_setup
 from adacd_hil.log.recording.ring import RingReader, split
 from adacd_hil.log.recording.run_folder import is_there
-from adacd_hil.log.viewer.feed import LiveFeed
 from adacd_hil.terminal import in_line
 
 POLL_PERIOD_US = 25_000
@@ -60,7 +59,7 @@ class WriterProcess:
         self._parts = 1
         self._file = self._begin_file()
         self._clock = clock or MonotonicClock()
-        self.live = self._open_live() if setup.live else None
+        self.live = self._open(setup.live) if setup.live else None
         watch = self.live.show if self.live else None
         self._packets = PacketWriter(self._file, setup.messages, setup.epoch_ns, watch)
         self._gathered: list[bytes] = []
@@ -74,9 +73,9 @@ class WriterProcess:
         if not setup.is_blocking:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, POLL_PERIOD_US))
 
-    def _open_live(self) -> LiveFeed:
+    def _open(self, live: LiveService) -> LiveFeed:
         start_ns = self._setup.epoch_ns + (0 if self._setup.is_blocking else self._clock.now_ns())
-        return LiveFeed(self._setup, self._file.ids, start_ns)
+        return live.open(self._setup, self._file.ids, start_ns)
 
     def run(self) -> None:
         """Write until the end, then answer with the last word."""

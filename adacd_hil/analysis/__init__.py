@@ -1,1 +1,0 @@
-"""The analysis of logs: scores, reports, replays, sweeps, thresholds."""

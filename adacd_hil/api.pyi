@@ -1,0 +1,15 @@
+from adacd_hil.lab.library.array_detection import ArrayContact as ArrayContact
+from adacd_hil.lab.library.array_detection import ArrayError as ArrayError
+from adacd_hil.lab.library.array_detection import detect as detect
+from adacd_hil.lab.library.array_detection import fit as fit
+from adacd_hil.lab.library.loaded_run import LoadedRun as LoadedRun
+from adacd_hil.lab.library.loaded_run import RunContact as RunContact
+from adacd_hil.lab.library.loaded_run import RunEvent as RunEvent
+from adacd_hil.lab.library.loaded_run import load as load
+from adacd_hil.lab.offline.recording_verdict import Verdict as Verdict
+from adacd_hil.log.log_files import LogError as LogError
+from adacd_hil.records import ContactReport as ContactReport
+from adacd_hil.records import SchemeState as SchemeState
+from adacd_hil.scheme.identify.certificate import Certificate as Certificate
+from adacd_hil.wire.bus import Bus as Bus
+from adacd_hil.wire.bus import Frame as Frame

@@ -1,0 +1,148 @@
+"""A scenario in one process: host and emulated arm on the embedded bus."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
+from adacd_hil.clock import VirtualClock
+from adacd_hil.control.cycle_compilation import compiling_cycle
+from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.control.session import LiveView, Session, SessionSummary
+from adacd_hil.device.contract import load_contract
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
+from adacd_hil.records import TRUTH_LAYOUT, Vector
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.score.emulator_truth import config_digest
+from adacd_hil.settings.configuration import Settings, configuration_layers, load_settings, resolved_table
+from adacd_hil.settings.run_settings import RequestSettings
+from adacd_hil.settings.schema import parse
+from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.wire.bus import Bus, EmbeddedBus
+from firmware_sim.bench.bench import Bench
+from firmware_sim.bench.bench_time import TruthLog
+from firmware_sim.body.body import Body
+from firmware_sim.canopen.object_dictionary import EmulatedContract, playable_contract
+from firmware_sim.cli.own_devices import rehearse_settings
+from firmware_sim.scenario.rehearsal import told_arm
+from firmware_sim.scenario.scenario import Scenario, load_scenario, named_profile
+
+SCENARIO = "paper"
+"""Whose requests to the host are in a script; the user of another one only asks to finish."""
+USER = "demo"
+"""The configuration with that script, for those that have none."""
+
+
+_TOUCHED_LINK = TRUTH_LAYOUT.slices["contact_link"].start
+
+
+class Cast(NamedTuple):
+    """Host and emulated arm of a run, resolved."""
+
+    settings: Settings
+    scenario: Scenario
+    contract: EmulatedContract | None = None
+    assumed: tuple[str, ...] = ()
+
+
+def resolve(config: str, scenario_name: str, profile: str | None, seed: int | None, truth: str | None = None) -> Cast:
+    """Read configuration, scenario and truth. Raises ConfigError, CodecError.
+
+    A configuration of an arm of one's own is played as that arm, unless a profile is given. Else the profile is the
+    given one, else that of the scenario's file, else the configuration's. A configuration without a
+    script gets the demo's user: who only watches can't acknowledge. The emulated arm's own configuration gets from it
+    what its motors hold, as from a data sheet; an arm of one's own runs by its file alone.
+    """
+    contract: EmulatedContract | None = None
+    assumed: list[str] = []
+    layers = configuration_layers(config, profile)
+    settings = parse(Settings, resolved_table(layers))
+    if truth is not None or (profile is None and told_arm(settings, layers).is_own):
+        _, contract, scenario, assumed = rehearse_settings(settings, layers, scenario_name, truth, seed)
+    else:
+        settings = load_settings(config, profile or named_profile(scenario_name))
+        scenario = load_scenario(scenario_name, settings.arm.profile, seed)
+    operator = settings.operator
+    if not operator.script:  # nobody else plays the user of an emulated arm
+        operator = load_settings(USER).operator
+    if scenario_name != SCENARIO:
+        operator = dataclasses.replace(
+            operator,
+            script=(RequestSettings(at_s=scenario.lasts_s, request="finish"),),
+            acknowledge_faults=scenario.acknowledge_faults,
+        )
+    arm = settings.arm
+    if contract is None and arm.holding_torque_Nm is None:
+        arm = dataclasses.replace(arm, holding_torque_Nm=scenario.mechanics.holding_torque_Nm)
+    return Cast(dataclasses.replace(settings, arm=arm, operator=operator), scenario, contract, tuple(assumed))
+
+
+class _TrueTouch:
+    """Since when the emulator's person touches the arm: for what is told of the run, not for the host."""
+
+    def __init__(self, truth: TruthLog) -> None:
+        self.since_ns: int | None = None
+        self._truth = truth
+
+    def write(self, cycle: int, t_ns: int, block: Vector) -> None:
+        """Log the truth of one cycle."""
+        if block[_TOUCHED_LINK] == 0.0:
+            self.since_ns = None
+        elif self.since_ns is None:
+            self.since_ns = t_ns
+        self._truth.write(cycle, t_ns, block)
+
+
+def run_embedded(
+    cast: Cast,
+    clock_name: str,
+    out: Path,
+    progress: Callable[[str], None] = lambda _: None,
+    live: LiveView | None = None,
+    on_started: Callable[[], None] = lambda: None,
+) -> tuple[SessionSummary, Path]:
+    """Run host and arm in this process, logs in `out`; return how it ended and where the truth is.
+
+    Raises ConfigError, CodecError, LogError, OSError.
+    """
+    settings, scenario = cast.settings, cast.scenario
+    check_shared("lockstep", settings)  # an arm in this process has no neighbour
+    codec = load_contract(settings)
+    contract = cast.contract or playable_contract(codec)
+    clock = make_clock(clock_name)
+    embedded = EmbeddedBus(clock)
+    bus: Bus = model_time(embedded, clock, codec, settings) if isinstance(clock, VirtualClock) else embedded
+    out.mkdir(parents=True, exist_ok=True)
+    host = {CONFIG_DIGEST_KEY: config_digest(to_toml(settings))}
+    with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", metadata=host, scenario=scenario) as truth:
+        try:
+            touch = _TrueTouch(truth)
+            with compiling_cycle(settings, Body.compiled_functions):
+                bench = Bench(
+                    scenario, codec, embedded.deliver, contract=contract, on_truth=touch.write, on_event=truth.event
+                )
+                Pipeline(settings).compile()
+            embedded.attach(bench.on_frame)
+            bench.boot()
+            session = Session(
+                settings,
+                codec,
+                bus,
+                clock,
+                ScriptedOperator(settings.operator),
+                out,
+                "embedded",
+                metadata={"scenario": scenario.name, "seed": str(scenario.seed)},
+                progress=progress,
+                live=live,
+                on_started=on_started,
+                touched_ns=lambda: touch.since_ns,
+            )
+            with on_interrupt(session.interrupt):
+                summary = session.run()
+            bench.outlive_host()  # whatever ended the run, the truth ends with an arm at rest
+        except BaseException:
+            truth.discard()
+            raise
+    return summary, truth.path

@@ -1,0 +1,237 @@
+"""What is wrong with a configuration, and what is odd about it: all of it at once, a line each, without a bus."""
+
+import math
+from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import PurePath
+from typing import NamedTuple
+
+from adacd_hil.control.host_checks import Check, CheckOutcome, ok, warning
+from adacd_hil.control.motions import motion_problems
+from adacd_hil.device.contract import load_contract
+from adacd_hil.device.profile import load_profile
+from adacd_hil.settings.configuration import (
+    ConfigurationLayer,
+    KnownKey,
+    Settings,
+    configuration_layers,
+    explain_unknown,
+    in_words,
+    known_keys,
+    resolved_table,
+    value_of,
+)
+from adacd_hil.settings.schema import ConfigError, find_problems, parse
+from adacd_hil.settings.toml_files import builtin_names
+from adacd_hil.wire.budget import check_budget
+from adacd_hil.wire.codec import Codec, CodecError
+
+Pair = tuple[float, float]
+
+_ARMS_OWN = ("arm.cad_theta", "controller.Kp", "controller.Kd")
+"""Keys that the built-in profiles give for an emulated arm."""
+_MOST_RAD = 2.0 * math.pi
+"""A limit in degrees below this is less than a hand's breadth of motion, and likely radians."""
+
+
+class ConfigurationFindings(NamedTuple):
+    """errors: why it can't be used. warnings: what it may not mean. `settings`: None with errors."""
+
+    errors: list[str]
+    warnings: list[str]
+    settings: Settings | None
+    is_late: bool = False
+    """Whether the frames don't get through in the period."""
+
+
+def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
+    """Look for everything that keeps a configuration from being used, and for what is likely a mistake."""
+    try:
+        layers = configuration_layers(name_or_file, profile)
+    except ConfigError as error:
+        return ConfigurationFindings([str(error)], [], None)
+    table = resolved_table(layers)
+    if problems := find_problems(Settings, table):
+        return ConfigurationFindings(problems, [], None)
+    settings = parse(Settings, table)
+    if problems := motion_problems(settings):
+        return ConfigurationFindings([*problems, *_radians(settings)], [], None)
+    if problems := [*_device_problems(settings), *_detector_problems(settings)]:
+        return ConfigurationFindings(problems, [], None)
+    try:
+        codec = load_contract(settings)
+    except (ConfigError, CodecError) as error:
+        return ConfigurationFindings([str(error)], [], None)
+    late = list(_budget_warnings(codec, settings))
+    guesses = [*settings.assumed, *profile_guesses(settings)]
+    assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in guesses)}"] if guesses else []
+    warnings = [*_oddities(settings), *_narrow(codec, settings), *assumed, *_layer_warnings(layers), *late]
+    return ConfigurationFindings([], warnings, settings, bool(late))
+
+
+def configuration_checks(settings: Settings) -> list[Check[Settings]]:
+    """Make doctor's checks of a configuration: what it may not mean, and one for each value that is a guess."""
+    known = known_keys()
+    guesses = [key for key in settings.assumed if key in known]
+    return [
+        Check("settings", _check_oddities),
+        *(Check(f"`{key}`", _asking_for(known[key])) for key in guesses),
+        *(Check(f"`{key}`", _asking_for_profile(value)) for key, value in profile_guesses(settings).items()),
+    ]
+
+
+def _check_oddities(settings: Settings) -> CheckOutcome:
+    odd = _oddities(settings)
+    if odd:
+        return warning("; ".join(odd), "correct the configuration; `adacd-hil config check` looks at it without a bus")
+    return ok(f"configuration {settings.name}")
+
+
+def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
+    def ask(settings: Settings) -> CheckOutcome:
+        value = value_of(settings, known.key)
+        told = "nothing is given" if value is None else f"{in_words(value)} is a guess"
+        remedy = f"measure it or look it up, write it, and take `{known.key}` off `assumed`"
+        return warning(f"{told}: {known.meaning}", remedy)
+
+    return ask
+
+
+def _asking_for_profile(value: float) -> Callable[[Settings], CheckOutcome]:
+    def ask(_: Settings) -> CheckOutcome:
+        remedy = "look it up or measure it, write it into that profile, and take the key off its `assumed`"
+        return warning(f"{value:.10g} is a guess", remedy)
+
+    return ask
+
+
+def profile_guesses(settings: Settings) -> dict[str, float]:
+    """Return the guesses within the profiles of the devices, as `my-drive.toml: scale.gear_ratio`."""
+    found = {}
+    for kind, names in (("drive", settings.devices.drive), ("sensor", settings.devices.sensor)):
+        for name in dict.fromkeys(names):
+            profile = load_profile(name, kind).settings
+            for key in profile.assumed:
+                section, _, field = key.partition(".")
+                found[f"{PurePath(name).name}: {key}"] = getattr(getattr(profile, section), field)
+    return found
+
+
+def _oddities(settings: Settings) -> list[str]:
+    return [line for look in _LOOKS for line in look(settings)]
+
+
+_MOST_NAMED = 4
+"""Guesses that a run names; `config check` names all."""
+
+
+def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
+    """Say in a line which values of a configuration are guesses, but for those that are measured; "" without any."""
+    guesses = [f"`{key}`" for key in (*profile_guesses(settings), *settings.assumed) if key not in measured]
+    more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
+    named = f"{', '.join(guesses[:_MOST_NAMED])}{more}"
+    remedy = "`adacd-hil config check` names all" if more else "`adacd-hil doctor` asks for each"
+    return f"guesses that nobody has confirmed: {named}; {remedy}" if guesses else ""
+
+
+def _device_problems(settings: Settings) -> list[str]:
+    devices = settings.devices
+    problems: dict[str, None] = {}
+    for kind, names in (("drive", devices.drive), ("sensor", devices.sensor)):
+        for name in names:
+            try:
+                load_profile(name, kind)
+            except ConfigError as error:
+                problems[str(error)] = None
+    return list(problems)
+
+
+def _detector_problems(settings: Settings) -> list[str]:
+    if not settings.detector.live:
+        return []
+    from adacd_hil.scheme.detect.live_detectors import live_problems
+
+    return live_problems(settings)
+
+
+_BOUNDS = (
+    ("arm.torque_limit_Nm", "arm.rated_torque_Nm", "Nm", ""),
+    ("reaction.velocity_limit_deg_s", "arm.velocity_limit_deg_s", "deg/s", "; a withdrawal keeps to the smaller one"),
+)
+"""Keys of pairs that must not be larger than those of other keys, and what comes of it."""
+
+
+def _over(settings: Settings) -> Iterator[str]:
+    for key, bound_key, unit, outcome in _BOUNDS:
+        pairs = zip(value_of(settings, key), value_of(settings, bound_key), strict=True)
+        for joint, (value, bound) in enumerate(pairs):
+            if value > bound:
+                told = f"`{bound_key}[{joint}]` = {bound:g} {unit}"
+                yield f"`{key}[{joint}]` = {value:g} {unit} exceeds {told}{outcome}"
+
+
+def _radians(settings: Settings) -> Iterator[str]:
+    for key in ("arm.position_limit_deg", "trajectory.amplitude_deg", "arm.velocity_limit_deg_s"):
+        values = value_of(settings, key)
+        if 0.0 < max(values) <= _MOST_RAD:
+            unit = "rad/s" if key.endswith("_s") else "rad"
+            meant = " and ".join(f"{math.degrees(value):.3g}" for value in values)
+            yield f"`{key}` = {_pair(values)} looks like {unit}; in degrees that would be {meant}"
+
+
+def _unknown_assumptions(settings: Settings) -> Iterator[str]:
+    known = known_keys()
+    for key in settings.assumed:
+        if key not in known:
+            yield f"`assumed` names no setting: {explain_unknown(key)}"
+
+
+_LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (_over, _radians, _unknown_assumptions)
+
+
+def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
+    """Look at who says what: a file of one's own arm with numbers of the emulated one."""
+    own = [layer for layer in layers if layer.origin not in builtin_names() and "[profiles." not in layer.origin]
+    if not own:
+        return
+    if not any("scheme" in layer.table for layer in layers if layer.origin != "paper"):
+        yield 'the scheme is the paper\'s, which certifies nothing; `extends = "certified"` gives the certified one'
+    if not any("arm" in layer.table or "devices" in layer.table for layer in own):
+        return
+    origins = origins_of(layers)
+    for key in _ARMS_OWN:
+        if "[profiles." in origins.get(key, ""):
+            remedy = "give your arm's, or [] for none" if key == "arm.cad_theta" else "give your arm's"
+            yield f"`{key}` is that of an emulated arm, from {origins[key]}; {remedy}"
+
+
+def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
+    """Say for each key that a layer gives which one it is from: the uppermost."""
+    found = {}
+    for origin, table in layers:
+        for section, content in table.items():
+            for key in [f"{section}.{name}" for name in content] if isinstance(content, dict) else [section]:
+                found[key] = origin
+    return found
+
+
+def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
+    """Look for torque sensors whose frames can't carry the rated torque."""
+    for joint, rated_Nm in enumerate(settings.arm.rated_torque_Nm):
+        message = codec.message(f"Sensor{joint + 1}Torque")
+        signal = message.values[message.place("torque")]
+        if (most_Nm := signal.raw_high * signal.scale) < rated_Nm:
+            yield (
+                f"{message.name} carries ±{most_Nm:.3g} Nm, `arm.rated_torque_Nm[{joint}]` = {rated_Nm:g} Nm: is "
+                f"`torque_Nm` of {settings.devices.sensor[joint]} right?"
+            )
+
+
+def _budget_warnings(codec: Codec, settings: Settings) -> Iterator[str]:
+    if b'"Trigger"' in codec.text:
+        budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
+        if not budget.is_fit:
+            yield f"contract {codec.path.stem}: {budget.line}"
+
+
+def _pair(values: Sequence[float]) -> str:
+    return f"[{', '.join(f'{value:g}' for value in values)}]"

@@ -1,0 +1,863 @@
+"""The draft of one's own arm as `init` makes it: scans the bus, asks, and lets what is known decide the rest."""
+
+import math
+import os
+import tempfile
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from adacd_hil import __version__
+from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.clock import MonotonicClock, format_date, wall_ns
+from adacd_hil.control.configuration_check import ConfigurationFindings, examine_configuration
+from adacd_hil.control.host_checks import Status, look_for_socketcan
+from adacd_hil.device.profile import ProfileSettings, ScaleSettings, load_profile, profile_names
+from adacd_hil.device.survey import survey
+from adacd_hil.file_access import read_input, replace_file
+from adacd_hil.lab.cli.interview import Interview, Proposal
+from adacd_hil.lab.commission.arm_draft import (
+    LEVEL_DEG,
+    ArmFacts,
+    Fact,
+    PlanarArm,
+    draft_arm,
+    draw_arm,
+    planar_from_urdf,
+    uniform_rods,
+    write_draft,
+)
+from adacd_hil.lab.commission.device_recognition import RecognisedDevice, choose_family, recognise
+from adacd_hil.lab.commission.profile_draft import (
+    DRIVE,
+    SENSOR,
+    TORQUE_KEYS,
+    DeviceRatings,
+    ProfileDraft,
+    describe_kind,
+    draft_profile,
+    identity_of,
+    is_of,
+    kind_of,
+)
+from adacd_hil.log.recording.run_folder import is_there
+from adacd_hil.scheme.model.urdf import UrdfError
+from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
+from adacd_hil.settings.configuration import known_keys
+from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.terminal import in_line
+from adacd_hil.wire.bus import open_bus
+from adacd_hil.wire.can_interface import can_interfaces, read_link
+
+Pair = tuple[float, float]
+_PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
+_NO_BUS = "none"
+
+
+@dataclass(frozen=True)
+class InitOptions:
+    """What the command line answers; None: not answered."""
+
+    interface: str | None = None
+    channel: str | None = None
+    bitrate: int | None = None
+    is_busless: bool = False
+    urdf: Path | None = None
+    locked: tuple[str, ...] = ()
+    length_m: Pair | None = None
+    mass_kg: Pair | None = None
+    is_upright: bool | None = None
+    mounting: str | None = None
+    at_zero: str | None = None
+    rated_torque_nm: Pair | None = None
+    torque_limit_nm: Pair | None = None
+    position_limit_deg: Pair | None = None
+    velocity_limit_deg_s: Pair | None = None
+    drive: tuple[str, str] | None = None
+    sensor: tuple[str, str] | None = None
+    drive_node: tuple[int, int] | None = None
+    sensor_node: tuple[int, int] | None = None
+    eds: tuple[Path, ...] = ()
+    drive_eds: tuple[Path, ...] = ()
+    sensor_eds: tuple[Path, ...] = ()
+    gear: Pair | None = None
+    gear_efficiency: Pair | None = None
+    increments: Pair | None = None
+    velocity_unit: str | None = None
+    rated_torque_unit: str | None = None
+    torque_count_nm: Pair | None = None
+
+
+@dataclass
+class DraftFiles:
+    """The files that are to be written: none replaces another unless asked for, and all of them or none."""
+
+    out: Path
+    is_forced: bool
+    contents: dict[Path, bytes] = field(default_factory=dict)
+
+    def check(self, path: Path) -> None:
+        """Raise CommandError where a file is in the way."""
+        if is_there(path) and not self.is_forced:
+            raise CommandError(f"{path} exists; give another name, or --force to replace it", ExitCode.USAGE)
+
+    def add(self, path: Path, content: str | bytes) -> None:
+        """Add a file. Raises CommandError where another is in the way."""
+        data = content.encode() if isinstance(content, str) else content
+        if not (path.is_file() and path.read_bytes() == data):
+            self.check(path)
+        self.contents[path] = data
+
+    def examine(self, text: str) -> ConfigurationFindings:
+        """Check a text for the file as `config check` does, beside the others. Raises CommandError."""
+        with tempfile.TemporaryDirectory() as folder:
+            for path, data in (self.contents | {self.out: text.encode()}).items():
+                (Path(folder) / path.name).write_bytes(data)
+            found = examine_configuration(str(Path(folder) / self.out.name))
+        if found.errors:
+            line = found.errors[0].replace(f"{folder}/", "")
+            raise CommandError(f"{self.out} is not written, as it could not be used: {line}", ExitCode.USAGE)
+        return found
+
+    def finish(self, text: str) -> None:
+        """Write the file and those beside it. Raises CommandError."""
+        self.contents[self.out] = text.encode()
+        try:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            for path, data in self.contents.items():
+                replace_file(path, data)
+        except OSError as error:
+            raise CommandError(f"{self.out} can't be written: {error.strerror}") from error
+
+
+class Drafting:
+    """One draft in the making: what was asked, what was found."""
+
+    def __init__(self, options: InitOptions, interview: Interview, writing: DraftFiles) -> None:
+        self.options, self.interview, self.writing = options, interview, writing
+        self.warnings: list[str] = []
+        self.bus: dict[str, Any] | None = None
+        self.bitrate = options.bitrate
+        self.guessed: set[str] = set()
+        """Profiles in which the worth of a count is a guess."""
+        self._answers: dict[str, tuple[Any, str]] = {}
+        self._drafts: dict[tuple[str, int], ProfileDraft] = {}
+        """Drafted and completed profiles, by kind and joint."""
+
+    def draft(self) -> tuple[str, dict[str, Any]]:
+        """Find out, ask, propose; return the text of the file and a summary."""
+        facts = self._gather()
+        title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
+        title += f" from {self.bus['interface']} {self.bus['channel']}." if self.bus else " without hardware."
+        for period_us in _PERIODS_US if facts.period_us in _PERIODS_US else (facts.period_us,):
+            draft = draft_arm(facts._replace(period_us=period_us))
+            text = write_draft(draft, title, self.writing.out.name)
+            if not self.writing.examine(text).is_late:
+                break
+        summary: dict[str, Any] = {
+            "bus": self.bus,
+            "drive": list(facts.drive.value),
+            "drive_node": list(facts.drive_node.value),
+            "sensor": list(facts.sensor.value),
+            "sensor_node": list(facts.sensor_node.value),
+            "assumed": [*draft.assumed, *self._profile_guesses(facts)],
+            "warnings": [*self.warnings, *draft.warnings],
+        }
+        return text, summary
+
+    def _gather(self) -> ArmFacts:
+
+        options = self.options
+        drives, sensors = self._find_devices()
+        drive, sensor = self._profiles(drives, sensors)
+        profiles = [self._drive_profile(drive.value[joint], joint) for joint in range(2)]
+        scales = [profile.scale for profile in profiles]
+        geometry, length_source, mass_source, gravity_source = self._ask_geometry()
+        ratings = [device.ratings for device in drives]
+        rated = self._rated(ratings, profiles, geometry)
+        torque = self._limit("torque_limit_Nm", "--torque-limit-nm", _torque_proposals(rated, ratings, geometry))
+        proposal = _position_proposals(ratings, scales, geometry)
+        position = self._limit("position_limit_deg", "--position-limit-deg", proposal)
+        proposal = _speed_proposals(ratings, scales, geometry)
+        velocity = self._limit("velocity_limit_deg_s", "--velocity-limit-deg-s", proposal)
+        nodes = [
+            Fact(tuple(device.node.node_id for device in found), "found on the bus")
+            if found
+            else Fact(given or default, "given" if given else "")
+            for found, given, default in (
+                (drives, options.drive_node, (1, 2)),
+                (sensors, options.sensor_node, (3, 4)),
+            )
+        ]
+        is_half = all(name.endswith("-500us") for name in (*drive.value, *sensor.value))
+        return ArmFacts(
+            geometry,
+            length_source,
+            mass_source,
+            gravity_source,
+            rated,
+            torque,
+            position,
+            velocity,
+            drive,
+            sensor,
+            nodes[0],
+            nodes[1],
+            500 if is_half else _PERIODS_US[0],
+            8_000_000 if is_half else None,
+            self.bitrate,
+        )
+
+    def _drive_profile(self, name: str, joint: int) -> ProfileSettings:
+        draft = self._drafts.get((DRIVE, joint))
+        if draft is not None:
+            return draft.settings
+        path = Path(name)
+        there = name if name in profile_names() or path.is_absolute() else str(self.writing.out.parent / path)
+        return load_profile(there, DRIVE).settings
+
+    def _profile_guesses(self, facts: ArmFacts) -> list[str]:
+        """Name the guesses within profiles, each once."""
+        keys: dict[str, None] = {}
+        for kind, names in ((DRIVE, facts.drive.value), (SENSOR, facts.sensor.value)):
+            for joint, name in enumerate(names):
+                draft = self._drafts.get((kind, joint))
+                if draft is not None and name not in profile_names():
+                    keys |= dict.fromkeys(f"{name}: {guess.key}" for guess in draft.guessed)
+                elif name in profile_names():
+                    keys |= dict.fromkeys(f"{name}: {key}" for key in load_profile(name, kind).settings.assumed)
+        return list(keys)
+
+    # -- devices
+
+    def _find_devices(self) -> tuple[list[RecognisedDevice], list[RecognisedDevice]]:
+        """Scan the bus, if there is one; return the drives and sensors of joint 1 and 2, or nothing."""
+        channel = self._ask_channel()
+        if channel is None:
+            return [], []
+        interface = self.options.interface or "socketcan"
+
+        clock = MonotonicClock()
+        bus = open_bus(interface, channel, clock, None, self.options.bitrate, False)
+        try:
+            found = survey(bus, clock, progress=self.interview.say)
+            kinds = dict.fromkeys(self.options.drive_node or (), DRIVE)
+            kinds |= dict.fromkeys(self.options.sensor_node or (), SENSOR)
+            devices = recognise(bus, clock, found.nodes, kinds)
+        finally:
+            bus.close()
+        self.bus = {"interface": interface, "channel": channel, "bitrate": self.options.bitrate}
+        link = read_link(channel) if interface == "socketcan" else None
+        self.bitrate = (None if link is None else link.bitrate) or self.bitrate
+        for device in devices:
+            what = " or ".join(device.profiles) or "no built-in profile"
+            self.interview.say(f"node {device.node.node_id}: {device.kind}, {device.title}: {what}")
+        for node in found.nodes:
+            if all(device.node is not node for device in devices):
+                self.interview.say(
+                    f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; --drive-node and "
+                    "--sensor-node say what such a node is"
+                )
+        chosen = [self._two(devices, kind, getattr(self.options, f"{kind}_node"), channel) for kind in (DRIVE, SENSOR)]
+        return chosen[0], chosen[1]
+
+    def _ask_channel(self) -> str | None:
+
+        options = self.options
+        if options.is_busless and (options.channel or options.interface):
+            raise CommandError("--no-bus and --interface or --channel exclude each other", ExitCode.USAGE)
+        if options.is_busless:
+            return None
+        if options.channel is not None:
+            return options.channel
+        if options.interface not in (None, "socketcan"):
+            raise CommandError(f"--interface {options.interface} needs --channel", ExitCode.USAGE)
+        present = can_interfaces()
+        kernel = look_for_socketcan()
+        if kernel.status is not Status.OK:
+            told = f"{kernel.reason} ({kernel.remedy}); an arm without hardware can be rehearsed"
+        else:
+            told = f"CAN interfaces: {', '.join(present) or 'none is there'}"
+        if self.interview.is_asking:
+            self.interview.say(told)
+        proposal = Proposal(present[0] if self.interview.is_asking and present else _NO_BUS)
+        question = f"CAN interface of the arm, `{_NO_BUS}` for an arm without hardware"
+
+        def read(text: str) -> str:
+            if text != _NO_BUS and present and text not in present:
+                raise ConfigError(f"no CAN interface {text!r}; there are {', '.join(present)}")
+            return text
+
+        channel, _ = self.interview.ask("--channel or --no-bus", None, question, read, proposal)
+        return None if channel == _NO_BUS else channel
+
+    def _two(
+        self, devices: Sequence[RecognisedDevice], kind: str, given: tuple[int, int] | None, channel: str
+    ) -> list[RecognisedDevice]:
+        """Choose the two drives, or the two sensors."""
+        known = {device.node.node_id: device for device in devices if device.kind == kind}
+        option, nodes = f"--{kind}-node", " ".join(map(str, known)) or "none"
+        if len(known) < 2:
+            raise CommandError(
+                f"{channel}: {kind}s that answer: {nodes}; an arm has two. Check power, wiring and node ids; --no-bus "
+                "writes a file without them",
+                ExitCode.BUS_MISSING,
+            )
+
+        def read(value: Any) -> list[RecognisedDevice]:
+            chosen = _numbers(value, int, option)
+            for number in chosen:
+                if number not in known:
+                    raise ConfigError(f"node {number} of {option} is no {kind} that answers; there are {nodes}")
+            if chosen[0] == chosen[1]:
+                raise ConfigError(f"{option} {chosen[0]} {chosen[1]}: the node ids must differ")
+            return [known[number] for number in chosen]
+
+        # Of more than two, as of two arms, nobody but the user knows.
+        proposal = Proposal(tuple(known) if len(known) == 2 else None, "in the order of the node ids")
+        answer, source = self.interview.ask(option, given, f"Node ids of the {kind}s of joint 1 and 2", read, proposal)
+        if source != "given":
+            self.warnings.append(f"{kind}s of joint 1 and 2 are nodes {nodes}, {source}: `doctor --move` checks it")
+        return answer
+
+    def _profiles(self, drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]) -> tuple[Fact, Fact]:
+
+        options = self.options
+        drafted = self._draft_profiles([*drives, *sensors])
+        found = choose_family(drives, sensors) if drives else (("",) * 2, ("",) * 2)
+        facts = []
+        for kind, devices, names, default in (
+            (DRIVE, drives, found[0], "adacd-drive"),
+            (SENSOR, sensors, found[1], "adacd-sensor"),
+        ):
+            given = getattr(options, kind)
+            if given is not None:
+                named = tuple(self.beside(name, kind) for name in given)
+                facts.append(Fact(self._complete(kind, named, devices), "given"))
+                continue
+            from_eds = tuple(drafted.get((kind, joint), "") for joint in range(2))
+            chosen = tuple(from_eds[joint] or names[joint] for joint in range(2))
+            for joint, name in enumerate(chosen):
+                if not name and devices and self.interview.is_asking:
+                    asked = self._ask_eds(kind, joint, devices[joint])
+                    chosen = tuple(asked if other == joint else known for other, known in enumerate(chosen))
+            if not any(chosen) and not devices:
+                facts.append(Fact((default, default)))
+            elif all(chosen):
+                source = "from the EDS" if all(from_eds) else "recognised by vendor and product"
+                completed = self._complete(kind, chosen, devices)
+                facts.append(Fact(completed, "" if self.guessed & set(completed) else source))
+            else:
+                joint = 0 if not chosen[0] else 1
+                title = devices[joint].title if devices else "the device"
+                raise CommandError(
+                    f"{kind} of joint {joint + 1} ({in_line(title)}) has no built-in profile: give --eds FILE, its "
+                    f"maker's, or --{kind} PROFILE PROFILE",
+                    ExitCode.USAGE,
+                )
+        return facts[0], facts[1]
+
+    def _ask_eds(self, kind: str, joint: int, device: RecognisedDevice) -> str:
+        """Ask for the EDS of a device that no profile describes; return the name of its draft."""
+
+        def read(text: str) -> str:
+            eds = Path(text)
+            if not eds.is_file():
+                raise ConfigError(f"EDS {eds} is not there")
+            return self._write_drafts(eds, kind, {joint: device.ratings})[kind, joint]
+
+        question = f"EDS of the {kind} of joint {joint + 1} ({in_line(device.title)})"
+        return self.interview.ask("--eds FILE", None, question, read)[0]
+
+    def beside(self, name: str, kind: str) -> str:
+        """Return a profile's name as the file will have it: a file is named from where the configuration lies."""
+        profile = load_profile(name, kind)
+        if name in profile_names():
+            return name
+        for path in (Path(name), profile.eds):
+            if path.resolve().parent == self.writing.out.resolve().parent:
+                self.writing.contents[path] = path.read_bytes()
+        return os.path.relpath(name, self.writing.out.parent)
+
+    def _draft_profiles(self, devices: Sequence[RecognisedDevice]) -> dict[tuple[str, int], str]:
+        """Draft a profile of each EDS, to lie beside the file; return the names by kind and joint."""
+        names: dict[tuple[str, int], str] = {}
+        for eds, kind in self._eds_files():
+            identity = identity_of(eds)
+            same = [device for device in devices if device.kind == kind]
+            fitting = [
+                joint
+                for joint in range(2)
+                if not same or is_of(identity, (same[joint].node.vendor, same[joint].node.product))
+            ]
+            if not fitting:
+                vendor, product = ("?" if number is None else f"0x{number:X}" for number in identity)
+                raise CommandError(
+                    f"EDS {eds} is of vendor {vendor}, product {product}, which is no {kind} on the bus: "
+                    f"{'; '.join(in_line(device.title) for device in same)}",
+                    ExitCode.USAGE,
+                )
+            names |= self._write_drafts(
+                eds, kind, {joint: same[joint].ratings if same else DeviceRatings() for joint in fitting}
+            )
+        return names
+
+    def _eds_files(self) -> list[tuple[Path, str]]:
+        """List the EDS files with what each describes; asks where 0x1000 doesn't tell."""
+        options = self.options
+        found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
+        for eds in options.eds:
+            kind = kind_of(eds)
+            if not kind:
+                kind, _ = self.interview.ask(
+                    f"--drive-eds {eds} or --sensor-eds {eds} in place of --eds",
+                    None,
+                    f"{describe_kind(eds)}: which is it",
+                    _drive_or_sensor,
+                )
+            found.append((eds, kind))
+        return found
+
+    def _write_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
+        """Draft the profile of an EDS for some joints, ask for missing values; return the names of the files."""
+        drafts = self._draft(eds, kind, ratings)
+        folder, stem = self.writing.out.parent, f"{self.writing.out.stem}-{eds.stem}"
+        self.writing.add(folder / eds.name, eds.read_bytes())
+        names: dict[tuple[str, int], str] = {}
+        texts: dict[str, str] = {}
+        for joint, draft in drafts.items():
+            name = texts.setdefault(draft.text, f"{stem}.toml" if not texts else f"{stem}-{joint + 1}.toml")
+            names[kind, joint] = name
+            self._note(kind, joint, name, draft)
+        for text, name in texts.items():
+            self.writing.add(folder / name, text)
+        return names
+
+    def _note(self, kind: str, joint: int, name: str, draft: ProfileDraft) -> None:
+        """Remember a draft, and warn of its guesses."""
+        self._drafts[kind, joint] = draft
+        for line in (*draft.guesses, *draft.remarks):
+            if (warning := f"{name}: {line}") not in self.warnings:
+                self.warnings.append(warning)
+        self.guessed |= {name} if _ESSENTIAL & {guess.key for guess in draft.guessed} else set()
+
+    def _draft(
+        self, eds: Path, kind: str, ratings: dict[int, DeviceRatings], among: Collection[str] | None = None
+    ) -> dict[int, ProfileDraft]:
+        """Draft the profile of an EDS for some joints, and ask for each guess; only for keys `among` these if given."""
+        answers: dict[int, dict[str, float]] = {joint: {} for joint in ratings}
+
+        def drafted() -> dict[int, ProfileDraft]:
+            return {joint: draft_profile(eds, ratings[joint], kind, answers[joint]) for joint in ratings}
+
+        drafts = drafted()
+        for question in _QUESTIONS:
+            if question.kind != kind or (among is not None and question.key not in among):
+                continue
+            guessed = {guess.key: guess.value for draft in drafts.values() for guess in draft.guessed}
+            if question.given(self.options) is None and question.key not in guessed:
+                continue
+            if question.option not in self._answers:
+                proposal = Proposal(question.propose(guessed.get(question.key, 1.0)))
+                self._answers[question.option] = self.interview.ask(
+                    question.option,
+                    question.given(self.options),
+                    question.text,
+                    question.read,
+                    proposal,
+                    question.explanation,
+                )
+            value, source = self._answers[question.option]
+            if source == "given":
+                for joint, known in answers.items():
+                    known[question.answer] = value[joint]
+                drafts = drafted()
+        return drafts
+
+    def _complete(self, kind: str, names: tuple[str, ...], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
+        """Extend shipped profiles by gear and encoder of this arm, if known; return the names of the files."""
+        completed, texts = list(names), dict[str, str]()
+        for joint, name in enumerate(names):
+            if name not in profile_names():
+                continue
+            profile = load_profile(name, kind)
+            if not profile.settings.assumed:
+                continue
+            ratings = devices[joint].ratings if devices else DeviceRatings()
+            (draft,) = self._draft(profile.eds, kind, {joint: ratings}, profile.settings.assumed).values()
+            left = [guess.key for guess in draft.guessed if guess.key in profile.settings.assumed]
+            if len(left) < len(profile.settings.assumed):
+                text = _extension(name, profile.settings.scale, draft.settings.scale, left)
+                file = f"{self.writing.out.stem}-{name}.toml" if not texts else f"{self.writing.out.stem}-{name}-2.toml"
+                completed[joint] = texts.setdefault(text, file)
+                self._drafts[kind, joint] = draft._replace(
+                    guessed=tuple(guess for guess in draft.guessed if guess.key in left), remarks=()
+                )
+            else:
+                self.guessed.add(name)
+        for text, file in texts.items():
+            self.writing.add(self.writing.out.parent / file, text)
+        return tuple(completed)
+
+    # -- the arm
+
+    def _ask_geometry(self) -> tuple[PlanarArm, str, str, str]:
+        """Return the geometry, and who says the lengths, the masses, and whether gravity acts."""
+        options, interview = self.options, self.interview
+        urdf, arm = options.urdf, None
+        if urdf is not None:
+            if options.length_m is not None or options.mass_kg is not None:
+                raise CommandError("--urdf says lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE)
+            if options.at_zero is not None or options.is_upright is not None:
+                raise CommandError(
+                    "--urdf says where gravity acts; --mounting floor, wall or ceiling says how its root is mounted",
+                    ExitCode.USAGE,
+                )
+            try:
+                arm = _read_urdf(urdf, options.locked)
+            except ConfigError as error:
+                raise CommandError(str(error), ExitCode.USAGE) from None
+        elif options.length_m is None and interview.is_asking:
+
+            def read(text: str) -> tuple[Path, PlanarArm] | None:
+                return None if text == "-" else (Path(text), _read_urdf(Path(text), options.locked))
+
+            found, _ = interview.ask("--urdf", None, "URDF of the arm, - for none", read, Proposal("-"))
+            urdf, arm = found or (None, None)
+        if urdf is not None and arm is not None:
+            if not arm.is_tip_known:
+                self.warnings.append(f"{urdf} has no frame at the tip: the length of link 2 is a guess")
+            source = f"URDF {urdf.name}"
+            arm, mounted = self._mount(urdf, arm)
+            interview.say(draw_arm(arm.mounting_deg))
+            return arm, source if arm.is_tip_known else "", source, f"{source}, {mounted}"
+        if options.locked:
+            raise CommandError("--lock names a joint of --urdf", ExitCode.USAGE)
+        length_m, length_source = interview.ask(
+            "--length-m L1 L2 or --urdf FILE",
+            options.length_m,
+            "Lengths in m, joint to joint and joint to tip",
+            lambda value: _checked("link_length_m", _numbers(value, float, "--length-m")),
+            Proposal((0.35, 0.30)),
+        )
+        mounting_deg, gravity_source = self._ask_mounting()
+        mass_kg = options.mass_kg
+        if mass_kg is None and interview.is_asking:
+            question = "Masses of the links in kg, - for unknown"
+            mass_kg, _ = interview.ask("--mass-kg", None, question, _masses, Proposal("-"))
+        if mass_kg is None:
+            return PlanarArm(length_m, (), mounting_deg), length_source, "", gravity_source
+        arm = uniform_rods(length_m, _masses(mass_kg) or (0.0, 0.0), mounting_deg)
+        self.warnings.append("inertia is that of uniform rods, without motors and gears")
+        return arm, length_source, "given masses, as uniform rods", gravity_source
+
+    def _ask_mounting(self) -> tuple[Pair, str]:
+        """Return tilt of the plane of motion and the q1 at which link 1 hangs, deg, and who says so."""
+        options, interview = self.options, self.interview
+        given = options.mounting
+        if options.is_upright is not None and given is None:
+            given = "wall" if options.is_upright else "flat"
+        (mounting, tilt_deg), source = interview.ask(
+            "--mounting or --flat",
+            given,
+            "Mounting of the base: flat (joint axes vertical), floor, wall, ceiling, or the tilt of the plane in deg",
+            lambda text: (text.casefold(), _tilt(text)),
+            Proposal("flat"),
+            "on floor, wall and ceiling the joint axes are level and all of gravity acts; a tilt of 0 is flat",
+        )
+        if tilt_deg <= SLIGHT_TILT_DEG:
+            return LEVEL_DEG, source
+        usual = _USUAL_POSES.get(mounting)
+        hangs_deg, at_zero_source = interview.ask(
+            "--at-zero",
+            options.at_zero,
+            "Link 1 at q1 = 0 points down, up, level (+q1 lifts it), or down only at q1 = (deg)",
+            _hanging,
+            Proposal(usual or "level", f"as usual of an arm on {mounting}" if usual else ""),
+            "q1 = 0 is where the drive reads 0, or `arm.zero_deg`; 90: level, and +q1 lowers it",
+        )
+        interview.say(draw_arm((tilt_deg, hangs_deg)))
+        return (tilt_deg, hangs_deg), source if at_zero_source else ""
+
+    def _mount(self, urdf: Path, arm: PlanarArm) -> tuple[PlanarArm, str]:
+        """Turn a URDF's root as it is mounted; return the arm, and how that is."""
+        interview, given = self.interview, self.options.mounting
+        if given is None and not interview.is_asking:
+            return arm, "its root's z axis up"
+        question = "Mounting of the URDF's root: floor (z up), wall (x down), ceiling (z down), or its pitch in deg"
+        try:
+            pitch_deg, _ = interview.ask("--mounting", given, question, _pitch, Proposal("floor"))
+        except ConfigError as error:
+            raise CommandError(str(error), ExitCode.USAGE) from None
+        mounted = "its root's z axis up" if pitch_deg == 0.0 else f"its root pitched by {pitch_deg:g} deg"
+        return _read_urdf(urdf, self.options.locked, pitch_deg), mounted
+
+    def _rated(
+        self, ratings: Sequence[DeviceRatings], profiles: Sequence[ProfileSettings], geometry: PlanarArm
+    ) -> Fact:
+        """Take the rated torque at the joints from the drives, from their EDS, or ask."""
+        scales = [profile.scale for profile in profiles]
+        by_drives = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
+        drafts = [self._drafts.get((DRIVE, joint)) for joint in range(2)]
+        by_eds = [None if draft is None else draft.rated_torque_Nm for draft in drafts]
+        is_known = not any(TORQUE_KEYS & set(profile.assumed) for profile in profiles)
+        are_of_eds = all(draft is not None and draft.is_rated_known for draft in drafts)
+        if self.options.rated_torque_nm is None and is_known:
+            for pair, source in (
+                (by_drives, "0x6076 of the drives"),
+                (by_eds if are_of_eds else [], "0x6076 of their EDS"),
+            ):
+                if len(pair) == 2 and None not in pair:
+                    behind = " behind their gears" if any(scale.gear_ratio != 1.0 for scale in scales) else ""
+                    return Fact(_checked("rated_torque_Nm", (pair[0], pair[1])), source + behind)
+        proposal = Proposal((12.0, 6.0))
+        if geometry.effort_Nm is not None and min(geometry.effort_Nm) > 0.0:
+            proposal = Proposal(geometry.effort_Nm)  # a URDF's effort is a limit, no rating
+        for pair in (by_eds, by_drives):
+            if len(pair) == 2 and None not in pair and _is_rating(pair):
+                proposal = Proposal((pair[0], pair[1]))
+        return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
+
+    def _limit(self, key: str, option: str, proposal: Proposal) -> Fact:
+
+        given = getattr(self.options, option[2:].replace("-", "_"))
+        meaning = known_keys()[f"arm.{key}"].meaning
+        value, source = self.interview.ask(
+            f"{option} A B",
+            given,
+            f"{meaning[0].upper()}{meaning[1:]}: joint 1 and 2 (`arm.{key}`)",
+            lambda value: _checked(key, _numbers(value, float, option)),
+            proposal,
+        )
+        return Fact(value, source)
+
+
+def _numbers(value: Any, kind: type, option: str) -> tuple[Any, Any]:
+    """Read two numbers, given or typed. Raises ConfigError."""
+    words = value.replace(",", " ").split() if isinstance(value, str) else list(value)
+    try:
+        first, second = (kind(word) for word in words)
+    except ValueError:
+        raise ConfigError(f"{option}: {value!r} must be two numbers, of joint 1 and 2") from None
+    return first, second
+
+
+def _checked(key: str, value: tuple[Any, Any]) -> Any:
+    """Check a pair against the bounds of its setting. Raises ConfigError."""
+    return getattr(parse(ArmSettings, {key: list(value)}, "arm."), key)
+
+
+_PITCHES_DEG = {"floor": 0.0, "wall": 90.0, "ceiling": 180.0}
+"""Of a URDF's root about its y axis, by what its base is on."""
+_TILTS_DEG = {"flat": 0.0, "floor": 90.0, "wall": 90.0, "ceiling": 90.0}
+"""Of the plane of motion, by what the base of an arm with level axes is on."""
+_HANGING_DEG = {"down": 0.0, "up": 180.0, "level": -90.0}
+"""The q1 at which link 1 hangs, by where it points at q1 = 0."""
+_USUAL_POSES = {"floor": "up", "wall": "level", "ceiling": "down"}
+
+
+def _tilt(text: str) -> float:
+    return _word_or_deg("--mounting", text, _TILTS_DEG, 0.0, 90.0)
+
+
+def _pitch(text: str) -> float:
+    return _word_or_deg("--mounting", text, _PITCHES_DEG, -180.0, 180.0)
+
+
+def _hanging(text: str) -> float:
+    return _word_or_deg("--at-zero", text, _HANGING_DEG, -180.0, 180.0)
+
+
+def _word_or_deg(option: str, text: str, words: dict[str, float], low: float, high: float) -> float:
+    """Read a word, or an angle within bounds, deg. Raises ConfigError."""
+    if text.casefold() in words:
+        return words[text.casefold()]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise ConfigError(f"{option} {text!r} must be {', '.join(words)}, or {low:g} to {high:g} deg")
+    return value
+
+
+def _masses(value: Any) -> Pair | None:
+    if value == "-":
+        return None
+    masses = _numbers(value, float, "--mass-kg")
+    for mass in masses:
+        if not 0.001 <= mass <= 1000.0:
+            raise ConfigError(f"--mass-kg: {mass:g} kg must be within 0.001 kg to 1000 kg")
+    return masses
+
+
+def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> PlanarArm:
+    """Read a URDF whose root is turned by so much about its y axis. Raises ConfigError."""
+    try:
+        return planar_from_urdf(read_input(path), locked, pitch_deg)
+    except FileNotFoundError:
+        raise ConfigError(f"URDF {path} does not exist") from None
+    except OSError as error:
+        raise ConfigError(f"URDF {path}: {error.strerror}") from None
+    except UrdfError as error:
+        raise ConfigError(f"URDF {path}: {error}") from None
+
+
+def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Proposal:
+    """Propose the least of what drives and URDF allow, and of the rated torque."""
+    shares = [min(rating.torque_share or 1.0, 1.0) for rating in ratings] or [1.0, 1.0]
+    efforts = geometry.effort_Nm or rated.value
+    limit = tuple(min(rated.value[joint] * shares[joint], efforts[joint]) for joint in range(2))
+    source = "the rated torque" if limit == tuple(rated.value) else "the least of 0x6072 and the URDF's effort"
+    return Proposal(limit, source if rated.source else "")
+
+
+def _position_proposals(
+    ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm
+) -> Proposal:
+    told = [rating.position_limit_deg(scale) for rating, scale in zip(ratings, scales, strict=False)]
+    if geometry.position_limit_deg is not None:
+        return Proposal(geometry.position_limit_deg, "the URDF's")
+    if told and None not in told:
+        return Proposal(tuple(told), "0x607D of the drives")
+    return Proposal((75.0, 120.0))
+
+
+def _speed_proposals(
+    ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm
+) -> Proposal:
+    told = [rating.velocity_limit_deg_s(scale) for rating, scale in zip(ratings, scales, strict=False)]
+    if geometry.velocity_limit_deg_s is not None:
+        return Proposal(geometry.velocity_limit_deg_s, "the URDF's")
+    if told and None not in told:
+        return Proposal(tuple(told), "0x6080 of the drives, by their gears")
+    return Proposal((250.0, 300.0))
+
+
+_ESSENTIAL = {"scale.increments_per_joint_rev", "scale.torque_Nm", "scale.rated_torque_count_Nm"}
+"""Guesses in a profile that make `devices` of the configuration a guess, too."""
+_VELOCITY_UNITS = {
+    "increment/s": 0x00B50300,
+    "rpm": 0x00B44700,
+    "0.1rpm": 0xFFB44700,
+    "mrpm": 0xFDB44700,
+    "deg/s": 0x00410300,
+    "rad/s": 0x00100300,
+}
+_TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "uNm": 1e-6, "Nm": 1.0, "0.01Nm": 0.01}
+
+
+@dataclass(frozen=True)
+class ScaleQuestion:
+    """A question about a value that an EDS may leave open. key: in a profile."""
+
+    kind: str
+    key: str
+    option: str
+    text: str
+    explanation: str
+    units: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def answer(self) -> str:
+        """Name of the answer for `draft_profile`."""
+        return "velocity_unit" if self.key == "scale.velocity_rad_s" else self.key.partition(".")[2]
+
+    def given(self, options: InitOptions) -> Any:
+        """Return the option's value, None if it is absent."""
+        return getattr(options, self.option.split()[0].lstrip("-").replace("-", "_"))
+
+    def propose(self, value: float) -> Any:
+        """Return the guess as it would be typed."""
+        if self.units:
+            return next((name for name, worth in self.units.items() if worth == value), next(iter(self.units)))
+        return (value, value)
+
+    def read(self, value: Any) -> tuple[float, float]:
+        """Read an answer, for joint 1 and 2. Raises ConfigError."""
+        if not self.units:
+            first, second = _numbers(value, float, self.option.split()[0])
+        elif value in self.units:
+            first = second = self.units[value]
+        else:
+            raise ConfigError(f"{self.option.split()[0]}: {value!r} must be one of {', '.join(self.units)}")
+        name = self.key.partition(".")[2]
+        if self.answer != "velocity_unit":
+            parse(ScaleSettings, {name: first})
+            parse(ScaleSettings, {name: second})
+        if min(first, second) <= 0.0:
+            raise ConfigError(f"{self.option.split()[0]}: {min(first, second):g} must be above 0")
+        return first, second
+
+
+_QUESTIONS = (
+    ScaleQuestion(
+        DRIVE,
+        "scale.gear_ratio",
+        "--gear A B",
+        "Gear of joint 1 and 2: motor revolutions per revolution of the joint",
+        "0x6076 is the motor's torque, and velocities are the motor's; 1 without a gear",
+    ),
+    ScaleQuestion(
+        DRIVE,
+        "scale.gear_efficiency",
+        "--gear-efficiency A B",
+        "Efficiency of these gears, 0 to 1; 1 where it is not known",
+        "part of the motor's torque that leaves the gear, 0.6 to 0.9 mostly",
+    ),
+    ScaleQuestion(
+        DRIVE,
+        "scale.increments_per_joint_rev",
+        "--increments A B",
+        "Position increments per revolution of joint 1 and 2",
+        "counts of 0x6064: increments per motor revolution times the gear; turn the joint by hand and look",
+    ),
+    ScaleQuestion(
+        DRIVE,
+        "scale.velocity_rad_s",
+        "--velocity-unit UNIT",
+        "Unit of the drives' velocity 0x606C: increment/s, rpm, 0.1rpm, mrpm, deg/s or rad/s, of the motor",
+        "the drive's manual has it under 0x606C or 0x60A9",
+        {name: float(code) for name, code in _VELOCITY_UNITS.items()},
+    ),
+    ScaleQuestion(
+        DRIVE,
+        "scale.rated_torque_count_Nm",
+        "--rated-torque-unit UNIT",
+        "Unit of the drives' rated torque 0x6076: mNm, µNm, Nm or 0.01Nm",
+        "mNm by CiA 402-2; an EPOS4 has µNm",
+        _TORQUE_UNITS_NM,
+    ),
+    ScaleQuestion(
+        SENSOR,
+        "scale.torque_Nm",
+        "--torque-count-nm A B",
+        "One count of the torque sensors of joint 1 and 2, Nm",
+        "in the sensor's data sheet, or by a known weight",
+    ),
+)
+
+
+def _is_rating(pair: Sequence[float | None]) -> bool:
+    try:
+        _checked("rated_torque_Nm", (pair[0], pair[1]))
+    except ConfigError:
+        return False
+    return True
+
+
+def _drive_or_sensor(text: str) -> str:
+    if text.casefold() not in (DRIVE, SENSOR):
+        raise ConfigError(f"{text!r} must be drive or sensor")
+    return text.casefold()
+
+
+def _extension(name: str, shipped: ScaleSettings, scale: ScaleSettings, left: Sequence[str]) -> str:
+    """Write a profile that extends a shipped one by gear and encoder of the arm."""
+    rows = [
+        f"{key} = {value!r}" for key, value in vars(scale).items() if not math.isclose(value, getattr(shipped, key))
+    ]
+    assumed = ", ".join(f'"{key}"' for key in left)
+    head = [f"# {name} with gear and encoder of this arm, by `adacd-hil init`.", "", f'extends = "{name}"']
+    return "\n".join([*head, f"assumed = [{assumed}]", "", "[scale]", *rows]) + "\n"

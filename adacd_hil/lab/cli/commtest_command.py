@@ -1,0 +1,288 @@
+"""Communication test: a while of cycles at zero torque, and a verdict on the connection."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+from adacd_hil.cli.connection import Connection, on_interrupt
+from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.clock import MonotonicClock, wall_ns
+from adacd_hil.control.pacing import prepare_spin
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.network import Master
+from adacd_hil.device.strangers import refuse_company
+from adacd_hil.file_access import replace_files
+from adacd_hil.lab.commission.communication_test import (
+    CommunicationReport,
+    CommunicationTest,
+    Verdict,
+    ZeroTorqueCycle,
+    ZeroTorqueLoop,
+)
+from adacd_hil.lab.score.evaluation import collect_evidence
+from adacd_hil.log.log_files import failing_as
+from adacd_hil.log.logged_run import QUANTITIES
+from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.recording.run_folder import check_free
+from adacd_hil.log.types.topics import ChannelId, pack_cycle
+from adacd_hil.records import FaultReason
+from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.score.distribution import bar_chart, doubling_bins
+from adacd_hil.score.metrics import TimingEvidence
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.terminal import in_line
+from adacd_hil.wire.bus import BusError, Tap
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.contract_frames import read_bitrates
+
+LOG_NAME = "commtest.mcap"
+HTML_NAME = "commtest.html"
+_EXIT = {Verdict.GOOD: ExitCode.OK, Verdict.WARNING: ExitCode.OK, Verdict.NOT_SUFFICIENT: ExitCode.FAILURE}
+_FIRST_BIN_US = 10.0
+_BINS = 12
+
+
+def run_commtest(
+    connection: Connection, seconds: float, is_enabling: bool, out: Path | None
+) -> tuple[dict[str, Any], ExitCode]:
+    """Boot the arm, cycle at zero torque, judge. Exit code: FAILURE when the connection is not sufficient.
+
+    Raises ConfigError, CodecError, BusMissingError, LogExistsError, LogError, CommandError.
+    """
+    settings, codec = connection.load()
+    clock = MonotonicClock()
+    if out is not None:
+        check_free(out / LOG_NAME)
+    with connection.bus(clock, codec.is_fd) as bus:
+        tap = Tap(bus, clock)
+        arm, master = Arm(settings, codec, tap), Master(settings, codec, tap)
+        _progress(f"looking for the arm on {bus.channel}")
+        try:
+            refuse_company(tap, clock, settings, codec)
+            master.reset()
+            master.identify()
+            master.configure()
+        except DeviceError as error:
+            raise CommandError(error.line, ExitCode.BUS_MISSING) from None
+        boot_frames = tap.take()
+        grant = request_realtime(settings.realtime_request)
+        for line in grant.missing:
+            _progress(f"not granted: {line}")
+        loop = ZeroTorqueLoop(settings, tap, clock, arm, master, is_enabling)
+        achieved = {**grant.describe(), **prepare_spin(loop.pacer, settings, clock, grant)}
+        with grant.unpinned():
+            recorder = None if out is None else _open_log(out, settings, codec, connection, achieved)
+        log_error = ""
+        try:
+            if recorder is not None:
+                recorder.cycle(clock.now_ns(), [], boot_frames)
+            test = CommunicationTest(settings, arm, *read_bitrates(codec))
+            _progress(f"testing for {seconds:g} s, drives {'enabled, torque zero' if is_enabling else 'not enabled'}")
+            fault = _run(loop, master, test, recorder, seconds)
+        finally:
+            if recorder is not None:
+                summary = recorder.close()
+                log_error = "" if summary.is_complete else summary.error or f"log lacks {summary.dropped} packets"
+    report = test.report()
+    described = describe(report, settings, grant.scheduler)
+    described |= {
+        "fault": fault.name,
+        "is_interrupted": loop.is_interrupted,
+        "device_faults": ArmReport(arm).describe_faults(),
+    }
+    described |= {"events": [f"{event.name}: {event.message}" for event in master.take_events()]}
+    if recorder is not None:
+        described |= {"log": str(recorder.path), "log_error": log_error}
+        described |= {"pictures": [str(path) for path in write_pictures(recorder.path.parent, report, described)]}
+    return described, _exit_code(report, fault, loop.is_interrupted, bool(log_error))
+
+
+def _run(
+    loop: ZeroTorqueLoop, master: Master, test: CommunicationTest, recorder: Recorder | None, seconds: float
+) -> FaultReason:
+    freeze_garbage()
+
+    def observe(cycle: ZeroTorqueCycle) -> None:
+        record = test.observe(cycle, 0 if recorder is None else recorder.waiting_bytes)
+        if recorder is not None:
+            recorder.cycle(cycle.state.t_ns, [(ChannelId.CYCLE, pack_cycle(record))], cycle.frames)
+
+    with on_interrupt(loop.interrupt):
+        try:
+            master.start()
+            return loop.run(seconds, observe)
+        except BusError as error:
+            raise CommandError(str(error), ExitCode.SAFETY_STOP) from None
+        finally:
+            master.stop()
+
+
+def _exit_code(report: CommunicationReport, fault: FaultReason, is_interrupted: bool, has_lost_log: bool) -> ExitCode:
+    if fault is not FaultReason.NONE:
+        return ExitCode.SAFETY_STOP
+    if is_interrupted:
+        return ExitCode.INTERRUPTED
+    code = _EXIT[report.verdict]
+    return ExitCode.PARTIAL if code is ExitCode.OK and has_lost_log else code
+
+
+def _open_log(
+    out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]
+) -> Recorder:
+    out.mkdir(parents=True, exist_ok=True)
+    return Recorder(
+        out / LOG_NAME,
+        messages=codec.messages.values(),
+        attachments={codec.path.name: codec.text, "config.toml": to_toml(settings).encode()},
+        metadata={
+            "command": "commtest",
+            "config": settings.name,
+            "interface": connection.interface,
+            "channel": connection.channel,
+            "clock": "realtime",
+            **achieved,
+            "period_us": str(settings.bus.period_us),
+        },
+        epoch_ns=wall_ns() - MonotonicClock().now_ns(),
+        settings=settings.log,
+    )
+
+
+def write_pictures(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
+    """Write commtest.html, the tables and figures of the times as in the report of a run, and its figures as PNG.
+
+    Returns what was written, the page first; nothing without a cycle. Raises LogError when it can't be written.
+    """
+    # Here and not above: plots take a second to import, and memory that the test itself has no use for.
+    from adacd_hil.lab.report.page import Heading, render_page
+    from adacd_hil.lab.report.report_tables import timing_tables
+    from adacd_hil.lab.report.timing_figures import draw_timing
+
+    if not len(report.columns):
+        return []
+    evidence = _evidence(report, described["period_us"])
+    drawings = draw_timing(report.columns, evidence, int(report.columns.t_ns[0]))
+    findings = [line for line in _findings(described) if not line.startswith(("log: ", "pictures: "))]
+    page = render_page(
+        "communication_test_page.html.j2",
+        "communication test",
+        Heading("adacd-hil commtest", findings[-1], findings[:-1], report.verdict is Verdict.GOOD),
+        timing=timing_tables(evidence),
+        timing_figures=drawings,
+    )
+    pictures: dict[str, bytes | str] = {
+        HTML_NAME: page,
+        **{f"{drawing.name}.png": drawing.png() for drawing in drawings},
+    }
+    with failing_as(f"pictures in {out} can't be written"):
+        return [*replace_files(out, pictures)]
+
+
+def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:
+    """Put the report into plain values; times in µs."""
+    evidence = _evidence(report, settings.bus.period_us)
+    return {
+        "verdict": report.verdict.value,
+        "share": round(report.share, 6),
+        "cycles": report.cycles,
+        "complete": report.complete,
+        "overruns": report.overruns,
+        "period_us": settings.bus.period_us,
+        "scheduler": scheduler,
+        "load_percent": round(report.load_percent, 2),
+        "warnings": _warnings(report, scheduler),
+        "devices": {name: dataclasses.asdict(device) for name, device in report.devices.items()},
+        "timing": evidence.as_json(),
+        "bins_us": {
+            quantity.name: [
+                {"below": None if bound == float("inf") else bound, "count": count}
+                for bound, count in doubling_bins(values_us, _FIRST_BIN_US, _BINS)
+            ]
+            for quantity in QUANTITIES
+            if (values_us := report.columns.times_us(quantity)) is not None
+        },
+    }
+
+
+def _evidence(report: CommunicationReport, period_us: float) -> TimingEvidence:
+    return collect_evidence(report.columns, period_us, is_modelled=False)
+
+
+def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
+    """Say what makes the figures worth less."""
+    warnings = []
+    if not scheduler.startswith(("SCHED_FIFO", "SCHED_DEADLINE")):
+        warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
+    silent = [name for name, device in report.devices.items() if not any(device.ages)]
+    if silent:
+        warnings.append(f"never a cyclic frame from {', '.join(silent)}")
+    if report.overruns:
+        warnings.append(f"{report.overruns} of {report.periods} periods were skipped: this host was late")
+    return warnings
+
+
+def as_text(described: dict[str, Any]) -> str:
+    """Write the result for people."""
+    lines = [
+        f"cycles {described['cycles']}, complete {described['complete']}, overruns {described['overruns']}, "
+        f"period {described['period_us']} µs, {described['scheduler']}, bus load {described['load_percent']:.1f} %"
+    ]
+    for name, device in described["devices"].items():
+        checks = ", ".join(f"{count} {status}" for status, count in device["checks"].items() if count) or "no frame"
+        if not device["is_protected"]:
+            checks = f"unprotected, {device['checks'].get('IMPLAUSIBLE', 0)} implausible"
+        lines.append(f"{name}: fresh in {100.0 * device['share']:.2f} % of the periods; {checks}")
+    for name, device in described["devices"].items():
+        ages = device["ages"]
+        oldest = max((age for age, count in enumerate(ages) if count), default=0)
+        labels = [f"{age}" if age < len(ages) - 1 else f">= {age}" for age in range(oldest + 1)]
+        lines += ["", f"age of {name}, cycles"]
+        lines += bar_chart([*labels, "never"], [*ages[: oldest + 1], device["never"]])
+    lines += _timing_lines(described)
+    lines += ["", *_findings(described)]
+    return "\n".join(lines)
+
+
+def _timing_lines(described: dict[str, Any]) -> list[str]:
+    """Write percentiles and bars of each time, then the queues and what was lost."""
+    timing, lines = described["timing"], []
+    for quantity in QUANTITIES:
+        found = _percentile_text(timing["times_us"][quantity.name])
+        lines += ["", f"{quantity.title}, µs ({quantity.meaning}): {found}"]
+        previous = 0.0
+        rows: list[tuple[str, int]] = []
+        for entry in described["bins_us"][quantity.name]:
+            label = f">= {previous:g}" if entry["below"] is None else f"< {entry['below']:g}"
+            previous = entry["below"] or previous
+            if rows or entry["count"]:  # bins before the first value say nothing
+                rows.append((label, entry["count"]))
+        lines += bar_chart([label for label, _ in rows], [count for _, count in rows])
+    queues = "; ".join(f"{name} {_percentile_text(found)}" for name, found in timing["queues_bytes"].items())
+    counts = ", ".join(f"{name.replace('_', ' ')} {count['total']}" for name, count in timing["counts"].items())
+    return [*lines, "", f"queues, bytes: {queues}", f"{counts}, in {timing['cycles']} cycles"]
+
+
+def _percentile_text(found: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.0f}" for name, value in found.items()) or "no value"
+
+
+def _findings(described: dict[str, Any]) -> list[str]:
+    lines = [f"warning: {line}" for line in described["warnings"]]
+    lines += [f"event: {line}" for line in described["events"]]
+    lines += [f"device: {line}" for line in described["device_faults"]]
+    if described["fault"] != FaultReason.NONE.name:
+        lines.append(f"stopped: {described['fault']}")
+    if described.get("log"):
+        lines.append(f"log: {described['log']}" + (f" ({described['log_error']})" if described["log_error"] else ""))
+    lines += [f"pictures: {path}" for path in described.get("pictures", ())[:1]]
+    verdict, share = described["verdict"], 100.0 * described["share"]
+    lines.append(f"{verdict}: {share:.2f} % of the periods brought complete fresh data (good from 95 %)")
+    return lines
+
+
+def _progress(line: str) -> None:
+    print(in_line(line), file=sys.stderr, flush=True)

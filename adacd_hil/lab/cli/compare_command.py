@@ -1,0 +1,121 @@
+"""`adacd-hil compare`: two logs beside each other."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from adacd_hil.cli.options import json_option, stretch_options
+from adacd_hil.cli.output import ExitCode, explained, format_table, show
+from adacd_hil.given_path import GivenPath
+from adacd_hil.log.log_files import log_in
+from adacd_hil.progress_lines import Progress
+from adacd_hil.terminal import in_line
+
+if TYPE_CHECKING:
+    from adacd_hil.lab.runs.log_comparison import ComparedContact, LogComparison
+    from adacd_hil.log.log_files import TimeWindow
+
+_EPILOG = (
+    "Exit status: 0 all decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "
+    "same as far as the logs are whole."
+)
+
+
+@click.command(epilog=_EPILOG)
+@click.argument("first", type=GivenPath())
+@click.argument("others", type=GivenPath(), nargs=-1, required=True)
+@json_option
+@explained
+@stretch_options
+def compare(first: Path, others: tuple[Path, ...], as_json: bool, stretch: "TimeWindow") -> ExitCode:
+    """Compare the first run with each other: settings, fields of /scheme, states, contacts, parameters, timing.
+
+    Times count from motion start, the first cycle in ADAPT. A folder stands for the run log in it.
+
+    --from and --until choose a stretch of the first log; of the second the cycles that lie equally long after motion
+    start are compared with it.
+    """
+    from adacd_hil.lab.runs.log_comparison import compare_logs
+
+    with Progress() as progress:
+        found = [compare_logs(log_in(first), log_in(other), progress, stretch) for other in others]
+    if as_json:
+        tables = [each.as_json() for each in found]
+        print(json.dumps(tables[0] if len(tables) == 1 else tables, indent=2))
+    else:
+        show("\n\n".join(map(_as_text, found)))
+    if not all(each.is_same for each in found):
+        return ExitCode.FAILURE
+    return ExitCode.PARTIAL if any(each.notes for each in found) else ExitCode.OK
+
+
+def _as_text(found: "LogComparison") -> str:
+    names = [str(found.first.path), str(found.second.path)]
+    lines = [in_line(line) for line in (f"1: {names[0]}", f"2: {names[1]}", "", *found.notes)]
+    if not found.stretch.is_whole:
+        lines.append(f"of 1 {found.stretch.text}; of 2 as long after motion start")
+    if found.is_same:
+        lines.append(f"the same in all {found.cycles} cycles")
+    else:
+        lines.append(f"{found.cycles} cycles compared, {found.only[0]} and {found.only[1]} only in one")
+    if found.settings:
+        lines += ["", format_table(("setting", "1", "2"), [(key, *pair) for key, pair in found.settings.items()])]
+    if found.metadata:
+        lines += ["", format_table(("metadata", "1", "2"), [(key, *pair) for key, pair in found.metadata.items()])]
+    if found.fields:
+        rows = [
+            (each.field, f"{each.first_s:.3f} s", str(each.first_cycle), str(each.cycles), f"{each.largest:.3g}")
+            for each in found.fields
+        ]
+        lines += ["", format_table(("field", "differs from", "cycle", "cycles", "by at most"), rows, (1, 2, 3, 4))]
+    if found.contacts:
+        rows3 = [(_contact(pair.first), _contact(pair.second)) for pair in found.contacts]
+        lines += ["", format_table(("contact in 1", "in 2"), rows3)]
+    lines += ["", format_table(("state", "1", "2"), _states(found))]
+    lines += ["", format_table(("parameter", "1", "2"), _parameters(found))]
+    lines += ["", format_table(("timing, µs", "1", "2"), _timing(found))]
+    return "\n".join(lines)
+
+
+def _contact(contact: "ComparedContact | None") -> str:
+    if contact is None:
+        return "–"
+    from adacd_hil.records import Location
+
+    is_known = contact.location in Location.__members__.values()  # a later version may have others
+    force = Location(contact.location).force_text(contact.force_N) if is_known else f"{contact.force_N:.1f}"
+    return f"{contact.time_s:.3f} s, link {contact.link}" + ("" if force == "–" else f", {force} N")
+
+
+def _states(found: "LogComparison") -> list[tuple[str, str, str]]:
+    first, second = found.first.states, found.second.states
+    rows = []
+    for index in range(max(len(first), len(second))):
+        a = first[index] if index < len(first) else None
+        b = second[index] if index < len(second) else None
+        name = a[1] if a and b and a[1] == b[1] else f"{a[1] if a else '–'} / {b[1] if b else '–'}"
+        rows.append((name, f"{a[0]:.3f} s" if a else "–", f"{b[0]:.3f} s" if b else "–"))
+    return rows
+
+
+def _parameters(found: "LogComparison") -> list[tuple[str, str, str]]:
+    first, second = found.first.parameters, found.second.parameters
+    names = [*first, *(name for name in second if name not in first)]
+    return [(name, _numbers(first.get(name, [])), _numbers(second.get(name, []))) for name in names]
+
+
+def _numbers(values: list[float]) -> str:
+    return ", ".join(f"{value:.6g}" for value in values) or "–"
+
+
+def _timing(found: "LogComparison") -> list[tuple[str, str, str]]:
+    rows = []
+    for name, values in found.first.timing_us.items():
+        cells = [
+            " / ".join(f"{value:.0f}" for value in side.timing_us.get(name, {}).values()) or "–"
+            for side in (found.first, found.second)
+        ]
+        rows.append((f"{name} {'/'.join(values)}", cells[0], cells[1]))
+    return rows

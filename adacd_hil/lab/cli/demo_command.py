@@ -1,0 +1,114 @@
+"""A scenario in one process, then the report."""
+
+import functools
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from adacd_hil.cli.embedded_run import SCENARIO, resolve, run_embedded
+from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
+from adacd_hil.control.session import LiveView, SessionSummary
+from adacd_hil.file_access import in_words
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
+from adacd_hil.progress_lines import Progress
+from adacd_hil.records import FaultReason, SchemeState
+from firmware_sim.scenario.scenario import ScenarioOutcome
+
+if TYPE_CHECKING:
+    from adacd_hil.lab.report.report_files import Report
+
+
+def play(
+    config: str,
+    scenario_name: str,
+    profile: str | None,
+    seed: int | None,
+    clock_name: str,
+    out: Path | None,
+    live: LiveView | None = None,
+    truth: str | None = None,
+) -> tuple["Report", ExitCode]:
+    """Play a scenario and report it; `out` None: in a new folder by date.
+
+    Raises ConfigError, CodecError, LogError, CommandError, OSError.
+    """
+    cast = resolve(config, scenario_name, profile, seed, truth)
+    settings, scenario = cast.settings, cast.scenario
+    what = "experiment" if scenario_name == SCENARIO else f"scenario {scenario.name}"
+    with run_folder(out, (LOG_NAME, TRUTH_NAME), "demo") as folder, Progress() as progress:
+        arm = f"profile {settings.arm.profile}" if scenario.own_arm is None else "its own arm"
+        progress(f"{what} of configuration {settings.name}, {arm}, in {folder.path}")
+        for line in cast.assumed:
+            progress(line)
+        on_started = functools.partial(folder.link, progress)
+        summary, truth_path = run_embedded(cast, clock_name, folder.path, progress, live, on_started)
+        if summary.result is not None:
+            played_s = summary.result.cycles * settings.bus.period_s
+            pace = played_s / summary.elapsed_s
+            progress(f"{played_s:.1f} s played in {summary.elapsed_s:.1f} s: {pace:.1f} x real time")
+        progress("drawing the report")
+        from adacd_hil.lab.report.report_files import write_report
+
+        try:
+            report = write_report(summary.log.path, truth_path, folder.path)
+        except (OSError, LogError) as error:
+            status = exit_code(summary)
+            if status is ExitCode.OK:
+                raise
+            what = f"{_ending(summary)}; nor can the report be written: {in_words(error)}"
+            raise CommandError(what, status) from None
+        progress(f"report: {folder.path / 'report.html'}")
+    if summary.error:
+        raise CommandError(summary.error, exit_code(summary))
+    return report, exit_code(summary)
+
+
+def next_of_report(html_path: Path) -> tuple[str, ...]:
+    """Name what may be typed after a demo."""
+    log_path = html_path.with_name(LOG_NAME)
+    return (
+        f"xdg-open {quoted(html_path)}",
+        f"adacd-hil replay {quoted(log_path)}   # the same decisions, bit for bit?",
+    )
+
+
+def _ending(summary: SessionSummary) -> str:
+    """Say how a run ended that has no report."""
+    result = summary.result
+    if summary.error or result is None:
+        return summary.error or "no cycle was run"
+    if result.state is SchemeState.FAULT:
+        return f"the run ended in FAULT ({result.fault.name})"
+    return f"log {summary.log.path} lacks something"
+
+
+def outcome_of(summary: SessionSummary, truth_path: Path) -> ScenarioOutcome:
+    """Read the logs of a run that has ended, to be compared with its scenario's `expect`. Raises LogError."""
+    from adacd_hil.lab.report.run_reading import read_run
+    from adacd_hil.lab.score.evaluation import evaluate
+
+    run, gathered, _ = read_run(summary.log.path, truth_path)
+    metrics = evaluate(run, gathered)
+    force_N = None if run.truth is None else run.truth.force_N
+    took_s = list(metrics.adaptation_s.values())
+    found = [contact for contact in metrics.contacts if contact.delay_ms is not None]
+    return ScenarioOutcome(
+        end=_end(summary),
+        fault=metrics.fault,
+        fault_s=metrics.fault_s,
+        adaptations=sum(time_s is not None for time_s in took_s),
+        adaptation_s=took_s[0] if took_s else None,
+        contacts=len(found),
+        false_alarms=metrics.false_alarms or 0,
+        missed=metrics.missed or 0,
+        delay_ms=max((contact.delay_ms for contact in found if contact.delay_ms is not None), default=None),
+        force_N=0.0 if force_N is None else float(force_N.max(initial=0.0)),
+    )
+
+
+def _end(summary: SessionSummary) -> str:
+    """Say how the run ended, by the names of `firmware_sim.scenario.scenario`."""
+    if not summary.has_started:
+        return "refused"
+    if summary.result is None:
+        return "lost"
+    return "finished" if summary.result.fault is FaultReason.NONE else "fault"

@@ -1,0 +1,91 @@
+"""Doctor: checks the host, the bus and the arm one by one, each with a reason and a remedy."""
+
+import sys
+from typing import Any
+
+from adacd_hil.cli.connection import Connection, on_interrupt, raise_interrupt
+from adacd_hil.cli.output import ExitCode, format_table
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.control.configuration_check import configuration_checks
+from adacd_hil.control.host_checks import HOST_CHECKS, Finding, Host, Status, diagnose, summarise
+from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination
+from adacd_hil.progress_lines import Progress
+from adacd_hil.scheduling import request_realtime
+from adacd_hil.terminal import in_line
+from adacd_hil.wire.bus import open_bus
+from adacd_hil.wire.can_interface import InterfaceState, read_link
+from adacd_hil.wire.contract_frames import read_bitrates
+
+_MARKS = {Status.OK: "ok", Status.WARNING: "WARNING", Status.FAILED: "FAILED", Status.SKIPPED: "skipped"}
+
+
+def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], ExitCode]:
+    """Run all checks; the drives stay disabled, the nodes end pre-operational. Exit code: FAILURE when one failed.
+
+    Raises ConfigError, CodecError.
+    """
+    settings, codec = connection.load()
+    bitrate, data_bitrate = read_bitrates(codec)
+    clock = MonotonicClock()
+
+    def link() -> InterfaceState | None:
+        return read_link(connection.channel) if connection.interface == "socketcan" else None
+
+    host = Host(
+        connection.interface,
+        connection.channel,
+        link(),
+        bitrate,
+        data_bitrate,
+        lambda: request_realtime(settings.realtime_request),
+        settings.realtime.cpu,
+    )
+    patient = ArmExamination(
+        settings,
+        codec,
+        clock,
+        lambda: open_bus(connection.interface, connection.channel, clock, None, connection.bitrate, codec.is_fd),
+        link,
+        bitrate,
+        data_bitrate,
+    )
+    with Progress() as progress:
+
+        def report(finding: Finding) -> None:
+            progress.passing(f"{finding.name}: {finding.status.value}")
+
+        if is_moving and sys.stdin is not None and sys.stdin.isatty():
+            patient.ask = lambda line: progress(f">>> {line}")
+        elif is_moving:
+            patient.no_move_reason = "nobody to ask: stdin is not a terminal"
+        findings = diagnose(configuration_checks(settings), settings, report)
+        findings += diagnose(HOST_CHECKS, host, report)
+        try:
+            with on_interrupt(raise_interrupt):
+                findings += diagnose(ARM_CHECKS, patient, report, findings)
+        finally:
+            trouble = patient.leave()
+    if trouble:
+        findings.append(Finding("end", Status.FAILED, f"nodes were not stopped: {trouble}", "cut the drives' power"))
+    has_failed = any(finding.status is Status.FAILED for finding in findings)
+    return findings, ExitCode.FAILURE if has_failed else ExitCode.OK
+
+
+def as_json(findings: list[Finding]) -> dict[str, Any]:
+    """Put the findings into plain values."""
+    checks = [finding._asdict() | {"status": finding.status.value} for finding in findings]
+    return {"checks": checks, "summary": summarise(findings)}
+
+
+def as_text(findings: list[Finding]) -> str:
+    """Write the findings for people: one line each, its remedy below; what has failed once more at the end."""
+    rows = []
+    for finding in findings:
+        rows.append((_MARKS[finding.status], finding.name, finding.reason))
+        if finding.remedy:
+            rows.append(("", "", f"-> {finding.remedy}"))
+    failed = [finding for finding in findings if finding.status is Status.FAILED]
+    last = [
+        f"{_MARKS[Status.FAILED]}   {finding.name}: {in_line(finding.remedy or finding.reason)}" for finding in failed
+    ]
+    return "\n".join([format_table(("", "", ""), rows), "", summarise(findings), *last])

@@ -1,0 +1,87 @@
+"""The search for an excitation: the command's work and its table."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+from adacd_hil.cli.output import CommandError, ExitCode, format_table
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.lab.tune.excitation_search import ExcitationLimits, Figures, NoExcitationError, Search
+from adacd_hil.progress_lines import Progress
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.run_settings import ExcitationSettings
+from adacd_hil.settings.toml_files import builtin_names, to_toml
+
+_LABELS = (
+    ("excitation_Nm2s", "smallest eigenvalue, Nm² s", "{:.3g}"),
+    ("condition", "condition number", "{:.3g}"),
+    ("inertia_Nm2s", "of the inertia after a payload's fit, Nm² s", "{:.3g}"),
+    ("travel_deg", "largest angle, deg", "{:.1f}"),
+    ("velocity_deg_s", "peak speed, deg/s", "{:.1f}"),
+    ("acceleration_deg_s2", "peak acceleration, deg/s²", "{:.0f}"),
+    ("torque_Nm", "peak torque of the CAD model, Nm", "{:.2f}"),
+)
+
+
+class ExcitationOutcome(NamedTuple):
+    """What a search came to; `present` is None where the configuration has no excitation."""
+
+    config: str
+    present: Figures | None
+    found: Figures
+    limits: ExcitationLimits
+    excitation: ExcitationSettings
+
+
+def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> ExcitationOutcome:
+    """Search; `out` is where it will be written. Raises ConfigError, CommandError."""
+    if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
+        raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
+    task = Search(load_settings(config, profile))
+    clock = MonotonicClock()
+    end_ns = clock.now_ns() + round(1e9 * seconds)
+    try:
+        with Progress() as progress:
+            found = task.run(seed, lambda _: clock.now_ns() < end_ns, progress)
+    except NoExcitationError as error:
+        raise CommandError(str(error)) from None
+    present = task.figures(task.present) if task.present.period_s else None
+    return ExcitationOutcome(config, present, task.figures(found), task.limits, found)
+
+
+def as_toml(outcome: ExcitationOutcome) -> str:
+    """Write the excitation as a configuration that extends the one that it was found for."""
+    base = outcome.config if outcome.config in builtin_names() else str(Path(outcome.config).resolve())
+    return f"extends = {json.dumps(base)}\n\n[excitation]\n{to_toml(outcome.excitation)}"
+
+
+def as_json(outcome: ExcitationOutcome) -> str:
+    """Write everything as JSON."""
+    named = {
+        "present": None if outcome.present is None else dataclasses.asdict(outcome.present),
+        "found": dataclasses.asdict(outcome.found),
+        "limits": outcome.limits.as_json(),
+        "excitation": dataclasses.asdict(outcome.excitation),
+    }
+    return json.dumps(named, indent=2, allow_nan=False)
+
+
+def as_text(outcome: ExcitationOutcome) -> str:
+    """Write the figures as a table, joint 1 / joint 2."""
+    limits = outcome.limits.as_json()
+    rows = [
+        (
+            label,
+            *(_cell(getattr(one, name, None), form) for one in (outcome.present, outcome.found)),
+            _cell(limits.get(name), form),
+        )
+        for name, label, form in _LABELS
+    ]
+    return format_table(("", "present", "found", "limit"), rows, (1, 2, 3))
+
+
+def _cell(value: float | tuple[float, float] | list[float] | None, form: str) -> str:
+    if value is None:
+        return "–"
+    return " / ".join(form.format(one) for one in value) if isinstance(value, tuple | list) else form.format(value)

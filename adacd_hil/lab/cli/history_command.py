@@ -1,0 +1,83 @@
+"""`adacd-hil history`: what an arm's runs have certified."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from adacd_hil.cli.options import json_option
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained, format_table
+from adacd_hil.file_access import is_anothers, replace_file
+from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.terminal import in_line
+
+if TYPE_CHECKING:
+    from adacd_hil.control.arm_records import History
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_MIDDLE = slice(1, None, 3)
+"""Of friction at 0.2, 0.6, 1.2 rad/s, joint by joint: at 0.6 rad/s."""
+
+
+@click.command(epilog=EPILOG)
+@click.argument("file", type=GivenPath(dir_okay=False))
+@click.option("--plot", type=WrittenPath(dir_okay=False), help="Draw it, as PNG.")
+@json_option
+@explained
+def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
+    """List what an arm's runs have certified: friction, inertia, torque offsets, and what they are known by.
+
+    `adacd-hil run --history FILE` makes the file. A file that is not as it was written is refused.
+    """
+    from adacd_hil.control.arm_records import read_history
+
+    found = read_history(file)
+    if plot is not None:
+        if plot.exists() and plot.samefile(file):
+            raise CommandError(f"--plot {plot} is the history itself; give another name", ExitCode.USAGE)
+        if is_anothers(plot, _PNG):
+            raise CommandError(f"--plot {plot} is there already and no PNG; give another name", ExitCode.USAGE)
+        replace_file(plot, _as_png(found))
+    answer(as_json, dataclasses.asdict(found), _as_text(found))
+    return ExitCode.OK
+
+
+def _as_png(found: "History") -> bytes:
+    import numpy as np
+
+    from adacd_hil.lab.drawing import HistoryPanel, history_figure
+
+    shown = found.certificates
+    joints = tuple(f"joint {number}" for number in range(1, len(found.last.offset_Nm) + 1))
+
+    def panel(title: str, names: tuple[str, ...], values: str, std: str) -> HistoryPanel:
+        found, deviations = (np.array([getattr(each, name) for each in shown]) for name in (values, std))
+        return HistoryPanel(title, names, found, deviations)
+
+    friction = panel("Friction at 0.6 rad/s, Nm", joints, "friction_Nm", "friction_std_Nm")
+    panels = (
+        friction._replace(values=friction.values[:, _MIDDLE], std=friction.std[:, _MIDDLE]),
+        panel("Inertia, kg m²", ("a1", "a2", "a3"), "inertia_kgm2", "inertia_std_kgm2"),
+        panel("Torque offset, Nm", joints, "offset_Nm", "offset_std_Nm"),
+    )
+    return history_figure([certificate.date_utc for certificate in shown], panels).png()
+
+
+def _as_text(found: "History") -> str:
+    devices = ", ".join(f"{device.name} {device.serial}" for device in found.devices)
+    head = ("certified", "F1 Nm", "F2 Nm", "a1 kg m²", "a2 kg m²", "a3 kg m²", "offset Nm", "payload", "known by")
+    rows = []
+    for certificate in found.certificates:
+        rows.append(
+            [
+                certificate.date_utc,
+                *(f"{value:.3f}" for value in certificate.friction_Nm[_MIDDLE]),
+                *(f"{value:.4f}" for value in certificate.inertia_kgm2),
+                ", ".join(f"{value:.3f}" for value in certificate.offset_Nm),
+                "yes" if certificate.is_payload else "",
+                certificate.text,
+            ]
+        )
+    table = format_table(head, rows, right=(1, 2, 3, 4, 5))
+    return f"{in_line(f'devices by serial number: {devices}')}\nfriction F at 0.6 rad/s\n{table}"

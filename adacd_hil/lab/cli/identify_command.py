@@ -1,0 +1,184 @@
+"""`adacd-hil identify`: a model of somebody else's arm from somebody else's recordings, and contacts in them."""
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from adacd_hil.cli.options import json_option
+from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show
+from adacd_hil.file_access import place_file, replace_file
+from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.progress_lines import Progress
+from adacd_hil.settings.toml_files import toml_value
+from adacd_hil.terminal import in_line
+
+if TYPE_CHECKING:
+    from adacd_hil.lab.offline.recording_identification import Identified, Watched
+    from adacd_hil.lab.offline.recording_import import ForeignRecording
+
+
+_RECORDING = GivenPath()
+"""A file, or the folder of a rosbag."""
+
+
+@click.command(
+    epilog="Exit status: 0 done; 1 a recording can't be read; 2 wrong usage or map; 3 the model doesn't explain the "
+    "test; the verdict says why."
+)
+@click.argument("recordings", nargs=-1, required=True, type=_RECORDING)
+@click.option(
+    "--map", "map_path", type=WrittenPath(dir_okay=False), help="TOML: what the columns are, and of which arm."
+)
+@click.option("--init", "is_init", is_flag=True, help="Write that map: --init RECORDING URDF.")
+@click.option("--test", type=_RECORDING, help="Recording to test on; default: the last part of the last one fitted.")
+@click.option("--watch", multiple=True, type=_RECORDING, help="Recording in which to look for contacts; repeatable.")
+@click.option("--from", "start_s", type=float, default=0.0, show_default=True, help="Fit from this time on, s.")
+@click.option("--until", "end_s", type=float, default=float("inf"), help="Fit until this time, s; default: the end.")
+@click.option("--out", type=WrittenPath(file_okay=False), help="Folder for pictures and identify.json.")
+@json_option
+@explained
+def identify(
+    recordings: tuple[Path, ...],
+    map_path: Path | None,
+    is_init: bool,
+    test: Path | None,
+    watch: tuple[Path, ...],
+    start_s: float,
+    end_s: float,
+    out: Path | None,
+    as_json: bool,
+) -> ExitCode:
+    """Identify an arm from RECORDINGS of positions, torques and, if there are some, velocities: CSV, MCAP, rosbags.
+
+    RECORDINGS are of free motion. The verdict says whether their torque is explained, why not, and what to do next.
+    With the model frozen, contacts are looked for in the recordings of --watch. With --init a recording and a URDF make
+    a map, whose guesses are told.
+    """
+    from adacd_hil.lab.offline.recording_identification import identify as run
+    from adacd_hil.lab.offline.recording_import import read_recording
+    from adacd_hil.lab.offline.recording_map import read_map
+    from adacd_hil.log.log_files import TimeWindow
+
+    if is_init:
+        return _init(recordings, map_path)
+    if map_path is None:
+        raise CommandError("--map is missing; `adacd-hil identify --init RECORDING URDF` writes one", ExitCode.USAGE)
+    if not start_s < end_s:
+        raise CommandError(f"--from {start_s:g} s is not before --until {end_s:g} s", ExitCode.USAGE)
+    described = read_map(map_path)
+    with Progress() as progress:
+        read: list[ForeignRecording] = []
+        for place, path in enumerate((*recordings, *((test,) if test else ()), *watch)):
+            progress(f"reading {path}")
+            # From 0 s on: nothing is left out before.
+            span = TimeWindow(start_s or -math.inf, end_s) if place < len(recordings) else None
+            read.append(read_recording(path, described, read[0].period_s if read else 0.0, span))
+        fitted = [recording.between(start_s, end_s) for recording in read[: len(recordings)]]
+        tested = read[len(recordings)] if test else None
+        progress(f"fitting {sum(recording.duration_s for recording in fitted):.1f} s")
+        found = run(described, fitted, tested, read[len(recordings) + bool(test) :])
+        if out is not None:
+            _write(found, out)
+            progress(f"pictures in {out}")
+    if as_json:
+        print(json.dumps(found.as_json(), indent=2))
+    else:
+        show(_as_text(found), *_next(found, map_path, recordings[0]))
+    return ExitCode.OK if found.is_explained else ExitCode.PARTIAL
+
+
+def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
+    """Write the map of a recording, and tell what is guessed."""
+    from adacd_hil.lab.offline.map_draft import draft_map
+    from adacd_hil.lab.offline.recording_map import read_map
+
+    urdfs = [path for path in given if path.suffix.lower() in (".urdf", ".xml")]
+    others = [path for path in given if path not in urdfs]
+    if len(urdfs) != 1 or len(others) != 1:
+        raise CommandError("--init takes one recording and one URDF, a file that ends in .urdf", ExitCode.USAGE)
+    recording = others[0]
+    target = map_path or recording.parent / "map.toml"
+    draft = draft_map(recording, urdfs[0], target)
+    try:
+        place_file(target, draft.text().encode())
+    except FileExistsError:
+        line = f"{target} is another map already; --map names a file for this one"
+        raise CommandError(line, ExitCode.USAGE) from None
+    read_map(target)
+    rows = [(f"{key.section}.{key.key}", toml_value(key.value), key.reason) for key in draft.keys]
+    table = format_table(("key", "value", "a guess, because"), [row for row in rows if row[2]])
+    told = f"{target} written" + (f"; look at these:\n{table}" if draft.guesses else ", nothing in it is a guess")
+    show(told, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
+    return ExitCode.OK
+
+
+def _next(found: "Identified", map_path: Path, recording: Path) -> tuple[str, ...]:
+    if found.verdict.remedy:
+        return (f"{found.verdict.remedy}; then identify again",)
+    if found.watched:
+        return ()
+    again = f"adacd-hil identify {quoted(recording)} --map {quoted(map_path)}"
+    return (f"{again} --watch TOUCHED.csv   # contacts in a recording of a touched arm",)
+
+
+def _write(found: "Identified", out: Path) -> None:
+    from adacd_hil.lab.offline.recording_identification import draw_watched
+
+    out.mkdir(parents=True, exist_ok=True)
+    replace_file(out / "identify.json", json.dumps(found.as_json(), indent=2))
+    names = ["test", *(f"watch{index + 1}" for index in range(len(found.watched)))]
+    for name, watched in zip(names, (found.test, *found.watched), strict=True):
+        replace_file(out / f"{name}.png", draw_watched(found, watched, name).png())
+
+
+def _as_text(found: "Identified") -> str:
+    from adacd_hil.lab.offline.recording_verdict import percent
+
+    certificate, verdict = found.certificate, found.verdict
+    parameters = [
+        (name, f"{value:.5g}", f"± {std:.2g}")
+        for name, value, std in zip(found.model.parameter_names, found.estimate.theta, found.deviation, strict=True)
+    ]
+    joints = [
+        (
+            joint.name,
+            *(f"{value:.3g}" for value in (noise, rms, largest)),
+            f"{joint.margin:.2f}" if math.isfinite(joint.margin) else "-",
+            percent(joint.share),
+        )
+        for joint, noise, rms, largest in zip(
+            verdict.joints,
+            found.settings.noise_Nm,
+            certificate.residual_rms_Nm,
+            certificate.residual_max_Nm,
+            strict=True,
+        )
+    ]
+    columns = ("joint", "noise, Nm", "residual rms, Nm", "largest, Nm", "margin", "torque explained")
+    lines = [
+        *(in_line(f"{path.name}: {note}") for path, notes in found.notes.items() for note in notes),
+        f"fitted {found.fit_s:.1f} s at {found.settings.period_s * 1e3:g} ms",
+        format_table(("parameter", "value", "std"), parameters, right=(1,)),
+        "",
+        f"tested on {found.test.recording.duration_s:.1f} s: {verdict.headline}",
+        *(f"  because {reason}" for reason in map(in_line, verdict.reasons)),
+        *(f"  note: {remark}" for remark in map(in_line, verdict.remarks)),
+        format_table(columns, joints, right=(1, 2, 3, 4, 5)),
+    ]
+    return "\n".join([*lines, *(_describe(watched) for watched in found.watched)])
+
+
+def _describe(watched: "Watched") -> str:
+    name = in_line(str(watched.recording.path))
+    lines = ["", f"{name}: {len(watched.contacts)} contacts in {watched.recording.duration_s:.1f} s"]
+    if watched.touches is not None:
+        found = watched.touches - (watched.missed or 0)
+        lines[-1] += f"; {found} of {watched.touches} touches found, {watched.false_contacts} false"
+    for contact in watched.contacts:
+        signs = " ".join("0+-"[sign] for sign in contact.direction)
+        truth = "  false" if contact.is_true is False else ""
+        lines.append(f"  {contact.start_s:9.3f} s  link {contact.link}  {signs}{truth}")
+    return "\n".join(lines)

@@ -1,0 +1,139 @@
+"""Init: writes the configuration of one's own arm, with what bus, URDF, log and user say, and marks what is a guess."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
+from adacd_hil.cli.options import json_option
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest
+from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
+from adacd_hil.lab.cli.interview import Interview
+from adacd_hil.terminal import in_line
+
+
+def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:
+    return click.option(name, nargs=2, type=kind, default=None, help=help_text)
+
+
+@click.command("init", epilog=EPILOG)
+@click.argument("out", metavar="[FILE]", type=WrittenPath(dir_okay=False), default=Path("my-arm.toml"))
+@click.option("-i", "--interface", help="python-can interface; default: socketcan.", shell_complete=complete_interface)
+@click.option("-c", "--channel", help="Channel of that interface, such as can0.", shell_complete=complete_channel)
+@click.option("-b", "--bitrate", type=click.IntRange(10_000, 1_000_000), help="bit/s of the bus.")
+@click.option("--no-bus", "is_busless", is_flag=True, help="Without hardware: an arm to rehearse.")
+@click.option("--from", "log", type=GivenPath(), help="Take all from the log of a run.", shell_complete=complete_run)
+@click.option("--urdf", type=GIVEN_FILE, help="A URDF with two moving joints.")
+@click.option("--lock", "locked", multiple=True, metavar="JOINT", help="A joint of the URDF that stays where it is.")
+@_pair("--length-m", "Joint to joint, joint to tip.")
+@_pair("--mass-kg", "Masses of the links; they are taken to be uniform rods.")
+@click.option("--upright/--flat", "is_upright", default=None, help="The same as --mounting wall, and --mounting flat.")
+@click.option(
+    "--mounting", metavar="WORD|DEG", help="Base on floor, wall or ceiling, flat, or the tilt of the plane of motion."
+)
+@click.option("--at-zero", metavar="WORD|DEG", help="Link 1 at q1 = 0: down, up, level, or the q1 where it is down.")
+@_pair("--rated-torque-nm", "Rated torque of each drive at its joint.")
+@_pair("--torque-limit-nm", "Largest commanded torque.")
+@_pair("--position-limit-deg", "Largest |q|.")
+@_pair("--velocity-limit-deg-s", "Largest |dq|.")
+@_pair("--drive", "Device profiles of the drives: built-in names or files.", str)
+@_pair("--sensor", "Device profiles of the sensors: built-in names or files.", str)
+@_pair("--drive-node", "Node ids of the drives of joint 1 and 2.", int)
+@_pair("--sensor-node", "Node ids of the sensors of joint 1 and 2.", int)
+@click.option("--eds", multiple=True, type=GIVEN_FILE, help="EDS of a device without a profile; repeatable.")
+@click.option("--drive-eds", multiple=True, type=GIVEN_FILE, help="The same, of a drive whose 0x1000 doesn't say so.")
+@click.option("--sensor-eds", multiple=True, type=GIVEN_FILE, help="The same, of a sensor.")
+@_pair("--gear", "Motor revolutions per revolution of joint 1 and 2.")
+@_pair("--gear-efficiency", "Part of the motor's torque that leaves the gear.")
+@_pair("--increments", "Position increments per revolution of joint 1 and 2.")
+@click.option("--velocity-unit", help="Of the drives' 0x606C: increment/s, rpm, 0.1rpm, mrpm, deg/s, rad/s.")
+@click.option("--rated-torque-unit", help="Of the drives' 0x6076: mNm, µNm, Nm, 0.01Nm.")
+@_pair("--torque-count-nm", "One count of the torque sensors, Nm.")
+@click.option("--yes", "takes_proposals", is_flag=True, help="Take what is proposed, guesses, too, and ask nothing.")
+@click.option("--force", "is_forced", is_flag=True, help="Replace files that are there.")
+@click.option("--rehearse/--no-rehearse", default=None, help="Play the experiment with this file and an emulated arm.")
+@click.option("--doctor/--no-doctor", default=None, help="Check host, bus and arm with this file.")
+@json_option
+@explained
+def init(
+    out: Path,
+    log: Path | None,
+    takes_proposals: bool,
+    is_forced: bool,
+    rehearse: bool | None,
+    doctor: bool | None,
+    as_json: bool,
+    **given: Any,
+) -> ExitCode:
+    """Write the configuration of your own arm, FILE (default: my-arm.toml), and the profiles of its devices beside it.
+
+    On a terminal, asks for what no option says. Scans the bus by SDO uploads only; never enables a drive. What nobody
+    knows is a guess, listed in the file as `assumed`; `doctor` asks for each.
+    """
+    from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
+    from adacd_hil.lab.cli.logged_arm import draft_from_log
+
+    interview = Interview(takes_proposals)
+    writing = DraftFiles(out, is_forced)
+    writing.check(out)
+    options = InitOptions(**given)
+    if log is None:
+        text, summary = Drafting(options, interview, writing).draft()
+    else:
+        text, summary = draft_from_log(log, options, interview, writing)
+    writing.finish(text)
+    summary |= {"file": str(out), "written": [str(path) for path in writing.contents]}
+    bus, code = summary.pop("bus", None), ExitCode.OK
+    if not as_json:
+        show(as_text(summary))
+    if interview.confirm(rehearse, "Rehearse with an emulated arm now?"):
+        from adacd_hil.lab.cli.demo_command import play
+
+        report, code = play(str(out), "paper", None, None, "lockstep", None)
+        summary["rehearsal"] = report.as_json()
+        if not as_json:
+            show(report.as_text())
+    if doctor and bus is None:
+        raise CommandError("--doctor needs a bus: run `adacd-hil doctor` where the arm is", ExitCode.USAGE)
+    if bus is not None and interview.confirm(doctor, "Check host, bus and arm now (`doctor`)?"):
+        from adacd_hil.cli.connection import Connection
+        from adacd_hil.lab.cli import doctor_command
+
+        connection = Connection(bus["interface"], bus["channel"], bus["bitrate"], str(out), None, None)
+        findings, doctor_code = doctor_command.examine(connection, False)
+        code = code or doctor_code
+        summary["doctor"] = doctor_command.as_json(findings)
+        if not as_json:
+            show(doctor_command.as_text(findings))
+    if as_json:
+        print(json.dumps(summary, indent=2))
+    else:
+        suggest(*next_of_init(str(out), bus))
+    return code
+
+
+def as_text(summary: dict[str, Any]) -> str:
+    """Say what was written, and what in it is a guess."""
+    lines = [f"written: {', '.join(summary['written'])}"]
+    lines += [f"warning: {line}" for line in summary["warnings"]]
+    if summary["assumed"]:
+        lines.append(f"guesses, which `adacd-hil doctor` asks for: {', '.join(summary['assumed'])}")
+    return "\n".join(map(in_line, lines))
+
+
+def next_of_init(file: str, bus: dict[str, Any] | None) -> tuple[str, ...]:
+    """Name what may be typed after a draft, up to the first run. bus: where the arm was found."""
+    from adacd_hil.cli.connection import Connection
+
+    bus = bus or {"interface": "socketcan", "channel": "can0", "bitrate": None}
+    arm = Connection(bus["interface"], bus["channel"], bus["bitrate"], file, None, None).arguments
+    tare = quoted(Path(file).with_name("tare.toml"))
+    return (
+        f"adacd-hil demo --config {quoted(Path(file))}   # rehearse",
+        f"adacd-hil doctor {arm}",
+        f"adacd-hil tare {arm} --out {tare}   # the zero of the torque sensors, while nobody touches the arm",
+        f"adacd-hil run {arm} --tare {tare}   # moves the arm",
+    )

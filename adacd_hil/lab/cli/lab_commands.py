@@ -1,0 +1,343 @@
+"""The commands of the lab that are one function each. Each parses, calls one function, prints."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from adacd_hil.cli.completion import complete_run, complete_scenario, complete_truth
+from adacd_hil.cli.options import (
+    clock_option,
+    config_option,
+    json_option,
+    live_options,
+    on_bus,
+    on_bus_or_url,
+    profile_option,
+    require_extra,
+    run_folder_option,
+    stretch_options,
+)
+from adacd_hil.cli.output import EPILOG, ExitCode, answer, explained, show, tell, tried
+from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.lab.cli.compare_command import compare
+from adacd_hil.lab.cli.history_command import history
+from adacd_hil.lab.cli.identify_command import identify
+from adacd_hil.lab.cli.init_command import init
+from adacd_hil.lab.cli.log_command import log
+from adacd_hil.lab.cli.play_command import play
+from adacd_hil.lab.cli.runs_command import runs, trend
+from adacd_hil.lab.cli.sweep_command import sweep
+from adacd_hil.lab.cli.tune_command import tune
+from adacd_hil.settings.toml_files import to_toml
+
+if TYPE_CHECKING:
+    from adacd_hil.cli.connection import Connection
+    from adacd_hil.control.session import LiveView
+    from adacd_hil.log.log_files import TimeWindow
+
+
+@click.command(epilog=EPILOG)
+@config_option
+@click.option(
+    "--scenario",
+    default="paper",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="What happens: one that `firmware-sim list` names, or a TOML file.",
+    shell_complete=complete_scenario,
+)
+@click.option(
+    "--truth",
+    metavar="NAME|FILE",
+    help="What the real arm is where the configuration says otherwise: a name or a TOML file.",
+    shell_complete=complete_truth,
+)
+@run_folder_option("demo")
+@click.option("--seed", type=click.IntRange(min=0), default=None, help="Noise of the emulated sensors.")
+@clock_option(default="lockstep")
+@profile_option
+@json_option
+@explained
+@live_options
+def demo(
+    config: str,
+    scenario: str,
+    truth: str | None,
+    out: Path | None,
+    seed: int | None,
+    clock: str,
+    profile: str | None,
+    as_json: bool,
+    live: "LiveView | None",
+) -> ExitCode:
+    """Play the paper's experiment, or another scenario, with an emulated arm in this process, and report it.
+
+    The arm is that of the configuration: a file with an arm of one's own is rehearsed, and what it lacks is assumed
+    and told.
+
+    The configuration's script plays the user of the paper's experiment. In any other scenario the user acknowledges
+    stops as the configuration says, and asks to finish at the scenario's `lasts_s`.
+    """
+    from adacd_hil.lab.cli.demo_command import next_of_report, play
+
+    report, code = play(config, scenario, profile, seed, clock, out, live, truth)
+    if as_json:
+        print(json.dumps(report.as_json(), indent=2))
+    else:
+        show(report.as_text(), *next_of_report(report.html_path))
+    return code
+
+
+@click.command(epilog=EPILOG)
+@on_bus
+@click.option("--poses", type=click.IntRange(1, 50), help="Poses to measure in; default: tare.poses.")
+@click.option("--seconds", type=click.FloatRange(0.1, 600.0), help="Measured time per pose; default: tare.window_s.")
+@click.option("--auto-zero", is_flag=True, help="Let the sensors set their own zero (0x6125) before.")
+@click.option("--out", type=WrittenPath(dir_okay=False), default=Path("tare.toml"), show_default=True)
+@clock_option(default="realtime")
+@json_option
+def tare(
+    connection: "Connection",
+    poses: int | None,
+    seconds: float | None,
+    auto_zero: bool,
+    out: Path,
+    clock: str,
+    as_json: bool,
+) -> ExitCode:
+    """Measure the offsets of the joint torque sensors at rest, with the drives disabled, and store them.
+
+    With more than one pose, the arm is moved by hand in between. Exit status 1: refused, for the reason given; the
+    file is as it was. `adacd-hil run --tare FILE` uses the offsets.
+    """
+    from adacd_hil.lab.cli.tare_command import tare_on_bus
+
+    result = tare_on_bus(connection, clock, out, poses, seconds, auto_zero)
+    answer(as_json, result.as_json(), result.as_text())
+    return ExitCode.OK
+
+
+@click.command(epilog=EPILOG)
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@click.option("--out", type=WrittenPath(file_okay=False), help="Folder; default: beside each log.")
+@json_option
+@explained
+@stretch_options
+def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "TimeWindow") -> ExitCode:
+    """Report logs: HTML, PDF, PNG, CSV and JSON. The emulator's truth.mcap beside a log is joined to it.
+
+    A folder stands for the run.mcap in it, or without one for all runs in its folders: then index.html leads to their
+    reports.
+
+    A stretch from --from until --until is widened so that it cuts no contact and no adaptation.
+    """
+    from adacd_hil.lab.cli.report_command import as_json as in_json
+    from adacd_hil.lab.cli.report_command import report_logs
+
+    reports, code = report_logs(logs, out, stretch)
+    if as_json:
+        print(json.dumps(in_json(reports), indent=2))
+    else:
+        show("\n\n".join(entry.as_text() for entry in reports))
+    return code
+
+
+@click.command(epilog=EPILOG)
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@click.option(
+    "--rate-per-h",
+    type=click.FloatRange(1e-6, 1e4),
+    default=0.01,
+    show_default=True,
+    help="Wanted false alarms per hour of a detector.",
+)
+@click.option("--out", type=WrittenPath(dir_okay=False), help="Write the thresholds here, as TOML.")
+@click.option(
+    "--report",
+    type=WrittenPath(file_okay=False),
+    help="Compare the detectors; JSON, PNG and SVG go here.",
+)
+@json_option
+@explained
+@stretch_options
+def thresholds(
+    logs: tuple[Path, ...],
+    rate_per_h: float,
+    out: Path | None,
+    report: Path | None,
+    as_json: bool,
+    stretch: "TimeWindow",
+) -> ExitCode:
+    """Find every detector's thresholds for a rate of false alarms, from what nobody touched in these logs.
+
+    Each comes with what limits it, and with the rate that half of the motion predicts for the other half. --from and
+    --until choose a stretch of each log.
+    """
+    from adacd_hil.lab.cli import thresholds_command as command
+    from adacd_hil.lab.thresholds.detector_comparison import write_comparison
+
+    with tried(out):
+        found, comparison = command.find(logs, rate_per_h, report is not None, stretch)
+        said = command.as_json(found, comparison) if as_json else command.as_text(found, comparison)
+        tell(said, out, to_toml(found), as_json)
+    if report is not None and comparison is not None:
+        write_comparison(comparison, report)
+    return ExitCode.OK
+
+
+@click.command(epilog=EPILOG)
+@config_option
+@profile_option
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0.0, 86_400.0),
+    default=60.0,
+    show_default=True,
+    help="How long to begin new climbs; the one under way is ended.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Where the climbs begin.")
+@click.option("--out", type=WrittenPath(dir_okay=False), help="Write a configuration with it here.")
+@json_option
+@explained
+def excitation(
+    config: str, profile: str | None, seconds: float, seed: int, out: Path | None, as_json: bool
+) -> ExitCode:
+    """Search the motion that shows a model soonest, within the limits of the arm and its trajectory.
+
+    Prints what the configuration's excitation shows and needs, and what the one found does.
+    """
+    from adacd_hil.lab.cli import excitation_command as command
+
+    with tried(out):
+        outcome = command.search(config, profile, seconds, seed, out)
+        tell(command.as_json(outcome) if as_json else command.as_text(outcome), out, command.as_toml(outcome), as_json)
+    return ExitCode.OK
+
+
+@click.command(epilog="Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC.")
+@click.option(
+    "--dbc", metavar="NAME|FILE", help="The contract: the package's, or a file; default: the configuration's devices'."
+)
+@config_option
+@click.option(
+    "--period-us",
+    type=click.IntRange(min=100, max=1_000_000),
+    help="SYNC period; default: BusPeriod_us of the DBC, else bus.period_us of the configuration.",
+)
+@click.option("-b", "--bitrate", type=click.IntRange(min=10_000, max=1_000_000), help="bit/s; default: the DBC's.")
+@click.option(
+    "--data-bitrate", type=click.IntRange(min=10_000, max=8_000_000), help="bit/s of CAN FD; default: the DBC's."
+)
+@click.option(
+    "--arms", type=click.IntRange(1, 7), help="Arms of this contract on the bus; default: the configuration's."
+)
+@json_option
+@explained
+def budget(
+    dbc: str | None,
+    config: str,
+    period_us: int | None,
+    bitrate: int | None,
+    data_bitrate: int | None,
+    arms: int | None,
+    as_json: bool,
+) -> ExitCode:
+    """Say whether the frames of a contract get through in time: bits, response times, what is left for the host."""
+    from adacd_hil.lab.cli import budget_command as budgets
+
+    found = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
+    answer(as_json, budgets.as_json(found), budgets.as_text(found))
+    return found.code
+
+
+@click.command(epilog=EPILOG)
+@on_bus
+@click.option(
+    "--seconds", type=click.FloatRange(0.1, 600.0), default=1.5, show_default=True, help="How long to listen."
+)
+@json_option
+def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
+    """Find the nodes on a bus: what they are, what they send, and whether that is the configured arm.
+
+    Sends SDO uploads only and changes no node's state. Exit status 5 when a node is missing or not the expected one.
+    """
+    from adacd_hil.lab.cli.scan_command import as_text, scan_bus
+
+    result, code = scan_bus(connection, seconds)
+    answer(as_json, result, as_text(result))
+    return code
+
+
+@click.command(epilog=EPILOG)
+@on_bus
+@click.option(
+    "--seconds", type=click.FloatRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test."
+)
+@click.option(
+    "--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: nothing holds the arm."
+)
+@click.option("--out", type=WrittenPath(file_okay=False), help="Folder for a log; default: none.")
+@json_option
+def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
+    """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.
+
+    Below 0.90 the connection is not sufficient (exit status 1), below 0.95 there is a warning. The drives are not
+    enabled unless asked for.
+    """
+    from adacd_hil.lab.cli.commtest_command import as_text, run_commtest
+
+    result, code = run_commtest(connection, seconds, is_enabling, out)
+    answer(as_json, result, as_text(result))
+    return code
+
+
+@click.command(epilog=EPILOG)
+@on_bus
+@click.option("--move", "is_moving", is_flag=True, help="Ask for each joint to be moved by hand, to check its signs.")
+@json_option
+def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode:
+    """Check host, bus and arm one by one, and say what to do about what is wrong. The drives are never enabled.
+
+    Exit status 1 when a check failed. Resets the nodes' communication and leaves them pre-operational; does neither
+    when it hears another master.
+    """
+    from adacd_hil.lab.cli import doctor_command as command
+
+    findings, code = command.examine(connection, is_moving)
+    answer(as_json, command.as_json(findings), command.as_text(findings))
+    return code
+
+
+@click.command(epilog=EPILOG)
+@on_bus_or_url("Watch the live view of a run instead, such as ws://127.0.0.1:8765.")
+@click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
+@click.option("--once", is_flag=True, help="Listen for 1 s, print one table, end.")
+@click.option("--seconds", type=click.FloatRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
+@json_option
+def monitor(
+    place: "Connection | str", node_id: int | None, once: bool, seconds: float | None, as_json: bool
+) -> ExitCode:
+    """Watch a bus: nodes, messages with rate, age, checks and values, load. Sends nothing.
+
+    With --url: watch a run that was started with --live: state, residuals against their thresholds, parameters,
+    contacts, events. Redraws a terminal in place until Ctrl-C, which ends it with exit status 0.
+    """
+    from adacd_hil.lab.cli.monitor_command import PLAIN_S, watch
+
+    listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
+    if not isinstance(place, str):
+        return watch(place, node_id, listened_s, listened_s is None, as_json)
+    require_extra("--url", "websockets")
+    from adacd_hil.lab.cli.live_monitor import watch_live
+
+    return watch_live(place, listened_s, listened_s is None, as_json)
+
+
+COMMANDS: Final[Sequence[click.Command]] = (
+    budget, commtest, compare, demo, doctor, excitation, history, identify, init, log, monitor, play, report, runs,
+    scan, sweep, tare, thresholds, trend, tune,
+)  # fmt: skip
+"""Entry point of `adacd_hil.commands`."""

@@ -1,0 +1,221 @@
+"""The live view in a terminal: state, residuals against their thresholds, parameters, contacts, events."""
+
+import contextlib
+import json
+import math
+import struct
+import sys
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.cli.connection import on_interrupt
+from adacd_hil.cli.output import ExitCode, format_table
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.lab.cli.monitor_command import Screen
+from adacd_hil.lab.live.client import LiveClient, LiveMessage, live_client
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.types.message_types import unpack_log
+from adacd_hil.records import (
+    GRAVITY_PARAMETER_NAMES,
+    JOINT_NAMES,
+    JOINTS,
+    PARAMETER_NAMES,
+    ContactKind,
+    ContactLevel,
+    FaultReason,
+    Location,
+    SchemeState,
+)
+from adacd_hil.terminal import fold, moves_cursor, one_line, terminal_columns, write_screen
+
+TOPICS = ("/scheme", "/cycle", "/contact", "/events")
+_BAR_WIDTH = 40
+_EVENTS, _CONTACTS = 8, 5
+
+
+class LiveMonitor:
+    """Keeps the latest of what a live view has sent, and describes it."""
+
+    def __init__(self, client: LiveClient) -> None:
+        self.messages = 0
+        self._client = client
+        self._begin_ns: int | None = None
+        self._scheme: Any = None
+        self._cycle: Any = None
+        self._log_ns = 0
+        self._contacts: deque[dict[str, Any]] = deque(maxlen=_CONTACTS)
+        self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
+
+    def accept(self, message: LiveMessage) -> None:
+        """Take in a message."""
+        if message.topic not in TOPICS:
+            return
+        self.messages += 1
+        self._log_ns = max(self._log_ns, message.log_ns)
+        self._begin_ns = message.log_ns if self._begin_ns is None else self._begin_ns
+        t_s = round((message.log_ns - self._begin_ns) * 1e-9, 3)
+        if message.topic == "/events":
+            event = unpack_log(message.payload)
+            self._events.append({"t_s": t_s, **event._asdict()})
+        elif message.topic == "/contact":
+            self._contacts.append({"t_s": t_s, **_describe_contact(self._client.decode(message))})
+        elif message.topic == "/scheme":
+            self._scheme = self._client.decode(message)
+        else:
+            self._cycle = self._client.decode(message)
+
+    def describe(self) -> dict[str, Any]:
+        """Put what has been seen into plain values; times are since the first message."""
+        begin_ns = self._log_ns if self._begin_ns is None else self._begin_ns
+        described: dict[str, Any] = {"messages": self.messages, "t_s": round((self._log_ns - begin_ns) * 1e-9, 3)}
+        if self._scheme is not None:
+            described |= _describe_scheme(self._scheme)
+        if self._cycle is not None:
+            names = ("lateness_ns", "slack_ns", "overruns", "data_age", "frames_missing")
+            described["timing"] = {name: int(self._cycle[name]) for name in names}
+        return described | {"contacts": list(self._contacts), "events": list(self._events)}
+
+
+def _describe_scheme(scheme: Any) -> dict[str, Any]:
+    shares = _shares(scheme)
+    joints = [
+        {
+            "joint": name,
+            "q_rad": float(scheme["q"][index]),
+            "tau_J_Nm": float(scheme["tau_j"][index]),
+            "tau_ext_hat_Nm": float(scheme["tau_ext_hat"][index]),
+            "threshold_Nm": _finite(scheme["threshold"][index]),
+            "share": _finite(shares[index]),
+        }
+        for index, name in enumerate(JOINT_NAMES)
+    ]
+    theta_hat = scheme["theta_hat"].tolist()
+    names = (PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES)[: len(theta_hat)]
+    return {
+        "cycle": int(scheme["cycle"]),
+        "state": SchemeState(int(scheme["state"])).name,
+        "fault": FaultReason(int(scheme["fault"])).name,
+        "joints": joints,
+        "parameters": dict(zip(names, theta_hat, strict=True)),
+    }
+
+
+def _shares(scheme: Any) -> Any:
+    """Return how far each joint is on its way to the nearest of its thresholds (2,); NaN: detection is off."""
+    has_bank = "tau_ext_bank" in scheme.dtype.names
+    torque, threshold = ("tau_ext_bank", "threshold_bank") if has_bank else ("tau_ext_hat", "threshold")
+    shares = np.abs(scheme[torque]) / np.where(np.isfinite(scheme[threshold]), scheme[threshold], np.nan)
+    by_joint = shares.reshape(-1, JOINTS)
+    return np.where(np.isnan(by_joint).all(axis=0), np.nan, np.nan_to_num(by_joint, nan=0.0).max(axis=0))
+
+
+def _describe_contact(contact: Any) -> dict[str, Any]:
+    return {
+        "link": int(contact["link"]),
+        "level": ContactLevel(int(contact["level"])).name,
+        "kind": ContactKind(int(contact["kind"])).name,
+        "location": Location(int(contact["location"])).name,
+        "force_N": float(contact["force_n"]),
+        "lever_m": float(contact["lever_m"]),
+        "is_final": bool(contact["is_final"]),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
+    """Watch a live view for `seconds` (None: until interrupted or it ends) and print; `is_live`: also on the way.
+
+    Raises LogError.
+    """
+    clock = MonotonicClock()
+    screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
+    is_stopped = False
+
+    def stop() -> None:
+        nonlocal is_stopped
+        is_stopped = True
+
+    with live_client(url, TOPICS) as client, on_interrupt(stop):
+        monitor = LiveMonitor(client)
+        now_ns = clock.now_ns()
+        end_ns = None if seconds is None else now_ns + round(seconds * 1e9)
+        drawn_ns = now_ns
+        while client.is_open and not is_stopped and (end_ns is None or now_ns < end_ns):
+            due_ns = drawn_ns + round(screen.redraw_s * 1e9)
+            wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
+            if (message := client.receive(max(0.0, (wake_ns - now_ns) * 1e-9))) is not None:
+                with _understood():
+                    monitor.accept(message)
+            now_ns = clock.now_ns()
+            if now_ns >= due_ns:
+                drawn_ns = now_ns
+                if is_live and not as_json:
+                    with _understood():
+                        screen.draw(as_text(monitor.describe(), is_cut=screen.is_redrawn))
+        with _understood():
+            described = {"url": url} | monitor.describe()
+    screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))
+    return ExitCode.OK
+
+
+@contextlib.contextmanager
+def _understood() -> Iterator[None]:
+    """Turn what a message holds that ours never do into a LogError."""
+    try:
+        yield
+    except (ValueError, LookupError, OverflowError, struct.error):
+        raise LogError("it does not serve a log of adacd-hil") from None
+
+
+def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
+    """Write the view for people; is_cut: a line for each event, cut to the terminal."""
+    if "state" not in described:
+        return f"{described['messages']} messages, none of /scheme"
+    fault = "" if described["fault"] == FaultReason.NONE.name else f" by {described['fault']}"
+    head = f"{described['state']}{fault}, cycle {described['cycle']}, {described['t_s']:.1f} s watched"
+    if timing := described.get("timing"):
+        head += (
+            f"; late {timing['lateness_ns'] * 1e-3:.0f} µs, slack {timing['slack_ns'] * 1e-3:.0f} µs, "
+            f"{timing['overruns']} periods skipped, {timing['frames_missing']} frames missing"
+        )
+    parts = [head, "\n".join(map(_joint_line, described["joints"]))]
+    parts.append("  ".join(f"{name} {value:.4g}" for name, value in described["parameters"].items()))
+    if described["contacts"]:
+        table_head = ("s", "contact", "link", "kind", "force N", "lever m", "location")
+        parts.append(format_table(table_head, list(map(_contact_row, described["contacts"])), right=(0, 2, 4, 5)))
+    if described["events"]:
+        rows = [
+            (f"{event['t_s']:.3f}", event["level"], one_line(event["name"]), one_line(event["message"]))
+            for event in described["events"]
+        ]
+        parts.append(format_table(("s", "level", "event", ""), rows, (0,), is_cut))
+    return "\n\n".join(parts)
+
+
+def _joint_line(joint: dict[str, Any]) -> str:
+    share = joint["share"]
+    filled = 0 if share is None else min(_BAR_WIDTH, round(share * _BAR_WIDTH))
+    bar = "#" * filled + "." * (_BAR_WIDTH - filled)
+    limit = "detection off" if share is None else f"{100.0 * share:3.0f} % of the threshold"
+    return (
+        f"{joint['joint']} [{bar}] {limit:<22}  external {joint['tau_ext_hat_Nm']:+.3f} Nm, "
+        f"torque {joint['tau_J_Nm']:+.3f} Nm, position {math.degrees(joint['q_rad']):+.1f}°"
+    )
+
+
+def _contact_row(contact: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        f"{contact['t_s']:.3f}",
+        contact["level"] if contact["is_final"] else f"{contact['level']} …",
+        str(contact["link"]),
+        contact["kind"],
+        Location[contact["location"]].force_text(contact["force_N"]),
+        f"{contact['lever_m']:.2f}",
+        contact["location"],
+    )

@@ -1,0 +1,105 @@
+"""An arm's configuration written anew from the log of a run: what it had beyond the configuration it is based on."""
+
+from pathlib import Path
+from typing import Any
+
+from adacd_hil import __version__
+from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.clock import format_date, wall_ns
+from adacd_hil.device.contract import find_contract
+from adacd_hil.file_access import exists
+from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
+from adacd_hil.lab.cli.interview import Interview
+from adacd_hil.lab.commission.arm_draft import ArmDraft, Entry, write_draft
+from adacd_hil.log.log_files import log_in
+from adacd_hil.log.log_info import attachment
+from adacd_hil.log.logged_run import settings_of
+from adacd_hil.settings.configuration import Settings, known_keys, load_settings, value_of
+from adacd_hil.settings.schema import ConfigError
+
+_NOT_TAKEN = {
+    "name": "",
+    "assumed": "",
+    "arm.torque_offset_Nm": "torque offsets are left out, as sensors drift: `adacd-hil tare`",
+    "arm.torque_offset_std_Nm": "",
+    "operator.script": "the scripted user is left out: on an arm nothing is acknowledged without a person",
+    "operator.acknowledge_after_s": "the scripted user is left out: on an arm nothing is acknowledged without a person",
+    "operator.acknowledge_faults": "the scripted user is left out: on an arm nothing is acknowledged without a person",
+    "operator.acknowledge_on_hardware": "",
+    "realtime.sample_period": "",
+    "safety.enable_timeout_s": "",
+}
+"""Keys that belong to the run and not to the arm, and what is said of them."""
+
+
+def draft_from_log(
+    log: Path, options: InitOptions, interview: Interview, files: DraftFiles
+) -> tuple[str, dict[str, Any]]:
+    """Return the text of a configuration for the arm of a log, and a summary. Raises LogError, CommandError."""
+    given = [name for name in options.__dataclass_fields__ if getattr(options, name) not in (None, (), False)]
+    if further := [name for name in given if name not in ("drive", "sensor")]:
+        option = f"--{further[0].removeprefix('is_').replace('_', '-')}"
+        raise CommandError(f"--from takes the arm from the log: leave out {option}", ExitCode.USAGE)
+    path = log_in(log)
+    text = attachment(path, "config.toml")
+    settings = settings_of(path, {} if text is None else {"config.toml": text})
+    base = "certified" if settings.scheme == "certified" else "paper"
+    warnings: list[str] = []
+    entries = _differences(settings, base, path, warnings)
+    devices = Drafting(options, interview, files)
+    entries = [_placed(entry, devices, options) for entry in entries]
+    for kind in ("drive", "sensor"):
+        names = getattr(options, kind)
+        if names is not None and all(entry.key != f"devices.{kind}" for entry in entries):
+            entries.append(Entry(f"devices.{kind}", tuple(devices.beside(name, kind) for name in names), "given"))
+    draft = ArmDraft(tuple(entries), tuple(warnings))
+    title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]} from the log {path.name}."
+    summary = {"from": str(path), "assumed": list(settings.assumed), "warnings": warnings}
+    written = write_draft(draft, title, files.out.name, base)
+    files.examine(written)
+    return written, summary
+
+
+def _differences(settings: Settings, base: str, path: Path, warnings: list[str]) -> list[Entry]:
+    """List the settings of a run that its base doesn't have."""
+    based = load_settings(base, settings.arm.profile)
+    entries = []
+    if settings.arm.profile != load_settings(base).arm.profile:
+        entries.append(Entry("arm.profile", settings.arm.profile, f"as in {path.name}"))
+    for key, known in known_keys().items():
+        value = None if known.is_in_row else value_of(settings, key)
+        if known.is_in_row or value is None or (value == value_of(based, key) and key not in settings.assumed):
+            continue
+        if key in _NOT_TAKEN:
+            if _NOT_TAKEN[key] and _NOT_TAKEN[key] not in warnings:
+                warnings.append(_NOT_TAKEN[key])
+            continue
+        comment = f"{known.meaning}: as in {path.name}"
+        entries.append(Entry(key, value, comment, key in settings.assumed))
+    entries += [Entry(key, None, "not known", True) for key in settings.assumed if _is_unset(settings, key)]
+    return entries
+
+
+def _is_unset(settings: Settings, key: str) -> bool:
+    return key in known_keys() and value_of(settings, key) is None
+
+
+def _placed(entry: Entry, devices: Drafting, options: InitOptions) -> Entry:
+    """Name files of devices and contract from where the new configuration lies. Raises CommandError."""
+    kind = entry.key.removeprefix("devices.")
+    if entry.key in ("devices.drive", "devices.sensor"):
+        names = getattr(options, kind) or entry.value
+        for name in names:
+            if Path(name).suffix and not exists(Path(name)):
+                raise CommandError(
+                    f"the log names the device profile {name}, which is not here: give --{kind} PROFILE PROFILE",
+                    ExitCode.USAGE,
+                )
+        return entry._replace(value=tuple(devices.beside(name, kind) for name in names))
+    if entry.key == "devices.contract" and entry.value:
+        try:
+            is_there = exists(find_contract(entry.value))
+        except ConfigError:
+            is_there = False
+        return entry if is_there else entry._replace(value="", comment="composed from the profiles")
+    return entry

@@ -1,0 +1,253 @@
+"""`adacd-hil play`: the frames of a recording on a bus, at their times."""
+
+import queue
+import sys
+import threading
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
+from adacd_hil.cli.options import json_option
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.given_path import GivenPath
+from adacd_hil.lab.cli.log_command import dbc_option, find_dbc, id_option, only_option
+from adacd_hil.log.log_files import LogError
+from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.terminal import in_line
+from adacd_hil.wire.bus import Bus, BusError, open_bus
+from adacd_hil.wire.can_interface import is_virtual
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from adacd_hil.lab.logs.frame_export import FrameChoice
+    from adacd_hil.wire.playback import PlayedFrame
+
+_PIECES_AHEAD = 4
+_BLOCK = 256
+"""Frames that are made ready between two sends at most."""
+_SWITCH_S = 50e-6
+"""How long the thread that reads ahead may keep the one that sends waiting."""
+
+
+@click.command("play", epilog=EPILOG)
+@click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
+@click.option(
+    "-i",
+    "--interface",
+    required=True,
+    help="python-can interface, such as socketcan.",
+    shell_complete=complete_interface,
+)
+@click.option(
+    "-c", "--channel", required=True, help="Channel of that interface, such as vcan0.", shell_complete=complete_channel
+)
+@click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")
+@click.option("--fd", "is_fd", is_flag=True, help="Open the bus for CAN FD; default: as the contract is.")
+@click.option("--speed", type=click.FloatRange(0.001, 1000.0), default=1.0, show_default=True, help="Of the times.")
+@click.option("--start", "start_s", type=click.FloatRange(0.0), help="Begin so many s after the first frame.")
+@click.option("--end", "end_s", type=click.FloatRange(0.0), help="End so many s after the first frame.")
+@click.option(
+    "--loop", "times", type=click.IntRange(0), default=1, show_default=True, help="How often; 0: until interrupted."
+)
+@click.option("--skip", "longest_pause_s", type=click.FloatRange(0.0), help="Cut longer pauses to so many s.")
+@click.option(
+    "--commands", is_flag=True, help="Also on a real bus, send what isn't the devices': it can move a real arm."
+)
+@only_option
+@id_option
+@dbc_option
+@json_option
+@explained
+def play(
+    log: Path,
+    interface: str,
+    channel: str,
+    bitrate: int | None,
+    is_fd: bool,
+    speed: float,
+    start_s: float | None,
+    end_s: float | None,
+    times: int,
+    longest_pause_s: float | None,
+    commands: bool,
+    only: Any,
+    can_ids: tuple[int, ...],
+    dbc: Path | None,
+    as_json: bool,
+) -> ExitCode:
+    """Send the frames of a recording at their times, and say how late they were.
+
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. On a real bus only frames that the contract says the devices
+    send are sent, unless --commands asks for the others: NMT, SDO and torque commands can move an arm.
+    """
+    from adacd_hil.lab.logs.frame_export import FrameChoice, sides
+    from adacd_hil.log.frames.frame_log import open_frames
+    from adacd_hil.wire.codec import parse_codec
+
+    codec = parse_codec(*find_dbc(log, dbc))
+    choice = FrameChoice(
+        only,
+        *sides(codec),
+        can_ids=frozenset(can_ids),
+        start_ns=None if start_s is None else round(start_s * 1e9),
+        end_ns=None if end_s is None else round(end_s * 1e9),
+    )
+    playback = Playback(log, choice, is_harmless=may_move_an_arm(interface, channel) and not commands)
+    open_frames(log)  # what is wrong with the recording comes before what is wrong with the bus
+    clock = MonotonicClock()
+    bus = open_bus(interface, channel, clock, (), bitrate, is_fd or codec.is_fd)
+    described, code = _run(playback, bus, clock, speed, times, longest_pause_s)
+    answer(as_json, described, _as_text(described))
+    return code
+
+
+@dataclass
+class Playback:
+    """What is played, and what was left out of it."""
+
+    log: Path
+    choice: "FrameChoice"
+    is_harmless: bool
+    """Only what the contract's devices send goes out."""
+    unsendable: int = 0
+    withheld: int = 0
+    problem: str = ""
+
+    def frames(self) -> "Iterator[PlayedFrame]":
+        """Give the frames, read ahead by a thread. Raises LogError."""
+        from adacd_hil.wire.playback import PlayedFrame
+
+        for piece in _ahead(self._pieces()):
+            for start in range(0, len(piece), _BLOCK):
+                block = piece[start : start + _BLOCK]
+                names = ("t_ns", "can_id", "length")
+                for t_ns, can_id, length, data in zip(*(block[n].tolist() for n in names), block["data"], strict=True):
+                    yield PlayedFrame(t_ns, can_id, data[:length].tobytes())
+
+    def _pieces(self) -> "Iterator[NDArray[Any]]":
+        import numpy as np
+
+        from adacd_hil.log.frames.frame_log import open_frames
+        from adacd_hil.log.types.record_arrays import is_sendable
+
+        source = open_frames(self.log)
+        for frames in self.choice.pieces(source):
+            can_go = is_sendable(frames)
+            self.unsendable += int(np.count_nonzero(~can_go))
+            if self.is_harmless:
+                is_devices = np.isin(frames["can_id"], list(self.choice.device_ids))
+                self.withheld += int(np.count_nonzero(can_go & ~is_devices))
+                can_go &= is_devices
+            yield frames[can_go]
+        self.problem = source.problem
+
+
+def _run(
+    playback: Playback, bus: Bus, clock: MonotonicClock, speed: float, times: int, longest_pause_s: float | None
+) -> tuple[dict[str, Any], ExitCode]:
+    """Play onto a bus until the recording ends or the user interrupts. Raises LogError, CommandError."""
+    from adacd_hil.cli.connection import on_interrupt
+    from adacd_hil.wire.playback import play as play_frames
+    from adacd_hil.wire.playback import repeat
+
+    interrupted = threading.Event()
+    for refusal in request_realtime().missing:
+        print(f"not granted: {refusal}", file=sys.stderr)
+    freeze_garbage()
+    switch_s = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        with on_interrupt(interrupted.set):
+            lateness = play_frames(
+                bus,
+                clock,
+                repeat(playback.frames, times),
+                speed=speed,
+                longest_pause_ns=None if longest_pause_s is None else round(longest_pause_s * 1e9),
+                is_stopped=interrupted.is_set,
+            )
+    except BusError as error:
+        raise CommandError(str(error), ExitCode.BUS_MISSING) from None
+    finally:
+        sys.setswitchinterval(switch_s)
+        bus.close()
+    described = {
+        "frames": lateness.frames,
+        "lateness_us": {
+            "p50": lateness.quantile_us(0.5),
+            "p99": lateness.quantile_us(0.99),
+            "max": -(-lateness.worst_ns // 1000),
+        },
+        "late_by_1_ms": lateness.late_frames,
+        "unsendable": playback.unsendable,
+        "withheld": playback.withheld,
+        "problem": playback.problem,
+    }
+    if interrupted.is_set():
+        return described, ExitCode.INTERRUPTED
+    return described, ExitCode.PARTIAL if playback.problem else ExitCode.OK
+
+
+def _as_text(described: dict[str, Any]) -> str:
+    """Describe it for people."""
+    late = described["lateness_us"]
+    lines = [
+        f"{described['frames']} frames sent, late by p50 {late['p50']} µs, p99 {late['p99']} µs, max {late['max']} µs; "
+        f"{described['late_by_1_ms']} by more than 1 ms"
+    ]
+    if described["withheld"]:
+        lines.append(
+            f"{described['withheld']} frames withheld: they could move an arm on this bus; --commands sends them, too"
+        )
+    if described["unsendable"]:
+        lines.append(f"{described['unsendable']} frames can't be sent: remote, error or short FD frames")
+    if described["problem"]:
+        lines.append(f"warning: {described['problem']}")
+    return "\n".join(in_line(line) for line in lines)
+
+
+def may_move_an_arm(interface: str, channel: str) -> bool:
+    """Tell whether real drives may hear what is sent."""
+    return not is_virtual(interface, channel)
+
+
+def _ahead(pieces: "Iterable[NDArray[Any]]") -> "Iterator[NDArray[Any]]":
+    """Give what a thread takes from an iterator some pieces ahead. Raises what that raises."""
+    waiting: queue.Queue[NDArray[Any] | LogError | None] = queue.Queue(_PIECES_AHEAD)
+    is_over = threading.Event()
+
+    def put(item: "NDArray[Any] | LogError | None") -> bool:
+        while not is_over.is_set():
+            try:
+                waiting.put(item, timeout=0.1)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def read() -> None:
+        try:
+            for piece in pieces:
+                if not put(piece):
+                    return
+        except LogError as error:
+            put(error)
+        else:
+            put(None)
+
+    thread = threading.Thread(target=read, name="playback reader", daemon=True)
+    thread.start()
+    try:
+        while (item := waiting.get()) is not None:
+            if isinstance(item, LogError):
+                raise item
+            yield item
+    finally:
+        is_over.set()
+        thread.join()

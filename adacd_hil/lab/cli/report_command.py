@@ -1,0 +1,122 @@
+"""Reports of logs and of folders of runs: the command's work."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.file_access import replace_file
+from adacd_hil.lab.report.report_files import Report, write_report
+from adacd_hil.lab.runs.run_pages import INDEX_NAME, ListedRun, runs_page
+from adacd_hil.lab.runs.run_summary import BROKEN, RunSummary, find_runs, reported
+from adacd_hil.lab.runs.run_table import count_text
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, TimeWindow, failing_as, log_in
+from adacd_hil.progress_lines import Progress
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.terminal import one_line
+
+
+class IndexEntry(NamedTuple):
+    """A run of the folder, and its report; None where it can't be reported."""
+
+    listed: ListedRun
+    report: Report | None
+
+
+class Index(NamedTuple):
+    """What was reported of a folder of runs, and the page over it."""
+
+    path: Path
+    entries: tuple[IndexEntry, ...]
+
+    def as_text(self) -> str:
+        """Give a line for each run."""
+        lines = [count_text([entry.listed.run for entry in self.entries]), ""]
+        for listed, _ in self.entries:
+            run = listed.run
+            lines.append(f"{run.name}: {'good' if run.is_clean else 'NOT GOOD'}: {one_line(listed.verdict)}")
+        return "\n".join([*lines, "", f"Index: {self.path}"])
+
+
+Reported = Report | Index
+
+
+def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -> tuple[list[Reported], ExitCode]:
+    """Report each log, or a stretch of it, beside it or in `out`; of several logs in folders of `out`.
+
+    A folder stands for the run log in it, or without one for the runs in its folders; of those one that can't be read
+    does not keep the others from being reported. Raises LogError, ConfigError, CommandError.
+    """
+    places: dict[Path, tuple[Path, tuple[Path, ...]]] = {}  # by folder of the report
+    for given in logs:
+        runs = _runs_in(given)
+        if given.is_dir() and not runs and not (given / LOG_NAME).exists():
+            raise LogError(f"{given} has no {LOG_NAME}, nor has any folder in it")
+        own = given if runs else log_in(given).parent
+        folder = own if out is None else out if len(logs) == 1 else out / own.name
+        if folder in places:
+            raise CommandError(f"two reports would go to {folder}; report these logs one by one", ExitCode.USAGE)
+        places[folder] = given, runs
+    reported: list[Reported] = []
+    codes = []
+    with Progress() as progress:
+        for folder, (given, runs) in places.items():
+            if runs:
+                index = _report_runs(given, runs, folder, stretch, progress)
+                reported.append(index)
+                codes += [_code(entry.report) for entry in index.entries]
+            else:
+                report = _report_one(log_in(given), folder, stretch, progress)
+                reported.append(report)
+                codes.append(_code(report))
+    return reported, ExitCode.OK if set(codes) <= {ExitCode.OK} else ExitCode.PARTIAL
+
+
+def _runs_in(given: Path) -> tuple[Path, ...]:
+    """List the folders with a run below a folder that has none itself."""
+    return () if not given.is_dir() or (given / LOG_NAME).exists() else tuple(find_runs(given))
+
+
+def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWindow, progress: Progress) -> Index:
+    """Report the runs of a folder, and write the page over them."""
+    entries: list[IndexEntry] = []
+    for number, run in enumerate(runs, start=1):
+        name = run.relative_to(given).as_posix()
+        progress(f"{number} of {len(runs)}: {run}")
+        try:
+            report = _report_one(run / LOG_NAME, out / name, stretch, progress)
+            listed = ListedRun(reported(run, name, report.as_json()), report.html_path)
+            entries.append(IndexEntry(listed, report))
+        except (LogError, ConfigError) as error:
+            problem = one_line(error)
+            progress(problem)
+            broken = RunSummary(name, run / LOG_NAME, BROKEN, problem)
+            entries.append(IndexEntry(ListedRun(broken, None, problem), None))
+    index = Index(out / INDEX_NAME, tuple(entries))
+    with failing_as(f"{index.path} can't be written"):
+        out.mkdir(parents=True, exist_ok=True)  # as after no run could be reported
+        replace_file(index.path, runs_page(out, [entry.listed for entry in entries]))
+    return index
+
+
+def as_json(reported: Sequence[Reported]) -> list[dict[str, Any]]:
+    """Give the content of each report.json; of a run that could not be reported its folder and why."""
+    tables = []
+    for each in reported:
+        if isinstance(each, Report):
+            tables.append(each.as_json())
+            continue
+        for listed, report in each.entries:
+            table = {"problem": listed.problem} if report is None else report.as_json()
+            tables.append({"folder": listed.run.name, **table})
+    return tables
+
+
+def _report_one(path: Path, folder: Path, stretch: TimeWindow, progress: Progress) -> Report:
+    truth = path.parent / TRUTH_NAME
+    truth_path = truth if truth.exists() else None
+    return write_report(path, truth_path, folder, is_printed=True, stretch=stretch, progress=progress)
+
+
+def _code(report: Report | None) -> ExitCode:
+    return ExitCode.OK if report is not None and report.is_complete else ExitCode.PARTIAL

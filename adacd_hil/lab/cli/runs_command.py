@@ -1,0 +1,254 @@
+"""`adacd-hil runs` and `trend`: the runs of a folder, and what an arm's figures did from run to run."""
+
+import dataclasses
+import functools
+import json
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from adacd_hil.cli.options import json_option
+from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, format_table, show
+from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.log.log_files import LOG_NAME, LogError
+from adacd_hil.progress_lines import Progress
+from adacd_hil.remedies import nearest_name
+from adacd_hil.terminal import in_line
+
+if TYPE_CHECKING:
+    from adacd_hil.lab.runs.run_summary import RunSummary
+    from adacd_hil.lab.runs.run_table import RunFilter
+    from adacd_hil.lab.runs.run_trend import Trend
+
+_STATUSES = ("good", "not good", "not judged", "broken", "running")
+_EPILOG = (
+    "Exit status: 0 done; 1 no run there, or a file can't be written; 2 wrong usage; 3 the log of a run is broken, the "
+    "others are told of; 130 interrupted."
+)
+_DATE_FORMS = "2026-11-25, 2026-11-25T14:22 or 2026-11-25T14:22:33"
+_DRAWN = (".svg", ".png", ".html")
+
+
+class LocalDate(click.ParamType[datetime]):
+    """A date, or date and time, of this machine's time zone; `is_end`: a date stands for the end of that day."""
+
+    name = "date"
+
+    def __init__(self, is_end: bool = False) -> None:
+        self._is_end = is_end
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> datetime:
+        """Read it."""
+        text = str(value)
+        try:
+            found = datetime.fromisoformat(text)
+            if self._is_end and len(text) <= len("2026-11-25"):
+                found += timedelta(days=1, microseconds=-1)
+            return found.astimezone()
+        except (ValueError, OverflowError, OSError):
+            self.fail(f"{text!r} is no date such as {_DATE_FORMS}", param, ctx)
+
+
+_FILTER_OPTIONS = (  # last first: click lists them the other way round
+    click.option("--until", type=LocalDate(is_end=True), metavar="DATE", help="Begun until then, that day included."),
+    click.option("--since", type=LocalDate(), metavar="DATE", help="Begun since then."),
+    click.option("--scenario", "scenarios", multiple=True, metavar="NAME", help="Played this; repeatable."),
+    click.option(
+        "--arm", "arms", multiple=True, metavar="NAME", help="Of this arm or configuration, or a pattern; repeatable."
+    ),
+)
+
+
+def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
+    """Give a command the options that choose runs; it takes them as a `RunFilter`."""
+
+    @functools.wraps(command)
+    def chosen(
+        *args: Any,
+        arms: tuple[str, ...],
+        scenarios: tuple[str, ...],
+        since: datetime | None,
+        until: datetime | None,
+        statuses: tuple[str, ...] = (),
+        **own: Any,
+    ) -> ExitCode:
+        from adacd_hil.lab.runs.run_table import RunFilter
+
+        if since is not None and until is not None and until < since:
+            raise CommandError(f"--since {since} is after --until {until}", ExitCode.USAGE)
+        return command(*args, asked=RunFilter(arms, statuses, scenarios, since, until), **own)
+
+    decorated: Callable[..., Any] = explained(chosen)
+    for option in _FILTER_OPTIONS:
+        decorated = option(decorated)
+    return decorated
+
+
+_folder_argument = click.argument("folder", type=GivenPath(file_okay=False), default=Path("runs"), required=False)
+
+
+@click.command(epilog=_EPILOG)
+@_folder_argument
+@click.option(
+    "--verdict", "statuses", multiple=True, type=click.Choice(_STATUSES), help="With this verdict; repeatable."
+)
+@click.option("--judge", "is_judging", is_flag=True, help="Read the whole log of each run without a report.")
+@click.option("--csv", "csv_path", type=WrittenPath(dir_okay=False), help="Write the table here.")
+@click.option("--parquet", "parquet_path", type=WrittenPath(dir_okay=False), help="The same, for DuckDB and others.")
+@click.option("--html", "html_path", type=WrittenPath(dir_okay=False), help="Write a page that leads to the reports.")
+@json_option
+@_filtered
+def runs(
+    folder: Path,
+    is_judging: bool,
+    csv_path: Path | None,
+    parquet_path: Path | None,
+    html_path: Path | None,
+    as_json: bool,
+    asked: "RunFilter",
+) -> ExitCode:
+    """List the runs in FOLDER, default `runs`: verdict, certificate, thresholds, margin, contacts; oldest first.
+
+    Figures are those of the report beside a log. A run without one is told by its events, and is not judged: `adacd-hil
+    report FOLDER` reports all, --judge reads their logs and keeps nothing. Links are left alone, and folders deeper
+    than four levels.
+    """
+    from adacd_hil.lab.runs import run_table
+
+    with Progress() as progress:
+        found = _chosen(folder, asked, is_judging, progress)
+        if csv_path is not None:
+            run_table.write_result(run_table.as_csv(found), csv_path)
+        if parquet_path is not None:
+            run_table.write_parquet(found, parquet_path)
+        if html_path is not None:
+            run_table.write_result(_page(found, html_path), html_path)
+    if as_json:
+        print(json.dumps({"folder": str(folder), "runs": run_table.as_json(found)}, indent=2, allow_nan=False))
+    else:
+        show(_as_text(found))
+    return _code(found)
+
+
+@click.command(epilog=_EPILOG)
+@_folder_argument
+@click.option(
+    "--share",
+    type=click.FloatRange(0.0, 10.0, min_open=True),
+    default=0.4,
+    show_default=True,
+    help="A threshold that differs by more than this share has changed; a quarter of it where settings have.",
+)
+@click.option(
+    "--out", type=WrittenPath(dir_okay=False), metavar="FILE", help="Draw it: .svg, .png, or .html with the tables."
+)
+@json_option
+@_filtered
+def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "RunFilter") -> ExitCode:
+    """Say when thresholds, friction and torque offsets of an arm last changed over the runs in FOLDER; draw them.
+
+    Runs without a report are judged first, which reads their logs. A friction or an offset has changed where it differs
+    by more than four standard deviations of both certificates.
+    """
+    from adacd_hil.lab.runs.run_trend import trends
+
+    if out is not None and out.suffix.lower() not in _DRAWN:
+        raise CommandError(f"--out {out} ends in none of {', '.join(_DRAWN)}", ExitCode.USAGE)
+    with Progress() as progress:
+        found = _chosen(folder, asked, True, progress)
+        made = trends(found, share)
+        if out is not None:
+            _draw(made, out)
+    if as_json:
+        print(json.dumps({"folder": str(folder), "arms": [each.as_json() for each in made]}, indent=2))
+    else:
+        show("\n\n".join(_trend_text(each) for each in made) or "no run")
+    return _code(found)
+
+
+def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progress) -> list["RunSummary"]:
+    """Find the runs of a folder that are asked for, in order. Raises LogError, CommandError."""
+    from adacd_hil.lab.runs import run_table
+    from adacd_hil.lab.runs.run_summary import NOT_JUDGED, find_runs, judged, summarise
+
+    if not folder.is_dir():
+        what = (
+            "does not exist; `adacd-hil demo` and `run` make runs in `runs`" if not folder.exists() else "is no folder"
+        )
+        raise LogError(f"{folder} {what}")
+    found = [summarise(each, each.relative_to(folder).as_posix()) for each in find_runs(folder)]
+    if not found:
+        raise LogError(f"{folder} has no {LOG_NAME}, nor has any folder in it")
+    for arm in asked.arms:
+        if not any(run_table.is_arm(run, arm) for run in found):
+            known = sorted({run.arm for run in found if run.arm})
+            near = nearest_name(arm, [*known, *sorted({run.config for run in found if run.config})])
+            hint = f"did you mean {near!r}?" if near else f"there are {', '.join(known) or 'none that is named'}"
+            raise CommandError(f"no run of arm {arm!r} in {folder}; {hint}", ExitCode.USAGE)
+    # What judging may change is asked for afterwards.
+    taken = [run for run in found if dataclasses.replace(asked, statuses=()).takes(run)] if is_judging else found
+    if is_judging:
+        waiting = sum(run.status == NOT_JUDGED for run in taken)
+        if waiting:
+            logs = "1 log" if waiting == 1 else f"{waiting} logs"
+            progress(f"reading {logs} without a report; `adacd-hil report` keeps the figures")
+        taken = [judged(run) for run in taken]
+    return [run for run in run_table.in_order(taken) if asked.takes(run)]
+
+
+def _page(found: list["RunSummary"], path: Path) -> str:
+    from adacd_hil.lab.report.report_files import HTML_NAME
+    from adacd_hil.lab.runs.run_pages import ListedRun, runs_page
+
+    listed = []
+    for run in found:
+        report = run.log.parent / HTML_NAME
+        listed.append(ListedRun(run, report if report.is_file() else None))
+    return runs_page(path.parent, listed)
+
+
+def _draw(made: list["Trend"], out: Path) -> None:
+    from adacd_hil.lab.drawing import paper_svg
+    from adacd_hil.lab.runs.run_pages import draw_trend, trend_page
+    from adacd_hil.lab.runs.run_table import write_result
+
+    kind = out.suffix.lower()
+    if kind == ".html":
+        write_result(trend_page(made), out)
+        return
+    if len(made) != 1:
+        arms = ", ".join(repr(each.arm) for each in made) or "none"
+        raise CommandError(f"--out {out} has room for one arm, there are {arms}: choose by --arm", ExitCode.USAGE)
+    drawing = draw_trend(made[0])
+    if drawing is None:
+        raise LogError(f"nothing to draw: no run of {made[0].arm} is judged")
+    write_result(paper_svg(drawing) if kind == ".svg" else drawing.png(), out)
+
+
+def _as_text(found: list["RunSummary"]) -> str:
+    from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, cells, count_text
+
+    if not found:
+        return "no run is as asked for"
+    lines = [format_table(HEAD, [cells(run) for run in found], right=NUMBERS), "", f"{count_text(found)}"]
+    lines += [in_line(f"{run.name}: {run.status}: {run.verdict}") for run in found if run.verdict and not run.is_clean]
+    return "\n".join(lines)
+
+
+def _trend_text(made: "Trend") -> str:
+    from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, cells
+
+    left = f", {len(made.left_out)} left out" if made.left_out else ""
+    lines = [in_line(line) for line in (f"{made.arm}: {counted(len(made.runs), 'run')}{left}", made.sentence)]
+    lines += [in_line(line) for line in made.further]
+    lines += [in_line(f"left out: {run.name}: {run.status}: {run.verdict}") for run in made.left_out]
+    if made.runs:
+        lines += ["", format_table(HEAD[:6], [cells(run)[:6] for run in made.runs], right=NUMBERS[:1])]
+    return "\n".join(lines)
+
+
+def _code(found: list["RunSummary"]) -> ExitCode:
+    return ExitCode.PARTIAL if any(run.status == "broken" for run in found) else ExitCode.OK

@@ -1,0 +1,196 @@
+"""`adacd-hil sweep`: logs or scenarios, settings and seeds, every combination, on all processors or a Dask cluster."""
+
+import json
+import os
+import shlex
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
+from adacd_hil.cli.options import json_option, profile_option
+from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, show
+from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
+from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.progress_lines import Progress
+from adacd_hil.terminal import in_line
+
+if TYPE_CHECKING:
+    from adacd_hil.lab.tune.sweep import Plan, SweepRow, Task, Values
+
+_SIMULATED_CONFIG = "certified"
+"""Of simulated runs where no --config is given."""
+
+
+@click.command(
+    epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` says why; 1 the cluster is "
+    "lost, or the folder can't be written; 2 wrong usage or configuration; 130 interrupted: the same command goes on."
+)
+@click.argument("logs", nargs=-1, type=GivenPath(), shell_complete=complete_run)
+@click.option(
+    "--scenario",
+    "scenarios",
+    multiple=True,
+    metavar="NAME",
+    help="Play this scenario instead; repeatable.",
+    shell_complete=complete_scenario,
+)
+@click.option("--seeds", default="1", show_default=True, metavar="N|A:B", help="Seeds of the scenarios, A to B.")
+@click.option(
+    "--vary",
+    multiple=True,
+    metavar="KEY=A,B,...",
+    help="A setting's values; every combination is a row.",
+    shell_complete=complete_setting,
+)
+@click.option("--config", default="", metavar="NAME|FILE", help="Configuration; default: each log's own, or certified.")
+@profile_option
+@click.option("--workers", type=click.IntRange(1, 1024), help="Processes on this machine; default: its processors.")
+@click.option(
+    "--scheduler",
+    default="",
+    metavar="ADDRESS",
+    help="Dask scheduler to use instead: tls://host:8786. One at tcp:// runs what anybody sends who reaches it.",
+)
+@click.option("--tls-ca-file", type=GIVEN_FILE, help="Of tls://: who signs the cluster's certificates; PEM.")
+@click.option("--tls-cert", type=GIVEN_FILE, help="Of tls://: the certificate to show; PEM.")
+@click.option("--tls-key", type=GIVEN_FILE, help="Of tls://: its key, where the certificate's file lacks it; PEM.")
+@click.option("--out", required=True, type=WrittenPath(file_okay=False), help="Folder of the results.")
+@json_option
+@explained
+def sweep(
+    logs: tuple[Path, ...],
+    scenarios: tuple[str, ...],
+    seeds: str,
+    vary: tuple[str, ...],
+    config: str,
+    profile: str | None,
+    workers: int | None,
+    scheduler: str,
+    tls_ca_file: Path | None,
+    tls_cert: Path | None,
+    tls_key: Path | None,
+    out: Path,
+    as_json: bool,
+) -> ExitCode:
+    """Replay LOGS, or play scenarios, with every combination of settings; one table, OUT/sweep.parquet.
+
+    A folder stands for every run.mcap below it. Begun again with the same folder, a sweep computes what is missing.
+    """
+    from adacd_hil.lab.tune.cluster import TLS, TlsFiles, connect
+    from adacd_hil.lab.tune.sweep import SweepStore, replay_task, run_sweep
+
+    if bool(logs) == bool(scenarios):
+        raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
+    plan = _plan(logs, scenarios, seeds, vary, config, profile or "")
+    work = replay_task if logs else simulate_task
+    store = SweepStore(out)
+    tls = TlsFiles(tls_ca_file, tls_cert, tls_key)
+    with Progress() as progress:
+        progress(
+            f"{counted(plan.size, 'row')}: {counted(len(plan.subjects), 'log' if logs else 'run')} × "
+            f"{counted(len(plan.variants), 'setting')}"
+        )
+        if scheduler and not scheduler.startswith(TLS) and not any(tls):
+            progress(
+                f"{scheduler} is open: it runs whatever anybody sends who reaches it; tls:// asks for a certificate"
+            )
+        with connect(scheduler, workers or os.cpu_count() or 1, tls) as client:
+            outcome = run_sweep(plan, work, store, client, progress)
+        about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
+        table = store.join(plan.row_keys(), about)
+    result = {
+        "table": str(table),
+        "rows": plan.size,
+        "computed": outcome.computed,
+        "found_done": outcome.found,
+        "failed": outcome.failed,
+        "elapsed_s": round(outcome.elapsed_s, 3),
+        "rows_per_s": round(outcome.computed / outcome.elapsed_s, 2) if outcome.elapsed_s else None,
+    }
+    verdict = f"{plan.size - outcome.failed} of {plan.size} rows are there"
+    lines = [verdict, *(in_line(f"{key}: {value}") for key, value in result.items())]
+    if as_json:
+        print(json.dumps(result, indent=2))
+    else:
+        show("\n".join(lines), *_next(table, outcome.failed))
+    return ExitCode.PARTIAL if outcome.failed else ExitCode.OK
+
+
+def _next(table: Path, failed: int) -> tuple[str, ...]:
+    if failed:
+        return ("the same command again: it computes what failed",)
+    read = f"import pandas; print(pandas.read_parquet({str(table)!r}))"
+    return (f"python -c {shlex.quote(read)}   # or any other reader of Parquet",)
+
+
+def _plan(
+    logs: Sequence[Path], scenarios: Sequence[str], seeds: str, vary: Sequence[str], config: str, profile: str
+) -> "Plan":
+    from adacd_hil import __version__
+    from adacd_hil.compiled import program_digest
+    from adacd_hil.lab.tune.sweep import plan_logs, plan_scenarios
+    from adacd_hil.settings.configuration import apply_settings, load_settings, parse_variations
+
+    variants = parse_variations(vary)
+    base = load_settings(config or "certified", profile or None)
+    for changes in variants:  # what no run could take is refused before the first one
+        apply_settings(base, changes)
+    version = f"{__version__} {program_digest()}"
+    if logs:
+        return plan_logs(_files(logs), variants, config, profile, version)
+    from firmware_sim.scenario.scenario import load_scenario
+
+    for scenario in scenarios:
+        load_scenario(scenario, base.arm.profile, None)
+    return plan_scenarios(scenarios, _seeds(seeds), variants, config, profile, version)
+
+
+def _files(logs: Sequence[Path]) -> list[Path]:
+    """Find the logs; a folder stands for those below it."""
+    found: list[Path] = []
+    for given in logs:
+        below = sorted(given.rglob(LOG_NAME)) if given.is_dir() else [given]
+        if not below or not below[0].exists():
+            raise CommandError(f"no {LOG_NAME} in {given}" if given.is_dir() else f"log {given} does not exist")
+        found += below
+    return found
+
+
+def _seeds(text: str) -> range:
+    """Read `N` or `A:B`."""
+    first, colon, last = text.partition(":")
+    try:
+        low, high = int(first), int(last if colon else first)
+    except ValueError:
+        low, high = 1, 0
+    if not 0 <= low <= high:
+        raise CommandError(f"--seeds {text!r} is neither a number nor A:B with 0 <= A <= B", ExitCode.USAGE)
+    return range(low, high + 1)
+
+
+def simulate_task(task: "Task") -> "list[Values]":
+    """Play the scenario of a task with the settings of each row: in a folder of its own, replayed, and forgotten."""
+    return [_simulate(task, row) for row in task.rows]
+
+
+def _simulate(task: "Task", row: "SweepRow") -> "Values":
+    from adacd_hil.cli.embedded_run import resolve, run_embedded
+    from adacd_hil.lab.tune.sweep import REFUSALS, failed, finished
+    from adacd_hil.replay.replay import replay
+    from adacd_hil.settings.configuration import apply_settings
+
+    subject = task.subject
+    try:
+        cast = resolve(task.config or _SIMULATED_CONFIG, subject.scenario, task.profile or None, subject.seed)
+        settings = apply_settings(cast.settings, dict(row.changes))
+        with tempfile.TemporaryDirectory(prefix="adacd-hil-sweep-") as name:
+            summary, _ = run_embedded(cast._replace(settings=settings), "lockstep", Path(name))
+            if summary.result is None:
+                return failed(subject, row, summary.error)
+            return finished(subject, row, replay(summary.log.path))
+    except REFUSALS as refusal:
+        return failed(subject, row, str(refusal))

@@ -1,0 +1,98 @@
+"""A tare on a bus: opens it, lets a tare session measure, stores what it found."""
+
+import dataclasses
+import signal
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
+from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.clock import VirtualClock
+from adacd_hil.control.arm_records import Tare, read_tare, write_tare
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.contract import load_contract
+from adacd_hil.device.strangers import refuse_company
+from adacd_hil.lab.commission.tare import TareRefusedError
+from adacd_hil.lab.commission.tare_session import TareSession
+from adacd_hil.progress_lines import Progress
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.terminal import in_line
+
+
+@dataclass(frozen=True)
+class StoredTare:
+    """A tare and where it lies. `backup`: where the file lies that was there."""
+
+    tare: Tare
+    path: Path
+    backup: Path | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Describe it for machines."""
+        backup = None if self.backup is None else str(self.backup)
+        return {"file": str(self.path), "backup": backup, **dataclasses.asdict(self.tare)}
+
+    def as_text(self) -> str:
+        """Describe it for people."""
+        tare = self.tare
+        lines = [
+            f"joint{joint}: offset {offset:+.4f} ± {error:.4f} Nm (was {old:+.4f}), spread of poses {spread:.4f} Nm, "
+            f"sensor {sensor.serial}"
+            for joint, (offset, error, old, spread, sensor) in enumerate(
+                zip(
+                    tare.offset_Nm,
+                    tare.standard_error_Nm,
+                    tare.old_offset_Nm,
+                    tare.spread_Nm,
+                    tare.sensors,
+                    strict=True,
+                ),
+                start=1,
+            )
+        ]
+        if tare.gravity_model != "none":
+            lines.append("gravity ({}): a4 = {:.4f} Nm, a5 = {:.4f} Nm".format(tare.gravity_model, *tare.gravity_Nm))
+        kept = "" if self.backup is None else f"; the one before is {self.backup}"
+        lines.append(f"{self.path}{kept}")
+        return "\n".join(in_line(line) for line in lines)
+
+
+def tare_on_bus(
+    connection: Connection,
+    clock_name: str,
+    out: Path,
+    poses: int | None,
+    seconds: float | None,
+    is_auto_zeroing: bool,
+) -> StoredTare:
+    """Tare the sensors of an arm on a bus. Raises ConfigError, CodecError, BusError, CommandError, OSError."""
+    interface, channel = connection.interface, connection.channel
+    check_clock(clock_name, interface, channel)
+    settings = _with_options(connection.settings(), poses, seconds)
+    check_shared(clock_name, settings)
+    # A file that is no tare isn't overwritten.
+    old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
+    codec = load_contract(settings)
+    clock = make_clock(clock_name)
+    bus = connection.open(clock, codec, settings)
+    try:
+        with Progress() as progress, closing(bus):
+            if not isinstance(clock, VirtualClock):
+                refuse_company(bus, clock, settings, codec)
+            session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)
+            with never_stopped(), on_interrupt(session.interrupt, signal.SIGTSTP):
+                tare = session.run()
+    except TareRefusedError as reason:
+        raise CommandError(f"tare refused: {reason}", ExitCode.FAILURE) from None
+    except DeviceError as reason:
+        raise CommandError(reason.line, ExitCode.BUS_MISSING) from None
+    return StoredTare(tare, out, write_tare(tare, out))
+
+
+def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
+    """Let the command's options outweigh the configuration."""
+    tare = settings.tare
+    tare = dataclasses.replace(tare, poses=poses or tare.poses, window_s=seconds or tare.window_s)
+    return dataclasses.replace(settings, tare=tare)

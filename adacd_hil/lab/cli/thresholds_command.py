@@ -1,0 +1,75 @@
+"""Thresholds from recorded motion: the command's work and its table."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+from adacd_hil.cli.output import format_table
+from adacd_hil.lab.thresholds.detector_comparison import Comparison, compare_detectors
+from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
+from adacd_hil.log.log_files import WHOLE, TimeWindow, log_in
+from adacd_hil.progress_lines import Progress
+
+
+def find(
+    logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: TimeWindow = WHOLE
+) -> tuple[Thresholds, Comparison | None]:
+    """Find the thresholds, and compare the detectors where asked for. Raises LogError."""
+    paths = [log_in(given) for given in logs]
+    with Progress() as progress:
+        thresholds, statistics = thresholds_of_logs(paths, rate_per_h, stretch, progress)
+    return thresholds, compare_detectors(statistics, rate_per_h) if is_compared else None
+
+
+def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:
+    """Write both as JSON."""
+    content = dataclasses.asdict(thresholds)
+    if comparison is not None:
+        content["comparison"] = comparison.as_json()
+    return json.dumps(content, indent=2, allow_nan=False)
+
+
+def as_text(thresholds: Thresholds, comparison: Comparison | None) -> str:
+    """Write both as tables."""
+    lines = [
+        f"{thresholds.rate_per_h:g} false alarms per hour, from {thresholds.hours:.2f} h of contact-free motion"
+        + (", extrapolated" if thresholds.is_extrapolated else "")
+        + f"; the velocity lags by {1e3 * thresholds.lag_s:.2f} ms",
+        "",
+    ]
+    rows = []
+    for row in thresholds.channels:
+        for i, threshold in enumerate(row.threshold):
+            unit = {"likelihood": "sigmas", "cusum": "Nm s"}.get(row.channel.split(" ", maxsplit=1)[0], "Nm")
+            rows.append(
+                (
+                    row.detector,
+                    row.channel,
+                    str(i + 1),
+                    f"{threshold:.4g} {unit}",
+                    f"{row.achievable_Nm[i]:.4f} Nm" if row.achievable_Nm else "",
+                    row.limit[i] if row.limit else "",
+                )
+            )
+    lines += [
+        format_table(
+            ("detector", "channel", "joint", "threshold", "achievable", "limited by"), rows, (2, 3, 4), names=3
+        )
+    ]
+    checks = [
+        (
+            row.name,
+            f"{row.rate_bound_per_h:.2g}",
+            f"x {row.bound_ratio:.2f}",
+            "too short" if row.predicted_per_h is None else f"{row.predicted_per_h:.3g}",
+            "" if row.measured_per_h is None else f"{row.measured_per_h:.3g}",
+        )
+        for row in thresholds.detectors
+    ]
+    head = ("detector", "95 % bound, 1/h", "to be sure", "held out: predicted, 1/h", "measured, 1/h")
+    lines += ["", format_table(head, checks, (1, 2, 3, 4))]
+    if thresholds.missing:
+        lines += ["", f"Too little motion for: {', '.join(thresholds.missing)}"]
+    if comparison is not None:
+        lines += ["", "Median delay of a step, ms, best detector first:", format_table(*comparison.table())]
+    return "\n".join(lines)

@@ -1,0 +1,152 @@
+"""`adacd-hil tune`: thresholds, filter and gain found from logs, as a configuration with its provenance."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from adacd_hil.cli.completion import complete_run
+from adacd_hil.cli.options import json_option, stretch_options
+from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show, suggest, tell, tried
+from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.log.log_files import log_in
+from adacd_hil.progress_lines import Progress
+from adacd_hil.terminal import in_line
+
+if TYPE_CHECKING:
+    from adacd_hil.lab.tune.tune_roc import Candidate, Found, Tuning
+    from adacd_hil.log.log_files import TimeWindow
+
+
+@click.command(
+    epilog="Exit status: 0 found, and the half to check on shows the wanted rate; 3 it can't show it, or no candidate "
+    "is fit; 1 a log can't be read, or has no motion that counts; 2 wrong usage or configuration; 130 interrupted."
+)
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@click.option(
+    "--rate-per-h",
+    type=click.FloatRange(1e-6, 1e4),
+    default=0.01,
+    show_default=True,
+    help="Wanted false alarms per hour.",
+)
+@click.option("--config", metavar="NAME|FILE", help="Settings to start from and to extend; default: the logs' own.")
+@click.option("--out", type=WrittenPath(dir_okay=False), help="Write the suggested configuration here.")
+@click.option("--report", type=WrittenPath(file_okay=False), help="Folder for tune.json and the figures.")
+@json_option
+@explained
+@stretch_options
+def tune(
+    logs: tuple[Path, ...],
+    rate_per_h: float,
+    config: str | None,
+    out: Path | None,
+    report: Path | None,
+    as_json: bool,
+    stretch: "TimeWindow",
+) -> ExitCode:
+    """Find thresholds, filter and gain from LOGS; a folder stands for the run log in it.
+
+    Thresholds are chosen on half of the logs, or of one log's time, and checked on the rest. With the truth.mcap beside
+    the logs: contacts found, delays, and a small grid of filters and gains, replayed. Without: thresholds only.
+
+    With --from and --until, motion and contacts of that stretch of each log count. The replays begin with the log.
+    """
+    from adacd_hil.lab.tune.tune import base_of, suggested_toml
+    from adacd_hil.lab.tune.tune import tune as find
+    from adacd_hil.replay.log_source import LogSource
+
+    paths = [log_in(given) for given in logs]
+    if len(set(paths)) < len(paths):
+        raise CommandError("a log is given twice: what is chosen on it can't be checked on it", ExitCode.USAGE)
+    with tried(out):
+        base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
+        with Progress() as progress:
+            found = find(paths, rate_per_h, config, progress, stretch)
+        said = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
+        if base is None or found.best is None:
+            print(said) if as_json else show(said, *_next(paths[0], found, None))
+        else:
+            tell(said, out, suggested_toml(found, found.best, *base), as_json)
+            if not as_json:
+                suggest(*_next(paths[0], found, out))
+    if report is not None:
+        from adacd_hil.lab.tune.tune import write_tuning
+
+        write_tuning(found, report)
+    return ExitCode.OK if found.is_shown else ExitCode.PARTIAL
+
+
+def _next(log_path: Path, found: "Tuning", out: Path | None) -> tuple[str, ...]:
+    """Name what may be typed after it: to write the configuration, then to try it on the log."""
+    if found.best is None:
+        return ()
+    if out is None:
+        return (f"adacd-hil tune {quoted(log_path)} --out tuned.toml   # writes the suggestion as a configuration",)
+    return (f"adacd-hil replay {quoted(log_path)} --config {quoted(out)}   # what it would have changed",)
+
+
+def _as_text(found: "Tuning") -> str:
+    from adacd_hil.lab.tune.tune import in_words
+    from adacd_hil.lab.tune.tune_roc import LIMITS, free_hours
+
+    hours = sum(map(free_hours, found.logs))
+    lines = [f"{found.rate_per_h:g} false alarms per hour wanted; {hours:.4f} h of motion that nobody touched", ""]
+    if found.detectors:
+        head = ("detector", "found", "95 %", "median ms", "p90 ms", "max ms", "alarms", "95 % bound, 1/h", "thresholds")
+        rows = [
+            (choice.name, *_cells(choice.checked), "largest seen" if choice.calibration is None else choice.method)
+            for choice in found.detectors
+        ]
+        lines += ["Detectors, in the half that their thresholds were not chosen on:", format_table(head, rows), ""]
+    columns = ("filter and gain", "thresholds", "adapts, s", "missed", "false", "median ms", "bound, 1/h", "fit")
+    lines += [
+        "The logs' scheme, replayed with the thresholds chosen:",
+        format_table(columns, [_row(candidate) for candidate in found.candidates]),
+        "",
+        *(in_line(f"Note: {note}") for note in found.notes),
+    ]
+    if found.best is None:
+        lines.append("No candidate is fit; nothing is suggested.")
+    else:
+        lines.append(f"Suggested: {', '.join(f'{key} = {value}' for key, value in found.best.changes.items())}")
+        lines.append(f"  chosen on:  {in_words(found.best.choice.chosen)}")
+        lines.append(f"  checked on: {in_words(found.best.choice.checked)}")
+        if not found.is_shown:
+            lines.append(
+                f"  {found.rate_per_h:g} per hour is not shown by counting, which needs {3.0 / found.rate_per_h:.4g} h "
+                f"without an alarm to check on; the thresholds are from the {found.best.choice.method}."
+            )
+    return "\n".join([*lines, "", LIMITS])
+
+
+def _cells(checked: "Found") -> tuple[str, ...]:
+    """Say what thresholds come to in one half, a cell for each figure."""
+    from adacd_hil.score.wording import delay_figures
+
+    low, high = checked.share_bounds
+    return (
+        "–" if checked.contacts is None else f"{len(checked.delays_ms)} of {checked.contacts}",
+        "–" if checked.contacts is None else f"{100 * low:.0f}–{100 * high:.0f} %",
+        *("–" if each is None else f"{each:.1f}" for each in delay_figures(checked.delays_ms)),
+        str(checked.alarms),
+        f"{checked.rate_bound_per_h:.3g}",
+    )
+
+
+def _row(candidate: "Candidate") -> tuple[str, ...]:
+    from adacd_hil.score.wording import delay_figures
+
+    outcome = candidate.outcome
+    median_ms, _, _ = delay_figures(outcome.delays_ms)
+    return (
+        candidate.name,
+        ", ".join(f"{each:.3g}" for each in candidate.choice.thresholds.reshape(-1)),
+        f"{max(outcome.adaptation_s):.2f}" if outcome.adaptation_s else "never",
+        "–" if outcome.missed is None else str(outcome.missed),
+        "–" if outcome.false_alarms is None else str(outcome.false_alarms),
+        "–" if median_ms is None else f"{median_ms:.1f}",
+        f"{candidate.choice.checked.rate_bound_per_h:.3g}",
+        "; ".join(candidate.problems) or "yes",
+    )

@@ -1,0 +1,479 @@
+"""Doctor's checks of the arm on its bus: who is there, whether they are as agreed, and what they measure at rest.
+
+The drives are never asked for more than Disable voltage. `ArmExamination.leave` puts the nodes back to pre-operational.
+"""
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.clock import Clock
+from adacd_hil.control.host_checks import Check, CheckOutcome, failed, ok, skipped, warning
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.canopen_bus import read_object
+from adacd_hil.device.cycle_frames import SensorStatus
+from adacd_hil.device.device_setup import contract_differences, describe_torque_scale, read_pdos
+from adacd_hil.device.network import Master
+from adacd_hil.device.strangers import host_frames
+from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, survey
+from adacd_hil.lab.commission.communication_test import (
+    CommunicationReport,
+    CommunicationTest,
+    Verdict,
+    ZeroTorqueCycle,
+    ZeroTorqueLoop,
+)
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.wire.bus import Bus, BusError, Tap
+from adacd_hil.wire.can_interface import InterfaceState
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.traffic import Traffic, listen
+
+LISTEN_S = 0.5
+"""For other masters: five of the usual heartbeats of 100 ms."""
+HIGH_LOAD_PERCENT = 80.0
+"""Above this the worst case (stuff bits, a status and an SDO frame) does not fit a period."""
+_PDOS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
+
+
+@dataclass
+class ArmExamination:
+    """What is examined, and what the checks have learnt so far.
+
+    open_bus: opens the bus, receiving everything. read_link: the interface's present state. ask: None when nobody can
+    move the arm, with the reason in `no_move_reason`; else tells the user what to do.
+    cycle_s: how long the cycle runs. move_s: how long the user has to move a joint.
+    """
+
+    settings: Settings
+    codec: Codec
+    clock: Clock
+    open_bus: Callable[[], Bus]
+    read_link: Callable[[], InterfaceState | None]
+    bitrate: int = 1_000_000
+    data_bitrate: int = 0
+    ask: Callable[[str], None] | None = None
+    no_move_reason: str = "give --move and move the joints when asked"
+    cycle_s: float = 1.0
+    move_s: float = 15.0
+    _tap: Tap | None = None
+    _bus: Bus | None = None
+    _loop: ZeroTorqueLoop | None = None
+    _has_reset: bool = False
+    cycles: list[ZeroTorqueCycle] = field(default_factory=list)
+    traffic: Traffic = field(default_factory=Traffic)
+
+    def connect(self) -> None:
+        """Open the bus and put arm and master on it. Raises BusMissingError."""
+        self._bus = self.open_bus()
+        self._tap = Tap(self._bus, self.clock)
+        self.arm = Arm(self.settings, self.codec, self._tap)
+        self.master = Master(self.settings, self.codec, self._tap)
+
+    @property
+    def tap(self) -> Tap:
+        """The open bus."""
+        assert self._tap is not None
+        return self._tap
+
+    @property
+    def loop(self) -> ZeroTorqueLoop:
+        """The loop of this examination; its cycles count on."""
+        if self._loop is None:
+            self._loop = ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
+        return self._loop
+
+    def reset(self) -> None:
+        """Reset the nodes' communication; from here on they have to be left safe. Raises DeviceError, BusError."""
+        self._has_reset = True
+        self.master.reset()
+
+    def leave(self) -> str:
+        """Put the nodes back to pre-operational and close the bus; returns what went wrong, "" when nothing did."""
+        trouble = ""
+        if self._has_reset:
+            try:
+                self.master.stop()
+            except BusError as error:
+                trouble = str(error)
+        if self._bus is not None:
+            with suppress(BusError):
+                self._bus.close()
+        return trouble
+
+    def communication(self) -> CommunicationReport:
+        """Judge the connection by the cycles so far."""
+        test = CommunicationTest(self.settings, self.arm, self.bitrate, self.data_bitrate)
+        for cycle in self.cycles:
+            test.observe(cycle)
+        return test.report()
+
+    def joint_values(self, name: str) -> NDArray[np.float64]:
+        """Return q, dq or tau_J of the cycles with complete data, (n, 2)."""
+        values = [getattr(cycle.state, name) for cycle in self.cycles if cycle.state.is_complete]
+        return np.array(values, dtype=np.float64).reshape(len(values), JOINTS)
+
+
+def check_bus(patient: ArmExamination) -> CheckOutcome:
+    """Check that the bus opens."""
+    patient.connect()
+    return ok(f"{patient.tap.channel} is open")
+
+
+def check_other_masters(patient: ArmExamination) -> CheckOutcome:
+    """Check that nobody else plays the host."""
+    traffic = Traffic()
+    listen(patient.tap, patient.clock, LISTEN_S, traffic)
+    patient.tap.take()
+    doing = host_frames(patient.settings, patient.codec)
+    if patient.settings.bus.is_shared:
+        del doing[patient.codec.message("Nmt").can_id]
+    heard = [f"{doing[can_id]} (0x{can_id:03X})" for can_id in sorted(doing.keys() & traffic.talks.keys())]
+    if heard:
+        return failed(f"somebody else {', '.join(heard)}", "end the other program; an arm has one master")
+    return ok(f"none in {LISTEN_S:g} s; {len(traffic.talks)} identifiers heard, {traffic.error_frames} error frames")
+
+
+def check_nodes(patient: ArmExamination) -> CheckOutcome:
+    """Check that the expected nodes are there, with the expected identity."""
+    expected = expected_nodes(patient.master.slaves)
+    found = survey(patient.tap, patient.clock, 0.0)
+    verdicts = compare(found, expected)
+    wrong = [f"node {node}: {text}" for node, text in verdicts.items() if text not in ("", "unexpected")]
+    if wrong:
+        return failed("; ".join(wrong), "check power, wiring, node id (0x100B or the maker's tool) and configuration")
+    strangers = [str(node) for node, text in verdicts.items() if text]
+    if strangers:
+        return warning(f"node {', '.join(strangers)} is not in the configuration", "take it off the bus if it can be")
+    return ok(", ".join(f"{node.name} (node {node.node_id})" for node in expected))
+
+
+def check_boot(patient: ArmExamination) -> CheckOutcome:
+    """Check that each node boots after a reset of communication."""
+    patient.reset()
+    return ok("all nodes booted after a reset of communication")
+
+
+def check_contract(patient: ArmExamination) -> CheckOutcome:
+    """Check that host and devices are made for the same contract."""
+    codec = patient.codec
+    lacking = []
+    for name, node in patient.master.nodes.items():
+        version, digest = read_object(node, 0x2000, 1), read_object(node, 0x2000, 2)
+        if version is None or digest is None:
+            lacking.append(name)
+            continue
+        pair = int.from_bytes(version, "little"), int.from_bytes(digest, "little")
+        if pair != (codec.wire_version, codec.layout_digest):
+            return failed(
+                f"{name}: wire version {pair[0]}, layout digest 0x{pair[1]:08X}; the DBC's are "
+                f"{codec.wire_version}, 0x{codec.layout_digest:08X}",
+                "give host and devices the same DBC file",
+            )
+    if lacking:
+        return skipped(f"{', '.join(lacking)} has no contract object 0x2000; the PDO map is compared instead")
+    return ok(f"wire version {codec.wire_version}, layout digest 0x{codec.layout_digest:08X}")
+
+
+def check_set_up(patient: ArmExamination) -> CheckOutcome:
+    """Check that the nodes take identity check and set-up as a run does them."""
+    patient.master.identify()
+    patient.master.configure()
+    return ok(f"SYNC period {patient.settings.bus.period_us} µs, heartbeat {patient.settings.bus.heartbeat_ms} ms")
+
+
+def check_pdo_map(patient: ArmExamination) -> CheckOutcome:
+    """Check that the PDOs that the devices have configured are those of the contract."""
+    lines = []
+    for slave in patient.master.slaves:
+        lines += contract_differences(slave.device, read_pdos(patient.master.nodes[slave.name]))
+    if lines:
+        return failed(
+            "; ".join(lines), "correct [[pdo]] of the devices' profiles, or map the devices' PDOs as these say"
+        )
+    return ok("read back, equal to the contract")
+
+
+def check_torque_scale(patient: ArmExamination) -> CheckOutcome:
+    """Say what the drives' rated torques are at the joints; the set-up has compared them."""
+    slaves = patient.master.slaves[:JOINTS]
+    pairs = zip(slaves, patient.settings.arm.rated_torque_Nm, strict=True)
+    text = "; ".join(describe_torque_scale(slave, rated_Nm) for slave, rated_Nm in pairs)
+    if any(not slave.has(0x6076) for slave in slaves):
+        return warning(text, "compare `arm.rated_torque_Nm` with the data sheets of motor and gear")
+    return ok(text)
+
+
+def check_protection(patient: ArmExamination) -> CheckOutcome:
+    """List the cyclic frames that carry no end-to-end header."""
+    names = [
+        message.name
+        for message in patient.codec.messages.values()
+        if message.can_id & 0x780 in _PDOS and not message.is_protected
+    ]
+    if names:
+        return warning(
+            f"unprotected: {', '.join(names)}",
+            "plausibility alone guards them; a CAN FD contract has room for a header in every frame",
+        )
+    return ok("every cyclic frame has an end-to-end header")
+
+
+def check_cycle(patient: ArmExamination) -> CheckOutcome:
+    """Run cycles at the period, drives not enabled."""
+    patient.tap.take()
+    patient.master.start()
+    patient.loop.run(patient.cycle_s, patient.cycles.append)
+    for cycle in patient.cycles:
+        for is_sent, frame in cycle.frames:
+            if not is_sent:
+                patient.traffic.accept(frame)
+    return ok(f"{len(patient.cycles)} cycles, torque zero, drives not enabled")
+
+
+def check_rate(patient: ArmExamination) -> CheckOutcome:
+    """Check that SYNC and feedback keep the period."""
+    report = patient.communication()
+    elapsed_s = report.periods * patient.settings.bus.period_s
+    rates = ", ".join(
+        f"{name} {device.share * report.periods / elapsed_s:.0f}/s" for name, device in report.devices.items()
+    )
+    text = (
+        f"SYNC {report.cycles / elapsed_s:.0f}/s of {1e6 / patient.settings.bus.period_us:.0f}, {rates}; "
+        f"{100.0 * report.share:.1f} % of the periods complete, {report.overruns} skipped"
+    )
+    remedy = (
+        "`adacd-hil commtest` shows what is late; see `scheduler` and `preemption`, or choose a longer bus.period_us"
+    )
+    if report.verdict is Verdict.NOT_SUFFICIENT:
+        return failed(text, remedy)
+    return warning(text, remedy) if report.verdict is Verdict.WARNING else ok(text)
+
+
+def check_load(patient: ArmExamination) -> CheckOutcome:
+    """Check that the bus has room for what is not cyclic."""
+    load = patient.communication().load_percent
+    text = f"{load:.1f} % at {patient.bitrate} bit/s"
+    if load > HIGH_LOAD_PERCENT:
+        return warning(text, "choose a longer bus.period_us or CAN FD; `adacd-hil budget` shows what takes the time")
+    return ok(text)
+
+
+def check_heartbeats(patient: ArmExamination) -> CheckOutcome:
+    """Check that each node says that it lives and is operational."""
+    expected_Hz = 1e3 / patient.settings.bus.heartbeat_ms
+    silent, odd, slow = [], [], []
+    for name, node in patient.master.nodes.items():
+        talk = patient.traffic.talks.get(0x700 + node.id)
+        if talk is None:
+            silent.append(name)
+        elif talk.data != b"\x05":
+            odd.append(f"{name} is {NMT_STATES.get(talk.data[0] & 0x7F if talk.data else -1, 'in an unknown state')}")
+        elif talk.rate_Hz is not None and talk.rate_Hz < expected_Hz / 1.5:
+            slow.append(f"{name} {talk.rate_Hz:.1f}/s")
+    if silent:
+        return failed(f"no heartbeat from {', '.join(silent)}", "the node must produce 0x1017; is it still powered?")
+    if odd:
+        return failed(f"{', '.join(odd)}, after NMT start", "see the node's EMCY and its manual")
+    if slow:
+        return warning(
+            f"slower than {expected_Hz:g}/s: {', '.join(slow)}", "a loaded bus delays heartbeats: see `load`"
+        )
+    return ok(f"all operational, every {patient.settings.bus.heartbeat_ms} ms")
+
+
+def check_devices(patient: ArmExamination) -> CheckOutcome:
+    """Check that no drive is in fault, no device reports an error."""
+    lines = [line for line in ArmReport(patient.arm).describe_faults() if ": status" not in line]
+    events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
+    if lines or events:
+        return warning("; ".join([*lines, *events]), "a run resets the fault if its cause has gone")
+    return ok("no fault, no EMCY")
+
+
+def check_saturation(patient: ArmExamination) -> CheckOutcome:
+    """Check that no sensor is saturated or invalid."""
+    told = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
+    text = ", ".join(f"{name} {status!r}" for name, status in told.items())
+    if any(status & SensorStatus.NOT_VALID for status in told.values()):
+        return failed(text, "see the sensor's EMCY; check its cable to the strain gauge")
+    if told:
+        return failed(text, "take the load off the joint; the arm must hang free")
+    return ok("within range")
+
+
+def check_rest(patient: ArmExamination) -> CheckOutcome:
+    """Check that the arm stands still with its drives off."""
+    dq = patient.joint_values("dq")
+    if not len(dq):
+        return skipped("no complete cycle")
+    fastest = np.abs(dq).max(axis=0)
+    bound = patient.settings.safety.rest_velocity_rad_s
+    text = ", ".join(f"joint {joint + 1} up to {fastest[joint]:.4f} rad/s" for joint in range(JOINTS))
+    if np.any(fastest > bound):
+        return failed(f"{text}, above {bound:g}", "let the arm come to rest and keep hands off")
+    return ok(text)
+
+
+def check_torque_zero(patient: ArmExamination) -> CheckOutcome:
+    """Check that the torque at rest is near zero."""
+    tau_J = patient.joint_values("tau_J")
+    if not len(tau_J):
+        return skipped("no complete cycle")
+    mean = tau_J.mean(axis=0)
+    bound = patient.settings.safety.rest_torque_Nm
+    text = ", ".join(f"joint {joint + 1} {mean[joint]:+.4f} Nm" for joint in range(JOINTS))
+    remedy = "let the arm hang free, then `adacd-hil tare`"
+    if np.any(np.abs(mean) > bound):
+        return failed(f"{text}, above {bound:g}", remedy)
+    if np.any(np.abs(mean) > patient.settings.detector.threshold_Nm):
+        return warning(f"{text}: more than the detection threshold", remedy)
+    return ok(text)
+
+
+def check_noise(patient: ArmExamination) -> CheckOutcome:
+    """Check that the torque signal is alive and quiet."""
+    tau_J = patient.joint_values("tau_J")
+    if len(tau_J) < 2:
+        return skipped("no complete cycles")
+    spread = tau_J.std(axis=0)
+    text = ", ".join(f"joint {joint + 1} {1000.0 * spread[joint]:.3f} mNm rms" for joint in range(JOINTS))
+    if np.any(np.ptp(tau_J, axis=0) == 0.0):
+        return warning(f"{text}: a value that never changes", "check the cable to the strain gauge")
+    if np.any(spread > np.array(patient.settings.detector.threshold_Nm) / 3.0):
+        return warning(
+            f"{text}: three of it exceed the detection threshold", "check shield and ground; move drive cables away"
+        )
+    return ok(text)
+
+
+def check_bus_errors(patient: ArmExamination) -> CheckOutcome:
+    """Check that the bus stayed without errors while the cycle ran."""
+    link = patient.read_link()
+    errors = patient.traffic.error_frames
+    counters = ""
+    if link is not None and link.state is not None:
+        counters = f", {link.state}, error counters rx {link.rx_errors or 0}, tx {link.tx_errors or 0}"
+    if errors or (link is not None and link.state not in (None, "ERROR-ACTIVE")):
+        return warning(f"{errors} error frames{counters}", "check wiring, termination and bit rate")
+    return ok(f"no error frame{counters}")
+
+
+def _check_joint(joint: int) -> Callable[[ArmExamination], CheckOutcome]:
+    def check(patient: ArmExamination) -> CheckOutcome:
+        if patient.ask is None:
+            return skipped(patient.no_move_reason)
+        tau_J = patient.joint_values("tau_J")
+        if not len(tau_J):
+            return skipped("no complete cycle")
+        motion = HandMotion(joint, tau_J.mean(axis=0))
+        patient.ask(
+            f"move joint {joint + 1} by hand toward +q, at least {motion.WANTED_DEG:g} degrees, "
+            f"within {patient.move_s:g} s"
+        )
+        patient.loop.run(patient.move_s, motion.observe, lambda: motion.is_done)
+        return motion.judge()
+
+    return check
+
+
+WORK_FLOOR_J = 1e-3
+"""Work that counts: 10 degrees against 6 mNm. Noise and zero error make less on a joint that turns freely."""
+_DOMINANCE = 2.0
+"""How much further than the other joint the moved one must have gone."""
+
+
+class HandMotion:
+    """Watches the cycles in which the user moves joint `joint` (0, 1) toward +q, its drive off, and judges its signs.
+
+    The hand drives the arm and the arm's sensor drives the idle motor, so the torque that the sensor sees opposes the
+    motion: the work ∫ tau_J dq must be negative. q, dq, tau_J (2,) are in joint coordinates. `zero_Nm` (2,): torque at
+    rest.
+    """
+
+    WANTED_DEG = 10.0
+
+    def __init__(self, joint: int, zero_Nm: Vector) -> None:
+        self._joint = joint
+        self._start: Vector | None = None
+        self._last: Vector | None = None
+        self._way = np.zeros(JOINTS)
+        self._work_J = np.zeros(JOINTS)
+        self._zero_Nm = zero_Nm
+
+    @property
+    def is_done(self) -> bool:
+        """Whether a joint has been moved far enough."""
+        return bool(np.abs(self._way).max() >= math.radians(self.WANTED_DEG))
+
+    def observe(self, cycle: ZeroTorqueCycle) -> None:
+        """Take in one cycle."""
+        state = cycle.state
+        if not state.is_complete:
+            return
+        if self._start is None or self._last is None:
+            self._start = self._last = state.q
+            return
+        self._work_J += (state.tau_J - self._zero_Nm) * (state.q - self._last)
+        self._last = state.q
+        self._way = state.q - self._start
+
+    def judge(self) -> CheckOutcome:
+        """Say what the motion told."""
+        joint, number = self._joint, self._joint + 1
+        ways_deg = np.degrees(self._way)
+        moved = int(np.argmax(np.abs(self._way)))
+        text = f"moved {ways_deg[0]:+.1f} and {ways_deg[1]:+.1f} deg, work {self._work_J[joint]:+.4f} J"
+        if not self.is_done:
+            return warning(f"not moved by {self.WANTED_DEG:g} deg in time ({text})", "run doctor --move again")
+        if moved != joint:
+            return failed(
+                f"drive {moved + 1} reports the motion of joint {number} ({text})",
+                "exchange the node ids of the drives, or their cables",
+            )
+        if abs(self._way[joint]) < _DOMINANCE * abs(self._way[1 - joint]):
+            return warning(f"both joints moved ({text})", "hold the other joint and run doctor --move again")
+        if self._way[joint] < 0.0:
+            return failed(f"position decreases toward +q ({text})", f"reverse arm.sign of joint {number}")
+        return self._judge_torque(text)
+
+    def _judge_torque(self, text: str) -> CheckOutcome:
+        work_J = self._work_J[self._joint]
+        if work_J > WORK_FLOOR_J:
+            return failed(
+                f"the torque has the motion's sign: it should oppose it ({text})",
+                "reverse the torque sensor's sign (0x6126 or the maker's tool), or exchange the sensors",
+            )
+        if work_J > -WORK_FLOOR_J:
+            return warning(f"right joint and direction; too little torque to tell its sign ({text})", "move it faster")
+        return ok(f"right joint, right signs ({text})")
+
+
+ARM_CHECKS: tuple[Check[ArmExamination], ...] = (
+    Check("bus", check_bus, ("kernel", "interface", "controller")),
+    Check("other masters", check_other_masters, ("bus",)),
+    Check("nodes", check_nodes, ("bus", "other masters")),
+    Check("boot", check_boot, ("bus", "other masters", "nodes")),
+    Check("contract", check_contract, ("boot",)),
+    Check("set-up", check_set_up, ("boot", "contract")),
+    Check("PDO map", check_pdo_map, ("boot", "set-up")),
+    Check("torque scale", check_torque_scale, ("boot", "set-up")),
+    Check("protection", check_protection),
+    Check("cycle", check_cycle, ("boot", "contract", "set-up", "PDO map")),
+    Check("rate", check_rate, ("cycle",)),
+    Check("load", check_load, ("cycle",)),
+    Check("heartbeat", check_heartbeats, ("cycle",)),
+    Check("devices", check_devices, ("cycle",)),
+    Check("saturation", check_saturation, ("cycle",)),
+    Check("rest", check_rest, ("cycle",)),
+    Check("torque zero", check_torque_zero, ("cycle", "rest", "saturation")),
+    Check("torque noise", check_noise, ("cycle", "rest", "saturation")),
+    Check("bus errors", check_bus_errors, ("cycle",)),
+    *(Check(f"joint {joint + 1}", _check_joint(joint), ("cycle", "rest")) for joint in range(JOINTS)),
+)

@@ -1,0 +1,229 @@
+"""The communication test: whether every cycle brings complete fresh data, and how late each part of it is.
+
+Judged as libfranka's `examples/communication_test.cpp` does by its success rate: below 0.90 the connection isn't
+sufficient, below 0.95 it is poor. A period that was skipped counts as one without data.
+
+Tests and tares cycle at zero torque on the fixed grid (`ZeroTorqueLoop`): SYNC out, feedback and torque in, zero torque
+out.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.clock import Clock
+from adacd_hil.control.exchange import Exchange
+from adacd_hil.control.pacing import make_pacer
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.cycle_frames import TorqueSensor
+from adacd_hil.device.drive import DISABLE_CYCLES, Drive
+from adacd_hil.device.network import Master
+from adacd_hil.lab.score.evaluation import OLDEST_CYCLES
+from adacd_hil.log.logged_run import CycleColumns, columns_of_records
+from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.wire.bus import Frame, Tap
+from adacd_hil.wire.frame_time import LoadMeter
+
+
+class ZeroTorqueCycle(NamedTuple):
+    """One cycle: what the arm reported, how it went, and its frames, True for sent."""
+
+    state: ArmState
+    record: CycleRecord
+    frames: list[tuple[bool, Frame]]
+
+
+class ZeroTorqueLoop:
+    """Cycles of an arm that has been started. `is_enabling`: the drives are asked to enable, with zero torque."""
+
+    def __init__(
+        self, settings: Settings, bus: Tap, clock: Clock, arm: Arm, master: Master, is_enabling: bool = False
+    ) -> None:
+        self.pacer = make_pacer(settings, clock, bus, arm.sync_id)
+        self._period_ns = settings.bus.period_ns
+        self._clock = clock
+        self._bus = bus
+        self._is_enabling = is_enabling
+        self.is_interrupted = False
+        """Whether somebody asked for the end."""
+        self._exchange = Exchange(settings, bus, arm, master, self.pacer, clock)
+        self._max_age_cycles = settings.bus.max_age_cycles
+
+    def interrupt(self) -> None:
+        """End after the present cycle. Safe in a signal handler."""
+        self.is_interrupted = True
+
+    def run(
+        self,
+        duration_s: float,
+        observe: Callable[[ZeroTorqueCycle], None],
+        is_over: Callable[[], bool] = lambda: False,
+    ) -> FaultReason:
+        """Cycle for a while, then disable the drives; returns what a device faulted with. Raises BusError."""
+        last_ns = self._clock.now_ns() + round(duration_s * 1e9) - self._period_ns
+        fault = FaultReason.NONE
+        while self._clock.now_ns() < last_ns and not (self.is_interrupted or is_over() or fault):
+            cycle = self.step(self._is_enabling)
+            fault = self._fault(cycle.state)
+            observe(cycle)
+        self.disable(quick_stop=fault is not FaultReason.NONE)
+        return fault
+
+    def _fault(self, state: ArmState) -> FaultReason:
+        """Say what ends a test with enabled drives; without torque nothing has to."""
+        if not self._is_enabling:
+            return FaultReason.NONE
+        if state.is_enabled and max(*state.age_q, *state.age_tau_J) > self._max_age_cycles:
+            return FaultReason.DATA_AGE
+        return state.fault
+
+    def disable(self, quick_stop: bool = False) -> None:
+        """Take the drives out of operation. Raises BusError."""
+        for _ in range(DISABLE_CYCLES):
+            self.step(quick_stop=quick_stop)
+
+    def step(self, is_enabling: bool = False, quick_stop: bool = False) -> ZeroTorqueCycle:
+        """Do one cycle. Raises BusError, of it SilenceError in lockstep."""
+        turn = self._exchange.turn()
+        self._exchange.leave()
+        record = self._exchange.end(turn, ArmCommand(np.zeros(JOINTS), is_enabling, quick_stop))
+        return ZeroTorqueCycle(turn.arm, record, self._bus.take())
+
+
+SUFFICIENT_SHARE = 0.90
+GOOD_SHARE = 0.95
+_LOAD_CYCLES = 1000
+"""Cycles at the end of the test whose frames make the bus load."""
+
+
+class Verdict(Enum):
+    """What the share of complete cycles says."""
+
+    GOOD = "good"
+    WARNING = "warning"
+    NOT_SUFFICIENT = "not sufficient"
+
+
+def judge(share: float) -> Verdict:
+    """Judge the share of cycles with complete fresh data, 0…1."""
+    if share < SUFFICIENT_SHARE:
+        return Verdict.NOT_SUFFICIENT
+    return Verdict.WARNING if share < GOOD_SHARE else Verdict.GOOD
+
+
+@dataclass(frozen=True)
+class DeviceReport:
+    """One device: share of periods with a fresh value, and how often each age occurred, in cycles.
+
+    checks: what its frames' checks found, by name. never: cycles before its first frame.
+    """
+
+    share: float
+    ages: list[int]
+    never: int
+    checks: dict[str, int]
+    is_protected: bool
+
+
+@dataclass(frozen=True)
+class CommunicationReport:
+    """What the test measured. columns: /cycle's; feedback_ns is -1 where a cycle was not complete. load: percent."""
+
+    cycles: int
+    overruns: int
+    complete: int
+    devices: dict[str, DeviceReport]
+    columns: CycleColumns
+    load_percent: float
+
+    @property
+    def periods(self) -> int:
+        """Periods that passed, with those that were skipped."""
+        return self.cycles + self.overruns
+
+    @property
+    def share(self) -> float:
+        """Share of the periods that brought complete fresh data; 0 when there was none."""
+        return self.complete / self.periods if self.periods else 0.0
+
+    @property
+    def verdict(self) -> Verdict:
+        """What this share says."""
+        return judge(self.share)
+
+
+@dataclass
+class CommunicationTest:
+    """Collects the cycles of a test: give `observe` to the loop, then ask for the `report`."""
+
+    settings: Settings
+    arm: Arm
+    bitrate: int
+    data_bitrate: int = 0
+    _t_ns: list[int] = field(default_factory=list)
+    _records: list[CycleRecord] = field(default_factory=list)
+    _ages: list[tuple[int, ...]] = field(default_factory=list)
+    _recent: deque[ZeroTorqueCycle] = field(default_factory=lambda: deque(maxlen=_LOAD_CYCLES))
+    _overruns: int = 0
+    _complete: int = 0
+
+    def observe(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
+        """Take in one cycle; returns its record for the log."""
+        state = cycle.state
+        ages = (*state.age_q, *state.age_tau_J)
+        if self._ages:  # what is skipped before the first cycle isn't the test's
+            self._overruns += state.periods - 1
+        self._complete += state.is_complete
+        self._ages.append(ages)
+        self._recent.append(cycle)
+        record = cycle.record._replace(overruns=self._overruns, log_queue_bytes=log_queue_bytes)
+        self._t_ns.append(state.t_ns)
+        self._records.append(record)
+        return record
+
+    def report(self) -> CommunicationReport:
+        """Sum up what was observed."""
+        cycles = len(self._ages)
+        ages = np.array(self._ages, dtype=np.int64).reshape(cycles, 2 * JOINTS)
+        periods = cycles + self._overruns
+        names = [drive.name for drive in self.arm.drives] + [sensor.name for sensor in self.arm.sensors]
+        return CommunicationReport(
+            cycles=cycles,
+            overruns=self._overruns,
+            complete=self._complete,
+            devices={name: self._device(ages[:, place], periods, place) for place, name in enumerate(names)},
+            columns=columns_of_records(self._t_ns, self._records),
+            load_percent=self._load_percent(),
+        )
+
+    def _device(self, ages: NDArray[np.int64], periods: int, place: int) -> DeviceReport:
+        seen = ages[np.cumsum(ages == 0) > 0]
+        counts = np.bincount(np.minimum(seen, OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
+        devices: tuple[Drive | TorqueSensor, ...] = (*self.arm.drives, *self.arm.sensors)
+        device = devices[place]
+        checks = {status.name: count for status, count in device.end_to_end.tally()} if device.is_protected else {}
+        checks["IMPLAUSIBLE"] = device.implausible_frames
+        fresh = int(np.count_nonzero(ages == 0))
+        return DeviceReport(
+            share=fresh / periods if periods else 0.0,
+            ages=counts.tolist(),
+            never=len(ages) - len(seen),
+            checks=checks,
+            is_protected=device.is_protected,
+        )
+
+    def _load_percent(self) -> float:
+        meter = LoadMeter(self.bitrate, self.data_bitrate, 0)
+        for cycle in self._recent:
+            for _, frame in cycle.frames:
+                with suppress(ValueError):  # a stranger's, of a length that the contract's bus can't carry
+                    meter.add(frame)
+        periods = sum(cycle.state.periods for cycle in self._recent)
+        return meter.take(periods * self.settings.bus.period_ns).percent

@@ -1,0 +1,143 @@
+"""Devices that a survey has found: which profile describes each, and the arm's ratings.
+
+Sends SDO uploads only. Sources: CiA 301 (0x1000, 0x1018), CiA 402-2 (0x6072, 0x6076, 0x607D, 0x6080, 0x608F, 0x6091),
+CiA 404 (0x6131, 0x6132).
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from adacd_hil.clock import Clock
+from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
+from adacd_hil.device.contract import compose
+from adacd_hil.device.profile import load_profile, place_devices, profile_names
+from adacd_hil.device.survey import BETWEEN_READS_S, Node
+from adacd_hil.lab.commission.profile_draft import KINDS, SENSOR, DeviceRatings, count_of, identity_of, is_of
+from adacd_hil.records import JOINTS
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.wire.bus import Bus, Tap
+from adacd_hil.wire.codec import CodecError
+
+
+class RecognisedDevice(NamedTuple):
+    """A drive or a sensor on the bus. profiles: built-in ones with its vendor and product; none: another's device."""
+
+    node: Node
+    kind: str
+    profiles: tuple[str, ...]
+    ratings: DeviceRatings
+
+    @property
+    def title(self) -> str:
+        """Name, vendor, product and serial number."""
+        node = self.node
+        identity = (("vendor", node.vendor), ("product", node.product))
+        numbers = (f"{what} {'?' if value is None else f'0x{value:X}'}" for what, value in identity)
+        return f"{node.name or 'a device without a name'}, {', '.join(numbers)}, serial {node.serial or '?'}"
+
+
+def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int, str]) -> list[RecognisedDevice]:
+    """Tell the drives and sensors among the nodes of a survey, and read their ratings. Raises BusError.
+
+    `kinds`: drive or sensor by node id, for nodes whose 0x1000 names neither.
+    """
+    canopen = CanopenBus(Tap(bus, clock))
+    found = []
+    for node in nodes:
+        kind = KINDS.get((node.device_type or 0) & 0xFFFF) or kinds.get(node.node_id)
+        if kind is not None and node.answers:
+            remote = canopen.add_node(node.node_id, None, pause_s=BETWEEN_READS_S)
+            profiles = fitting_profiles(node, kind)
+            if any(load_profile(name, kind).settings.contract_object for name in profiles):
+                node.layout_digest = _number(remote, 0x2000, 2)
+            found.append(RecognisedDevice(node, kind, profiles, _read_ratings(remote, kind)))
+    return found
+
+
+def fitting_profiles(node: Node, kind: str) -> tuple[str, ...]:
+    """Name the built-in profiles whose EDS has this node's vendor, and its product where it gives one."""
+    names = []
+    for name in profile_names():
+        try:
+            profile = load_profile(name, kind)
+        except ConfigError:  # of the other kind
+            continue
+        identity = identity_of(profile.eds)
+        if identity[0] is not None and is_of(identity, (node.vendor, node.product)):
+            names.append(name)
+    return tuple(sorted(names, key=len))
+
+
+_SIGNED = ((0x607D, 1), (0x607D, 2))
+_OF_DRIVES = (
+    (0x6076, 0),
+    (0x6072, 0),
+    (0x608F, 1),
+    (0x608F, 2),
+    (0x6091, 1),
+    (0x6091, 2),
+    (0x6092, 1),
+    (0x6092, 2),
+    (0x60A8, 0),
+    (0x60A9, 0),
+    *_SIGNED,
+    (0x6080, 0),
+    (0x6502, 0),
+)
+
+
+def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> int | None:
+    try:
+        data = read_object(remote, index, sub)
+    except DeviceError:  # it refuses, or tells it otherwise than by a number
+        return None
+    return None if not data or len(data) > 8 else int.from_bytes(data, "little", signed=is_signed)
+
+
+def _read_ratings(remote: Any, kind: str) -> DeviceRatings:
+    if kind == SENSOR:
+        return DeviceRatings(torque_Nm=count_of(_number(remote, 0x6131, 1), _number(remote, 0x6132, 1)))
+    read = {place: _number(remote, *place, is_signed=place in _SIGNED) for place in _OF_DRIVES}
+    return DeviceRatings({place: value for place, value in read.items() if value is not None})
+
+
+def choose_family(
+    drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Choose the profiles of two drives and two sensors: those whose frames the devices say they have (0x2000).
+
+    Where none says so, the first that fits each; "" where none does.
+    """
+    digests = {device.node.layout_digest for device in (*drives, *sensors)} - {None}
+    combinations = itertools.product(drives[0].profiles or ("",), sensors[0].profiles or ("",))
+    for drive, sensor in combinations if len(digests) == 1 else ():
+        if not all(drive in device.profiles for device in drives):
+            continue
+        if not all(sensor in device.profiles for device in sensors):
+            continue
+        nodes = [tuple(device.node.node_id for device in group) for group in (drives, sensors)]
+        if _digest_of(drive, sensor, nodes[0], nodes[1]) in digests:
+            return (drive,) * JOINTS, (sensor,) * JOINTS
+    first = [tuple((device.profiles or ("",))[0] for device in group) for group in (drives, sensors)]
+    return first[0], first[1]
+
+
+def _digest_of(drive: str, sensor: str, drive_nodes: tuple[int, ...], sensor_nodes: tuple[int, ...]) -> int | None:
+    settings = load_settings("certified")
+    devices = dataclasses.replace(
+        settings.devices,
+        drive=(drive, drive),
+        sensor=(sensor, sensor),
+        drive_node=(drive_nodes[0], drive_nodes[1]),
+        sensor_node=(sensor_nodes[0], sensor_nodes[1]),
+        contract="",
+        data_bitrate=8_000_000,
+    )
+    settings = dataclasses.replace(settings, devices=devices)
+    try:
+        return compose(settings, place_devices(settings)).layout_digest
+    except (ConfigError, CodecError):
+        return None

@@ -1,0 +1,361 @@
+"""Arrays of any serial arm through the offline scheme: a model from free motion, its test, contacts in the rest.
+
+The steps and their equations: `adacd_hil.scheme.identify.offline`. Nothing has to be known of the arm but its geometry;
+masses, friction and the torque sensors' offsets are identified.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adacd_hil.file_access import read_input
+from adacd_hil.lab.offline.recorded_columns import LARGEST, SHORTEST_SAMPLES, RecordedColumns
+from adacd_hil.lab.offline.recording_identification import Identified, identify, watch
+from adacd_hil.lab.offline.recording_import import (
+    LONGEST_PERIOD_S,
+    SHORTEST_PERIOD_S,
+    ForeignRecording,
+    recording_of,
+)
+from adacd_hil.lab.offline.recording_map import (
+    ArmSection,
+    BagSection,
+    ColumnsSection,
+    CsvSection,
+    RecordingMap,
+    SamplingSection,
+    ScaleSection,
+    UnitsSection,
+)
+from adacd_hil.lab.offline.recording_verdict import Verdict
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.robot_description import robot_description
+from adacd_hil.records import Vector
+from adacd_hil.remedies import nearest_name
+from adacd_hil.scheme.identify.offline import OfflineSettings
+from adacd_hil.scheme.model.urdf import STANDARD_GRAVITY_M_S2, SerialArm, read_urdf
+from adacd_hil.score.wording import number_of
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError, parse
+
+FIT_SHARE: Final = 0.4
+"""Of arrays of which nobody says what is free motion: the part from the beginning that is taken for it."""
+_REQUIRED: Final = ("t", "q", "tau_J")
+_OPTIONAL: Final = ("dq", "touched")
+_ALIASES: Final = {"t_s": "t", "time": "t", "qd": "dq", "tau": "tau_J"}
+_KNOWN: Final = (*_REQUIRED, *_OPTIONAL, *_ALIASES)
+_LONGEST_LAG_S: Final = 0.05
+_UNITS: Final = {"t": "s", "q": "rad", "dq": "rad/s", "tau_J": "Nm"}
+
+
+class ArrayError(ValueError):
+    """Arrays or options that can't be used; one line: quantity, value, bound, unit."""
+
+
+@dataclass(frozen=True)
+class OfflineArm:
+    """A serial arm of n joints: its geometry, and whether the torques are those of geared motors."""
+
+    serial: SerialArm
+    has_rotors: bool = False
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: str | Path,
+        *,
+        gravity_m_s2: tuple[float, float, float] = STANDARD_GRAVITY_M_S2,
+        locked: tuple[str, ...] = (),
+        has_rotors: bool = False,
+    ) -> Self:
+        """Read a URDF file, or its text; inertias in it are not needed.
+
+        gravity_m_s2: in the axes of the root link. locked: joints that do not move, as of a gripper. has_rotors: the
+        torques are those of geared motors, which turn their rotors too. Raises UrdfError, a ValueError; OSError.
+        """
+        text = urdf if isinstance(urdf, str) and "<" in urdf else read_input(Path(urdf))
+        return cls(read_urdf(text, gravity_m_s2, locked), has_rotors)
+
+    @classmethod
+    def from_config(cls, config: str | Path, profile: str | None = None) -> Self:
+        """Take the two-joint arm of a configuration, a name or a TOML file. Raises ConfigError, a ValueError."""
+        return cls(read_urdf(robot_description(load_settings(str(config), profile))))
+
+    def __repr__(self) -> str:
+        name = self.serial.name or "without a name"
+        return f"<Arm {name}: {number_of(self.joints, 'joint')}, {' '.join(self.joint_names)}>"
+
+    @property
+    def joints(self) -> int:
+        """Number of joints, n."""
+        return len(self.serial.joint_names)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints (n,), from the base outward."""
+        return self.serial.joint_names
+
+
+class _GivenArrays(NamedTuple):
+    """Arrays as a recording, whose time begins with 0 at begin_s of `t`."""
+
+    recording: ForeignRecording
+    begin_s: float
+    has_dq: bool
+
+
+class ArrayContact(NamedTuple):
+    """A contact: when it was detected, in the time of the arrays; link from 1; sign of each joint's torque (n,)."""
+
+    t_s: float
+    link: int
+    direction: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A model that was fitted to free motion, and tested on motion that it was not fitted to.
+
+    names, theta, std: parameters (p,), and how far they may be off. margin: smallest threshold over residual in the
+    test; below 1 the model lacks more than noise. explained: share (n,) of each joint's torque that it explains in the
+    test, nan where there is none. verdict: whether all of it is, why not, and what to do next.
+    """
+
+    arm: OfflineArm
+    names: tuple[str, ...]
+    theta: Vector
+    std: Vector
+    margin: float
+    explained: Vector
+    identified: Identified
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the torque is explained, with reasons, remarks and the next thing to do."""
+        return self.identified.verdict
+
+    def __repr__(self) -> str:
+        return f"<Model of {number_of(self.arm.joints, 'joint')}: {self.verdict.headline}>"
+
+
+@dataclass(frozen=True)
+class ArrayDetection:
+    """The model, and of m samples at a fixed period: t_s (m,), tau_ext_hat and threshold (m, n) in Nm; the contacts.
+
+    The samples are those of the arrays where these have a fixed period; gaps part them, and short rests are left out.
+    """
+
+    model: FittedModel
+    t_s: Vector
+    tau_ext_hat: Vector
+    threshold: Vector
+    contacts: tuple[ArrayContact, ...]
+
+    def __repr__(self) -> str:
+        seconds = self.t_s.size * self.model.identified.settings.period_s
+        found = f"{number_of(len(self.contacts), 'contact')} in {seconds:.1f} s"
+        return f"<Detection: {found}; model {self.model.verdict.headline}>"
+
+
+def fit(
+    arrays: Mapping[str, ArrayLike],
+    arm: OfflineArm,
+    *,
+    fit_s: tuple[float, float] | None = None,
+    velocity_lag_s: float = 0.0,
+    **scheme: Any,
+) -> FittedModel:
+    """Fit a model to the free motion in arrays and test it on the last 40 % of that; see `detect`.
+
+    `verdict` of the model says whether it explains the torque: look at it before anything else.
+    """
+    return _fitted(_taken(arrays, arm, velocity_lag_s), arm, fit_s, scheme)
+
+
+def _fitted(
+    given: _GivenArrays, arm: OfflineArm, fit_s: tuple[float, float] | None, scheme: Mapping[str, Any]
+) -> FittedModel:
+    start_s, end_s = _span(given, fit_s)
+    described = _described(arm, given.has_dq, scheme)
+    try:
+        found = identify(described, [given.recording.between(start_s, end_s)], None)
+    except LogError:
+        bounds = f"{given.begin_s + start_s:g} to {given.begin_s + end_s:g} s"
+        raise ArrayError(
+            f"too little free motion to fit from {bounds}: {2 * SHORTEST_SAMPLES} samples in a row are the least"
+        ) from None
+    return FittedModel(
+        arm=arm,
+        names=found.model.parameter_names,
+        theta=found.estimate.theta,
+        std=found.deviation,
+        margin=found.certificate.margin,
+        explained=found.explained,
+        identified=found,
+    )
+
+
+def detect(
+    arrays: Mapping[str, ArrayLike],
+    arm: OfflineArm,
+    *,
+    model: FittedModel | None = None,
+    fit_s: tuple[float, float] | None = None,
+    velocity_lag_s: float = 0.0,
+    **scheme: Any,
+) -> ArrayDetection:
+    """Run the offline scheme over recorded arrays: fit, test, then look for contacts in all of them.
+
+    arrays: `t` (k,) s, increasing; `q` (k, n) rad; `tau_J` (k, n) Nm, positive along the joint's axis; if there are
+    some `dq` (k, n) rad/s, else derived from q; `touched` (k,) bool, true while somebody touches the arm, left out of
+    the fit. `time`, `qd` and `tau` stand for `t`, `dq` and `tau_J`. All finite, below 1e6; gaps in time part them.
+
+    model: of `fit`, in place of fitting here. fit_s: from when to when, by `t`, the arm moves freely; default: the
+    first 40 %. A touch in it is learnt. velocity_lag_s: by how much dq is older than tau_J, as behind a tracking loop;
+    1.25e-3 of the emulated drives. scheme: `OfflineSettings` by name, such as detection_cutoff_rad_s=20.0,
+    deviations=6.0, noise_Nm=(0.02, 0.02); noise that isn't given is estimated from the arrays.
+
+    Raises ArrayError, a ValueError, for what can't be used, in one line: quantity, value, bound.
+    """
+    given = _taken(arrays, arm, velocity_lag_s)
+    recording, begin_s = given.recording, given.begin_s
+    if model is None:
+        model = _fitted(given, arm, fit_s, scheme)
+    elif fit_s is not None or scheme:
+        raise ArrayError(
+            f"model is given, and so is {'fit_s' if fit_s is not None else next(iter(scheme))}: choose one"
+        )
+    elif model.arm.joints != arm.joints:
+        raise ArrayError(f"model is of {model.arm.joints} joints, the arm has {arm.joints}")
+    found = model.identified
+    period_s = found.settings.period_s
+    if not math.isclose(recording.period_s, period_s, rel_tol=0.05):
+        raise ArrayError(f"t has a period of {recording.period_s:g} s, the model was fitted at {period_s:g} s")
+    watched = watch(found.model, found.settings, found.estimate, found.certificate.lack_Nm, recording)
+    stretches = recording.stretches
+    t_s = [begin_s + each.start_s + recording.period_s * np.arange(len(each.record.q)) for each in stretches]
+    return ArrayDetection(
+        model=model,
+        t_s=np.concatenate(t_s),
+        tau_ext_hat=np.concatenate(watched.tau_ext_hat),
+        threshold=np.concatenate(watched.threshold),
+        contacts=tuple(ArrayContact(begin_s + each.start_s, each.link, each.direction) for each in watched.contacts),
+    )
+
+
+def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
+    """Give arrays by their own names. Raises ArrayError for one that is unknown, missing or given twice."""
+    named: dict[str, ArrayLike] = {}
+    for given, values in arrays.items():
+        name = _ALIASES.get(given, given)
+        if name not in (*_REQUIRED, *_OPTIONAL):
+            near = nearest_name(given, _KNOWN)
+            raise ArrayError(
+                f"unknown array {given!r}; " + (f"did you mean {near!r}?" if near else f"known: {', '.join(_KNOWN)}")
+            )
+        if name in named:
+            raise ArrayError(f"array {name!r} is given twice, once as {given!r}")
+        named[name] = values
+    for name in _REQUIRED:
+        if name not in named:
+            raise ArrayError(f"array {name!r} is missing; there are {', '.join(arrays) or 'none'}")
+    return named
+
+
+def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: float) -> _GivenArrays:
+    """Check arrays and make a recording of them. Raises ArrayError."""
+    named = _named(arrays)
+    t_s = _numbers("t", named["t"])
+    if t_s.ndim != 1 or t_s.size < SHORTEST_SAMPLES:
+        raise ArrayError(f"t has shape {t_s.shape}, (k,) with k ≥ {SHORTEST_SAMPLES} is expected")
+    backward = np.flatnonzero(~(np.diff(t_s) > 0.0))
+    if backward.size:
+        row = int(backward[0]) + 1
+        raise ArrayError(f"t[{row}] = {t_s[row]:.9g} s is not after t[{row - 1}] = {t_s[row - 1]:.9g} s")
+    period_s = float(np.median(np.diff(t_s)))
+    if not SHORTEST_PERIOD_S <= period_s <= LONGEST_PERIOD_S:
+        bounds = f"{SHORTEST_PERIOD_S:g} to {LONGEST_PERIOD_S:g} s are expected"
+        raise ArrayError(f"t has a median period of {period_s:g} s, {bounds}")
+    columns = []
+    for name in ("q", "tau_J", *(("dq",) if "dq" in named else ())):
+        values = _numbers(name, named[name])
+        if values.shape != (t_s.size, arm.joints):
+            raise ArrayError(f"{name} has shape {values.shape}, ({t_s.size}, {arm.joints}) is expected")
+        columns.append(values)
+    if not 0.0 <= velocity_lag_s <= _LONGEST_LAG_S:
+        raise ArrayError(f"velocity_lag_s = {velocity_lag_s:g} s is not within 0 to {_LONGEST_LAG_S:g} s")
+    if "dq" in named and velocity_lag_s:
+        columns[-1] = np.column_stack([np.interp(t_s + velocity_lag_s, t_s, column) for column in columns[-1].T])
+    touched = None
+    if "touched" in named:
+        touched = np.asarray(named["touched"])
+        if touched.shape != t_s.shape or touched.dtype.kind not in "bui":
+            raise ArrayError(f"touched has shape {touched.shape} of {touched.dtype}, ({t_s.size},) of bool is expected")
+        touched = touched.astype(np.bool_)
+    described = _described(arm, "dq" in named, {})
+    try:
+        given = RecordedColumns(t_s, float(t_s[0]), np.hstack(columns), touched, ())
+        recording = recording_of(Path("arrays"), described, given)
+    except LogError as error:
+        raise ArrayError(str(error)) from None
+    return _GivenArrays(recording, float(t_s[0]), "dq" in named)
+
+
+def _numbers(name: str, given: ArrayLike) -> Vector:
+    """Take finite float64 values. Raises ArrayError."""
+    try:
+        values = np.asarray(given)
+        if values.dtype.kind not in "fiu":
+            raise TypeError
+        values = np.ascontiguousarray(values, np.float64)
+    except (TypeError, ValueError):
+        kind = getattr(given, "dtype", type(given).__name__)
+        raise ArrayError(f"{name} is of {kind}, real numbers in {_UNITS[name]} are expected") from None
+    bad = np.argwhere(~(np.abs(values) <= LARGEST)) if name != "t" else np.argwhere(~np.isfinite(values))
+    if len(bad):
+        place = tuple(bad[0].tolist())
+        bound = "finite" if name == "t" else f"at most {LARGEST:g} {_UNITS[name]}"
+        raise ArrayError(f"{name}[{', '.join(map(str, place))}] = {values[place]:g} {_UNITS[name]} is not {bound}")
+    return np.asarray(values, np.float64)
+
+
+def _span(given: _GivenArrays, fit_s: tuple[float, float] | None) -> tuple[float, float]:
+    """Give the stretch of free motion in the recording's time, from 0. Raises ArrayError."""
+    if fit_s is None:
+        last = given.recording.stretches[-1]
+        return 0.0, FIT_SHARE * (last.start_s + len(last.record.q) * given.recording.period_s)
+    try:
+        start_s, end_s = (float(bound) - given.begin_s for bound in fit_s)
+    except (TypeError, ValueError):
+        raise ArrayError(f"fit_s = {fit_s!r} is no pair of times in s") from None
+    if not start_s < end_s:
+        raise ArrayError(f"fit_s = ({fit_s[0]:g}, {fit_s[1]:g}) s ends before it begins")
+    return start_s, end_s
+
+
+def _described(arm: OfflineArm, has_dq: bool, scheme: Mapping[str, Any]) -> RecordingMap:
+    """Describe arrays as a map does a file. Raises ArrayError for a setting of the scheme that can't be."""
+    names = tuple(f"{place}" for place in range(1, arm.joints + 1))
+    plain = {key: list(value) if isinstance(value, tuple | np.ndarray) else value for key, value in scheme.items()}
+    try:
+        parse(OfflineSettings, {"noise_Nm": [1.0] * arm.joints} | plain, "")
+    except ConfigError as error:
+        raise ArrayError(str(error)) from None
+    if len(plain.get("noise_Nm", names)) != arm.joints:
+        raise ArrayError(f"noise_Nm has {len(plain['noise_Nm'])} values, the arm {arm.joints} joints")
+    return RecordingMap(
+        arm=ArmSection(urdf="", has_rotors=arm.has_rotors),
+        columns=ColumnsSection(time="t", q=names, tau_J=names, dq=names if has_dq else ()),
+        units=UnitsSection(),
+        scale=ScaleSection(),
+        csv=CsvSection(),
+        bag=BagSection(),
+        sampling=SamplingSection(),
+        scheme=plain,
+        urdf=arm.serial,
+    )

@@ -1,0 +1,202 @@
+"""A run's log as named numpy arrays, one row per cycle, with its events, contacts and certificates."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.log.log_files import LogError, log_in
+from adacd_hil.log.logged_run import settings_of
+from adacd_hil.log.reader import LoggedContact, LoggedEvent, RunLog, read_log
+from adacd_hil.records import ContactReport, SchemeState, Vector
+from adacd_hil.remedies import install_command, nearest_name
+from adacd_hil.score.metrics import certificates_in
+from adacd_hil.score.wording import number_of
+from adacd_hil.settings.configuration import Settings
+
+if TYPE_CHECKING:
+    import pandas
+    import polars
+
+    from adacd_hil.scheme.identify.certificate import Certificate
+
+_TOPICS: Final = ("/scheme", "/control", "/cycle")
+"""Each has a record per cycle."""
+_READ: Final = (*_TOPICS, "/contact", "/events")
+
+
+class RunEvent(NamedTuple):
+    """An event: when, s since motion start; level: "info", "warning" or "error"."""
+
+    t_s: float
+    level: str
+    name: str
+    message: str
+
+
+class RunContact(NamedTuple):
+    """A contact: when it was detected, s since motion start, and its last report."""
+
+    t_s: float
+    report: ContactReport
+
+    def __repr__(self) -> str:
+        report = self.report
+        what = f"{report.kind.name.lower()} on link {report.link}, {report.level.name.lower()}"
+        return f"<RunContact at {self.t_s:.3f} s: {what}>"
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A run over its n cycles; in a cut log, those that all of its topics have.
+
+    arrays: read-only, by the names that `adacd-hil log info` and `records.py` give them, each (n,) or (n, columns):
+    `q`, `dq` (rad, rad/s), `tau_J`, `tau_ext_hat`, `threshold` (Nm), `theta_hat`, `tau_d`, `tau_c`, `state`,
+    `lateness_ns` and so on, and `t_s`. Times are s since motion start, the first cycle in ADAPT, else since the first
+    cycle. problem: what is missing of the log, "" for a whole one.
+    """
+
+    path: Path
+    arrays: Mapping[str, NDArray[Any]]
+    events: tuple[RunEvent, ...]
+    contacts: tuple[RunContact, ...]
+    metadata: Mapping[str, str]
+    attachments: Mapping[str, bytes]
+    problem: str
+
+    def __repr__(self) -> str:
+        seconds = float(self.t_s[-1] - self.t_s[0]) if len(self) else 0.0
+        found = (number_of(len(self), "cycle"), f"{seconds:.1f} s", number_of(len(self.contacts), "contact"))
+        certified = number_of(len(self.certificates), "certificate")
+        return f"<LoadedRun {self.path}: {', '.join(found)}, {certified}{'; ' + self.problem if self.problem else ''}>"
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Give an array by its name. Raises KeyError that names the nearest."""
+        if name not in self.arrays:
+            near = nearest_name(name, self.arrays)
+            hint = f"did you mean {near!r}?" if near else f"there are {', '.join(self.arrays)}"
+            raise KeyError(f"no array {name!r}; {hint}")
+        return self.arrays[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.arrays)
+
+    def __len__(self) -> int:
+        return self.t_s.size
+
+    @property
+    def t_s(self) -> Vector:
+        """Times of the cycles (n,), s since motion start."""
+        return self.arrays["t_s"]
+
+    @property
+    def state(self) -> NDArray[np.uint8]:
+        """States of the scheme (n,), numbers of `SchemeState`."""
+        return self.arrays["state"]
+
+    @property
+    def motion(self) -> dict[str, Vector]:
+        """What `detect` takes: `t` (n,) s, `q`, `dq`, `tau_J` (n, 2)."""
+        return {"t": self.t_s, **{name: self.arrays[name] for name in ("q", "dq", "tau_J")}}
+
+    @cached_property
+    def certificates(self) -> "tuple[Certificate, ...]":
+        """The certificates that were not taken back, in order; none in a log that lacks its end."""
+        return tuple(certificates_in((event.name, event.message) for event in self.events))
+
+    @property
+    def certificate(self) -> "Certificate | None":
+        """The last certificate."""
+        return self.certificates[-1] if self.certificates else None
+
+    @cached_property
+    def settings(self) -> Settings:
+        """The settings that the run had. Raises LogError where the log lacks them."""
+        return settings_of(self.path, self.attachments)
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Give a column for each number of a cycle: `q_1`, `q_2`; `state` by name."""
+        found: dict[str, NDArray[Any]] = {}
+        for name, values in self.arrays.items():
+            if values.ndim == 1:
+                found[name] = values
+            else:
+                found |= {f"{name}_{place + 1}": values[:, place] for place in range(values.shape[1])}
+        found["state"] = np.array([state.name for state in SchemeState])[self.state]
+        return found
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Make a data frame of `columns`, the index `t_s`. Raises ImportError that says how to install pandas."""
+        try:
+            import pandas
+        except ImportError:
+            raise ImportError(f"to_pandas needs the extra `pandas`: {install_command('pandas')}") from None
+        return pandas.DataFrame(self.columns()).set_index("t_s")
+
+    def to_polars(self) -> "polars.DataFrame":
+        """Make a data frame of `columns`. Raises ImportError that says how to install polars."""
+        try:
+            import polars
+        except ImportError:
+            raise ImportError(f"to_polars needs the extra `polars`: {install_command('polars')}") from None
+        return polars.DataFrame(self.columns())
+
+
+def load(run: str | Path) -> LoadedRun:
+    """Read the log of a run: a folder with run.mcap, or the log's first part; all its parts as one.
+
+    A cut or damaged log is read as far as it is intact, see `problem`. Raises LogError, one line, where nothing can be
+    read or the log has no cycle.
+    """
+    path = log_in(run)
+    log = read_log(path, _READ)
+    arrays = _arrays(log)
+    t_ns = arrays.pop("t_ns")
+    is_moving = np.flatnonzero(arrays["state"] == SchemeState.ADAPT)
+    zero_ns = int(t_ns[is_moving[0] if is_moving.size else 0])
+    arrays = {"t_s": (t_ns - zero_ns) * 1e-9, **arrays}
+    for values in arrays.values():
+        values.flags.writeable = False
+    return LoadedRun(
+        path=path,
+        arrays=arrays,
+        events=tuple(RunEvent((t_ns - zero_ns) * 1e-9, *event) for t_ns, event in _in_order(log.events)),
+        contacts=tuple(_contacts(log.contacts, zero_ns)),
+        metadata=log.metadata,
+        attachments=log.attachments,
+        problem=log.problem,
+    )
+
+
+def _arrays(log: RunLog) -> dict[str, NDArray[Any]]:
+    """Give the fields of all topics of a cycle, in rows of the cycles that all of them have."""
+    if not len(log.scheme):
+        raise LogError(f"log {log.path} has no cycle" + (f": {log.problem}" if log.problem else ""))
+    series = [log.topics[topic] for topic in _TOPICS if len(log.topics[topic])]
+    stamps = [topic.records["publish_time"].astype(np.int64) for topic in series]
+    common = stamps[0]
+    for stamp in stamps[1:]:
+        common = np.intersect1d(common, stamp)
+    arrays: dict[str, NDArray[Any]] = {}
+    for topic, stamp in zip(series, stamps, strict=True):
+        rows = np.searchsorted(stamp, common)
+        arrays |= {"t_ns": topic.t_ns[rows]} if not arrays else {}
+        arrays |= {name: topic[name][rows] for name in topic.fields if name not in arrays}
+    return arrays
+
+
+def _in_order(events: Iterable[LoggedEvent]) -> list[LoggedEvent]:
+    return sorted(events, key=lambda event: event.t_ns)
+
+
+def _contacts(contacts: Iterable[LoggedContact], zero_ns: int) -> Iterator[RunContact]:
+    """Give each contact once: when it was first reported, and its last report."""
+    found: dict[int, RunContact] = {}
+    for t_ns, report in contacts:
+        first = found.get(report.cycle)
+        found[report.cycle] = RunContact((t_ns - zero_ns) * 1e-9 if first is None else first.t_s, report)
+    yield from found.values()

@@ -1,0 +1,112 @@
+"""The admission of viewers to a run: decided by the request that opens a connection, before any data is sent.
+
+A browser sends with every WebSocket the origin of the page that opens it, and lets any page open one to this machine:
+so a page that is not a viewer's must be refused, or a stranger's page could read the run (cross-site WebSocket
+hijacking). A page that reaches this machine by a name of its own (DNS rebinding) also shows itself by the Host that it
+asks for. Programs that are no browsers send no origin; admission does not keep out anybody who can start one on this
+network.
+"""
+
+import ipaddress
+import re
+import socket
+import struct
+from collections.abc import Sequence
+from http import HTTPStatus
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from adacd_hil.lab.live.live_setup import LiveSetup
+
+
+SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+"""Two names of what is the same on the wire: of the viewers since 2025, and of the ones before."""
+OPEN_TIMEOUT_S = 5.0
+SHOWN_DATA, SHOWN_HEAD = 1, struct.Struct("<BIQ")
+"""What a message to a viewer begins with: SHOWN_DATA, number of its subscription, log time in ns."""
+VIEWER_ORIGINS = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "file://")
+"""Foxglove's pages, and `file://`, which the desktop applications of Foxglove and Lichtblick send."""
+_OWN_PAGE = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d{1,5})?")
+"""A page that the viewer's own machine serves, such as Lichtblick's container at http://localhost:8080."""
+_OWN_NAMES = ("localhost", "localhost.localdomain")
+
+
+class ViewerRefusal(NamedTuple):
+    """The reason why a viewer is refused. `notice`: the line for the run's terminal; no word of it is the viewer's."""
+
+    status: HTTPStatus
+    reason: str
+    notice: str
+
+
+_ORIGIN = ViewerRefusal(
+    HTTPStatus.FORBIDDEN,
+    "this web page may not watch the run: allow its origin with --live-origin",
+    "live view: a web page was refused, its origin is none of --live-origin",
+)
+_HOST = ViewerRefusal(
+    HTTPStatus.FORBIDDEN,
+    "this machine has no such name: ask for it by address, or allow the name with --live-name",
+    "live view: a request for another host name was refused; --live-name allows one",
+)
+_PROTOCOL = ViewerRefusal(
+    HTTPStatus.BAD_REQUEST,
+    f"this is a WebSocket server for viewers that speak {' or '.join(SUBPROTOCOLS)}",
+    f"live view: a client was refused that speaks neither {' nor '.join(SUBPROTOCOLS)}",
+)
+FULL = ViewerRefusal(
+    HTTPStatus.SERVICE_UNAVAILABLE,
+    "as many viewers as --live-viewers allows are watching",
+    "live view: a viewer was refused, there are as many as --live-viewers allows",
+)
+NOTICES = tuple(refusal.notice for refusal in (_ORIGIN, _HOST, _PROTOCOL, FULL))
+
+
+def normal_origin(origin: str) -> str:
+    """Return an origin as browsers write it. Raises ValueError for what is none."""
+    found = re.fullmatch(r"([a-z][a-z0-9+.-]*://[^/\s@]*)/?", origin.lower())
+    if not found:
+        raise ValueError(f"{origin!r} is no origin: scheme, host and port, such as https://view.lab.example")
+    return found[1]
+
+
+class Admission:
+    """The rules of one run."""
+
+    def __init__(self, setup: "LiveSetup") -> None:
+        """Take in what `setup` allows beside the viewers' own pages and this machine's own names."""
+        self._origins = {*VIEWER_ORIGINS, *map(normal_origin, setup.origins)}
+        own = socket.gethostname().lower()
+        short = own.partition(".")[0]
+        self._names = {*_OWN_NAMES, own, short, f"{short}.local", *(name.lower() for name in setup.names)}
+
+    def refuse(
+        self, origins: Sequence[str], hosts: Sequence[str], subprotocols: Sequence[str] | None
+    ) -> ViewerRefusal | None:
+        """Judge a request by all values of its headers Origin, Host and Sec-WebSocket-Protocol; None: welcome.
+
+        subprotocols: None of a browser that asks for a page.
+        """
+        if len(hosts) != 1 or not self._is_own_host(hosts[0]):
+            return _HOST
+        if len(origins) > 1 or not all(map(self._is_viewer, origins)):
+            return _ORIGIN
+        if subprotocols is None:
+            return None
+        offered = {name.strip() for line in subprotocols for name in line.split(",")}
+        return None if offered.intersection(SUBPROTOCOLS) else _PROTOCOL
+
+    def _is_viewer(self, origin: str) -> bool:
+        return origin.lower() in self._origins or _OWN_PAGE.fullmatch(origin.lower()) is not None
+
+    def _is_own_host(self, host: str) -> bool:
+        """Whether a Host header, such as `name:port` or `[::1]:port`, is an address, or a name of this machine."""
+        found = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::\d{1,5})?", host)
+        if not found:
+            return False
+        name = (found[1] or found[2]).lower().rstrip(".")
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return name in self._names
+        return True

@@ -1,0 +1,319 @@
+"""The live view's records: from the writer into a ring that a process of its own looks into, and which are shown.
+
+Nothing here waits for that process. Records that find the ring full are not shown; one that is stopped, dead or busy
+with five hundred viewers costs the log nothing. Only the writer's start waits until it listens, or says why it can't.
+
+**Topics**: those of a log, fewer records of them, and three that are drawn from these.
+
+A person watches, and the network may be a radio, so each topic has a rate. The decimator keeps a rate by log time: it
+divides time into slots of 1 / rate, and shows all records of the first cycle in each slot. So frames of one cycle stay
+together, and a topic that comes more seldom than its rate is shown whole.
+
+Encoding (`cdr`), schemas (`ros2msg`) and stamps are those of the file.
+"""
+
+import contextlib
+import json
+import os
+import socket
+import struct
+import subprocess
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.lab.live.live_setup import LiveSetup
+from adacd_hil.lab.live.scene import (
+    DESCRIPTION_TOPIC,
+    SCENE,
+    STRING,
+    TRANSFORMS,
+    TRANSFORMS_TOPIC,
+    Entity,
+    Shape,
+    draw_contact,
+    draw_joints,
+    pack_scene,
+    pack_string,
+    pack_transforms,
+    transforms_of,
+)
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
+from adacd_hil.log.recording import processes
+from adacd_hil.log.recording.processes import WriterSetup, start_module
+from adacd_hil.log.recording.ring import Ring
+from adacd_hil.log.types.message_types import ENCAPSULATION, JOINT_STATE_DTYPE, MessageType
+from adacd_hil.log.types.topics import DECODED, RUN_TOPICS, ChannelId, LogChannel, unpack_contact
+from adacd_hil.log.viewer_layout import SCENE_TOPIC
+from adacd_hil.records import SchemeState
+
+_HEAD = struct.Struct("<Q")
+
+
+class Batch(NamedTuple):
+    """Message records that follow each other, as the writer lays them down for the file.
+
+    records: their bytes (b,) uint8; channels: the file's numbers (n,) uint16; log_ns: log times (n,) int64; ends: where
+    each record ends (n,) int64.
+    """
+
+    records: NDArray[np.uint8]
+    channels: NDArray[np.uint16]
+    log_ns: NDArray[np.int64]
+    ends: NDArray[np.int64]
+
+
+class ServerSetup(NamedTuple):
+    """ids: the file's number of each channel, by ours; start_ns: log time before the first record."""
+
+    setup: WriterSetup
+    ids: dict[int, int]
+    start_ns: int
+
+
+def pack_batch(batch: Batch) -> bytes:
+    """Write a batch: the number of its records, their times, ends and channels, then their bytes."""
+    columns = (batch.log_ns, batch.ends, batch.channels, batch.records)
+    return _HEAD.pack(len(batch.ends)) + b"".join(column.tobytes() for column in columns)
+
+
+def unpack_batch(data: bytes) -> Batch:
+    """Read it; no bytes are copied."""
+    (count,) = _HEAD.unpack_from(data)
+    place = _HEAD.size
+    log_ns = np.frombuffer(data, np.int64, count, place)
+    ends = np.frombuffer(data, np.int64, count, place + 8 * count)
+    channels = np.frombuffer(data, np.uint16, count, place + 16 * count)
+    records = np.frombuffer(data, np.uint8, -1, place + 18 * count)
+    return Batch(records, channels, log_ns, ends)
+
+
+START_TIMEOUT_S = 30.0
+RING_BYTES = 8 * 1024 * 1024
+"""3.8 s of a certified run at 1 kHz: longer than any viewer's request keeps the other process busy."""
+
+
+class LiveFeed:
+    """Records for the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
+
+    def __init__(self, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> None:
+        """Start the process, and wait until it listens where `setup.live` says. Raises LogError.
+
+        ids: the file's number of each channel, by ours. start_ns: log time before the first record.
+        """
+        self.hidden = 0
+        self._is_watched = False
+        assert isinstance(setup.live, LiveSetup)
+        place = f"{setup.live.host}:{setup.live.port}"
+        told = ServerSetup(replace(setup, attachments={}, metadata={}), ids, start_ns)
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._ring = Ring(RING_BYTES)
+            descriptors = (theirs.fileno(), self._ring.descriptor)
+            # Whatever its libraries might say of what a viewer sent stays away from the run's terminal.
+            notices = os.dup(2)
+            try:
+                self.process = start_module(
+                    "adacd_hil.lab.live.server", (*descriptors, notices), told, subprocess.DEVNULL
+                )
+            finally:
+                os.close(notices)
+        except OSError as error:
+            self._socket.close()
+            raise LogError(f"the live view can't start: {error}") from None
+        finally:
+            theirs.close()
+        word = self._hear()
+        if word["error"]:
+            self.process.kill()
+            self.process.wait()
+            self._release()
+            raise LogError(f"the live view can't listen on {place}: {word['error']}")
+        self.url = word["url"]
+        self._socket.setblocking(False)
+
+    def _hear(self) -> dict[str, str]:
+        self._socket.settimeout(START_TIMEOUT_S)
+        try:
+            received = self._socket.recv(processes.MOST_BYTES)
+        except OSError:
+            received = b""
+        word: dict[str, str] = json.loads(received) if received else {"error": "it did not start"}
+        return word
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody is there to see what is shown."""
+        with contextlib.suppress(BlockingIOError, ConnectionResetError):
+            while word := self._socket.recv(processes.MOST_BYTES):
+                self._is_watched = word == processes.WATCHED
+            self._is_watched = False  # nobody is left
+        return self._is_watched
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes that the other side has not taken yet."""
+        return self._ring.waiting
+
+    def show(
+        self,
+        records: NDArray[np.uint8],
+        channels: NDArray[np.uint16],
+        log_ns: NDArray[np.int64],
+        ends: NDArray[np.int64],
+    ) -> None:
+        """Hand over message records that follow each other, of which the other side shows some; see Batch."""
+        if not len(ends) or not self.is_watched:
+            return
+        if not self._ring.put(pack_batch(Batch(records, channels, log_ns, ends))):
+            self.hidden += 1
+            return
+        self._say(processes.WAKE)
+
+    def _say(self, word: bytes) -> None:
+        with contextlib.suppress(OSError):  # it has words that it hasn't heard yet, or is dead
+            self._socket.send(word)
+
+    def close(self) -> None:
+        """Let it send what it has, and end, in its own time."""
+        self._say(processes.END)
+        self._release()
+
+    def _release(self) -> None:
+        self._socket.close()
+        self._ring.close()
+
+
+RATES_HZ = {TRANSFORMS_TOPIC: 50, SCENE_TOPIC: 10, **{topic.name: topic.rate_Hz for topic in RUN_TOPICS}}
+DECODED_RATE_HZ = 10
+EVERY_RECORD = 0
+"""The rate of topics that have none, as /events, /contact and /frame_checks."""
+
+
+def rate_of(topic: str) -> int:
+    """Return the rate of a topic, Hz; EVERY_RECORD: it is shown whole."""
+    return DECODED_RATE_HZ if topic.startswith(DECODED) else RATES_HZ.get(topic, EVERY_RECORD)
+
+
+class Decimator:
+    """Chooses the records of one topic that are shown."""
+
+    def __init__(self, rate_Hz: int) -> None:
+        self._slot_ns = 1_000_000_000 // rate_Hz if rate_Hz else 0
+        self._slot = -1
+        self._first_ns = -1  # the first cycle of the slot
+
+    def choose(self, cycles_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Say which of the next records are shown (n,), by the times of their cycles, which never run backwards."""
+        if not self._slot_ns or not len(cycles_ns):
+            return np.ones(len(cycles_ns), np.bool_)
+        slots = cycles_ns // self._slot_ns
+        begins = np.diff(slots, prepend=self._slot) != 0
+        latest = np.maximum.accumulate(np.where(begins, np.arange(len(slots)), -1))
+        firsts_ns = np.where(latest < 0, self._first_ns, cycles_ns[latest])
+        self._slot, self._first_ns = int(slots[-1]), int(firsts_ns[-1])
+        return np.asarray(cycles_ns == firsts_ns)
+
+
+_PUBLISH_TIME = slice(MESSAGE_HEAD - 8, MESSAGE_HEAD)
+_BODY = len(ENCAPSULATION) + 8
+"""Where a body begins in a payload, bytes: after the stamp."""
+
+
+class Shown(NamedTuple):
+    """A message for those who have subscribed to its topic."""
+
+    channel: int
+    log_ns: int
+    payload: bytes
+
+
+class LiveTopics:
+    """The topics that are served. `latest_ns`: log time of the latest record; before the first, of the beginning."""
+
+    def __init__(self, setup: LiveSetup, channels: Iterable[LogChannel], ids: dict[int, int], start_ns: int) -> None:
+        """`ids`: the file's number of each channel, by ours. `start_ns`: log time before the first record."""
+        channels = tuple(channels)
+        self.latest_ns = start_ns
+        self._shape = Shape(setup.link_length_m, setup.tilt_rad, setup.level_rad)
+        self._decimators = {ids[channel.id]: Decimator(rate_of(channel.topic)) for channel in channels}
+        self._scene_decimator = Decimator(rate_of(SCENE_TOPIC))
+        self._joint_states, self._scheme, self._contact = (
+            ids.get(channel) for channel in (ChannelId.JOINT_STATES, ChannelId.SCHEME, ChannelId.CONTACT)
+        )
+        self._scheme_dtype = next(channel.type.dtype for channel in channels if channel.id == ChannelId.SCHEME)
+        free = 1 + max(ids.values())
+        self.transforms, self.scene, self.robot = free, free + 1, free + 2
+        """Numbers of the topics that only the live view has."""
+        types = {ids[channel.id]: (channel.topic, channel.type) for channel in channels}
+        types[self.transforms] = (TRANSFORMS_TOPIC, TRANSFORMS)
+        types[self.scene] = (SCENE_TOPIC, SCENE)
+        types[self.robot] = (DESCRIPTION_TOPIC, STRING)
+        self.advertised = [_advertise(number, *named) for number, named in types.items()]
+        """As the protocol describes channels."""
+        self._description = pack_string(setup.robot_description)
+
+    def description(self) -> Shown:
+        """Return the arm's description, for somebody who has just asked for it."""
+        return Shown(self.robot, self.latest_ns, self._description)
+
+    def choose(self, batch: Batch, wanted: Collection[int]) -> Iterator[Shown]:
+        """Give what is shown of a batch, in its order, on the channels that somebody wants."""
+        if not len(batch.ends):
+            return
+        self.latest_ns = max(self.latest_ns, int(batch.log_ns.max()))
+        starts = np.concatenate(([0], batch.ends[:-1]))
+        is_shown = np.zeros(len(batch.ends), np.bool_)
+        for channel in self._sources(wanted):
+            places = np.flatnonzero(batch.channels == channel)
+            at = starts[places][:, np.newaxis] + np.arange(MESSAGE_HEAD)[_PUBLISH_TIME]
+            is_shown[places] = self._decimators[channel].choose(batch.records[at].view(np.int64)[:, 0])
+        for place in np.flatnonzero(is_shown).tolist():
+            payload = batch.records[starts[place] + MESSAGE_HEAD : batch.ends[place]].tobytes()
+            shown = Shown(int(batch.channels[place]), int(batch.log_ns[place]), payload)
+            if shown.channel in wanted:
+                yield shown
+            with contextlib.suppress(ValueError, IndexError, struct.error):  # a record without sense isn't drawn
+                yield from self._drawn_from(shown, wanted)
+
+    def _sources(self, wanted: Collection[int]) -> set[int]:
+        """Return the file's channels that are wanted, or that something wanted is drawn from."""
+        sources = set(wanted)
+        if self.transforms in sources:
+            sources.add(self._joint_states or 0)
+        if self.scene in sources:
+            sources |= {self._scheme or 0, self._contact or 0}
+        return sources & self._decimators.keys()
+
+    def _drawn_from(self, shown: Shown, wanted: Collection[int]) -> Iterator[Shown]:
+        channel, log_ns, payload = shown
+        if channel == self._joint_states and self.transforms in wanted:
+            q = np.frombuffer(payload, JOINT_STATE_DTYPE)[0]["q"]
+            yield Shown(self.transforms, log_ns, pack_transforms(log_ns, transforms_of(self._shape, q)))
+        elif channel == self._contact and self.scene in wanted:
+            yield self._draw(log_ns, draw_contact(self._shape, unpack_contact(payload[_BODY:])))
+        elif channel == self._scheme and self.scene in wanted and self._is_scene_due(log_ns):
+            record = np.frombuffer(payload, self._scheme_dtype)[0]
+            state = SchemeState(int(record["state"]))
+            yield self._draw(log_ns, *draw_joints(state, record["tau_ext_hat"], record["threshold"]))
+
+    def _is_scene_due(self, log_ns: int) -> bool:
+        return bool(self._scene_decimator.choose(np.array([log_ns]))[0])
+
+    def _draw(self, log_ns: int, *entities: Entity) -> Shown:
+        return Shown(self.scene, log_ns, pack_scene(log_ns, entities))
+
+
+def _advertise(number: int, topic: str, message_type: MessageType) -> dict[str, Any]:
+    return {
+        "id": number,
+        "topic": topic,
+        "encoding": "cdr",
+        "schemaName": message_type.name,
+        "schema": message_type.text,
+        "schemaEncoding": "ros2msg",
+    }

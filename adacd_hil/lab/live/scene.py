@@ -1,0 +1,251 @@
+"""The arm and its contacts as viewers draw them in 3-D: TFMessage, SceneUpdate, and their types.
+
+Unlike the log's types these hold lists and texts of any length, so a payload is put together field by field. Of a
+scene's primitives only arrows, spheres and texts are filled; lists of the others are empty, as the type demands.
+"""
+
+import math
+import struct
+from typing import NamedTuple
+
+from adacd_hil.log.robot_description import BASE, LINK_NAMES, TIP, WORLD
+from adacd_hil.log.types.message_types import ENCAPSULATION, MessageType, foreign_type
+from adacd_hil.records import JOINT_NAMES, ContactLevel, ContactReport, Location, SchemeState, Vector
+
+TRANSFORMS_TOPIC, DESCRIPTION_TOPIC = "/tf", "/robot_description"
+"""Topics that only the live view has; the last is sent to whoever subscribes, once."""
+Point = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Color = tuple[float, float, float, float]
+"""Red, green, blue, opacity, each 0 to 1."""
+UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+STRING = MessageType("std_msgs/msg/String", "string data\n")
+TRANSFORMS = foreign_type("tf2_msgs/msg/TFMessage")
+SCENE = foreign_type("foxglove_msgs/msg/SceneUpdate")
+
+
+class Transform(NamedTuple):
+    """Where the frame `child` is in the frame `parent`."""
+
+    parent: str
+    child: str
+    translation: Point
+    rotation: Quaternion
+
+
+class Arrow(NamedTuple):
+    """An arrow from `tail`, along +x before it is rotated; lengths in m."""
+
+    tail: Point
+    rotation: Quaternion
+    length_m: float
+    color: Color
+
+
+class Sphere(NamedTuple):
+    """A sphere."""
+
+    centre: Point
+    diameter_m: float
+    color: Color
+
+
+class Label(NamedTuple):
+    """A text that faces who looks."""
+
+    centre: Point
+    text: str
+    height_m: float
+    color: Color
+
+
+class Entity(NamedTuple):
+    """What moves with one frame; it replaces the entity of the same name. `lifetime_ns` 0: until then."""
+
+    name: str
+    frame: str
+    arrows: tuple[Arrow, ...] = ()
+    spheres: tuple[Sphere, ...] = ()
+    labels: tuple[Label, ...] = ()
+    lifetime_ns: int = 0
+
+
+class _Payload:
+    """A `cdr` payload in the making."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+
+    def put(self, code: str, *values: float) -> None:
+        """Add numbers of one kind, each aligned to its size."""
+        size = struct.calcsize(code)
+        self._data += bytes(-len(self._data) % size)
+        self._data += struct.pack(f"<{len(values)}{code}", *values)
+
+    def time(self, t_ns: int) -> None:
+        """Add a time or a duration."""
+        self.put("I", *divmod(t_ns, 1_000_000_000))
+
+    def text(self, text: str) -> None:
+        """Add a string."""
+        encoded = text.encode() + b"\0"
+        self.put("I", len(encoded))
+        self._data += encoded
+
+    def bytes(self) -> bytes:
+        """Return the payload."""
+        return ENCAPSULATION + bytes(self._data)
+
+
+def pack_string(text: str) -> bytes:
+    """Pack a String."""
+    payload = _Payload()
+    payload.text(text)
+    return payload.bytes()
+
+
+def pack_transforms(time_ns: int, transforms: tuple[Transform, ...]) -> bytes:
+    """Pack a TFMessage; `time_ns` is that of the log."""
+    payload = _Payload()
+    payload.put("I", len(transforms))
+    for transform in transforms:
+        payload.time(time_ns)
+        payload.text(transform.parent)
+        payload.text(transform.child)
+        payload.put("d", *transform.translation, *transform.rotation)
+    return payload.bytes()
+
+
+def pack_scene(time_ns: int, entities: tuple[Entity, ...]) -> bytes:
+    """Pack a SceneUpdate that adds or replaces `entities`; `time_ns` is that of the log."""
+    payload = _Payload()
+    payload.put("I", 0, len(entities))  # no deletions
+    for entity in entities:
+        payload.time(time_ns)
+        payload.text(entity.frame)
+        payload.text(entity.name)
+        payload.time(entity.lifetime_ns)
+        payload.put("?", True)  # moves with its frame
+        payload.put("I", 0, len(entity.arrows))  # no metadata
+        for arrow in entity.arrows:
+            head_m = min(0.4 * arrow.length_m, 0.04)
+            sizes_m = arrow.length_m - head_m, 0.012, head_m, 0.03
+            payload.put("d", *arrow.tail, *arrow.rotation, *sizes_m, *arrow.color)
+        payload.put("I", 0, len(entity.spheres))  # no cubes
+        for sphere in entity.spheres:
+            payload.put("d", *sphere.centre, *UPRIGHT, *[sphere.diameter_m] * 3, *sphere.color)
+        payload.put("I", 0, 0, 0, len(entity.labels))  # no cylinders, lines, triangles
+        for label in entity.labels:
+            payload.put("d", *label.centre, *UPRIGHT)
+            payload.put("?", True)
+            payload.put("d", label.height_m)
+            payload.put("?", False)
+            payload.put("d", *label.color)
+            payload.text(label.text)
+        payload.put("I", 0)  # no models
+    return payload.bytes()
+
+
+ARROW_M_PER_N = 0.01
+LONGEST_ARROW_M = 0.6
+ARROW_LIFETIME_NS = 2_000_000_000
+SMALLEST_SPHERE_M, LARGEST_SPHERE_M = 0.08, 0.16
+NEAR = 0.5
+"""Share of the threshold from which a joint is yellow."""
+GREY: Color = (0.6, 0.6, 0.6, 0.5)
+GREEN: Color = (0.2, 0.7, 0.3, 0.6)
+YELLOW: Color = (0.95, 0.75, 0.1, 0.7)
+RED: Color = (0.85, 0.15, 0.15, 0.8)
+INK: Color = (0.3, 0.3, 0.3, 1.0)
+_LABEL_HEIGHT_M = 0.04
+_ABOVE_M = 0.16
+
+
+class Shape(NamedTuple):
+    """The arm as it is drawn: tilt of its plane of motion, and the q1 at which link 1 is level, rad."""
+
+    link_length_m: tuple[float, float]
+    tilt_rad: float = 0.0
+    level_rad: float = 0.0
+
+
+def about_z(angle_rad: float) -> Quaternion:
+    """Return the rotation by an angle about z."""
+    return (0.0, 0.0, math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad))
+
+
+def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
+    """Place all frames of the robot description for the joint positions q (2,)."""
+    half_rad = 0.5 * shape.tilt_rad
+    origin = (0.0, 0.0, 0.0)
+    elbow, end = ((length_m, 0.0, 0.0) for length_m in shape.link_length_m)
+    return (
+        Transform(WORLD, BASE, origin, (math.sin(half_rad), 0.0, 0.0, math.cos(half_rad))),
+        Transform(BASE, LINK_NAMES[0], origin, about_z(q[0] - shape.level_rad)),
+        Transform(LINK_NAMES[0], LINK_NAMES[1], elbow, about_z(q[1])),
+        Transform(LINK_NAMES[1], TIP, end, UPRIGHT),
+    )
+
+
+def share_of_threshold(tau_ext_hat: float, threshold: float) -> float:
+    """Return |residual| / threshold; NaN while detection is off."""
+    return abs(tau_ext_hat) / threshold if 0.0 < threshold < math.inf else math.nan
+
+
+def draw_joints(state: SchemeState, tau_ext_hat: Vector, threshold: Vector) -> tuple[Entity, ...]:
+    """Draw both joints and the state; tau_ext_hat, threshold (2,), Nm."""
+    entities = []
+    for index, link in enumerate(LINK_NAMES):
+        share = share_of_threshold(float(tau_ext_hat[index]), float(threshold[index]))
+        sphere = Sphere((0.0, 0.0, 0.0), _diameter_m(share), _color(share))
+        label = Label((0.0, 0.0, 0.5 * _ABOVE_M), _joint_text(float(tau_ext_hat[index]), share), _LABEL_HEIGHT_M, INK)
+        entities.append(Entity(JOINT_NAMES[index], link, spheres=(sphere,), labels=(label,)))
+    label = Label((0.0, 0.0, _ABOVE_M), state.name, 1.5 * _LABEL_HEIGHT_M, INK)
+    return (*entities, Entity("state", BASE, labels=(label,)))
+
+
+def draw_contact(shape: Shape, report: ContactReport) -> Entity:
+    """Draw the force of a report: on link 2 where its place is known, else at the end of the link that was touched."""
+    on_link_2 = report.link == 2
+    length_m = shape.link_length_m[report.link - 1]
+    place_m = min(max(report.lever_m, 0.0), length_m) if on_link_2 and report.location is Location.KNOWN else length_m
+    force_N, is_measured = _force(shape, report)
+    arrow_m = min(max(abs(force_N) * ARROW_M_PER_N, 0.05), LONGEST_ARROW_M)
+    side = -1.0 if force_N > 0.0 else 1.0  # a force toward +y comes from the side of -y
+    tail: Point = (place_m, side * arrow_m, 0.0)
+    color = RED if report.level is ContactLevel.COLLISION else YELLOW
+    sign = "" if is_measured else "≥ "
+    text = f"{report.level.name} link {report.link}: {sign}{abs(force_N):.1f} N"
+    if on_link_2 and report.location is Location.KNOWN:
+        text += f" at {report.lever_m:.2f} m"
+    arrow = Arrow(tail, about_z(-side * 0.5 * math.pi), arrow_m, color)
+    label = Label((place_m, side * (arrow_m + 0.03), 0.5 * _ABOVE_M), text, _LABEL_HEIGHT_M, INK)
+    return Entity("contact", LINK_NAMES[report.link - 1], (arrow,), labels=(label,), lifetime_ns=ARROW_LIFETIME_NS)
+
+
+def _force(shape: Shape, report: ContactReport) -> tuple[float, bool]:
+    """Return the force across the link, N, and whether it is that rather than the smallest with this torque."""
+    if report.location is Location.NOT_SOUGHT:
+        torque = report.tau_ext_peak[report.link - 1]
+        return torque / shape.link_length_m[report.link - 1], False
+    return report.force_N, report.location is Location.KNOWN
+
+
+def _diameter_m(share: float) -> float:
+    if math.isnan(share):
+        return SMALLEST_SPHERE_M
+    return SMALLEST_SPHERE_M + min(share, 1.0) * (LARGEST_SPHERE_M - SMALLEST_SPHERE_M)
+
+
+def _color(share: float) -> Color:
+    if math.isnan(share):
+        return GREY
+    if share < NEAR:
+        return GREEN
+    return YELLOW if share < 1.0 else RED
+
+
+def _joint_text(tau_ext_hat: float, share: float) -> str:
+    return f"{tau_ext_hat:+.3f} Nm" + ("" if math.isnan(share) else f", {100.0 * share:.0f} %")

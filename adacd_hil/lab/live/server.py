@@ -1,0 +1,423 @@
+"""The process of the live view: batches from the writer in, the Foxglove WebSocket protocol out. Run by LiveFeed.
+
+Server to viewer, JSON: serverInfo, advertise, status. Binary, little endian: 1, subscription (uint32), log time in ns
+(uint64), payload; and 2, time (uint64), since the capability `time` is offered: log time, which never runs backwards.
+Viewer to server: subscribe, unsubscribe; whatever else is answered with one warning and changes nothing.
+
+A viewer that reads slowly loses its oldest messages; one that answers no ping for some 40 s is closed. The number of
+viewers is limited, and so is the number of connections that are still opening. The server never logs or prints data
+that a viewer sends: the run's terminal gets a fixed line of each kind of refusal, once.
+
+It runs with lower priority than the writer, and ends with it.
+"""
+
+import asyncio
+import contextlib
+import html
+import json
+import logging
+import os
+import secrets
+import socket
+import struct
+import sys
+from collections import defaultdict, deque
+from collections.abc import Mapping
+from http import HTTPStatus
+from pathlib import Path
+from string import Template
+from typing import Any, cast
+
+from websockets.asyncio.connection import Connection
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from adacd_hil.lab.live.admission import (
+    FULL,
+    OPEN_TIMEOUT_S,
+    SHOWN_DATA,
+    SHOWN_HEAD,
+    SUBPROTOCOLS,
+    Admission,
+    ViewerRefusal,
+)
+from adacd_hil.lab.live.feed import LiveTopics, ServerSetup, Shown, unpack_batch
+from adacd_hil.lab.live.live_setup import LiveSetup
+from adacd_hil.log.recording import processes
+from adacd_hil.log.recording.processes import read_setup
+from adacd_hil.log.recording.ring import RingReader, split
+
+NICENESS = 5
+BACKLOG = 1024
+"""Messages that are kept for a viewer which is slow."""
+BACKLOG_BYTES = 4 * 1024 * 1024
+OPENING = 64
+"""Connections beyond the viewers, such as those that are still opening; further ones are dropped at once."""
+PING_S = 20.0
+LINGER_S = 1.0
+"""How long it outlives the log at most: for what it still has to send."""
+_MOST_REQUEST_BYTES = 64 * 1024
+_SUBSCRIPTIONS_PER_TOPIC = 4
+_AT_ONCE_BYTES = 256 * 1024
+_TIME = struct.Struct("<BQ")
+_TIME_DATA = 2
+_TIME_STEP_NS = 10_000_000
+"""Time is sent again after so much of it: viewers stamp what they receive with the latest."""
+_WARNING, _ERROR = 1, 2
+_POLICY_VIOLATION = 1008
+
+Data = str | bytes
+
+
+class Viewer:
+    """A connection, what it has subscribed to, and what waits for it."""
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self.subscriptions: dict[int, int] = {}
+        """Channel of each subscription, by the numbers that the viewer has given them."""
+        self.by_channel: dict[int, list[int]] = defaultdict(list)
+        self._connection = connection
+        self._waiting: deque[Data] = deque()
+        self._waiting_bytes = 0
+        self._has_some = asyncio.Event()
+        self._is_warned = False
+
+    def put(self, data: Data) -> None:
+        """Let something wait, in place of the oldest where too much does."""
+        self._waiting.append(data)
+        self._waiting_bytes += len(data)
+        while len(self._waiting) > BACKLOG or self._waiting_bytes > BACKLOG_BYTES:
+            self._waiting_bytes -= len(self._waiting.popleft())
+        self._has_some.set()
+
+    def put_message(self, shown: Shown) -> None:
+        """Let a message wait, once for each subscription to it."""
+        for number in self.by_channel.get(shown.channel, ()):
+            self.put(_message(number, shown))
+
+    def warn_once(self, text: str) -> None:
+        """Say what it asks for in vain."""
+        if not self._is_warned:
+            self._is_warned = True
+            self.put(_status(_WARNING, text))
+
+    @property
+    def is_served(self) -> bool:
+        """Whether nothing waits."""
+        return not self._waiting
+
+    async def send_all(self) -> None:
+        """Send what waits, for ever."""
+        while True:
+            await self._has_some.wait()
+            self._has_some.clear()
+            while self._waiting:
+                data = self._waiting.popleft()
+                self._waiting_bytes -= len(data)
+                await self._connection.send(data)
+
+
+class LiveServer:
+    """Serves the batches of a ring, as long as the writer is there."""
+
+    def __init__(self, setup: LiveSetup, topics: LiveTopics, ring: RingReader, writer: socket.socket) -> None:
+        self._setup = setup
+        self._topics = topics
+        self._known = {channel["id"] for channel in topics.advertised}
+        self._ring = ring
+        self._writer = writer
+        self._admission = Admission(setup)
+        self._viewers: set[Viewer] = set()
+        self._connections: set[Connection] = set()
+        self._admitted: set[Connection] = set()
+        self._is_over = asyncio.Event()
+        self._is_watched = False
+        self._time_ns = topics.latest_ns
+        self._noticed: set[str] = set()
+        self._session = secrets.token_hex(8)
+        self._notices: int | None = None
+
+    async def run(self, listening: socket.socket, notices: int | None = None) -> None:
+        """Serve until the writer says that it is over, or is gone. `notices`: descriptor of the run's terminal."""
+        self._notices = notices
+        loop = asyncio.get_running_loop()
+        server = await serve(
+            self._attend,
+            sock=listening,
+            compression=None,  # the viewer is near, and memory is bounded without it
+            process_request=self._judge,
+            subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
+            server_header=None,
+            open_timeout=OPEN_TIMEOUT_S,
+            ping_interval=PING_S,
+            ping_timeout=PING_S,
+            close_timeout=LINGER_S,
+            max_size=_MOST_REQUEST_BYTES,
+            logger=_no_logger(),
+            create_connection=cast(Any, self._counted),  # which may be any factory
+        )
+        self._writer.setblocking(False)
+        loop.add_reader(self._writer, self._hear)
+        await self._is_over.wait()
+        loop.remove_reader(self._writer)
+        await self._end(server)
+
+    # -- the writer -----------------------------------------------------------------------------------------------
+
+    def _hear(self) -> None:
+        """Take the writer's words; whatever they are, look into the ring."""
+        word: bytes | None = None
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                try:
+                    word = self._writer.recv(processes.MOST_BYTES)
+                except ConnectionResetError:
+                    word = processes.NOTHING
+                if word in (processes.END, processes.NOTHING):
+                    self._is_over.set()
+                    break
+        self._show_some()
+
+    def _show_some(self) -> None:
+        """Show a part of what waits in the ring; the rest after the viewers had their turn."""
+        data = self._ring.take(_AT_ONCE_BYTES)
+        for start, size in zip(*(numbers.tolist() for numbers in split(data)), strict=True):
+            self._show(data[start : start + size])
+        if self._ring.waiting:
+            asyncio.get_running_loop().call_soon(self._show_some)
+
+    def _show(self, data: bytes) -> None:
+        wanted = {channel for viewer in self._viewers for channel in viewer.by_channel}
+        for shown in self._topics.choose(unpack_batch(data), wanted):
+            self._tell_time(shown.log_ns)
+            for viewer in self._viewers:
+                viewer.put_message(shown)
+        self._tell_time(self._topics.latest_ns)
+
+    def _tell_time(self, log_ns: int) -> None:
+        if log_ns - self._time_ns >= _TIME_STEP_NS:
+            self._time_ns = log_ns
+            for viewer in self._viewers:
+                viewer.put(_TIME.pack(_TIME_DATA, log_ns))
+
+    def _tell_writer(self) -> None:
+        """Say whether somebody has subscribed to something, where that has changed."""
+        is_watched = any(viewer.subscriptions for viewer in self._viewers)
+        if is_watched != self._is_watched:
+            self._is_watched = is_watched
+            with contextlib.suppress(OSError):  # it is gone, which _hear will notice
+                self._writer.send(processes.WATCHED if is_watched else processes.ALONE)
+
+    # -- viewers --------------------------------------------------------------------------------------------------
+
+    def _counted(self, *given: Any, **named: Any) -> ServerConnection:
+        """Make a connection that is counted from its first byte to its last."""
+        return _CountedConnection(
+            self._connections, self._admitted, self._setup.most_viewers + OPENING, *given, **named
+        )
+
+    def _judge(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer a request that is refused, with the reason, and a browser with a page; None: it may go on."""
+        headers = request.headers
+        origins, hosts, protocols = (headers.get_all(name) for name in ("Origin", "Host", "Sec-WebSocket-Protocol"))
+        is_page = not headers.get_all("Upgrade")
+        refusal = self._admission.refuse(origins, hosts, None if is_page else protocols)
+        if refusal is None and is_page:
+            return _page(connection, hosts[0])
+        if refusal is None and len(self._admitted) >= self._setup.most_viewers:
+            refusal = FULL
+        if refusal is None:
+            self._admitted.add(connection)
+            return None
+        self._notice(refusal)
+        return connection.respond(refusal.status, refusal.reason + "\n")
+
+    def _notice(self, refusal: ViewerRefusal) -> None:
+        if self._notices is not None and refusal.notice not in self._noticed:
+            self._noticed.add(refusal.notice)
+            with contextlib.suppress(OSError):
+                os.write(self._notices, f"{refusal.notice}\n".encode())
+
+    async def _attend(self, connection: ServerConnection) -> None:
+        """Serve one viewer as long as it is there."""
+        viewer = Viewer(connection)
+        viewer.put(json.dumps(self._describe()))
+        viewer.put(json.dumps({"op": "advertise", "channels": self._topics.advertised}))
+        viewer.put(_TIME.pack(_TIME_DATA, self._time_ns))
+        self._viewers.add(viewer)
+        sending = asyncio.create_task(viewer.send_all())
+        try:
+            async for data in connection:
+                if not self._obey(viewer, data):
+                    await connection.close(_POLICY_VIOLATION, "more subscriptions than topics")
+        except ConnectionClosed:
+            pass
+        finally:
+            self._viewers.discard(viewer)
+            self._tell_writer()
+            sending.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
+                await sending
+
+    def _describe(self) -> Mapping[str, Any]:
+        return {
+            "op": "serverInfo",
+            "name": "adacd-hil",
+            "capabilities": ["time"],
+            "supportedEncodings": [],
+            "metadata": {},
+            "sessionId": self._session,
+        }
+
+    def _obey(self, viewer: Viewer, data: Data) -> bool:
+        """Do what a viewer asks; False when it asks for too much."""
+        try:
+            word = json.loads(data) if isinstance(data, str) else {}
+            op = word.get("op") if isinstance(word, dict) else None
+            if op == "subscribe":
+                return self._subscribe(
+                    viewer, [(int(row["id"]), int(row["channelId"])) for row in word["subscriptions"]]
+                )
+            if op == "unsubscribe":
+                self._unsubscribe(viewer, [int(number) for number in word["subscriptionIds"]])
+                return True
+            viewer.warn_once("this run can only be watched: it takes subscriptions, and nothing else")
+        except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
+            viewer.put(_status(_ERROR, "this request makes no sense"))
+        return True
+
+    def _subscribe(self, viewer: Viewer, asked: list[tuple[int, int]]) -> bool:
+        for number, channel in asked:
+            if len(viewer.subscriptions) >= _SUBSCRIPTIONS_PER_TOPIC * len(self._topics.advertised):
+                return False
+            if channel not in self._known or number in viewer.subscriptions or not 0 <= number < 2**32:
+                viewer.put(_status(_ERROR, "a subscription to no topic, or with a number that is taken"))
+                continue
+            viewer.subscriptions[number] = channel
+            viewer.by_channel[channel].append(number)
+            self._tell_writer()
+            if channel == self._topics.robot:
+                viewer.put(_message(number, self._topics.description()))
+        return True
+
+    def _unsubscribe(self, viewer: Viewer, numbers: list[int]) -> None:
+        for number in numbers:
+            channel = viewer.subscriptions.pop(number, None)
+            if channel is not None:
+                viewer.by_channel[channel].remove(number)
+                if not viewer.by_channel[channel]:
+                    del viewer.by_channel[channel]
+        self._tell_writer()
+
+    async def _end(self, server: Server) -> None:
+        """Listen no more; send what is left, for a moment, and part."""
+        for listening in server.sockets:  # before it closes: asyncio drops, unclosed, whom it accepts while it does
+            asyncio.get_running_loop().remove_reader(listening)
+        server.close(close_connections=False)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LINGER_S):
+                while self._ring.waiting or not all(viewer.is_served for viewer in self._viewers):
+                    await asyncio.sleep(0.01)  # the ring and each viewer empty at their own pace
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LINGER_S):
+                await asyncio.gather(*(each.close(1001, "the run is over") for each in list(server.connections)))
+
+
+class _CountedConnection(ServerConnection):
+    """A connection that stands in two sets while it lasts: of all, and of those that were admitted."""
+
+    def __init__(
+        self, present: set[Connection], admitted: set[Connection], most: int, *given: Any, **named: Any
+    ) -> None:
+        super().__init__(*given, **named)
+        self._present, self._admitted, self._most = present, admitted, most
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._present.add(self)
+        if len(self._present) > self._most:
+            self.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._present.discard(self)
+        self._admitted.discard(self)
+        super().connection_lost(exc)
+
+
+def _message(subscription: int, shown: Shown) -> bytes:
+    return SHOWN_HEAD.pack(SHOWN_DATA, subscription, shown.log_ns) + shown.payload
+
+
+def _status(level: int, text: str) -> str:
+    return json.dumps({"op": "status", "level": level, "message": text})
+
+
+def _page(connection: ServerConnection, host: str) -> Response:
+    """Tell a browser what connects here; `host` is what it asked for, and was admitted."""
+    page = Template(_PAGE.read_text(encoding="utf-8")).substitute(url=f"ws://{html.escape(host)}")
+    response = connection.respond(HTTPStatus.OK, page)
+    del response.headers["Content-Type"]  # headers may be there twice
+    response.headers.update(_PAGE_HEADERS)
+    return response
+
+
+_PAGE_HEADERS = {
+    "Content-Type": "text/html; charset=utf-8",
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'",
+    "X-Content-Type-Options": "nosniff",
+}
+_PAGE = Path(__file__).with_name("live_page.html")
+
+
+def _no_logger() -> logging.Logger:
+    """Return one that formats nothing: what strangers send can be much."""
+    logger = logging.getLogger("adacd_hil.live")
+    logger.disabled = True
+    return logger
+
+
+def listen(setup: LiveSetup) -> socket.socket:
+    """Open the listening socket: the first address that the host stands for. Raises OSError."""
+    family, _, _, _, address = socket.getaddrinfo(setup.host, setup.port, type=socket.SOCK_STREAM)[0]
+    return socket.create_server(address[:2], family=family, backlog=128)
+
+
+def url_of(setup: LiveSetup, listening: socket.socket) -> str:
+    """Say where viewers find it."""
+    host = f"[{setup.host}]" if ":" in setup.host else setup.host
+    return f"ws://{host}:{listening.getsockname()[1]}"
+
+
+def make_server(told: ServerSetup, ring: RingReader, writer: socket.socket) -> LiveServer:
+    """Make the server of a log."""
+    setup = told.setup
+    assert isinstance(setup.live, LiveSetup)
+    return LiveServer(setup.live, LiveTopics(setup.live, setup.channels, told.ids, told.start_ns), ring, writer)
+
+
+async def _serve(
+    told: ServerSetup, ring: RingReader, writer: socket.socket, listening: socket.socket, notices: int
+) -> None:
+    await make_server(told, ring, writer).run(listening, notices)
+
+
+def main(socket_descriptor: int, ring_descriptor: int, notices: int) -> None:
+    """Serve: say where, show what comes, end with the writer."""
+    writer = socket.socket(fileno=socket_descriptor)
+    told: ServerSetup = read_setup()
+    assert isinstance(told.setup.live, LiveSetup)
+    with contextlib.suppress(OSError):
+        os.nice(NICENESS)
+    try:
+        listening = listen(told.setup.live)
+    except (OSError, OverflowError, UnicodeError) as error:
+        writer.send(json.dumps({"error": " ".join(str(error).split())}).encode())
+        return
+    writer.send(json.dumps({"error": "", "url": url_of(told.setup.live, listening)}).encode())
+    asyncio.run(_serve(told, RingReader(ring_descriptor), writer, listening, notices))
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""Logs as files: check, cut, merge, recover, export."""

@@ -1,0 +1,260 @@
+"""The rules on definitions (schemas, channels, .msg texts) and messages (order of times, cdr payloads)."""
+
+import re
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel, Schema
+from numpy.typing import NDArray
+
+from adacd_hil.lab.logs.check.findings import Findings
+from adacd_hil.log.mcap.chunks import Contents
+from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, MESSAGE_HEAD
+from adacd_hil.log.payload_sizes import is_own, payload_size
+from adacd_hil.log.types.joint_states import is_joint_state
+from adacd_hil.log.types.message_types import (
+    ENCAPSULATION,
+    FD_FRAME,
+    FD_FRAME_DTYPE,
+    JOINT_STATE,
+    JOINT_STATE_DTYPE,
+    LOG,
+    SEPARATOR,
+    is_log,
+)
+
+_ANY_SIZE = -1
+_LAST_ENCAPSULATION = 0x0D
+"""DDS-XTypes 7.6.3.1.2."""
+
+
+class DefinitionCheck:
+    """Watches the definitions of a file, in the data section and then in the summary."""
+
+    def __init__(self, findings: Findings) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.all_channels: dict[int, Channel] = {}
+        """Those of the summary, too."""
+        self.summary_schemas: set[int] = set()
+        self.summary_channels: set[int] = set()
+        self._findings = findings
+        self._summary_only: list[tuple[str, int, int]] = []
+        self._duplicates: set[str] = set()
+
+    def schema(self, schema: Schema, offset: int, is_summary: bool) -> None:
+        """Take in a schema."""
+        name = f"schema {schema.id}"
+        if schema.id == 0:
+            self._findings.add("schema-id", f"schema {schema.name!r} has the number 0", offset)
+        if not schema.encoding and schema.data:
+            self._findings.add("schema-encoding", f"{name} has data but no encoding", offset)
+        elif not schema.encoding:
+            self._findings.add("empty-schema", f"{name} ({schema.name!r}) is empty", offset)
+        known = self.schemas.get(schema.id)
+        if known is not None:
+            pairs = (("name", "name"), ("encoding", "encoding"), ("data", "data"))
+            self._compare(name, known, schema, pairs, offset)
+        self._place("schema", schema.id, schema.id in self.schemas, offset, is_summary)
+        if is_summary:
+            self.summary_schemas.add(schema.id)
+        else:
+            self.schemas.setdefault(schema.id, schema)
+
+    def channel(self, channel: Channel, offset: int, is_summary: bool) -> None:
+        """Take in a channel."""
+        name = f"channel {channel.id}"
+        known = self.channels.get(channel.id)
+        if known is not None:
+            pairs = (
+                ("schema", "schema_id"),
+                ("topic", "topic"),
+                ("message encoding", "message_encoding"),
+                ("metadata", "metadata"),
+            )
+            self._compare(name, known, channel, pairs, offset)
+        is_defined = channel.schema_id in self.schemas or (is_summary and channel.schema_id in self.summary_schemas)
+        if channel.schema_id and not is_defined:
+            text = f"{name} ({channel.topic}) has the schema {channel.schema_id}, which is not defined"
+            self._findings.add("undefined-schema", text, offset)
+        self._place("channel", channel.id, channel.id in self.channels, offset, is_summary)
+        if is_summary:
+            self.summary_channels.add(channel.id)
+            self.all_channels.setdefault(channel.id, channel)
+        else:
+            self.channels.setdefault(channel.id, channel)
+            self.all_channels[channel.id] = channel
+
+    def _compare(
+        self, name: str, known: object, other: object, pairs: tuple[tuple[str, str], ...], offset: int
+    ) -> None:
+        different = [what for what, field in pairs if getattr(known, field) != getattr(other, field)]
+        if different:
+            self._findings.add("redefinition", f"{name} is defined again with another {', '.join(different)}", offset)
+
+    def _place(self, kind: str, number: int, is_known: bool, offset: int, is_summary: bool) -> None:
+        name = f"{kind} {number}"
+        if is_summary and not is_known:
+            self._summary_only.append((kind, number, offset))
+        elif not is_summary and is_known and name not in self._duplicates:
+            self._duplicates.add(name)
+            self._findings.add("duplicate", f"{name} is defined more than once in the data section", offset)
+
+    def finish(self, counts: NDArray[Any]) -> None:
+        """Judge what the summary alone defines. counts: messages of each channel."""
+        used = {"channel": set(np.flatnonzero(counts).tolist())}
+        used["schema"] = {self.all_channels[number].schema_id for number in used["channel"] & set(self.all_channels)}
+        unused = []
+        for kind, number, offset in self._summary_only:
+            if number in used[kind]:
+                self._findings.add("summary-only", f"{kind} {number} is defined in the summary only", offset)
+            else:
+                unused.append(f"{kind} {number}")
+        if unused:
+            text = f"the summary alone defines what no message uses: {', '.join(unused)}"
+            self._findings.add("unused-summary-only", text)
+
+
+class ContentCheck:
+    """Watches the messages of a file."""
+
+    def __init__(self, findings: Findings) -> None:
+        self._findings = findings
+        self._described: set[int] = set()
+        self._read: set[int] = set()  # schemas
+        self._latest = np.zeros(CHANNEL_NUMBERS, np.uint64)  # log time of each channel
+        self._sizes = np.full(CHANNEL_NUMBERS, _ANY_SIZE, np.int64)
+        self._is_cdr = np.zeros(CHANNEL_NUMBERS, np.bool_)
+        self._fd_frames: set[int] = set()
+        self._logs: set[int] = set()
+        self._joint_states: set[int] = set()
+
+    def schema(self, schema: Schema, offset: int) -> None:
+        """Read the text of a schema."""
+        if schema.encoding == "ros2msg" and schema.id not in self._read:
+            self._read.add(schema.id)
+            if problem := text_problem(schema.data):
+                self._findings.add("schema-text", f"schema {schema.id} ({schema.name}): {problem}", offset)
+
+    def messages(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
+        """Take in the messages of a chunk."""
+        for number in np.unique(contents.channels).tolist():
+            if number not in self._described and number in definitions.channels:
+                channel = definitions.channels[number]
+                self._describe(channel, definitions.schemas.get(channel.schema_id))
+        self._check_order(contents, definitions, offset)
+        self._check_payloads(contents, definitions, offset)
+
+    def _describe(self, channel: Channel, schema: Schema | None) -> None:
+        """Note what the payloads of a channel must be."""
+        self._described.add(channel.id)
+        self._is_cdr[channel.id] = channel.message_encoding == "cdr"
+        self._sizes[channel.id] = _ANY_SIZE if (size := payload_size(channel, schema)) is None else size
+        if schema is not None and is_own(channel, schema, FD_FRAME):
+            self._fd_frames.add(channel.id)
+        elif schema is not None and is_own(channel, schema, LOG):
+            self._logs.add(channel.id)
+        elif schema is not None and is_own(channel, schema, JOINT_STATE):
+            self._joint_states.add(channel.id)
+            self._sizes[channel.id] = _ANY_SIZE  # others have the same text, and other joints
+
+    def _check_order(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
+        order = np.argsort(contents.channels, kind="stable")
+        channels, times = contents.channels[order], contents.log_times[order]
+        is_first = np.concatenate(([True], channels[1:] != channels[:-1]))
+        before = np.concatenate((times[:1], times[:-1]))
+        before[is_first] = self._latest[channels[is_first]]
+        backwards = np.flatnonzero(times < before)
+        if len(backwards):
+            number = int(channels[backwards[0]])
+            channel = definitions.channels.get(number)
+            back_ns = int(before[backwards[0]]) - int(times[backwards[0]])
+            text = (
+                f"{len(backwards)} messages of a chunk are earlier than the one before in their channel, the first on "
+                f"{channel.topic if channel else number} by {back_ns} ns"
+            )
+            self._findings.add("order", text, offset)
+        np.maximum.at(self._latest, channels, times)
+
+    def _check_payloads(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
+        data = np.frombuffer(contents.data, np.uint8)
+        sizes = contents.ends - contents.starts - MESSAGE_HEAD
+        is_cdr = self._is_cdr[contents.channels]
+        expected = self._sizes[contents.channels]
+        is_wrong = is_cdr & ((sizes < len(ENCAPSULATION)) | ((expected != _ANY_SIZE) & (sizes != expected)))
+        looked_at = np.flatnonzero(is_cdr & ~is_wrong)
+        heads = data[contents.starts[looked_at, np.newaxis] + np.arange(MESSAGE_HEAD, MESSAGE_HEAD + 4)]
+        is_wrong[looked_at] = (heads[:, 0] != 0) | (heads[:, 1] > _LAST_ENCAPSULATION)
+        for place in np.flatnonzero(np.isin(contents.channels, [*self._fd_frames, *self._logs]) & ~is_wrong).tolist():
+            payload = contents.payload(place)
+            is_fd = int(contents.channels[place]) in self._fd_frames
+            is_wrong[place] = not (_is_fd_frame(payload) if is_fd else is_log(payload))
+        is_others = np.isin(contents.channels, [*self._joint_states]) & (sizes != JOINT_STATE_DTYPE.itemsize)
+        for place in np.flatnonzero(is_others & ~is_wrong).tolist():
+            is_wrong[place] = not is_joint_state(contents.payload(place))
+        for place in np.flatnonzero(is_wrong)[:1].tolist():
+            channel = definitions.channels[int(contents.channels[place])]
+            count = np.count_nonzero(is_wrong)
+            text = f"{count} messages of a chunk aren't as their schemas say, the first on {channel.topic}"
+            self._findings.add("cdr", text, offset)
+
+
+def _is_fd_frame(payload: bytes) -> bool:
+    assert FD_FRAME_DTYPE.fields is not None
+    head, place = int(FD_FRAME_DTYPE.fields["data"][1]), int(FD_FRAME_DTYPE.fields["count"][1])
+    return len(payload) >= head and len(payload) == head + int.from_bytes(payload[place : place + 4], "little")
+
+
+_PRIMITIVES = {
+    *("bool", "byte", "char", "string", "wstring", "float32", "float64"),
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+}
+_LINE = re.compile(
+    r"(?P<type>[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){0,2})(<=\d+)?(?P<array>\[(<=)?\d*\])?"
+    r"\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)"
+)
+_PARTS = "---"
+"""Between the parts of a service or an action, whose events rosbag2 records."""
+_CONSTANT = re.compile(r"=\s*\S.*")
+
+
+def text_problem(data: bytes) -> str:
+    """Say what is wrong with the text of a schema; "" when it can be read."""
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError:
+        return "is not UTF-8"
+    first, *others = re.split(rf"^={{{len(SEPARATOR)}}}$\n?", text, flags=re.MULTILINE)
+    types = {"": first}
+    for other in others:
+        head, _, body = other.partition("\n")
+        if not head.startswith("MSG: "):
+            return f"a type has no name: {head!r}"
+        types[head.removeprefix("MSG: ").strip()] = body
+    known = {_short(name) for name in types}
+    for name, body in types.items():
+        for line in body.splitlines():
+            if problem := _line_problem(line.strip(), known):
+                return f"{name or 'the type'}: {problem}"
+    return ""
+
+
+def _line_problem(line: str, known: set[str]) -> str:
+    if not line or line.startswith("#") or line == _PARTS:
+        return ""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        return f"no field: {line!r}"
+    rest = match["rest"]
+    if rest.startswith("=") and not (_CONSTANT.fullmatch(rest) and match["type"] in _PRIMITIVES):
+        return f"no constant: {line!r}"
+    if match["type"] in _PRIMITIVES or _short(match["type"]) in known:
+        return ""
+    names = {name.rsplit("/")[-1] for name in known}
+    return "" if "/" not in match["type"] and match["type"] in names else f"unknown type {match['type']}"
+
+
+def _short(name: str) -> str:
+    """Spell package/msg/Type as package/Type."""
+    parts = name.split("/")
+    return f"{parts[0]}/{parts[-1]}" if len(parts) > 1 else name

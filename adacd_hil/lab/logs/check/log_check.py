@@ -1,0 +1,343 @@
+"""The check of logs: each file by itself, then the parts of a log against each other.
+
+The rules are in `findings.RULES`: those of `mcap doctor` (foxglove/mcap), all CRCs, indexes against records, and our
+own. The check reads a file once, from front to back, in constant memory but for 0.5 kB per chunk, and passes each
+record to the rules that concern it.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Header, Metadata
+
+from adacd_hil.file_access import open_input
+from adacd_hil.lab.logs.check.content_checks import DefinitionCheck
+from adacd_hil.lab.logs.check.findings import Findings, LogFinding, Severity
+from adacd_hil.lab.logs.check.structure_checks import ChunkCheck, SummaryCheck
+from adacd_hil.log.log_files import (
+    CONTINUED,
+    DROPPED_KEY,
+    ENDING_KEY,
+    LOST_KEY,
+    PART_KEY,
+    PLANNED_ENDINGS,
+    RUN_METADATA,
+    SUMMARY_METADATA,
+    LogError,
+    failing_as,
+    find_parts,
+    part_path,
+    parts_of,
+)
+from adacd_hil.log.mcap.mcap_records import (
+    HEAD,
+    MAGIC,
+    FileGap,
+    RawRecord,
+    Trailer,
+    attachment_crc_fits,
+    crc32,
+    crc_of,
+    name_of,
+    parse,
+    scan,
+)
+from adacd_hil.log.types.record_arrays import count_frames
+
+_DATA = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA}
+_SUMMARY = {
+    Opcode.STATISTICS,
+    Opcode.CHUNK_INDEX,
+    Opcode.ATTACHMENT_INDEX,
+    Opcode.METADATA_INDEX,
+    Opcode.SUMMARY_OFFSET,
+}
+_PROFILES = ("", "ros1", "ros2")
+_FOOTER_CRC = 4
+_DATA_SECTION = "data section"
+
+
+class FileFacts(NamedTuple):
+    """The facts that a checked file states about itself."""
+
+    findings: Findings
+    metadata: dict[str, dict[str, str]]
+    messages: int
+    frames: int
+    is_ended: bool
+
+
+def check_file(path: Path) -> FileFacts:
+    """Check a file by itself. Raises LogError when it can't be read."""
+    with failing_as(f"log {path} can't be read"), open_input(path) as file:
+        return _FileCheck(path.name, file).run()
+
+
+class _FileCheck:
+    def __init__(self, name: str, file: IO[bytes]) -> None:
+        self._file = file
+        self._findings = Findings(name)
+        self._definitions = DefinitionCheck(self._findings)
+        self._chunks = ChunkCheck(self._findings, self._definitions)
+        self._summary = SummaryCheck(self._findings, self._definitions, self._chunks)
+        self._metadata: dict[str, dict[str, str]] = {}
+        self._is_summary = False  # DataEnd is behind
+        self._crc = 0  # of the section so far
+        self._counts = {Opcode.HEADER: 0, Opcode.DATA_END: 0, Opcode.FOOTER: 0}
+        self._has_trailer = False
+
+    def run(self) -> FileFacts:
+        magic = self._file.read(len(MAGIC))
+        is_right = magic == MAGIC
+        if not is_right:
+            self._findings.add("magic", "the file doesn't begin with MCAP's magic", 0)
+        self._crc = crc32(magic) if is_right else 0
+        end = len(magic) if is_right else 0
+        for item in scan(self._file):
+            if isinstance(item, Trailer):
+                self._has_trailer = True
+                end = item.offset + len(MAGIC)
+            elif isinstance(item, FileGap):
+                self._gap(item)
+                end = item.offset + item.size
+            else:
+                self._record(item)
+                end = item.end
+        self._chunks.end_indexes()
+        self._finish(end)
+        topics = {number: channel.topic for number, channel in self._definitions.channels.items()}
+        counts = {number: int(self._chunks.counts[number]) for number in topics}
+        total = int(self._chunks.counts.sum())
+        is_ended = self._counts[Opcode.DATA_END] > 0
+        return FileFacts(self._findings, self._metadata, total, count_frames(topics, counts), is_ended)
+
+    def _gap(self, gap: FileGap) -> None:
+        """Tell of bytes that are no record; they count for the CRC."""
+        self._findings.add("record", f"{gap.size} bytes are no record", gap.offset)
+        position = self._file.tell()
+        self._crc = crc_of(self._file, gap.offset, gap.offset + gap.size, self._crc)
+        self._file.seek(position)
+
+    def _record(self, record: RawRecord) -> None:
+        head = HEAD.pack(record.opcode, len(record.body))
+        if record.opcode != Opcode.MESSAGE_INDEX:
+            self._chunks.end_indexes()
+        if record.opcode == Opcode.DATA_END:
+            self._data_end(record)
+            return
+        if record.opcode == Opcode.FOOTER:
+            self._count(record)
+            crc = crc32(record.body[:-_FOOTER_CRC], crc32(head, self._crc))
+            self._summary.footer(record, crc)
+            return
+        self._crc = crc32(record.body, crc32(head, self._crc))
+        try:
+            self._judge(record)
+        except LogError as error:
+            self._findings.add("record", str(error), record.offset)
+
+    def _count(self, record: RawRecord) -> None:
+        """Count records of which there is one."""
+        opcode = Opcode(record.opcode)
+        self._counts[opcode] += 1
+        if self._counts[opcode] > 1:
+            rule = {Opcode.HEADER: "header", Opcode.DATA_END: "data-end", Opcode.FOOTER: "footer"}[opcode]
+            self._findings.add(rule, f"there is more than one {name_of(opcode)}", record.offset)
+
+    def _data_end(self, record: RawRecord) -> None:
+        self._count(record)
+        stored = int.from_bytes(record.body, "little")
+        if not stored:
+            self._findings.without_crc[_DATA_SECTION] += 1
+        elif stored != self._crc:
+            self._findings.add("data-crc", "the data section fails its CRC", record.offset)
+        self._is_summary = True
+        self._crc = 0
+
+    def _judge(self, record: RawRecord) -> None:
+        opcode = record.opcode
+        if opcode not in set(Opcode):
+            self._findings.add("unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset)
+            return
+        if opcode in (_DATA if self._is_summary else _SUMMARY):
+            where = "summary" if self._is_summary else "data section"
+            self._findings.add("place", f"{name_of(opcode)} in the {where}", record.offset)
+            return
+        if self._is_summary:
+            self._summary.record(record)
+        match opcode:
+            case Opcode.HEADER:
+                self._header(record)
+            case Opcode.SCHEMA:
+                schema = parse(opcode, record.body)
+                self._definitions.schema(schema, record.offset, self._is_summary)
+                self._chunks.content.schema(schema, record.offset)
+            case Opcode.CHANNEL:
+                self._definitions.channel(parse(opcode, record.body), record.offset, self._is_summary)
+            case Opcode.CHUNK:
+                self._chunks.chunk(record)
+            case Opcode.MESSAGE_INDEX:
+                self._chunks.message_index(record)
+            case Opcode.MESSAGE:
+                self._chunks.message(record)
+            case Opcode.ATTACHMENT:
+                self._attachment(record)
+            case Opcode.METADATA:
+                metadata: Metadata = parse(opcode, record.body)
+                self._metadata[metadata.name] = metadata.metadata
+                self._summary.metadata(record, metadata.name)
+
+    def _header(self, record: RawRecord) -> None:
+        self._count(record)
+        if record.offset != len(MAGIC):
+            self._findings.add("header", "the Header doesn't come first", record.offset)
+        header: Header = parse(record.opcode, record.body)
+        if not header.library:
+            self._findings.add("library", "the Header doesn't say what wrote the file", record.offset)
+        if header.profile not in _PROFILES:
+            self._findings.add("profile", f"the profile {header.profile!r} is not a known one", record.offset)
+
+    def _attachment(self, record: RawRecord) -> None:
+        attachment = parse(record.opcode, record.body)
+        self._summary.attachment(record, attachment)
+        if record.body[-4:] == bytes(4):
+            self._findings.without_crc["attachment"] += 1
+        elif not attachment_crc_fits(record):
+            self._findings.add("attachment-crc", f"the attachment {attachment.name} fails its CRC", record.offset)
+
+    def _finish(self, end: int) -> None:
+        """Judge the file as a whole; it was read up to `end`."""
+        for opcode, rule in ((Opcode.HEADER, "header"), (Opcode.DATA_END, "data-end"), (Opcode.FOOTER, "footer")):
+            if not self._counts[opcode]:
+                self._findings.add(rule, f"there is no {name_of(opcode)}")
+        self._file.seek(0, 2)
+        size = self._file.tell()
+        if not self._has_trailer:
+            self._findings.add("magic", "the file doesn't end with a Footer and MCAP's magic", size)
+        elif end < size:
+            self._findings.add("magic", f"{size - end} bytes follow the end", end)
+        self._definitions.finish(self._chunks.counts)
+        self._summary.finish()
+        self._judge_missing_crcs()
+
+    def _judge_missing_crcs(self) -> None:
+        """Name what no CRC vouches for; that of the data section does so for all that is in it."""
+        missing, chunks = self._findings.without_crc, len(self._chunks.facts)
+        if not missing[_DATA_SECTION]:
+            missing = Counter(summary=missing["summary"])
+        elif 0 < missing["chunk"] < chunks:
+            text = f"{missing['chunk']} of {chunks} chunks have no CRC, nor has the data section"
+            self._findings.add("some-crc", text)
+        elif chunks and not missing["chunk"] and not self._chunks.has_outside:
+            missing = missing - Counter([_DATA_SECTION])  # each chunk has its own
+        parts = [f"{count} {part}s" if count > 1 else f"the {part}" for part, count in missing.items() if count]
+        if parts:
+            self._findings.add("no-crc", f"nothing vouches for these bytes, which have no CRC: {', '.join(parts)}")
+
+
+class LogCheck(NamedTuple):
+    """The findings in a log, with all its parts."""
+
+    path: Path
+    files: int
+    messages: int
+    findings: list[LogFinding]
+    errors: int  # more than are in `findings` where a rule was broken often
+    warnings: int
+    notes: int
+
+
+def find_logs(paths: Iterable[Path]) -> list[Path]:
+    """List the logs that are meant: files as they are, of folders all .mcap in them but the later parts of a log.
+
+    Raises LogError when a folder has none.
+    """
+    logs = []
+    for path in paths:
+        if not path.is_dir():
+            logs.append(path)
+            continue
+        files = sorted(path.rglob("*.mcap"))
+        later = {part for file in files for number, part in find_parts(file).items() if number}
+        if not files:
+            raise LogError(f"folder {path} has no .mcap file")
+        logs += [file for file in files if file not in later]
+    return logs
+
+
+def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> LogCheck:
+    """Check the log whose first part is `path`, with all its parts. Raises LogError when a file can't be read."""
+    parts = parts_of(path)
+    checked = {}
+    for number, part in parts.items():
+        progress(f"checking {part.name}")
+        checked[number] = check_file(part)
+    whole = Findings(path.name)
+    _check_parts(path, checked, whole)
+    for facts in checked.values():
+        _check_words(facts)
+    all_findings = [whole, *(facts.findings for facts in checked.values())]
+    return LogCheck(
+        path,
+        len(parts),
+        sum(facts.messages for facts in checked.values()),
+        [finding for findings in all_findings for finding in findings.found],
+        sum(findings.count(Severity.ERROR) for findings in all_findings),
+        sum(findings.count(Severity.WARNING) for findings in all_findings),
+        sum(findings.count(Severity.NOTE) for findings in all_findings),
+    )
+
+
+def _check_parts(path: Path, checked: dict[int, FileFacts], findings: Findings) -> None:
+    """Judge the parts of a log together."""
+    for before, number in pairwise((-1, *checked)):
+        for missing in range(before + 1, number):
+            findings.add("missing-part", f"{part_path(path, missing).name} is missing")
+    last = max(checked)
+    if _summary(checked[last]).get(ENDING_KEY) == CONTINUED:
+        findings.add("missing-part", f"{part_path(path, last + 1).name} is missing: the part before says it follows")
+    runs = {number: facts.metadata[RUN_METADATA] for number, facts in checked.items() if RUN_METADATA in facts.metadata}
+    first = next(iter(runs.values()), {})
+    for number, run in runs.items():
+        name = part_path(path, number).name
+        different = sorted(key for key, _ in {*_identity(run)} ^ {*_identity(first)})
+        if different:
+            text = f"{name} is of another run: {', '.join(dict.fromkeys(different))} differ"
+            findings.add("foreign-part", text)
+        said = run.get(PART_KEY, str(number))
+        if said != str(number):
+            findings.add("foreign-part", f"{name} is part {said} of a log")
+
+
+def _identity(run: dict[str, str]) -> Iterator[tuple[str, str]]:
+    return (pair for pair in run.items() if pair[0] != PART_KEY)
+
+
+def _summary(facts: FileFacts) -> dict[str, str]:
+    return facts.metadata.get(SUMMARY_METADATA, {})
+
+
+def _check_words(facts: FileFacts) -> None:
+    """Judge what one of our own files says of itself."""
+    findings, summary = facts.findings, _summary(facts)
+    if RUN_METADATA not in facts.metadata:
+        return
+    if not summary:
+        if facts.is_ended:
+            findings.add("ending", "the log doesn't say why it ended")
+        return
+    for key, real in (("messages", facts.messages), ("frames", facts.frames)):
+        if summary.get(key, str(real)) != str(real):
+            findings.add("counts", f"there are {real} {key}, the summary says {summary[key]}")
+    dropped = summary.get(DROPPED_KEY, "0")
+    if dropped != "0":
+        findings.add("dropped", f"{dropped} packets were dropped on the way to the log")
+    ending = summary.get(ENDING_KEY, "")
+    if ending not in PLANNED_ENDINGS:
+        findings.add("ending", f"the log ended because: {ending}" if ending else "the log doesn't say why it ended")
+    if LOST_KEY in summary:
+        findings.add("lost", f"lost before it was recovered: {summary[LOST_KEY]}")

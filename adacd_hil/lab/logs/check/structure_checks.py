@@ -1,0 +1,391 @@
+"""The rules on a log's structure.
+
+Chunks, their message indexes, messages outside of chunks; the summary's statements about attachments, metadata,
+messages and itself.
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Chunk,
+    ChunkIndex,
+    Footer,
+    MetadataIndex,
+    Statistics,
+    SummaryOffset,
+)
+from numpy.typing import NDArray
+
+from adacd_hil.lab.logs.check.content_checks import ContentCheck, DefinitionCheck
+from adacd_hil.lab.logs.check.findings import Findings
+from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
+from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, HEAD, INDEX_ENTRY, RawRecord, name_of, parse
+
+
+@dataclass
+class ChunkFacts:
+    """What a chunk index must say of a chunk."""
+
+    length: int
+    message_start_time: int
+    message_end_time: int
+    compression: str
+    compressed_size: int
+    uncompressed_size: int
+    channels: bytes = b""  # numbers of those of its messages, uint16 each
+    message_index_length: int = 0
+    message_index_offsets: bytes = b""  # packed: as a table they would fill 60 MB in an hour
+    is_indexed: bool = False
+
+
+def pack_offsets(offsets: Mapping[int, int]) -> bytes:
+    """Pack the places of message indexes, by channel."""
+    return b"".join(struct.pack("<HQ", channel, offsets[channel]) for channel in sorted(offsets))
+
+
+class ChunkCheck:
+    """Watches the chunks of a file."""
+
+    def __init__(self, findings: Findings, definitions: DefinitionCheck) -> None:
+        self.facts: dict[int, ChunkFacts] = {}
+        """By where the chunk begins."""
+        self.counts = np.zeros(CHANNEL_NUMBERS, np.int64)
+        """Messages of each channel."""
+        self.start_ns, self.end_ns = 2**64, 0
+        self.first_later_than_zero_ns = 2**64
+        self.has_outside = False
+        """Whether there are messages outside of chunks."""
+        self._findings = findings
+        self._opening = Opening()
+        self._definitions = definitions
+        self.content = ContentCheck(findings)
+        self._latest: ChunkFacts | None = None  # whose indexes may follow
+        self._expected: dict[int, NDArray[Any]] | None = None  # entries of its indexes; None where it can't be opened
+        self._offsets: dict[int, int] = {}
+
+    def chunk(self, record: RawRecord) -> None:
+        """Take in a chunk."""
+        chunk: Chunk = parse(record.opcode, record.body)
+        facts = ChunkFacts(
+            HEAD.size + len(record.body),
+            chunk.message_start_time,
+            chunk.message_end_time,
+            chunk.compression,
+            len(chunk.data),
+            chunk.uncompressed_size,
+        )
+        self._latest = self.facts[record.offset] = facts
+        self._expected, self._offsets = None, {}
+        if not chunk.uncompressed_crc:
+            self._findings.without_crc["chunk"] += 1
+        try:
+            data = self._opening.open_checked(chunk)
+        except ChunkError as error:
+            self._findings.add("chunk-crc", f"a chunk {error}", record.offset)
+            return
+        if len(data) != chunk.uncompressed_size:
+            text = f"a chunk holds {len(data)} bytes, and says {chunk.uncompressed_size}"
+            self._findings.add("chunk-size", text, record.offset)
+        contents = read_contents(data)
+        for opcode in contents.strangers:
+            self._findings.add("chunk-record", f"a chunk holds a {name_of(opcode)}", record.offset)
+        for place in contents.breaks:
+            rest = len(data) - place
+            self._findings.add("chunk-record", f"a chunk ends with {rest} bytes of no record", record.offset)
+        self._compare_times(chunk, contents, record.offset)
+        self._messages(contents, record.offset)
+        self._expect(contents, facts)
+
+    def _compare_times(self, chunk: Chunk, contents: Contents, offset: int) -> None:
+        if not len(contents.starts):
+            return
+        first, last = int(contents.log_times.min()), int(contents.log_times.max())
+        if chunk.message_start_time != first:
+            text = f"a chunk begins at {chunk.message_start_time}, its earliest message at {first}"
+            self._findings.add("chunk-times", text, offset)
+        if chunk.message_end_time != last:
+            text = f"a chunk ends at {chunk.message_end_time}, its latest message at {last}"
+            self._findings.add("chunk-times", text, offset)
+
+    def _expect(self, contents: Contents, facts: ChunkFacts) -> None:
+        """Note what the indexes of the chunk must be."""
+        order = np.argsort(contents.channels, kind="stable")
+        channels, firsts = np.unique(contents.channels[order], return_index=True)
+        groups = np.split(contents.entries[order], firsts[1:])
+        self._expected = dict(zip(channels.tolist(), groups, strict=False))
+        facts.channels = channels.tobytes()
+
+    def message_index(self, record: RawRecord) -> None:
+        """Take in a message index: of the chunk before it, one for each channel."""
+        channel = int.from_bytes(record.body[:2], "little")
+        latest = self._latest
+        if latest is None:
+            self._findings.add("place", "a MessageIndex doesn't follow a chunk", record.offset)
+            return
+        self._offsets[channel] = record.offset
+        latest.message_index_length += HEAD.size + len(record.body)
+        latest.message_index_offsets = pack_offsets(self._offsets)
+        if self._expected is None or len(record.body) % INDEX_ENTRY.itemsize != 6:
+            if self._expected is not None:
+                self._findings.add("message-index", "an index has part of an entry", record.offset)
+            return
+        found = np.frombuffer(record.body[6:], INDEX_ENTRY)
+        expected = self._expected.pop(channel, found[:0])
+        if found.tobytes() != expected.tobytes() and np.sort(found, order="offset").tobytes() != expected.tobytes():
+            text = f"the index of channel {channel} has {len(found)} entries that aren't its {len(expected)} messages"
+            self._findings.add("message-index", text, record.offset)
+
+    def end_indexes(self) -> None:
+        """Take notice that the indexes of the latest chunk are over."""
+        if self._latest is not None and self._expected:
+            channels = [channel for channel, entries in self._expected.items() if len(entries)]
+            offset = next(reversed(self.facts))
+            if not self._offsets:
+                self._findings.add("no-message-index", "a chunk has no message index", offset)
+            elif channels:
+                text = f"a chunk has no index of the channels {', '.join(map(str, channels))}"
+                self._findings.add("message-index", text, offset)
+        self._latest = None
+
+    def message(self, record: RawRecord) -> None:
+        """Take in a message outside of chunks."""
+        self.has_outside = True
+        self._messages(message_contents(record), record.offset)
+
+    def _messages(self, contents: Contents, offset: int) -> None:
+        """Take in messages, after the definitions that stand between them."""
+        channels, firsts = np.unique(contents.channels, return_index=True)
+        first_at = dict(zip(channels.tolist(), contents.starts[firsts].tolist(), strict=True))
+        known = set(self._definitions.channels)
+        for definition in contents.definitions:
+            parsed = parse(definition.opcode, definition.body)
+            if definition.opcode == Opcode.SCHEMA:
+                self._definitions.schema(parsed, offset, is_summary=False)
+                self.content.schema(parsed, offset)
+            else:
+                self._definitions.channel(parsed, offset, is_summary=False)
+                if definition.offset < first_at.get(parsed.id, len(contents.data)):
+                    known.add(parsed.id)
+        for channel in channels.tolist():
+            if channel not in known:
+                text = f"messages of channel {channel} come before its definition"
+                self._findings.add("undefined-channel", text, offset)
+        if len(contents.starts):
+            self.counts += np.bincount(contents.channels, minlength=CHANNEL_NUMBERS)
+            self.start_ns = min(self.start_ns, int(contents.log_times.min()))
+            later = contents.log_times[contents.log_times > 0]
+            if len(later):
+                self.first_later_than_zero_ns = min(self.first_later_than_zero_ns, int(later.min()))
+            self.end_ns = max(self.end_ns, int(contents.log_times.max()))
+            self.content.messages(contents, self._definitions, offset)
+
+    def compare(self, index: ChunkIndex, offset: int) -> None:
+        """Compare a chunk index with its chunk."""
+        facts = self.facts.get(index.chunk_start_offset)
+        if facts is None:
+            text = f"a chunk index points to byte {index.chunk_start_offset}, where no chunk begins"
+            self._findings.add("chunk-index", text, offset)
+            return
+        if facts.is_indexed:
+            text = f"the chunk at byte {index.chunk_start_offset} is indexed more than once"
+            self._findings.add("chunk-index", text, offset)
+        facts.is_indexed = True
+        pairs = {
+            "length": (index.chunk_length, facts.length),
+            "start time": (index.message_start_time, facts.message_start_time),
+            "end time": (index.message_end_time, facts.message_end_time),
+            "compression": (index.compression, facts.compression),
+            "compressed size": (index.compressed_size, facts.compressed_size),
+            "uncompressed size": (index.uncompressed_size, facts.uncompressed_size),
+            "length of message indexes": (index.message_index_length, facts.message_index_length),
+        }
+        for what, (said, real) in pairs.items():
+            if said != real:
+                text = f"the {what} of the chunk at byte {index.chunk_start_offset} is {real}, its index says {said}"
+                self._findings.add("chunk-index", text, offset)
+        if pack_offsets(index.message_index_offsets) != facts.message_index_offsets:
+            text = f"the message indexes of the chunk at byte {index.chunk_start_offset} are not where its index says"
+            self._findings.add("chunk-index", text, offset)
+
+
+class SummaryCheck:
+    """Watches the summary of a file, and the facts that it must state."""
+
+    def __init__(self, findings: Findings, definitions: DefinitionCheck, chunks: ChunkCheck) -> None:
+        self.statistics: Statistics | None = None
+        self._findings = findings
+        self._definitions = definitions
+        self._chunks = chunks
+        self._attachments: dict[int, AttachmentIndex] = {}  # what the indexes must be, by offset
+        self._metadata: dict[int, MetadataIndex] = {}
+        self._attachment_count = self._metadata_count = 0
+        self._indexed: set[int] = set()
+        self._start = 0  # of the summary; 0: none so far
+        self._groups: list[list[int]] = []  # opcode, start, end of each
+        self._offsets: list[tuple[int, SummaryOffset]] = []
+        self._offset_start = 0
+
+    def attachment(self, record: RawRecord, attachment: Attachment) -> None:
+        """Take in an attachment."""
+        self._attachment_count += 1
+        self._attachments[record.offset] = AttachmentIndex(
+            offset=record.offset,
+            length=HEAD.size + len(record.body),
+            log_time=attachment.log_time,
+            create_time=attachment.create_time,
+            data_size=len(attachment.data),
+            name=attachment.name,
+            media_type=attachment.media_type,
+        )
+
+    def metadata(self, record: RawRecord, name: str) -> None:
+        """Take in a metadata record."""
+        self._metadata_count += 1
+        self._metadata[record.offset] = MetadataIndex(record.offset, HEAD.size + len(record.body), name)
+
+    def record(self, record: RawRecord) -> None:
+        """Take in a record of the summary, but for its definitions."""
+        self._start = self._start or record.offset
+        if record.opcode == Opcode.SUMMARY_OFFSET:
+            self._offset_start = self._offset_start or record.offset
+            self._offsets.append((record.offset, parse(record.opcode, record.body)))
+            return
+        if self._groups and self._groups[-1][0] == record.opcode:
+            self._groups[-1][2] = record.end
+        else:
+            self._groups.append([record.opcode, record.offset, record.end])
+        if record.opcode == Opcode.CHUNK_INDEX:
+            self._chunks.compare(parse(record.opcode, record.body), record.offset)
+        elif record.opcode == Opcode.ATTACHMENT_INDEX:
+            self._compare("attachment-index", self._attachments, parse(record.opcode, record.body), record.offset)
+        elif record.opcode == Opcode.METADATA_INDEX:
+            self._compare("metadata-index", self._metadata, parse(record.opcode, record.body), record.offset)
+        elif record.opcode == Opcode.STATISTICS:
+            if self.statistics is not None:
+                self._findings.add("statistics", "there is more than one Statistics", record.offset)
+            self.statistics = parse(record.opcode, record.body)
+            self._check_counted_channels(self.statistics, record.offset)
+
+    def _compare(self, rule: str, expected: Mapping[int, Any], index: Any, offset: int) -> None:
+        kind = rule.removesuffix("-index")
+        if index.offset in self._indexed:
+            self._findings.add(rule, f"the {kind} at byte {index.offset} is indexed more than once", offset)
+        elif index.offset not in expected:
+            self._findings.add(rule, f"an index points to byte {index.offset}, where no {kind} begins", offset)
+        elif index != expected[index.offset]:
+            text = f"an index says {index}, it is {expected[index.offset]}"
+            self._findings.add(rule, text, offset)
+        self._indexed.add(index.offset)
+
+    def _check_counted_channels(self, statistics: Statistics | None, offset: int) -> None:
+        if statistics is None or not statistics.channel_message_counts:
+            return
+        needed = {*self._definitions.channels, *statistics.channel_message_counts}
+        for channel in sorted(needed - self._definitions.summary_channels):
+            text = f"channel {channel} is counted, but isn't defined in the summary before the Statistics"
+            self._findings.add("summary-channels", text, offset)
+
+    def footer(self, record: RawRecord, crc: int) -> None:
+        """Take in the footer; `crc`: of the summary up to its own."""
+        footer: Footer = parse(record.opcode, record.body)
+        if footer.summary_start != self._start:
+            text = f"the Footer says that the summary begins at byte {footer.summary_start}, it is {self._start}"
+            self._findings.add("summary-offset", text, record.offset)
+        if footer.summary_offset_start != self._offset_start:
+            text = f"the Footer says {footer.summary_offset_start} for the summary offsets, it is {self._offset_start}"
+            self._findings.add("summary-offset", text, record.offset)
+        if not footer.summary_crc:
+            self._findings.without_crc["summary"] += 1
+        elif footer.summary_crc != crc:
+            self._findings.add("summary-crc", "the summary fails its CRC", record.offset)
+
+    def finish(self) -> None:
+        """Judge the summary as a whole."""
+        self._check_groups()
+        self._check_indexes()
+        if self.statistics is not None:
+            self._check_statistics(self.statistics)
+
+    def _check_groups(self) -> None:
+        groups = {(opcode, start, end - start) for opcode, start, end in self._groups}
+        for offset, said in self._offsets:
+            if (said.group_opcode, said.group_start, said.group_length) not in groups and said.group_length:
+                text = f"a group is said to be at byte {said.group_start}, {said.group_length} bytes, and isn't"
+                self._findings.add("summary-offset", text, offset)
+
+    def _check_indexes(self) -> None:
+        if not self._groups:
+            return
+        kinds = {group[0] for group in self._groups}
+        chunks = self._chunks.facts
+        if chunks and Opcode.CHUNK_INDEX not in kinds:
+            self._findings.add("no-chunk-index", "the summary has no chunk indexes")
+        elif chunks:
+            for offset in (offset for offset, facts in chunks.items() if not facts.is_indexed):
+                self._findings.add("chunk-index", "a chunk isn't in the index", offset)
+            self._check_needed_channels()
+        if self._chunks.has_outside and Opcode.CHUNK_INDEX in kinds:
+            self._findings.add("unindexed-messages", "there are messages outside chunks, which no index has")
+        for rule, opcode, expected in (
+            ("attachment-index", Opcode.ATTACHMENT_INDEX, self._attachments),
+            ("metadata-index", Opcode.METADATA_INDEX, self._metadata),
+        ):
+            if opcode in kinds:
+                for offset in sorted(set(expected) - self._indexed):
+                    self._findings.add(rule, f"a record has no {rule.replace('-', ' ')}", offset)
+
+    def _check_needed_channels(self) -> None:
+        used = {
+            int(channel)
+            for facts in self._chunks.facts.values()
+            if facts.is_indexed
+            for channel in np.frombuffer(facts.channels, np.uint16)
+        }
+        for channel in sorted(used - self._definitions.summary_channels):
+            self._findings.add("summary-channels", f"channel {channel} of an indexed chunk isn't in the summary")
+        schemas = {self._definitions.channels[channel].schema_id for channel in used & set(self._definitions.channels)}
+        for schema in sorted(schemas - self._definitions.summary_schemas - {0}):
+            self._findings.add("summary-channels", f"schema {schema} of an indexed chunk isn't in the summary")
+
+    def _check_statistics(self, statistics: Statistics) -> None:
+        chunks = self._chunks
+        total = int(chunks.counts.sum())
+        pairs = {
+            "messages": (statistics.message_count, total),
+            "attachments": (statistics.attachment_count, self._attachment_count),
+            "metadata records": (statistics.metadata_count, self._metadata_count),
+            "chunks": (statistics.chunk_count, len(chunks.facts)),
+        }
+        for what, (said, real) in pairs.items():
+            if said != real:
+                self._findings.add("statistics", f"there are {real} {what}, the Statistics say {said}")
+        # Some writers count what the summary alone defines, some don't.
+        for what, said, data, summary in (
+            ("schemas", statistics.schema_count, self._definitions.schemas, self._definitions.summary_schemas),
+            ("channels", statistics.channel_count, self._definitions.channels, self._definitions.summary_channels),
+        ):
+            if said not in (len(data), len({*data, *summary})):
+                text = f"there are {len({*data, *summary})} {what}, the Statistics say {said}"
+                self._findings.add("statistics", text)
+        if total:
+            for what, said, allowed in (  # mcap's writer in C++ takes 0 for no time yet
+                ("first", statistics.message_start_time, (chunks.start_ns, chunks.first_later_than_zero_ns)),
+                ("last", statistics.message_end_time, (chunks.end_ns,)),
+            ):
+                if said not in allowed:
+                    text = f"the {what} message is of {allowed[0]}, the Statistics say {said}"
+                    self._findings.add("statistics", text)
+        counts = statistics.channel_message_counts
+        if counts:
+            for channel in sorted({*counts, *np.flatnonzero(chunks.counts).tolist()}):
+                said, real = counts.get(channel, 0), int(chunks.counts[channel])
+                if said != real:
+                    text = f"channel {channel} has {real} messages, the Statistics say {said}"
+                    self._findings.add("statistics", text)

@@ -1,0 +1,331 @@
+"""Recordings to tables in Parquet or CSV, one file each: topics of our logs, and frames decoded by a contract.
+
+A stretch of the log is in memory at a time. A table begins with `t_ns` (of the run's clock) and `cycle_t_ns` (of the
+cycle that it was logged with, by which tables are joined); a field of several numbers becomes as many columns,
+`tau_J_1`, `tau_J_2`. Booleans stay booleans, states and reasons are the numbers that the schemas name.
+"""
+
+import contextlib
+import csv
+import errno
+import fnmatch
+import itertools
+import math
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, NamedTuple, Protocol
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from adacd_hil.file_access import is_anothers, open_input, replacing
+from adacd_hil.log.frames.frame_log import open_frames
+from adacd_hil.log.log_files import LogError, failing_as
+from adacd_hil.log.mcap.chunks import ChunkError, Opening, read_contents
+from adacd_hil.log.mcap.mcap_records import MAGIC, RawRecord, parse, scan
+from adacd_hil.log.reader import LoggedEvent, LogStream, Series
+from adacd_hil.log.types.joint_states import joint_state_columns
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
+from adacd_hil.log.types.topics import DECODED, EVENTS
+from adacd_hil.remedies import install_command, nearest_name
+from adacd_hil.wire.dbc_decoder import DbcDecoder
+
+_LONGEST_STEM = 60
+"""Letters of the name of a file, so that it has room in 255 bytes."""
+
+_HEADS = {"csv": b"t_ns,", "parquet": b"PAR1"}
+"""How the tables begin that are made here."""
+
+Columns = Mapping[str, Any]
+"""Columns of a table by name, of equal length: arrays or lists."""
+
+
+def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
+    """Make the columns of a topic."""
+    columns: dict[str, Any] = {
+        "t_ns": series.t_ns,
+        "cycle_t_ns": series.records["publish_time"].astype(np.int64) - epoch_ns,
+    }
+    for name in series.fields:
+        values = series[name]
+        if values.ndim == 1:
+            columns[name] = values
+        else:
+            columns |= {f"{name}_{place}": values[:, place - 1] for place in range(1, values.shape[1] + 1)}
+    return columns
+
+
+def event_columns(events: Iterable[LoggedEvent]) -> dict[str, Any]:
+    """Make the columns of /events."""
+    rows = [(t_ns, *event) for t_ns, event in events]
+    return {name: [row[place] for row in rows] for place, name in enumerate(("t_ns", "level", "name", "message"))}
+
+
+def frame_columns(frames: NDArray[Any], decoder: DbcDecoder) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Decode frames of RECORDED_FRAME_DTYPE by a DBC: (message, columns) of each one that occurs.
+
+    A signal that a frame lacks, because it is short or multiplexed, is NaN.
+    """
+    frames = frames[~frames["is_error"] & ~frames["is_remote"]]
+    there = set(frames["can_id"].tolist())
+    for message in decoder.messages.values():
+        if message.can_id not in there:
+            continue
+        is_own = (frames["can_id"] == message.can_id) & (frames["is_extended"] == message.is_extended)
+        found = frames[is_own]
+        found = found[np.array([message.takes(length) for length in found["length"].tolist()], np.bool_)]
+        if not len(found):
+            continue
+        pairs = zip(found["data"], found["length"].tolist(), strict=True)
+        rows = [message.decode(data[:length].tobytes()) for data, length in pairs]
+        columns: dict[str, Any] = {"t_ns": found["t_ns"], "cycle_t_ns": found["cycle_t_ns"]}
+        for name in message.units:
+            values = np.array([row.get(name, math.nan) for row in rows], np.float64)
+            columns[name if name not in columns else f"{name}_"] = values
+        yield message.name, columns
+
+
+class _Table(Protocol):
+    """A file of one table."""
+
+    def write(self, columns: Columns) -> None:
+        """Add rows."""
+
+    def close(self) -> None:
+        """End the file."""
+
+
+class Tables:
+    """Files of tables in one folder, each begun when its first rows come; they appear when all are whole."""
+
+    def __init__(self, folder: Path, kind: str, metadata: Mapping[str, str]) -> None:
+        """Make the folder. `metadata` goes into Parquet files. Raises LogError when nothing can be written."""
+        self.rows: dict[Path, int] = {}
+        """How many rows each file has."""
+        self._folder = folder
+        self._kind = kind
+        self._metadata = dict(metadata)
+        self._paths: dict[str, Path] = {}
+        self._tables: dict[str, _Table] = {}
+        self._files = ExitStack()
+        if kind == "parquet":
+            import_pyarrow()
+        with failing_as(f"{folder} can't be made a folder"):
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def write(self, topic: str, columns: Columns) -> None:
+        """Add rows to the table of a topic; none make an empty table. Raises LogError."""
+        path = self._paths.get(topic) or self._path(topic)
+        with failing_as(f"{path} can't be written"):
+            if topic not in self._tables:
+                if is_anothers(path, _HEADS[self._kind]):  # as a recording may be, which is CSV, too
+                    raise FileExistsError(errno.EEXIST, "what is there is no table of this command", str(path))
+                beside = self._files.enter_context(replacing(path))
+                table = _Csv(beside) if self._kind == "csv" else _Parquet(beside, self._metadata)
+                self._tables[topic] = self._files.enter_context(closing(table))
+                self.rows[path] = 0
+                self._tables[topic].write(columns)
+            elif len(columns["t_ns"]):
+                self._tables[topic].write(columns)
+        self.rows[path] += len(columns["t_ns"])
+
+    def _path(self, topic: str) -> Path:
+        """Name the file of a topic: one of its own, whatever others have called their topics."""
+        stem = re.sub(r"[^\w.-]", "_", topic.strip("/"))[:_LONGEST_STEM] or "_"
+        stems = itertools.chain((stem,), (f"{stem}_{number}" for number in itertools.count(2)))
+        paths = (self._folder / f"{stem}.{self._kind}" for stem in stems)
+        self._paths[topic] = next(path for path in paths if path not in self.rows)
+        return self._paths[topic]
+
+    def __enter__(self) -> "Tables":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End all files, or remove them after an error. Raises LogError."""
+        with failing_as(f"{self._folder} can't be written"):
+            self._files.__exit__(kind, value, trace)
+
+
+class _Csv:
+    def __init__(self, path: Path) -> None:
+        self._file: IO[str] = path.open("w", encoding="utf-8", newline="")
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._has_head = False
+
+    def write(self, columns: Columns) -> None:
+        if not self._has_head:
+            self._writer.writerow(columns)
+            self._has_head = True
+        lists = [values.tolist() if isinstance(values, np.ndarray) else values for values in columns.values()]
+        self._writer.writerows(zip(*lists, strict=True))
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class _Parquet:
+    def __init__(self, path: Path, metadata: dict[str, str]) -> None:
+        self._path = path
+        self._metadata = metadata
+        self._writer: Any = None
+        self._arrow, self._parquet = import_pyarrow()
+
+    def write(self, columns: Columns) -> None:
+        table = self._arrow.table(dict(columns))
+        if self._writer is None:
+            schema = table.schema.with_metadata(self._metadata)
+            self._writer = self._parquet.ParquetWriter(self._path, schema, compression="zstd")
+        self._writer.write_table(table)
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+
+def import_pyarrow() -> tuple[Any, Any]:
+    """Return pyarrow and its module for Parquet. Raises LogError with what to install."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        hint = f"Parquet is written with pyarrow: {install_command('tables')}, or choose csv"
+        raise LogError(hint) from None
+    return pyarrow, pyarrow.parquet
+
+
+_RAW = tuple(name.removeprefix("/") for name in FRAME_TOPICS)
+"""Ends of the topics of frames, which other formats are for."""
+
+
+class TableSummary(NamedTuple):
+    """The written rows of each file. `problem`: the missing part of the recording, one line. `notes`: a line each."""
+
+    rows: Mapping[Path, int]
+    problem: str
+    notes: Sequence[str] = ()
+
+
+def export_tables(
+    path: Path,
+    out: Path,
+    kind: str,
+    wanted: Collection[str],
+    decoder: DbcDecoder,
+    progress: Callable[[int], None] = lambda _: None,
+) -> TableSummary:
+    """Write the tables of a recording into the folder `out`.
+
+    wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty: all. decoder:
+    decodes the frames of recordings that have no decoded topics. progress: is told the rows so far.
+    Raises LogError when the recording can't be read, lacks a topic, or a table can't be written.
+    """
+    is_mcap = path.suffix.lower() == ".mcap"
+    defined = _topics(path) if is_mcap else []
+    raw = [topic for topic in defined if topic.rsplit("/", 1)[-1] in _RAW]
+    topics = [topic for topic in defined if topic not in raw]
+    if topics:
+        return _export_topics(path, out, kind, choose_topics(topics, wanted, raw), progress)
+    if is_mcap and wanted and not raw:
+        raise LogError(f"{path} has no topic that can be read")
+    return _export_frames(path, out, kind, wanted, decoder, progress)
+
+
+def choose_topics(
+    topics: Collection[str], wanted: Collection[str], raw: Collection[str] = (), owner: str = "the log"
+) -> list[str]:
+    """Choose topics by names or patterns. Raises LogError for one that fits none, with the nearest.
+
+    raw: topics of frames, of which no table is made. owner: who has the topics, for the error.
+    """
+    if not wanted:
+        return list(topics)
+    chosen: list[str] = []
+    for pattern in wanted:
+        found = _matching(topics, pattern)
+        if not found:
+            if frames := _matching(raw, pattern):
+                raise LogError(f"topic {frames[0]} holds frames, which become no table: --format candump, blf or asc")
+            near = nearest_name("/" + pattern.strip("/"), topics) or nearest_name(DECODED + pattern, topics)
+            hint = f"did you mean {near}" if near else f"there are {', '.join(topics)}"
+            raise LogError(f"{owner} has no topic {pattern}, {hint}")
+        chosen += found
+    return list(dict.fromkeys(chosen))
+
+
+def _matching(topics: Collection[str], pattern: str) -> list[str]:
+    forms = ("/" + pattern.strip("/"), DECODED + pattern)
+    return [topic for topic in topics if any(fnmatch.fnmatchcase(topic, form) for form in forms)]
+
+
+def _export_topics(
+    path: Path, out: Path, kind: str, topics: list[str], progress: Callable[[int], None]
+) -> TableSummary:
+    stream = LogStream(path, topics)
+    keys: dict[tuple[str, tuple[str, ...]], str] = {}  # tables of joint states: a choice of joints has its own
+    with Tables(out, kind, stream.metadata) as tables:
+        for piece in stream:
+            others = stream.joint_states(piece)
+            for topic, series in piece.series.items():
+                if topic in topics and topic not in others:
+                    tables.write(topic, series_columns(series, stream.epoch_ns))
+            for topic, payloads in others.items():
+                for names, columns in joint_state_columns(payloads):
+                    is_first = all(other != topic for other, _ in keys)
+                    key = keys.setdefault((topic, names), topic if is_first else f"{topic}_{names[0]}_{len(keys)}")
+                    tables.write(key, columns)
+            if events := stream.events(piece):
+                tables.write(EVENTS.name, event_columns(events))
+            progress(sum(tables.rows.values()))
+        if not tables.rows and not stream.problem:
+            raise LogError(f"{path} makes no table: messages of varying size are not exported: {', '.join(topics)}")
+    return TableSummary(tables.rows, stream.problem)
+
+
+def _export_frames(
+    path: Path, out: Path, kind: str, wanted: Collection[str], decoder: DbcDecoder, progress: Callable[[int], None]
+) -> TableSummary:
+    source = open_frames(path)
+    owner = f"{path} has frames only, and their contract {decoder.path.name}"
+    chosen = choose_topics([DECODED + name for name in decoder.messages], wanted, owner=owner)
+    pieces = iter(source)
+    with Tables(out, kind, {"contract": decoder.path.name}) as tables:
+        for frames in pieces:
+            for name, columns in frame_columns(frames, decoder):
+                if DECODED + name in chosen:
+                    tables.write(DECODED + name, columns)
+            progress(sum(tables.rows.values()))
+    notes = [
+        f"{name}: of {count} frames only the signals that are in every frame are decoded: {reason}"
+        for name, message in decoder.messages.items()
+        if DECODED + name in chosen
+        for reason, count in message.partly_decoded.items()
+    ]
+    return TableSummary(tables.rows, source.problem, notes)
+
+
+def _topics(path: Path) -> list[str]:
+    """List the topics that the first chunk of an MCAP file defines. Raises LogError when it is none."""
+    topics: list[str] = []
+    with failing_as(f"log {path} can't be read"):
+        file = open_input(path)
+    with file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise LogError(f"{path} is not an MCAP file")
+        with contextlib.suppress(OSError, LogError, ChunkError):  # who reads the log says what is wrong with it
+            for record in scan(file):
+                if not isinstance(record, RawRecord):
+                    break
+                if record.opcode == Opcode.CHANNEL:
+                    topics.append(parse(record.opcode, record.body).topic)
+                elif record.opcode == Opcode.CHUNK:
+                    contents = read_contents(Opening().open_checked(parse(record.opcode, record.body)))
+                    channels = (found for found in contents.definitions if found.opcode == Opcode.CHANNEL)
+                    topics += [parse(channel.opcode, channel.body).topic for channel in channels]
+                    break
+    return list(dict.fromkeys(topics))

@@ -1,0 +1,367 @@
+"""What the columns of a recording show before anything is fitted: constant, stuck, clipped, in another unit.
+
+A sensor that is dead, or a column that was never filled in, reads always the same. One that is stuck reads the same for
+a while in which its joint moves. One that is clipped stays at its largest reading far longer than just below it.
+Velocities are compared with the slope of the positions, positions and torques with the limits of the URDF.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.lab.offline.recording_import import MEDIAN_TO_SIGMA, ForeignRecording, derivative_window, derive
+from adacd_hil.lab.offline.recording_map import RecordingMap, units_by_slope
+from adacd_hil.records import Vector
+from adacd_hil.scheme.model.urdf import SerialArm
+from adacd_hil.score.wording import number_of
+
+_STUCK_S: Final = 0.5
+_STUCK_TRAVEL: Final = 0.2
+"""Of its whole travel, that a joint makes while a torque that is stuck reads the same."""
+_STUCK_TIMES: Final = 5.0
+"""Longer than 99 % of the other runs of equal readings: coarse sensors have long ones."""
+_CLIPPED_SHARE, _CLIPPED_ROWS, _CLIPPED_RUN = 0.005, 10, 5
+_CLIPPED_BAND: Final = 0.05
+"""Of the span below the largest reading, which a clipped sensor passes in less time than it stays at the bound."""
+_PLATEAU_SIGMAS: Final = 3.5
+_PLATEAU_WIDTH: Final = 0.1
+_PLATEAU_SHARE, _PLATEAU_TIMES = 0.02, 4.0
+"""A sine stays at its crest for 2.4 times as long as just below it."""
+_FEWEST_LEVELS, _FINE_LEVELS = 50, 200
+"""Of a sensor whose largest reading says anything, and of one that a sine leaves sooner, to half the time."""
+STILL_RAD: Final = 0.01
+"""A joint that travels less is at rest."""
+_SPIKE_WINDOW, _SPIKE_SIGMAS, _SPIKE_SPAN, _SPIKES_SHARE = 5, 30.0, 1.0, 0.005
+"""Samples around one, its distance to their median by noise and by the usual span, and the most of all samples."""
+_NOISE_STEP: Final = 0.5
+"""Mean square of the steps from sample to sample over twice the variance: 1 of white noise, 0.01 of a motion of 1 Hz at
+50 Hz."""
+_NOISE_PERIOD_S: Final = 0.02
+"""At longer periods a fast motion has such steps, too."""
+_TURNS_THOUGH_STILL_RAD: Final = 0.3
+"""Travel by the velocities, of a joint at rest, that neither their noise nor their offset makes."""
+_WELL_CORRELATED: Final = 0.8
+_SAME_SLOPE: Final = (0.8, 1.25)
+_BEYOND_LIMITS: Final = 3.0
+"""Times the limits of a joint: no arm goes there, but degrees taken for radians are 57 times."""
+_BEYOND_EFFORT: Final = 30.0
+"""Times the effort of the URDF: mNm taken for Nm are 1000 times."""
+
+CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
+
+
+class ColumnFinding(NamedTuple):
+    """What is wrong with columns, and the next thing to do.
+
+    is_dead: no model can be made of it. is_wrong: no model of it is worth anything, if no other reading is found. What
+    is neither may be why nothing fits.
+    """
+
+    text: str
+    remedy: str
+    is_dead: bool = False
+    is_wrong: bool = False
+
+
+class _Columns(NamedTuple):
+    """All samples of some recordings, (k, n), their times in the recording (k,), and the period."""
+
+    time_s: Vector
+    q: Vector
+    dq: Vector
+    tau_J: Vector
+    period_s: float
+
+
+def find_faults(
+    described: RecordingMap, fitted: Sequence[ForeignRecording], tested: ForeignRecording
+) -> tuple[ColumnFinding, ...]:
+    """List what the columns of what is fitted and tested show."""
+    recordings = [*fitted, tested]
+    stretches = [stretch for recording in recordings for stretch in recording.stretches]
+    period_s = recordings[0].period_s
+    times = [stretch.start_s + period_s * np.arange(len(stretch.record.q)) for stretch in stretches]
+    q, dq, tau_J = (
+        np.concatenate([getattr(stretch.record, name) for stretch in stretches]) for name in ("q", "dq", "tau_J")
+    )
+    columns = _Columns(np.concatenate(times), q, dq, tau_J, period_s)
+    found = [*_of_torques(described, columns), *_of_positions(described, columns), *_of_spikes(described, columns)]
+    still = np.ptp(q, axis=0) < STILL_RAD
+    for part, records in (("fit", fitted), ("test", [tested])):
+        found += _of_rest(described, part, records, still)
+    if all(recording.has_velocities for recording in recordings):
+        found += _of_velocities(described, recordings)
+    return tuple(found)
+
+
+def joined_names(names: list[str], count: int) -> str:
+    """Join the names of some of so many joints."""
+    if len(names) == count > 2:
+        return "all joints"
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def column_name(described: RecordingMap, key: str, joint: int) -> str:
+    """Name a joint with its column."""
+    name, columns = described.urdf.joint_names[joint], getattr(described.columns, key)
+    return f"{name} ({columns[joint]})" if columns and columns[joint] != name else name
+
+
+def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+    n = described.joints
+    constant = [joint for joint in range(n) if np.ptp(columns.tau_J[:, joint]) == 0.0]
+    if constant:
+        names = joined_names([column_name(described, "tau_J", joint) for joint in constant], n)
+        always = ", ".join(dict.fromkeys(f"{columns.tau_J[0, joint] + 0.0:g}" for joint in constant))
+        yield ColumnFinding(
+            f"the torque of {names} is always {always} Nm: a dead sensor, or a column that nobody filled in",
+            "check that sensor, and `columns.tau_J`",
+            is_dead=True,
+        )
+    for joint in (joint for joint in range(n) if joint not in constant):
+        torque, name = columns.tau_J[:, joint], column_name(described, "tau_J", joint)
+        run = _stuck_run(torque, columns.q, columns.period_s)
+        if run is not None:
+            seconds, start_s = (run[1] - run[0]) * columns.period_s, columns.time_s[run[0]]
+            yield ColumnFinding(
+                f"the torque of {name} is stuck at {torque[run[0]]:g} Nm for {seconds:.2g} s, from {start_s:.4g} s on, "
+                "while the arm moves",
+                "leave that time out with --from and --until, and check the sensor",
+            )
+        if bounds := list(_clipped_at(torque)):
+            yield ColumnFinding(
+                f"the torque of {name} is clipped at {' and '.join(f'{bound:g}' for bound in bounds)} Nm",
+                CLIPPED_REMEDY,
+            )
+    yield from _against_effort(described, columns)
+
+
+def largest_torques(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
+    """Return the largest torque (n,) of each joint, but for outliers, and its effort (n,): inf where unknown."""
+    effort = np.where(np.isfinite(arm.torque_limit) & (arm.torque_limit > 0.0), arm.torque_limit, np.inf)
+    return np.nanquantile(np.abs(tau_J), 0.99, axis=0), effort
+
+
+def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+    largest, effort = largest_torques(columns.tau_J, described.urdf)
+    is_over = largest > _BEYOND_EFFORT * effort
+    if "A" in described.units.tau_J or not is_over.any():
+        return
+    joint = int(np.argmax(largest / effort))
+    yield ColumnFinding(
+        f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest[joint]:.3g} Nm, the URDF allows "
+        f"{effort[joint]:g} Nm",
+        f"if the torques are mNm: {_unit_or_scale(described, 'tau_J', 'mNm', 1e-3, is_over | np.isinf(effort))}",
+        is_dead=not np.any(described.urdf.theta_full),  # else its masses say more
+    )
+
+
+def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, is_meant: NDArray[np.bool_]) -> str:
+    """Name the key that gives all joints another unit, or some of them."""
+    if is_meant.all():
+        return f'`units.{key}` = "{unit}", which the map has as "{getattr(described.units, key)}"'
+    scale = np.array(getattr(described.scale, key) or (1.0,) * described.joints)
+    values = np.where(is_meant, scale * factor, scale).tolist()
+    return f"`scale.{key}` = [{', '.join(f'{value:.6g}' for value in values)}]"
+
+
+def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+    n, urdf = described.joints, described.urdf
+    travel = np.ptp(columns.q, axis=0)
+    still = [joint for joint in range(n) if travel[joint] < STILL_RAD]
+    if len(still) == n:
+        yield ColumnFinding("the arm does not move", "record motion of every joint, fast and slow", is_dead=True)
+    at_rest: list[int] = []
+    for joint in still if len(still) < n else ():
+        turned = float(np.ptp(np.cumsum(columns.dq[:, joint]))) * columns.period_s
+        if turned > _TURNS_THOUGH_STILL_RAD:
+            yield ColumnFinding(
+                f"the position of {column_name(described, 'q', joint)} {_stays(columns.q[:, joint])}, though by its "
+                "velocity it turns: a dead encoder",
+                "check that encoder, and `columns.q`",
+                is_wrong=True,
+            )
+        else:
+            at_rest.append(joint)
+    if at_rest:
+        names = joined_names([column_name(described, "q", joint) for joint in at_rest], n)
+        said = f"the position of {names} {_stays(columns.q[:, at_rest[0]])}: a dead encoder, or a joint"
+        if len(at_rest) > 1:
+            said = f"the positions of {names} change by less than {STILL_RAD:g} rad: dead encoders, or joints"
+        yield ColumnFinding(
+            f"{said} at rest, of which neither friction nor inertia can be learnt",
+            "move every joint, name one that never moves in `arm.locked`, and check `columns.q`",
+        )
+    noise = [joint for joint in range(n) if joint not in still and _is_noise(columns.q[:, joint], columns.period_s)]
+    if noise:
+        names = joined_names([column_name(described, "q", joint) for joint in noise], n)
+        yield ColumnFinding(
+            f"the position of {names} is noise: from sample to sample it jumps as far as it goes at all",
+            "check that encoder, and `columns.q`",
+            is_dead=True,
+        )
+    low, high, limit = urdf.position_low, urdf.position_high, urdf.velocity_limit
+    is_known = np.isfinite(low) & np.isfinite(high) & (high > low)
+    bound = np.where(is_known, np.maximum(np.abs(low), np.abs(high)), 4.0 * math.pi)
+    reach, speed = np.abs(columns.q).max(axis=0), np.quantile(np.abs(columns.dq), 0.99, axis=0)
+    goes_far = reach > _BEYOND_LIMITS * bound
+    is_fast = np.isfinite(limit) & (limit > 0.0) & (speed > _BEYOND_LIMITS * limit)
+    is_beyond = (goes_far | is_fast) & (urdf.chain.is_prismatic == 0.0) & ~np.isin(np.arange(n), noise)
+    for joint in np.flatnonzero(is_beyond)[:1].tolist():
+        much = f"goes to {reach[joint]:.3g} rad" if goes_far[joint] else f"turns at {speed[joint]:.3g} rad/s"
+        most = f"{bound[joint]:.3g} rad" if goes_far[joint] else f"{limit[joint]:g} rad/s"
+        yield ColumnFinding(
+            f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
+            f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
+        )
+
+
+def _stays(column: Vector) -> str:
+    return f"changes by less than {STILL_RAD:g} rad" if np.ptp(column) else f"is always {column[0]:g} rad"
+
+
+def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+    """Name single samples that are far from their neighbours, as of a frame that was read wrong."""
+    for key, what, unit in (("tau_J", "torque", "Nm"), ("q", "position", "rad")):
+        for joint, column in enumerate(getattr(columns, key).T):
+            rows = _spikes(column)
+            if len(rows):
+                yield ColumnFinding(
+                    f"the {what} of {column_name(described, key, joint)} jumps for single samples, "
+                    f"{number_of(len(rows), 'time')}, first to {column[rows[0]]:.4g} {unit} at "
+                    f"{columns.time_s[rows[0]]:.4g} s",
+                    "empty these cells: a missing value parts the recording, and does no harm",
+                )
+
+
+def _spikes(column: Vector) -> NDArray[np.int64]:
+    """List the samples that are spikes, if they are few."""
+    if len(column) < _SPIKE_WINDOW:
+        return np.zeros(0, np.int64)
+    windows = np.lib.stride_tricks.sliding_window_view(column, _SPIKE_WINDOW)
+    apart = np.abs(column[2:-2] - np.median(windows, axis=1))
+    noise = MEDIAN_TO_SIGMA * np.median(np.abs(np.diff(column, 2)))
+    usual = np.ptp(np.quantile(column, (0.005, 0.995)))
+    rows = np.flatnonzero(apart > max(_SPIKE_SIGMAS * noise, _SPIKE_SPAN * usual)) + 2
+    return rows if len(rows) <= _SPIKES_SHARE * len(column) else rows[:0]
+
+
+def _is_noise(column: Vector, period_s: float) -> bool:
+    return period_s <= _NOISE_PERIOD_S and float(np.mean(np.diff(column) ** 2)) > _NOISE_STEP * 2.0 * float(
+        np.var(column)
+    )
+
+
+def _of_rest(
+    described: RecordingMap, part: str, recordings: Sequence[ForeignRecording], still: NDArray[np.bool_]
+) -> Iterator[ColumnFinding]:
+    """Say which joints rest in the part that is fitted, or tested, though they move in the other one. still (n,)."""
+    q = np.concatenate([stretch.record.q for recording in recordings for stretch in recording.stretches])
+    rests = np.ptp(q, axis=0) < STILL_RAD
+    joints = np.flatnonzero(rests & ~still).tolist()
+    if joints:
+        names = "the arm" if rests.all() else joined_names([described.urdf.joint_names[i] for i in joints], len(rests))
+        yield ColumnFinding(
+            f"{names} does not move in the part that is {'fitted' if part == 'fit' else 'tested'}",
+            "choose what is fitted with --from and --until, and other motion for --test",
+            is_dead=bool(rests.all()),
+        )
+
+
+def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) -> Iterator[ColumnFinding]:
+    """Compare measured velocities with the slope of the positions."""
+    n = described.joints
+    products = np.zeros((n, n))
+    window = derivative_window(described, recordings[0].period_s)
+    squares, own = np.zeros(n), np.zeros(n)
+    for stretch in (stretch for recording in recordings for stretch in recording.stretches):
+        if len(stretch.record.q) < window:
+            continue
+        slope = derive(stretch.record.q, recordings[0].period_s, window)
+        products += slope.T @ stretch.record.dq
+        squares += np.sum(slope**2, axis=0)
+        own += np.sum(stretch.record.dq**2, axis=0)
+    slopes = np.diag(products) / np.maximum(squares, 1e-12)
+    alike = products / np.sqrt(np.maximum(np.outer(squares, own), 1e-24))
+    moving = [joint for joint in range(n) if squares[joint] > 0.0]
+    for joint in moving:
+        other = int(np.argmax(np.abs(alike[joint])))
+        if abs(alike[joint, joint]) < _WELL_CORRELATED < alike[joint, other]:
+            yield ColumnFinding(
+                f"the velocity of {column_name(described, 'dq', joint)} is in the column of "
+                f"{column_name(described, 'dq', other)}",
+                "in the map: exchange them in `columns.dq`, or leave that key out: velocities are derived then",
+                is_wrong=True,
+            )
+            return
+    for joint in moving:
+        if abs(alike[joint, joint]) < _WELL_CORRELATED or _SAME_SLOPE[0] < slopes[joint] < _SAME_SLOPE[1]:
+            continue
+        name, factor = column_name(described, "dq", joint), float(slopes[joint])
+        how = "has the other sign than" if factor < 0.0 else f"is {factor:.3g} times"
+        keys = [f'`units.{key}` = "{unit}"' for key, unit in units_by_slope(described.units, abs(factor))]
+        yield ColumnFinding(
+            f"the velocity of {name} {how} its position's slope",
+            f"in the map: {' or '.join([*keys, 'leave `columns.dq` out'])}: velocities are derived then",
+            is_wrong=True,
+        )
+        return
+
+
+def _runs(column: Vector) -> NDArray[np.int64]:
+    """List the runs of equal readings: first row, and the one after the last (r, 2)."""
+    edges = np.flatnonzero(np.diff(column) != 0.0) + 1
+    bounds = np.concatenate(([0], edges, [len(column)]))
+    return np.column_stack([bounds[:-1], bounds[1:]])
+
+
+def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | None:
+    """Find the longest run of equal torques in which a joint moves, if it is too long for a coarse sensor. q (k, n)."""
+    runs = _runs(torque)
+    lengths = runs[:, 1] - runs[:, 0]
+    lengths[np.isin(torque[runs[:, 0]], (torque.min(), torque.max()))] = 1  # of a sensor that is clipped
+    place = int(np.argmax(lengths))
+    first, last = runs[place].tolist()
+    usual = float(np.quantile(np.delete(lengths, place), 0.99)) if len(lengths) > 1 else 0.0
+    is_long = (last - first) * period_s >= _STUCK_S and last - first >= 20 and last - first > _STUCK_TIMES * usual
+    is_moving = np.any(np.ptp(q[first:last], axis=0) > _STUCK_TRAVEL * np.ptp(q, axis=0))
+    return (first, last) if is_long and is_moving else None
+
+
+def plateau(torque: Vector) -> tuple[float, float] | None:
+    """Find a bound at which a torque stays within its noise: the bound, and the share of the time; None: there is none.
+
+    The last stretch before its extreme reading, as wide as the noise, holds far more readings than the one before it.
+    A joint that overcomes nothing but friction is like that, too.
+    """
+    noise = float(MEDIAN_TO_SIGMA) * float(np.median(np.abs(np.diff(torque, 2))))
+    width, span = 2.0 * _PLATEAU_SIGMAS * noise, float(np.ptp(torque))
+    if not 0.0 < width < _PLATEAU_WIDTH * span:
+        return None
+    for sign in (1.0, -1.0):
+        if np.count_nonzero(torque == sign * np.max(sign * torque)) >= _CLIPPED_RUN:
+            continue  # cut off behind the noise, see `_clipped_at`
+        below = float(np.max(sign * torque)) - sign * torque
+        at, beside = np.count_nonzero(below < width), np.count_nonzero((below >= width) & (below < 2.0 * width))
+        if at > _PLATEAU_SHARE * len(torque) and at > _PLATEAU_TIMES * beside:
+            return float(np.median(torque[below < width])), at / len(torque)
+    return None
+
+
+def _clipped_at(torque: Vector) -> Iterator[float]:
+    """List the bounds at which readings are cut off."""
+    levels = np.unique(torque)
+    if len(levels) < _FEWEST_LEVELS:
+        return
+    runs = _runs(torque)
+    lengths, at_run = runs[:, 1] - runs[:, 0], torque[runs[:, 0]]
+    times = 1.0 if len(levels) < _FINE_LEVELS else 0.5
+    for bound in (levels[0], levels[-1]):
+        at = int(lengths[at_run == bound].sum())
+        beside = int(np.count_nonzero(np.abs(torque - bound) <= _CLIPPED_BAND * (levels[-1] - levels[0]))) - at
+        is_long = lengths[at_run == bound].max() >= _CLIPPED_RUN
+        if at > max(_CLIPPED_SHARE * len(torque), _CLIPPED_ROWS, times * beside) and is_long:
+            yield float(bound)

@@ -1,0 +1,294 @@
+"""A recording in a CSV file: its heads, its rows, and which key of the map a file asks for that can't be read.
+
+A row is left out if it has fewer cells than the head, or a cell that is no number; an empty cell is a missing value. A
+row of units below the head is compared with the map.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from decimal import Decimal, InvalidOperation
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import Final, NamedTuple, TextIO
+
+from adacd_hil.file_access import open_input
+from adacd_hil.lab.offline.recorded_columns import RecordedColumns, RecordedRows
+from adacd_hil.lab.offline.recording_map import ISO, RecordingMap, unit_of
+from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.remedies import nearest_name
+from adacd_hil.settings.schema import ConfigError
+
+DELIMITERS: Final = (",", ";", "\t", " ")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_CUT, _UNREADABLE = "cut short", "that can't be read"
+_KINDS_OF_FILE: Final = (
+    (b"PK\x03\x04", "a spreadsheet or an archive: save it as CSV"),
+    (b"\x1f\x8b", "compressed: gunzip it"),
+    (b"\xff\xfe", "UTF-16: save it as UTF-8"),
+    (b"\xfe\xff", "UTF-16: save it as UTF-8"),
+    (b"MATLAB", "a MATLAB file: adacd_hil.api.detect takes arrays"),
+    (b"\x93NUMPY", "a numpy array: adacd_hil.api.detect takes arrays"),
+    (b"\x89HDF", "an HDF5 file: adacd_hil.api.detect takes arrays"),
+    (b"PAR1", "a Parquet file: save it as CSV"),
+    (b"LOGG", "a BLF of frames: `adacd-hil log export --format csv --dbc` makes tables of it"),
+    (b"<?xml", "XML, no recording: if it is the URDF, the map names it, `arm.urdf`"),
+    (b"<robot", "a URDF: the map names it, `arm.urdf`"),
+)
+
+
+class CsvHead(NamedTuple):
+    """The first row: heads, none where the map says so, and the number of cells."""
+
+    heads: list[str]
+    cells: int
+
+
+class _Column(NamedTuple):
+    """A column that is wanted: how errors name it, its place from 0, how a cell is read, and its unit by the map."""
+
+    name: str
+    place: int
+    read: Callable[[str], float]
+    unit: str
+
+
+def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
+    """Read the columns of a map. Raises LogError when the file can't be read, ConfigError when it lacks a column."""
+    for key in ("q", "tau_J"):
+        if not getattr(described.columns, key):
+            raise ConfigError(f"missing key `columns.{key}`: which columns of {path}?")
+    rows = _rows(path, described)
+    first = next(rows, (1, []))
+    head = _head(path, first[1], described)
+    columns = _columns(path, head, described)
+    read = RecordedRows(path, len(columns), described.time_s, span)
+    if not columns[0].name:
+        read.notes.append(f"no column of times: a row every {described.sampling.period_s:g} s (sampling.period_s)")
+    reader = _RowReader(path, columns, described, head.cells)
+    for number, cells in rows if described.csv.has_header else chain([first], rows):
+        if row := reader.read(number, cells, read):
+            read.append(number, row)
+        if read.is_past_span:
+            break
+    names = [column.name for column in columns[1 : len(columns) - bool(described.columns.contact)]]
+    return read.columns(described, names, has_touches=bool(described.columns.contact))
+
+
+def _head(path: Path, first: list[str], described: RecordingMap) -> CsvHead:
+    while first and not first[-1].strip():  # as of a delimiter at the end of every row
+        first = first[:-1]
+    heads = [cell.strip() for cell in first]
+    if heads:
+        heads[0] = heads[0].removeprefix("#").strip()
+    if described.csv.has_header and len(heads) == 1:
+        for delimiter in DELIMITERS:
+            if delimiter != described.csv.delimiter and len(heads[0].split(delimiter)) > 2:
+                raise ConfigError(f"recording {path} has one column; with `csv.delimiter` = {delimiter!r} it has more")
+    return CsvHead(heads if described.csv.has_header else [], len(heads))
+
+
+def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
+    """List the rows with their numbers from 1; empty ones, and comments below the first, are passed over."""
+    form = described.csv
+    with opened_text(path) as file:
+        for _ in range(form.skip_rows):
+            next(file, "")
+        for number, cells in enumerate(split_rows(path, file, form.delimiter), start=1 + form.skip_rows):
+            is_comment = bool(cells) and cells[0].startswith("#") and number > 1 + form.skip_rows
+            if not is_comment and any(map(str.strip, cells)):
+                yield number, cells
+
+
+@contextmanager
+def opened_text(path: Path) -> Iterator[TextIO]:
+    """Open a file of text. Raises LogError for what is of another kind, or can't be read."""
+    try:
+        with _open_text(path) as file:
+            yield file
+    except UnicodeDecodeError:
+        raise LogError(f"recording {path} is no text in UTF-8") from None
+    except OSError as error:
+        raise LogError(f"recording {path}: {error.strerror or error}") from None
+
+
+def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
+    """Split lines into cells. Raises LogError."""
+    if delimiter == " ":
+        yield from (line.split() for line in lines)
+        return
+    rows = csv.reader(lines, delimiter=delimiter)
+    try:
+        yield from rows
+    except csv.Error as error:
+        raise LogError(f"recording {path}, row {rows.line_num}: {error}") from None
+
+
+def _open_text(path: Path) -> TextIO:
+    file = open_input(path)
+    begin = file.peek(16)
+    for magic, kind in _KINDS_OF_FILE:
+        if begin.startswith(magic):
+            file.close()
+            raise LogError(f"recording {path} is {kind}")
+    return io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+
+
+def _columns(path: Path, head: CsvHead, described: RecordingMap) -> list[_Column]:
+    """Find the columns: time, positions, torques, velocities, touches. Raises ConfigError."""
+    columns, units = described.columns, described.units
+    number = partial(read_number, decimal=",") if described.csv.decimal == "," else float
+    time = _time_column(path, head, described)
+    wanted = (
+        *((name, units.q) for name in columns.q),
+        *((name, units.tau_J) for name in columns.tau_J),
+        *((name, units.dq) for name in columns.dq),
+        *((name, "") for name in filter(None, (columns.contact,))),
+    )
+    return [time, *(_Column(name, find_column(name, head, path), number, unit) for name, unit in wanted)]
+
+
+def _time_column(path: Path, head: CsvHead, described: RecordingMap) -> _Column:
+    """Find the column of times, or one without a name where the map has a period in its place. Raises ConfigError."""
+    name, units = described.columns.time, described.units
+    read = _Times(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
+    has_period = described.sampling.period_s > 0.0
+    if name and not (has_period and name not in head.heads and nearest_name(name, head.heads) is None):
+        try:
+            return _Column(name, find_column(name, head, path), read, units.time)
+        except ConfigError as error:
+            raise ConfigError(f"{error}; if it has no times, `sampling.period_s` says how far rows are apart") from None
+    if not has_period:
+        raise ConfigError("missing key `columns.time`; where there are no times `sampling.period_s` is the period")
+    return _Column("", 0, read, "")
+
+
+def find_column(name: str, head: CsvHead, path: Path) -> int:
+    """Find a column by its head or its number from 1. Raises ConfigError."""
+    if name in head.heads:
+        return head.heads.index(name)
+    if name.isdecimal() and 1 <= int(name) <= head.cells:
+        return int(name) - 1
+    nearest = nearest_name(name, head.heads)
+    known = f"did you mean {nearest!r}?" if nearest else f"there are {', '.join(head.heads) or f'1 to {head.cells}'}"
+    raise ConfigError(f"recording {path} has no column {name!r}; {known}")
+
+
+class _RowReader:
+    """Reads the wanted cells of a row."""
+
+    def __init__(self, path: Path, columns: list[_Column], described: RecordingMap, cells: int) -> None:
+        self._path, self._columns, self._described, self._cells = path, columns, described, cells
+        self._first = self._rows = 0
+        self._has_time = bool(columns[0].name)
+        self._wanted = columns if self._has_time else columns[1:]
+        self._plain = [(column.place, column.read) for column in self._wanted]
+
+    def read(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
+        """Return the numbers of a row, the time first; None, and count it, where it is left out."""
+        self._rows += 1
+        self._first = self._first or number
+        if len(cells) < self._cells:
+            into.drop(_CUT, f"row {number}: it has {len(cells)} cells of {self._cells}")
+            return None
+        row: list[float] | None
+        try:
+            row = [read(cells[place]) for place, read in self._plain]
+        except (ValueError, OverflowError):
+            row = self._slowly(number, cells, into)
+        if row is None:
+            return None
+        if len(cells) > self._cells and any(map(str.strip, cells[self._cells :])):
+            into.drop(_UNREADABLE, f"row {number}: it has {len(cells)} cells, more than the head's {self._cells}")
+            return None
+        return row if self._has_time else [(self._rows - 1) * self._described.sampling.period_s, *row]
+
+    def _slowly(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
+        """Read a row of which a cell is no number: empty, of units, or spoilt."""
+        row, wrong = [], []
+        for column in self._wanted:
+            text = cells[column.place].strip()
+            try:
+                row.append(column.read(text) if text else math.nan)
+            except (ValueError, OverflowError):
+                wrong.append((column, text))
+        if not wrong:
+            return row
+        if number == self._first and len(wrong) == len(self._wanted) and self._is_of_units(wrong):
+            into.notes.append(f"row {number} names units ({', '.join(text for _, text in wrong)})")
+            self._rows -= 1
+            self._first = number + 1
+            return None
+        column, text = wrong[0]
+        into.drop(_UNREADABLE, f"row {number}: column {column.name!r} is {text!r}{self._remedy(text, column)}")
+        return None
+
+    def _is_of_units(self, wrong: list[tuple[_Column, str]]) -> bool:
+        """Tell whether a row names units. Raises ConfigError where one is not that of the map."""
+        for column, text in wrong:
+            unit = unit_of(text)
+            if unit and column.unit and unit != column.unit and not (column.unit == ISO):
+                raise ConfigError(
+                    f"recording {self._path}: its row of units says {unit!r} for column {column.name!r}, the map "
+                    f"{column.unit!r} (`units`)"
+                )
+        return not any(map(str.isdigit, "".join(text for _, text in wrong)))
+
+    def _remedy(self, text: str, column: _Column) -> str:
+        """Name the key of the map with which a cell could be read."""
+        if self._described.csv.decimal == "." and text.count(",") == 1 and is_number(text, ","):
+            return ', no number: `csv.decimal` = "," reads it'
+        if column is self._columns[0] and is_iso_time(text):
+            return f', no number: `units.time` = "{ISO}" reads it'
+        return ", no number"
+
+
+def read_number(text: str, decimal: str) -> float:
+    """Read a number. Raises ValueError."""
+    return float(text.replace(",", ".") if decimal == "," else text)
+
+
+class _Times:
+    """Reads times since the first one: a count of ns since 1970 has more digits than a float."""
+
+    def __init__(self, read: Callable[[str], Decimal], decimal: str) -> None:
+        self._read, self._decimal = read, decimal
+        self._first: Decimal | None = None
+
+    def __call__(self, text: str) -> float:
+        try:
+            moment = self._read(text.strip().replace(self._decimal, "."))
+        except InvalidOperation:
+            raise ValueError(text) from None
+        if self._first is None and moment.is_finite():
+            self._first = moment
+        return float(moment - (self._first or 0))
+
+
+def _iso_seconds(text: str) -> Decimal:
+    """Read a date and time of ISO 8601, of UTC unless it says otherwise, as s since 1970."""
+    moment = datetime.fromisoformat(text)
+    since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - _EPOCH
+    return since // timedelta(microseconds=1) * Decimal("1e-6")
+
+
+def is_number(text: str, decimal: str) -> bool:
+    """Tell whether a text is a number with such a sign before its decimals."""
+    try:
+        read_number(text, decimal)
+    except ValueError:
+        return False
+    return True
+
+
+def is_iso_time(text: str) -> bool:
+    """Tell whether a text is a date and time of ISO 8601."""
+    try:
+        _iso_seconds(text)
+    except ValueError:
+        return False
+    return True

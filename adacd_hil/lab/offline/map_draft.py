@@ -1,0 +1,248 @@
+"""A map drafted from a recording and a URDF: columns by their heads or values, units by spans against the URDF.
+
+What is guessed says so in the map, with the reason; `identify` names what is still wrong.
+"""
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from adacd_hil.file_access import read_input
+from adacd_hil.lab.logs.joint_state_bags import JOINT_STATES, is_bag, joint_state_topics, opened_bag
+from adacd_hil.lab.offline.column_checks import largest_torques
+from adacd_hil.lab.offline.recording_map import ISO, TIME_S, UnitsSection, time_unit_of, units_by_slope
+from adacd_hil.lab.offline.table_guess import TableGuess, guess_table
+from adacd_hil.log.log_files import LogError
+from adacd_hil.records import Vector
+from adacd_hil.scheme.model.urdf import SerialArm, UrdfError, read_urdf
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.toml_files import toml_value
+
+_FINGERS: Final = re.compile(r"finger|gripper|claw|knuckle|jaw", re.IGNORECASE)
+_DEGREES: Final = 180.0 / np.pi
+_BEYOND: Final = 1.5
+"""Times the limits of the URDF, from which positions are degrees."""
+_BEYOND_EFFORT: Final = 5.0
+_SEEN_MESSAGES: Final = 20_000
+
+
+class DraftedKey(NamedTuple):
+    """A key of the map, its value, and why; reason "": it is certain."""
+
+    section: str
+    key: str
+    value: object
+    reason: str
+
+
+@dataclass(frozen=True)
+class MapDraft:
+    """The keys of a map."""
+
+    recording: Path
+    keys: tuple[DraftedKey, ...]
+
+    @property
+    def guesses(self) -> tuple[DraftedKey, ...]:
+        """The keys that are to be looked at."""
+        return tuple(key for key in self.keys if key.reason)
+
+    def text(self) -> str:
+        """Write the map as TOML."""
+        lines = [f"# Drafted from {self.recording.name}: look at what is a guess."]
+        for section in dict.fromkeys(key.section for key in self.keys):
+            lines += ["", f"[{section}]"]
+            for key in (key for key in self.keys if key.section == section):
+                comment = f"  # a guess: {key.reason}" if key.reason else ""
+                lines.append(f"{key.key} = {toml_value(key.value)}{comment}")
+        return "\n".join(lines) + "\n"
+
+
+def draft_map(recording: Path, urdf: Path, map_path: Path) -> MapDraft:
+    """Draft the map of a recording, which will stand at map_path. Raises ConfigError, LogError."""
+    arm, locked = _read_arm(urdf)
+    where = Path(os.path.relpath(urdf.resolve(), map_path.resolve().parent)).as_posix()
+    keys = [DraftedKey("arm", "urdf", where, "")]
+    if locked:
+        keys.append(DraftedKey("arm", "locked", locked, "by their names joints of a gripper"))
+    keys += _of_bag(recording, arm) if is_bag(recording) else _of_table(recording, arm)
+    return MapDraft(recording, tuple(keys))
+
+
+def _read_arm(urdf: Path) -> tuple[SerialArm, tuple[str, ...]]:
+    """Read the arm; joints of a gripper are locked where it would branch. Raises ConfigError."""
+    try:
+        text = read_input(urdf)
+        try:
+            return read_urdf(text), ()
+        except UrdfError:
+            names = re.findall(r'<joint[^>]*name="([^"]+)"', text.decode("utf-8", "replace"))
+            locked = tuple(dict.fromkeys(name for name in names if _FINGERS.search(name)))
+            if not locked:
+                raise
+            return read_urdf(text, locked=locked), locked
+    except OSError as error:
+        raise ConfigError(f"URDF {urdf}: {error.strerror or error}") from None
+    except UrdfError as error:
+        raise ConfigError(f"URDF {urdf}: {error}") from None
+
+
+def _of_table(recording: Path, arm: SerialArm) -> list[DraftedKey]:
+    guess = guess_table(recording, arm.joint_names)
+    n, form = len(arm.joint_names), guess.form
+    for role, what in (("q", "positions"), ("tau_J", "torques or currents")):
+        if role not in guess.columns:
+            raise ConfigError(
+                f"recording {recording}: no {n} columns look like {what} of {', '.join(arm.joint_names)}; there are "
+                f"{', '.join(form.heads)}"
+            )
+    keys = []
+    defaults = {"delimiter": ",", "decimal": ".", "has_header": True, "skip_rows": 0}
+    for key, default in defaults.items():
+        if getattr(form, key) != default:
+            keys.append(DraftedKey("csv", key, getattr(form, key), ""))
+    for role in ("time", "q", "dq", "tau_J", "contact"):
+        if role in guess.columns:
+            names = guess.columns[role]
+            value: object = names[0] if role in ("time", "contact") else names
+            keys.append(DraftedKey("columns", role, value, guess.reasons.get(role, "")))
+    keys += _units_of_table(guess, arm)
+    if "time" not in guess.columns:
+        keys.append(DraftedKey("sampling", "period_s", 0.0, "write how far rows are apart, s; there are no times"))
+    return keys
+
+
+def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
+    keys = []
+    step = 1e-3
+    if guess.is_iso:
+        keys.append(DraftedKey("units", "time", ISO, ""))
+    elif "time" in guess.columns:
+        step = float(np.nanmedian(np.diff(guess.of("time")[:, 0])))
+        unit = guess.units.get("time") or time_unit_of(step) or "s"
+        if unit != "s":
+            why = "" if "time" in guess.units else f"rows are {step:g} {unit} apart"
+            keys.append(DraftedKey("units", "time", unit, why))
+        step *= TIME_S[unit]
+    angle = guess.units.get("q") or _angle_unit(guess.of("q"), arm)
+    if "q" in guess.units or angle != "rad":
+        why = "" if "q" in guess.units else _span(guess.of("q"), arm)
+        keys.append(DraftedKey("units", "q", angle, why))
+    if "dq" in guess.columns:
+        speed = guess.units.get("dq") or _speed_unit(guess, angle, step)
+        if speed != "rad/s":
+            keys.append(
+                DraftedKey("units", "dq", speed, "" if "dq" in guess.units else "by the slope of the positions")
+            )
+    torque = guess.units.get("tau_J") or _torque_unit(guess.of("tau_J"), arm)
+    if torque != "Nm":
+        why = "" if "tau_J" in guess.units else _reach(guess.of("tau_J"), arm)
+        keys.append(DraftedKey("units", "tau_J", torque, why))
+    if torque in ("A", "mA"):
+        ones = (1.0,) * len(arm.joint_names)
+        keys.append(DraftedKey("scale", "tau_J", ones, "Nm/A of each joint, which only its maker knows"))
+        keys.insert(0, DraftedKey("arm", "has_rotors", True, "currents of motors turn the rotors, too"))
+    return keys
+
+
+def _angle_unit(q: Vector, arm: SerialArm) -> str:
+    """Guess degrees where positions go beyond what the URDF allows in radians."""
+    bound = _bounds(arm)
+    reach = np.nanmax(np.abs(q), axis=0)
+    is_revolute = arm.chain.is_prismatic == 0.0
+    return "deg" if np.any((reach > _BEYOND * bound) & is_revolute) else "rad"
+
+
+def _bounds(arm: SerialArm) -> Vector:
+    bound = np.maximum(np.abs(arm.position_low), np.abs(arm.position_high))
+    return np.where(np.isfinite(bound) & (bound > 0.0), bound, 2.0 * np.pi)
+
+
+def _span(q: Vector, arm: SerialArm) -> str:
+    reach, bound = np.nanmax(np.abs(q), axis=0), _bounds(arm)
+    joint = int(np.argmax(reach / bound))
+    return f"{arm.joint_names[joint]} goes to {reach[joint]:.3g}, the URDF to {bound[joint]:.3g} rad"
+
+
+def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
+    """Guess the unit in which velocities are the slope of the positions."""
+    slope = np.gradient(guess.of("q"), axis=0) / step_s * (1.0 / _DEGREES if angle == "deg" else 1.0)
+    square = np.nansum(slope**2)
+    factor = abs(float(np.nansum(slope * guess.of("dq")) / square)) if square > 0.0 else 1.0
+    return next((unit for key, unit in units_by_slope(UnitsSection(), factor) if key == "dq"), "rad/s")
+
+
+def _torque_unit(tau: Vector, arm: SerialArm) -> str:
+    """Guess mNm where torques reach beyond the effort of the URDF, and would not in mNm."""
+    largest, effort = largest_torques(tau, arm)
+    return "mNm" if np.any(largest > _BEYOND_EFFORT * effort) else "Nm"
+
+
+def _reach(tau: Vector, arm: SerialArm) -> str:
+    largest, effort = largest_torques(tau, arm)
+    joint = int(np.nanargmax(largest / effort))
+    return f"they reach {largest[joint]:.3g}, the effort of the URDF is {effort[joint]:g} Nm"
+
+
+def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
+    """Draft what a bag needs: nothing, where it has the URDF's names on one topic."""
+    keys = []
+    with opened_bag(recording) as bag:
+        found = joint_state_topics(bag.topics)
+        if not found:
+            raise LogError(f"recording {recording} has no topic of sensor_msgs/msg/JointState")
+        topic = JOINT_STATES if JOINT_STATES in found else found[0]
+        if len(found) > 1:
+            keys.append(DraftedKey("bag", "topic", topic, f"one of {', '.join(found)}"))
+        names: dict[str, None] = {}
+        positions, efforts = [], []
+        is_stamped = False
+        for _, (_, message) in zip(range(_SEEN_MESSAGES), bag.messages(topic), strict=False):
+            names |= dict.fromkeys(message.names)
+            is_stamped |= message.stamp_ns != 0
+            if len(message.names) == len(message.position) == len(message.effort):
+                positions.append(dict(zip(message.names, message.position.tolist(), strict=True)))
+                efforts.append(dict(zip(message.names, message.effort.tolist(), strict=True)))
+    if not is_stamped:
+        keys.append(DraftedKey("bag", "time", "received", "all stamps are 0"))
+    chosen = _bag_names(recording, list(names), arm)
+    if chosen != arm.joint_names:
+        keys.append(DraftedKey("columns", "q", chosen, "by their endings and order"))
+    if positions:
+        q, tau = (
+            np.array([[row.get(name, np.nan) for name in chosen] for row in rows]) for rows in (positions, efforts)
+        )
+        if np.isfinite(q).any() and _angle_unit(q, arm) != "rad":
+            keys.append(DraftedKey("units", "q", "deg", _span(q, arm)))
+        if np.isfinite(tau).any() and _torque_unit(tau, arm) != "Nm":
+            keys.append(DraftedKey("units", "tau_J", "mNm", _reach(tau, arm)))
+    return keys
+
+
+def _bag_names(recording: Path, names: list[str], arm: SerialArm) -> tuple[str, ...]:
+    """Find the arm's joints among a bag's. Raises ConfigError."""
+    if set(arm.joint_names) <= set(names):
+        return arm.joint_names
+    chosen = []
+    for wanted in arm.joint_names:
+        ends = [name for name in names if name.endswith(wanted) or wanted.endswith(name)]
+        if len(ends) == 1:
+            chosen.append(ends[0])
+    if len(set(chosen)) == len(arm.joint_names):
+        return tuple(chosen)
+    if len(names) == len(arm.joint_names):
+        return tuple(sorted(names, key=_natural))
+    raise ConfigError(
+        f"recording {recording} has the joints {', '.join(names)}, the URDF {', '.join(arm.joint_names)}: write "
+        "`columns.q` by hand"
+    )
+
+
+def _natural(name: str) -> list[tuple[bool, int, str]]:
+    """Order names by their numbers."""
+    parts = re.split(r"(\d+)", name)
+    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]

@@ -1,0 +1,168 @@
+"""The rows of a recording, from whatever file they come: put in order of time, in SI units, with what was dropped.
+
+A logger doubles rows, cuts the last one, writes a word where a number should be. Such a row is dropped and counted; the
+recording is refused only where they are many, with the first of them.
+
+A recording is held in memory, at most `MOST_ROWS` rows of it: of a longer file only the span that is asked for.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.lab.offline.recording_map import RecordingMap
+from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.records import Vector
+from adacd_hil.score.wording import number_of
+
+MOST_ROWS: Final = 4_000_000
+"""Rows of a file that are kept, and samples that they become: an hour at 1 kHz, with a little to spare."""
+SHORTEST_SAMPLES: Final = 50
+"""A shorter stretch teaches nothing: the filters have not settled."""
+LARGEST: Final = 1e6
+"""rad, rad/s or Nm: what is larger is no measurement, and its square would spoil all others."""
+_BLOCK_ROWS = 50_000
+_SPARE_S = 1.0
+"""Kept before and after the span that is asked for: what a derived velocity and the grid of samples reach over."""
+_FEW_ROWS, _FEW_SHARE = 3, 0.01
+"""So many rows, or such a share of all, may be spoilt: beyond it the file is not what the map says."""
+
+_DOUBLED = "with the time of the row before"
+
+
+@dataclass(frozen=True)
+class RecordedColumns:
+    """Time (k,) s, increasing, that of the first row, and values (k, 2 n or 3 n) in SI units.
+
+    values: positions, torques and, if there are some, velocities side by side; what is missing is not finite. touched
+    (k,), if known. notes: what was dropped or taken for granted, a few words each.
+    """
+
+    time_s: Vector
+    begin_s: float
+    values: Vector
+    touched: NDArray[np.bool_] | None
+    notes: tuple[str, ...]
+
+
+@dataclass
+class _Drop:
+    """Rows that are dropped for one reason, and the first of them in words."""
+
+    count: int
+    first: str
+
+
+class RecordedRows:
+    """Takes the rows of a recording one by one, and makes columns of them."""
+
+    def __init__(self, path: Path, width: int, time_unit_s: float, span: TimeWindow | None) -> None:
+        """Begin. width: numbers of a row, the time first."""
+        self.notes: list[str] = []
+        self.count = 0
+        """Rows so far."""
+        self._path, self._width, self._unit_s, self._span = path, width + 1, time_unit_s, span
+        self._block: list[float] = []
+        self._kept: list[Vector] = []
+        self._drops: dict[str, _Drop] = {}
+        self._begin_s = self._latest_s = -np.inf
+        self._is_long = False  # only the span is kept
+
+    def append(self, number: int, row: list[float]) -> None:
+        """Take a row; number: its place in the file, from 1. Raises LogError where there are too many."""
+        self._block.append(number)
+        self._block += row
+        self.count += 1
+        if self.count % _BLOCK_ROWS == 0:
+            self._flush()
+
+    def drop(self, kind: str, first: str, count: int = 1) -> None:
+        """Count rows that are left out. kind: follows the word "row"; first: says what the first of them is like."""
+        if count:
+            self._drops.setdefault(kind, _Drop(0, first)).count += count
+
+    @property
+    def is_past_span(self) -> bool:
+        """Whether what is asked for has been read of a file that is too long to be read whole."""
+        return self._is_long and self._span is not None and self._latest_s - self._begin_s > self._span.end_s + _SPARE_S
+
+    def columns(self, described: RecordingMap, names: list[str], has_touches: bool = False) -> RecordedColumns:
+        """Make columns of all rows. names: of the values, for errors. Raises LogError."""
+        self._flush()
+        table = np.concatenate(self._kept) if self._kept else np.empty((0, self._width))
+        self._check_drops(len(table))
+        if len(table) < SHORTEST_SAMPLES:
+            where = "" if self._span is None or self._span.is_whole else f" {self._span.text}"
+            dropped = "".join(f"; {note}" for note in self._dropped())
+            raise LogError(
+                f"recording {self._path} has {number_of(len(table), 'row')}{where}, {SHORTEST_SAMPLES} are the least"
+                f"{dropped}"
+            )
+        has_dq = len(names) > 2 * described.joints
+        units = np.array((*described.q_rad, *described.tau_J_Nm, *(described.dq_rad_s if has_dq else ())))
+        time_s, given = table[:, 1] * self._unit_s, table[:, 2 : 2 + len(units)]
+        with np.errstate(over="ignore"):
+            values = given * units
+        self._check_values(given, values, time_s - self._begin_s, names)
+        touched = table[:, -1] != 0.0 if has_touches else None
+        notes = (*self.notes, *self._dropped())
+        return RecordedColumns(time_s, self._begin_s, values, touched, notes)
+
+    def _flush(self) -> None:
+        """Put the rows so far in order, and keep those that are asked for."""
+        if not self._block:
+            return
+        table = np.array(self._block).reshape(-1, self._width)
+        self._block = []
+        time_s = table[:, 1] * self._unit_s
+        if np.isneginf(self._begin_s) and np.any(np.isfinite(time_s)):
+            self._begin_s = float(time_s[np.isfinite(time_s)][0])
+        before_s = np.fmax.accumulate(np.concatenate(([self._latest_s], time_s)))
+        self._drop_rows(table, time_s == before_s[:-1], _DOUBLED, "{time} once more")
+        self._drop_rows(table, time_s < before_s[:-1], "out of order", "time goes back to {time}")
+        self._drop_rows(table, ~np.isfinite(time_s), "without a time", "it has no time")
+        is_later = np.isfinite(time_s) & (time_s > before_s[:-1])
+        self._latest_s = float(before_s[-1])
+        self._kept.append(table[is_later])
+        self._is_long |= self.count > MOST_ROWS
+        if self._is_long:
+            self._kept = [self._within(part) for part in self._kept]
+        if sum(map(len, self._kept)) > MOST_ROWS:
+            remedy = "cut it" if self._span is None else "choose a part with --from and --until"
+            raise LogError(f"recording {self._path} has more than {MOST_ROWS} rows: {remedy}")
+
+    def _drop_rows(self, table: Vector, is_wrong: NDArray[np.bool_], kind: str, words: str) -> None:
+        for number, time in table[is_wrong, :2][:1].tolist():
+            first = words.format(time=f"{time * self._unit_s:.9g} s")
+            self.drop(kind, f"row {number:.0f}: {first}", int(np.count_nonzero(is_wrong)))
+
+    def _within(self, table: Vector) -> Vector:
+        if self._span is None:
+            return table
+        time_s = table[:, 1] * self._unit_s - self._begin_s
+        return table[(time_s >= self._span.start_s - _SPARE_S) & (time_s <= self._span.end_s + _SPARE_S)]
+
+    def _dropped(self) -> list[str]:
+        return [f"{number_of(drop.count, 'row')} {kind} left out ({drop.first})" for kind, drop in self._drops.items()]
+
+    def _check_drops(self, kept: int) -> None:
+        """Refuse a recording of which more than a few rows are spoilt; doubled ones are no harm."""
+        spoilt = {kind: drop for kind, drop in self._drops.items() if kind != _DOUBLED}
+        count = sum(drop.count for drop in spoilt.values())
+        if count > max(_FEW_ROWS, _FEW_SHARE * (kept + count)):
+            kind, worst = max(spoilt.items(), key=lambda pair: pair[1].count)
+            raise LogError(
+                f"recording {self._path}, {worst.first}; {number_of(worst.count, 'row')} {kind} are too many"
+            )
+
+    def _check_values(self, given: Vector, values: Vector, time_s: Vector, names: list[str]) -> None:
+        too_large = np.argwhere(np.isfinite(given) & ~(np.abs(values) <= LARGEST))
+        if len(too_large):
+            row, column = too_large[0].tolist()
+            raise LogError(
+                f"recording {self._path}: column {names[column]!r} is {given[row, column]:g} at {time_s[row]:.9g} s, "
+                f"more than {LARGEST:g} rad, rad/s or Nm"
+            )

@@ -1,0 +1,273 @@
+"""A foreign recording through the scheme: parameters from free motion, their test on other motion, contacts in a third.
+
+The fit learns whatever is in its recording, a touch too; where the map names a column of touches, those are left out.
+The figure shows the external torque of each joint against its threshold, and the contacts. The thresholds of the test
+are those of its margin: noise and what is known of the parameters. Those of other recordings are wider by what the
+test shows as lacking.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from adacd_hil.lab.drawing import COLOURS, Drawing, note, plot, style
+from adacd_hil.lab.offline.recording_import import ForeignRecording, RecordingStretch
+from adacd_hil.lab.offline.recording_map import RecordingMap
+from adacd_hil.lab.offline.recording_verdict import Fitted, Verdict, judge_fit
+from adacd_hil.log.log_files import LogError
+from adacd_hil.records import Vector
+from adacd_hil.scheme.identify import offline
+from adacd_hil.scheme.identify.offline import ModelEstimate, OfflineCertificate, OfflineSettings
+from adacd_hil.score.judge import explained_until, owners
+
+FIT_SHARE = 0.6
+"""Of a recording that is both fitted and tested: the part that is fitted."""
+
+
+class Spell(NamedTuple):
+    """A contact that was found: times from the recording's start, links counted from 1, signs of each joint (n,)."""
+
+    start_s: float
+    link: int
+    direction: tuple[int, ...]
+    is_true: bool | None  # None where nobody knows
+
+
+@dataclass(frozen=True)
+class Watched:
+    """The findings in a recording that the model has not seen."""
+
+    recording: ForeignRecording
+    tau_ext_hat: tuple[Vector, ...]  # per stretch (k, n), Nm
+    threshold: tuple[Vector, ...]
+    contacts: tuple[Spell, ...]
+    touches: int | None  # None where nobody knows
+    missed: int | None
+    delays_s: tuple[float, ...]  # of the touches that were found
+
+    @property
+    def false_contacts(self) -> int | None:
+        """Contacts where nobody touched; None where nobody knows."""
+        return None if self.touches is None else sum(contact.is_true is False for contact in self.contacts)
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Parameters (p,) and their deviations, and how much of the torque they explain on motion that was not fitted."""
+
+    model: offline.ArmModel
+    settings: OfflineSettings
+    joint_names: tuple[str, ...]
+    estimate: ModelEstimate
+    deviation: Vector
+    certificate: OfflineCertificate
+    verdict: Verdict
+    fit_s: float
+    test: Watched
+    watched: tuple[Watched, ...]
+    notes: dict[Path, tuple[str, ...]]  # what was left out of the recordings, or taken for granted
+
+    def __repr__(self) -> str:
+        return f"<Identified: {self.verdict.headline}>"
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether the torque of the test is explained; see `recording_verdict`."""
+        return self.verdict.is_explained
+
+    @property
+    def explained(self) -> Vector:
+        """The share (n,) of each joint's torque that the model explains in the test; nan where there is none."""
+        return np.array([joint.share for joint in self.verdict.joints])
+
+    def as_json(self) -> dict[str, Any]:
+        """Describe it for machines."""
+        names, certificate = self.model.parameter_names, self.certificate
+        return {
+            "parameters": {
+                name: {"value": value, "std": std}
+                for name, value, std in zip(names, self.estimate.theta.tolist(), self.deviation.tolist(), strict=True)
+            },
+            "fit_s": self.fit_s,
+            "period_s": self.settings.period_s,
+            "noise_Nm": list(self.settings.noise_Nm),
+            "velocity_noise_rad_s": self.settings.velocity_noise_rad_s,
+            "test": {
+                "seconds": self.test.recording.duration_s,
+                "verdict": self.verdict.as_json(),
+                "margin": _finite(certificate.margin),
+                "margins": dict(zip(self.joint_names, map(_finite, certificate.margins.tolist()), strict=True)),
+                "explained": dict(zip(self.joint_names, map(_finite, self.explained.tolist()), strict=True)),
+                "residual_rms_Nm": certificate.residual_rms_Nm.tolist(),
+                "residual_max_Nm": certificate.residual_max_Nm.tolist(),
+                "lack_Nm": certificate.lack_Nm.tolist(),
+            },
+            "left_out": {str(path): list(notes) for path, notes in self.notes.items()},
+            "watched": [
+                {
+                    "recording": str(watched.recording.path),
+                    "contacts": [contact._asdict() for contact in watched.contacts],
+                    "touches": watched.touches,
+                    "missed": watched.missed,
+                    "false_contacts": watched.false_contacts,
+                    "delays_s": list(watched.delays_s),
+                }
+                for watched in self.watched
+            ],
+        }
+
+
+def identify(
+    described: RecordingMap,
+    fitted: Sequence[ForeignRecording],
+    tested: ForeignRecording | None,
+    watched: Sequence[ForeignRecording] = (),
+) -> Identified:
+    """Fit recordings one after the other, test on another, and look for contacts in further ones.
+
+    tested: None takes the last part of the last recording that is to be fitted. Raises ConfigError, LogError.
+    """
+    recordings = [recording.free for recording in fitted]
+    if tested is None:
+        last = recordings[-1]
+        if not last.stretches:
+            raise LogError(f"{last.path}: nothing is free of touches")
+        first, final = last.stretches[0], last.stretches[-1]
+        end_s = final.start_s + len(final.record.q) * last.period_s
+        split_s = first.start_s + FIT_SHARE * (end_s - first.start_s)
+        recordings[-1], tested = last.between(-np.inf, split_s), last.between(split_s, np.inf)
+    tested = tested.free
+    if not tested.stretches or not any(recording.stretches for recording in recordings):
+        raise LogError("too little free motion: nothing is left to fit or to test")
+    source = recordings[-1]
+    settings = described.settings(source.noise_Nm, source.period_s, source.velocity_noise_rad_s)
+    model = offline.model_of(described.urdf.chain, described.arm.has_rotors)
+    before = estimate = offline.prior(model)
+    records = [stretch.record for recording in recordings for stretch in recording.stretches]
+    for record in records:
+        estimate = offline.identify(model, record, estimate, settings)
+    deviation = offline.parameter_deviation(model, records, before, estimate, settings)
+    certificate = _joined(
+        [offline.certify(model, part.record, estimate, settings) for part in tested.stretches], tested
+    )
+    fit = Fitted(described, model, settings, before, estimate, deviation, certificate, tuple(recordings), tested)
+    return Identified(
+        model=model,
+        settings=settings,
+        joint_names=described.urdf.joint_names,
+        estimate=estimate,
+        deviation=deviation,
+        certificate=certificate,
+        verdict=judge_fit(fit),
+        fit_s=sum(recording.duration_s for recording in recordings),
+        test=watch(model, settings, estimate, np.zeros(model.joints), tested),
+        watched=tuple(watch(model, settings, estimate, certificate.lack_Nm, recording) for recording in watched),
+        notes={recording.path: recording.notes for recording in (*recordings, tested)},
+    )
+
+
+def _finite(value: float) -> float | None:
+    """Return a number as JSON can hold it."""
+    return value if math.isfinite(value) else None
+
+
+def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:
+    """Join the certificates of all stretches, each by its length."""
+    weights = np.array([len(stretch.record.q) for stretch in tested.stretches], np.float64)
+    weights /= weights.sum()
+    return OfflineCertificate(
+        residual_rms_Nm=np.sqrt(sum(w * part.residual_rms_Nm**2 for w, part in zip(weights, parts, strict=True))),
+        residual_max_Nm=np.max([part.residual_max_Nm for part in parts], axis=0),
+        lack_Nm=np.sqrt(sum(w * part.lack_Nm**2 for w, part in zip(weights, parts, strict=True))),
+        threshold_Nm=sum(w * part.threshold_Nm for w, part in zip(weights, parts, strict=True)),
+        margins=np.min([part.margins for part in parts], axis=0),
+    )
+
+
+def watch(
+    model: offline.ArmModel,
+    settings: OfflineSettings,
+    estimate: ModelEstimate,
+    lack_Nm: Vector,
+    recording: ForeignRecording,
+) -> Watched:
+    """Look for contacts in a recording, and compare them with its touches where these are known."""
+    detections = [offline.detect(model, part.record, estimate, settings, lack_Nm) for part in recording.stretches]
+    spells: list[Spell] = []
+    delays: list[float] = []
+    touches: int | None = None
+    for stretch, detection in zip(recording.stretches, detections, strict=True):
+        samples = np.array([contact.sample for contact in detection.contacts], np.int64)
+        about = _owners(stretch, samples, recording, settings)
+        for contact, place in zip(detection.contacts, about.tolist(), strict=True):
+            is_true = None if stretch.is_touched is None else place >= 0
+            start_s = stretch.start_s + contact.sample * recording.period_s
+            spells.append(Spell(start_s, contact.link + 1, contact.direction, is_true))
+        if stretch.is_touched is not None:
+            bounds = _touches(stretch)
+            touches = (touches or 0) + len(bounds)
+            places, firsts = np.unique(about, return_index=True)
+            found = firsts[places >= 0]
+            delays += ((samples[found] - bounds[about[found], 0]) * recording.period_s).tolist()
+    return Watched(
+        recording=recording,
+        tau_ext_hat=tuple(detection.tau_ext_hat for detection in detections),
+        threshold=tuple(detection.threshold for detection in detections),
+        contacts=tuple(spells),
+        touches=touches,
+        missed=None if touches is None else touches - len(delays),
+        delays_s=tuple(delays),
+    )
+
+
+def _touches(stretch: RecordingStretch) -> NDArray[np.int64]:
+    """Return the first and the last sample of each touch (k, 2)."""
+    if stretch.is_touched is None:
+        return np.zeros((0, 2), np.int64)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], stretch.is_touched, [False])).astype(np.int8)))
+    return edges.reshape(-1, 2) - (0, 1)
+
+
+def _owners(
+    stretch: RecordingStretch, samples: NDArray[np.int64], recording: ForeignRecording, settings: OfflineSettings
+) -> NDArray[np.int64]:
+    """Return which touch each contact is about, -1 for none, as far as the touches' times are known."""
+    firsts, lasts = _touches(stretch).T
+    onsets = firsts - round(recording.blur_s / recording.period_s)
+    return owners(samples, onsets, explained_until(onsets, lasts + round(settings.isolation_s / settings.period_s)))
+
+
+def draw_watched(identified: Identified, watched: Watched, name: str) -> Drawing:
+    """Draw one recording, a panel per joint."""
+    n = identified.model.joints
+    with style():
+        figure = Figure(figsize=(7.2, 0.9 + 1.3 * n), layout="constrained")
+        panels = np.atleast_1d(figure.subplots(n, 1, sharex=True))
+        for joint, axes in enumerate(panels):
+            for stretch, tau_ext_hat, threshold in zip(
+                watched.recording.stretches, watched.tau_ext_hat, watched.threshold, strict=True
+            ):
+                time_s = stretch.start_s + watched.recording.period_s * np.arange(len(tau_ext_hat), dtype=np.float64)
+                plot(axes, time_s, tau_ext_hat[:, joint], color=COLOURS["joint1"], linewidth=0.8)
+                for sign in (-1.0, 1.0):
+                    plot(axes, time_s, sign * threshold[:, joint], color=COLOURS["muted"], linewidth=0.6)
+                if stretch.is_touched is not None:
+                    axes.fill_between(
+                        time_s, 0.0, 1.0, where=stretch.is_touched, transform=axes.get_xaxis_transform(), alpha=0.15
+                    )
+            for contact in watched.contacts:
+                axes.axvline(contact.start_s, color=COLOURS["joint2"], linewidth=0.6)
+            axes.set_ylabel("Nm")
+            note(axes, identified.joint_names[joint])
+        panels[-1].set_xlabel("time, s")
+    caption = (
+        f"Estimated external torque between its thresholds; lines: {len(watched.contacts)} contacts found; "
+        "shaded: touches, where they are known."
+    )
+    return Drawing(name, watched.recording.path.name, caption, figure)

@@ -1,0 +1,257 @@
+"""A recording of an arm that others made: a file and its map become samples at a fixed period, in SI units.
+
+A gap in time, a value that is missing or not finite, and where a touch begins or ends, part a recording in stretches;
+the model is carried over, the filters begin anew. Values between two samples are interpolated.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from adacd_hil.lab.logs.joint_state_bags import is_bag
+from adacd_hil.lab.offline.bag_recording import read_bag
+from adacd_hil.lab.offline.csv_recording import read_csv
+from adacd_hil.lab.offline.recorded_columns import MOST_ROWS, SHORTEST_SAMPLES, RecordedColumns
+from adacd_hil.lab.offline.recording_map import RecordingMap, time_unit_of
+from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.records import Vector
+from adacd_hil.scheme.identify.offline import Record
+from adacd_hil.score.wording import number_of
+
+SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.1
+_LEAST_NOISE_NM = 1e-4
+_MOST_BESIDE_JUMP_RAD = 0.8
+"""Motion in the time of a jump, 8 rad/s in the longest period."""
+_JITTER = 0.25
+"""Of a period, by which the times between rows vary: a derived velocity is off by as much."""
+_DEGREE = 3  # of the polynomial whose slope is a derived velocity
+MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white noise
+_STEP_TO_SIGMA = 1.0 / np.sqrt(12.0)  # of the rounding to a step
+
+
+@dataclass(frozen=True)
+class RecordingStretch:
+    """Samples without a gap: when the first was, and, if known, whether somebody touched the arm at each (k,)."""
+
+    start_s: float
+    record: Record
+    is_touched: NDArray[np.bool_] | None
+
+
+@dataclass(frozen=True)
+class ForeignRecording:
+    """A recording, time-first. `noise_Nm` (n,), `velocity_noise_rad_s`: rms of what looks like white noise in it.
+
+    `blur_s`: how far a derived velocity looks ahead and back. `columns`: what the file had. `notes`: what was left out
+    or taken for granted, a few words each.
+    """
+
+    path: Path
+    period_s: float
+    stretches: tuple[RecordingStretch, ...]
+    noise_Nm: tuple[float, ...]
+    velocity_noise_rad_s: float
+    blur_s: float
+    columns: RecordedColumns
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_velocities(self) -> bool:
+        """Whether velocities were measured, and not derived from the positions."""
+        return self.blur_s == 0.0
+
+    @property
+    def duration_s(self) -> float:
+        """Sum of the stretches."""
+        return sum(len(stretch.record.q) for stretch in self.stretches) * self.period_s
+
+    def between(self, start_s: float, end_s: float) -> "ForeignRecording":
+        """Return what lies in a span of the recording's time, which begins with 0."""
+        parts = [_cut(stretch, self.period_s, start_s, end_s) for stretch in self.stretches]
+        kept = tuple(part for part in parts if len(part.record.q) >= SHORTEST_SAMPLES)
+        return replace(self, stretches=kept)
+
+    @property
+    def free(self) -> "ForeignRecording":
+        """What nobody touched, as far as that is known."""
+        return replace(self, stretches=tuple(part for stretch in self.stretches for part in self._untouched(stretch)))
+
+    def _untouched(self, stretch: RecordingStretch) -> list[RecordingStretch]:
+        """Split a stretch at its touches, with what is blurred around them."""
+        if stretch.is_touched is None:
+            return [stretch]
+        width = 2 * round(self.blur_s / self.period_s) + 1
+        is_touched = np.convolve(stretch.is_touched, np.ones(width), "same") > 0.5
+        bounds = [0, *(np.flatnonzero(np.diff(is_touched)) + 1).tolist(), len(is_touched)]
+        parts = [
+            _part(stretch, self.period_s, first, last) for first, last in pairwise(bounds) if not is_touched[first]
+        ]
+        return [part for part in parts if len(part.record.q) >= SHORTEST_SAMPLES]
+
+
+def read_recording(
+    path: Path, described: RecordingMap, period_s: float = 0.0, span: TimeWindow | None = None
+) -> ForeignRecording:
+    """Read a CSV file, an MCAP file or a rosbag. period_s: of the samples, where neither map nor recording is to say.
+
+    span: what has to be read of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError when
+    it can't be read or is too long, ConfigError when it lacks a column of the map.
+    """
+    read = read_bag if is_bag(path) else read_csv
+    return recording_of(path, described, read(path, described, span), period_s)
+
+
+def recording_of(
+    path: Path, described: RecordingMap, given: RecordedColumns, period_s: float = 0.0
+) -> ForeignRecording:
+    """Make a recording of columns; path: its name, for errors. Raises LogError."""
+    n = described.joints
+    is_whole = np.isfinite(given.values).all(axis=1)
+    time_s, values = given.time_s[is_whole] - given.begin_s, given.values[is_whole]
+    touched = None if given.touched is None else given.touched[is_whole]
+    notes = list(given.notes)
+    if missing := int(np.count_nonzero(~is_whole)):
+        notes.append(f"{number_of(missing, 'row')} without all values")
+    if len(time_s) < SHORTEST_SAMPLES:
+        raise LogError(f"recording {path}: {number_of(len(time_s), 'row')} with all values, {SHORTEST_SAMPLES} needed")
+    period_s = described.sampling.period_s or period_s or _period_s(path, time_s, described)
+    values, idle = _without_idle_velocities(values, described)
+    values, turned = _without_jumps(values, described)
+    notes += [*idle, *turned]
+    has_dq = values.shape[1] > 2 * n
+    if described.columns.time and not has_dq and (jitter := _jitter(time_s, period_s)):
+        notes.append(jitter)
+    longest_s = max(described.sampling.longest_gap_s, 1.5 * period_s)
+    window = derivative_window(described, period_s)
+    shortest = max(SHORTEST_SAMPLES, window)
+    edges = np.flatnonzero(np.diff(time_s) > longest_s) + 1
+    stretches = []
+    room = MOST_ROWS
+    for rows in np.split(np.arange(len(time_s)), edges):
+        count = int((time_s[rows[-1]] - time_s[rows[0]]) / period_s + 1e-6) + 1
+        if count < shortest:
+            continue
+        room -= count
+        if room < 0:
+            raise LogError(f"{path}: more than {MOST_ROWS} samples of {period_s:g} s")
+        grid_s = time_s[rows[0]] + period_s * np.arange(count)
+        columns = [np.interp(grid_s, time_s[rows], values[rows, column]) for column in range(values.shape[1])]
+        q, tau_J = np.column_stack(columns[:n]), np.column_stack(columns[n : 2 * n])
+        dq = np.column_stack(columns[2 * n :]) if has_dq else derive(q, period_s, window)
+        is_touched = None
+        if touched is not None:
+            is_touched = touched[rows][np.searchsorted(time_s[rows], grid_s, side="right") - 1]
+        stretches.append(RecordingStretch(float(grid_s[0]), Record(q, dq, tau_J), is_touched))
+    if not stretches:
+        raise LogError(f"{path}: no {shortest} samples of {period_s:g} s without a gap")
+    noise_Nm = _noise([stretch.record.tau_J for stretch in stretches], values[:, n : 2 * n])
+    velocity = _noise([stretch.record.dq for stretch in stretches], values[:, 2 * n :]) if has_dq else np.zeros(n)
+    return ForeignRecording(
+        path=path,
+        period_s=period_s,
+        stretches=tuple(stretches),
+        noise_Nm=tuple(np.maximum(noise_Nm, _LEAST_NOISE_NM).tolist()),
+        velocity_noise_rad_s=min(float(velocity.max()), 1.0),
+        blur_s=0.0 if has_dq else 0.5 * window * period_s,
+        columns=given,
+        notes=tuple(notes),
+    )
+
+
+def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
+    """Return the recording's own period. Raises LogError where no arm is recorded like that, with the likely unit."""
+    period_s = float(np.median(np.diff(time_s)))
+    if SHORTEST_PERIOD_S <= period_s <= LONGEST_PERIOD_S:
+        return period_s
+    unit = time_unit_of(period_s / described.time_s)
+    remedy = f'; with `units.time` = "{unit}" they are {period_s / described.time_s:g} {unit}' if unit else ""
+    raise LogError(
+        f"recording {path}: rows are {period_s:g} s apart, {SHORTEST_PERIOD_S:g} to {LONGEST_PERIOD_S:g} s are "
+        f"expected{remedy}"
+    )
+
+
+def _jitter(time_s: Vector, period_s: float) -> str:
+    """Say by how much rows are apart where that varies; "" where it hardly does."""
+    short_s, long_s = np.quantile(np.diff(time_s), (0.05, 0.95)).tolist()
+    if long_s - short_s < _JITTER * period_s:
+        return ""
+    return (
+        f"rows are {1e3 * short_s:.3g} to {1e3 * long_s:.3g} ms apart: if they were sampled evenly, leave "
+        f"`columns.time` out and write `sampling.period_s` = {_even_period_s(time_s):.6g}"
+    )
+
+
+def _even_period_s(time_s: Vector) -> float:
+    return float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
+
+
+def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
+    """Drop velocities, as some drivers leave them empty, where one never changes though its joint moves."""
+    n = described.joints
+    idle = np.ptp(values[:, 2 * n :], axis=0) == 0.0
+    moved = np.ptp(values[:, :n], axis=0) > 0.0
+    if not len(idle) or not np.any(idle & moved):
+        return values, []
+    joint = int(np.flatnonzero(idle & moved)[0])
+    name, always = described.urdf.joint_names[joint], values[0, 2 * n + joint]
+    note = f"the velocity of {name} is always {always:g} rad/s: velocities are derived from the positions"
+    return values[:, : 2 * n], [note]
+
+
+def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
+    """Let positions go on where they jump by a turn, as those of joints without end do from +180 to -180 degrees."""
+    notes = []
+    values = values.copy()
+    for joint in np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist():
+        steps = np.abs(np.diff(values[:, joint]))
+        jumps = steps[steps > np.pi]
+        if len(jumps) and np.all(np.abs(jumps - 2.0 * np.pi) < _MOST_BESIDE_JUMP_RAD):
+            values[:, joint] = np.unwrap(values[:, joint])
+            name, times = described.urdf.joint_names[joint], number_of(len(jumps), "time")
+            notes.append(f"the position of {name} jumps by a turn {times}: it goes on instead")
+    return values, notes
+
+
+def derivative_window(described: RecordingMap, period_s: float) -> int:
+    """Return over how many samples velocities are derived."""
+    return max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
+
+
+def derive(q: Vector, period_s: float, window: int) -> Vector:
+    """Derive velocities (k, n) from positions, without delay: the slope of a cubic over a window of samples."""
+    return np.asarray(savgol_filter(q, window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
+
+
+def _noise(parts: list[Vector], given: Vector) -> Vector:
+    """Estimate the rms of white noise (n,), by the median of the second difference, which motion hardly shows in.
+
+    given (k, n): the values as they were recorded; noise is at least that of their rounding.
+    """
+    seconds = np.concatenate([np.abs(np.diff(part, 2, axis=0)) for part in parts])
+    rounding = _STEP_TO_SIGMA * np.array([_step(column) for column in given.T])
+    return np.asarray(np.maximum(MEDIAN_TO_SIGMA * np.median(seconds, axis=0), rounding))
+
+
+def _step(column: Vector) -> float:
+    """Return the smallest difference of two recorded values."""
+    levels = np.unique(column)
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-9 * (levels[-1] - levels[0])]
+    return float(np.min(steps)) if steps.size else 0.0
+
+
+def _cut(stretch: RecordingStretch, period_s: float, start_s: float, end_s: float) -> RecordingStretch:
+    time_s = stretch.start_s + period_s * np.arange(len(stretch.record.q))
+    first, last = np.searchsorted(time_s, (start_s, end_s))
+    return _part(stretch, period_s, int(first), int(last))
+
+
+def _part(stretch: RecordingStretch, period_s: float, first: int, last: int) -> RecordingStretch:
+    record, touched = stretch.record, stretch.is_touched
+    kept = Record(record.q[first:last], record.dq[first:last], record.tau_J[first:last])
+    return RecordingStretch(stretch.start_s + first * period_s, kept, None if touched is None else touched[first:last])

@@ -1,0 +1,529 @@
+"""The verdict on a recording: whether its torque is explained, why not, and what to do next.
+
+**Share.** Of each joint's torque, the part that the frozen model explains in the test:
+
+    share = 1 - sum (tau_f - W_f theta)² / sum (tau_f - c u_f)²
+
+with the filter of the fit on both, u_f what it leaves of a constant and c the best one: what the filter takes away is
+no one's merit, nor is an offset. A torque that is noise has a share of 0.
+
+**Margin.** The smallest threshold over the residual in the test, of thresholds that noise and the parameters' P make.
+
+A joint is explained if its share is at least `WHOLE`, or if the residual stays below its threshold and the share is at
+least `HALF`: of a torque that is mostly noise no model explains more. The test is explained if all joints are, no
+column is dead, both parts are long enough and an arm can have the parameters. Beyond a margin of 1 the model lacks more
+than noise, which the verdict says with the smallest contact that shows beside it.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from adacd_hil.lab.offline.column_checks import CLIPPED_REMEDY, ColumnFinding, find_faults, joined_names, plateau
+from adacd_hil.lab.offline.other_readings import UNITS, find_readings
+from adacd_hil.lab.offline.recording_import import ForeignRecording
+from adacd_hil.lab.offline.recording_map import RecordingMap
+from adacd_hil.records import Vector
+from adacd_hil.scheme.identify import offline
+from adacd_hil.scheme.identify.offline import ArmModel, ModelEstimate, OfflineCertificate, OfflineSettings
+
+WHOLE: Final = 0.99
+HALF: Final = 0.5
+NOTHING: Final = 0.1
+"""Largest share of a torque in which nothing of the motion is."""
+_NOISE_TIMES: Final = 1.5
+"""Times the filtered noise, up to which a torque is called noise."""
+_SHORTEST_FIT_S, _SHORTEST_TEST_S = 2.0, 1.0
+_SIGMAS: Final = 3.0
+_UNKNOWN: Final = 0.3
+"""Of the deviation before any motion: a parameter of which more is left was not excited."""
+_MILLI: Final = (300.0, 3000.0)
+"""Times the masses of the URDF that torques ask for if they are mNm."""
+_ODD_SCALE: Final = 2.0
+_ODD_MASSES: Final = 0.3
+"""Share by which the parameters of a URDF may be off."""
+_HEAVIEST_KG, _LIGHTEST_KG = 300.0, 0.01
+"""Inertia over the square of the reach: what no arm of a lab has."""
+_HEAVY_KG, _LIGHT_KG = 30.0, 0.1
+"""What few have."""
+_MOSTLY: Final = 0.8
+"""Share of the torque that is explained where the scale of the parameters says anything."""
+
+
+class JointShare(NamedTuple):
+    """What the test says of a joint. share: nan where there is no torque."""
+
+    name: str
+    share: float
+    margin: float
+    torque_Nm: float  # rms behind the filter of the fit, about its best constant
+    is_explained: bool
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the torque is explained. reasons: why not, and remarks: what else is to be known, a sentence each."""
+
+    is_explained: bool
+    headline: str
+    joints: tuple[JointShare, ...]
+    reasons: tuple[str, ...]
+    remarks: tuple[str, ...]
+    remedy: str  # the next thing to do; "" where nothing has to be mended
+
+    def __repr__(self) -> str:
+        return f"<Verdict: {self.headline}>"
+
+    def as_json(self) -> dict[str, Any]:
+        """Describe it for machines."""
+        return {
+            "is_explained": self.is_explained,
+            "headline": self.headline,
+            "reasons": list(self.reasons),
+            "remarks": list(self.remarks),
+            "next": self.remedy,
+        }
+
+
+class Fitted(NamedTuple):
+    """What is judged. before: the estimate that the fit began with."""
+
+    described: RecordingMap
+    model: ArmModel
+    settings: OfflineSettings
+    before: ModelEstimate
+    estimate: ModelEstimate
+    deviation: Vector
+    certificate: OfflineCertificate
+    fitted: tuple[ForeignRecording, ...]
+    tested: ForeignRecording
+
+
+class _Finding(NamedTuple):
+    text: str
+    remedy: str
+    is_against: bool
+
+
+def judge_fit(fit: Fitted) -> Verdict:
+    """Judge a fit by its test."""
+    joints = _shares(fit)
+    columns = find_faults(fit.described, fit.fitted, fit.tested)
+    plain = [_against(found) for found in columns if found.is_dead] or list(_of_length(fit))
+    findings = plain or _of_model(fit, joints, columns)
+    findings += [] if plain else _of_friction(fit)
+    is_explained = all(joint.is_explained for joint in joints) and not any(found.is_against for found in findings)
+    findings += [*_of_excitation(fit), *_of_residual(fit, joints)] if is_explained else []
+    against = [found for found in findings if found.is_against]
+    remedies = [found.remedy for found in against if found.remedy]
+    return Verdict(
+        is_explained=is_explained,
+        headline=_headline(fit, joints, is_explained),
+        joints=joints,
+        reasons=tuple(found.text for found in against),
+        remarks=tuple(found.text for found in findings if not found.is_against),
+        remedy=remedies[0] if remedies else "",
+    )
+
+
+def _against(found: ColumnFinding) -> _Finding:
+    return _Finding(found.text, found.remedy, is_against=True)
+
+
+def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[ColumnFinding]) -> list[_Finding]:
+    """Say why the torque is not explained, or not by an arm that there can be: the likeliest cause alone.
+
+    columns: what may be a cause; remarks where the torque is explained.
+    """
+    remarks = [_Finding(found.text, found.remedy, is_against=False) for found in columns]
+    scale = list(_of_scale(fit, joints))
+    if any(found.is_against for found in scale):
+        return [*scale, *remarks]
+    inertia = list(_of_inertia(fit))
+    wrong = [_against(found) for found in columns if found.is_wrong]
+    is_good = not inertia and not wrong and all(joint.is_explained for joint in joints)
+    if is_good and fit.certificate.margin >= 1.0:
+        return [*scale, *remarks]
+    if not all(_is_noise(fit, joints)) and (readings := list(_of_readings(fit, joints, WHOLE if columns else 0.0))):
+        return [*readings, *remarks]
+    if is_good:
+        return [*scale, *remarks]
+    lack = list(_of_lack(fit, joints))
+    causes = wrong or [*map(_against, columns)]
+    if causes:
+        return [*causes, *scale, *(found._replace(is_against=False) for found in lack)]
+    return [*(list(_of_noise(fit, joints)) or inertia or lack), *scale]
+
+
+def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
+    """Tell of each torque whether it is no more than the sensor's noise behind the filter of the fit."""
+    noise = offline.filtered_noise_Nm(fit.settings)
+    return [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
+
+
+def _shares(fit: Fitted) -> tuple[JointShare, ...]:
+    """Measure each joint's share and margin."""
+    parts = [
+        offline.filtered(fit.model, stretch.record, fit.estimate, fit.settings) for stretch in fit.tested.stretches
+    ]
+    torque, residual = (np.concatenate([getattr(part, name) for part in parts]) for name in ("torque", "residual"))
+    unit = np.concatenate([part.unit for part in parts])
+    spread = torque - np.outer(unit, unit @ torque / (unit @ unit))
+    squares, left = np.sum(spread**2, axis=0), np.sum(residual**2, axis=0)
+    is_there = squares > 1e-18 * np.maximum(np.sum(torque**2, axis=0), 1e-12)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(is_there, 1.0 - left / squares, np.nan)
+    rms = np.sqrt(squares / len(unit))
+    return tuple(
+        JointShare(name, each, margin, torque_Nm, each >= WHOLE or (margin >= 1.0 and each >= HALF))
+        for name, each, margin, torque_Nm in zip(
+            fit.described.urdf.joint_names,
+            share.tolist(),
+            fit.certificate.margins.tolist(),
+            rms.tolist(),
+            strict=True,
+        )
+    )
+
+
+def percent(share: float) -> str:
+    """Write a share; what is explained less than not at all is nothing."""
+    if math.isnan(share):
+        return "-"
+    digits = 1 if share < 0.9995 else 2
+    return f"{100.0 * max(share, 0.0):.{digits}f} %" if share < 0.99995 else "100.0 %"
+
+
+def _headline(fit: Fitted, joints: Sequence[JointShare], is_explained: bool) -> str:
+    shares = [joint.share for joint in joints if not math.isnan(joint.share)]
+    least = f"{percent(min(shares))} of the torque" if shares else "no torque"
+    where = " at the worst joint" if len(joints) > 1 else ""
+    margin = f"margin {fit.certificate.margin:.2f}" if math.isfinite(fit.certificate.margin) else "no margin"
+    if not shares:
+        return f"NOT explained: {least}"
+    if is_explained:
+        return f"explained; {margin}" if fit.certificate.margin >= 1.0 else f"explained: {least}{where}; {margin}"
+    if all(joint.is_explained for joint in joints):
+        return f"NOT explained, although {least}{where} is; {margin}"
+    return f"NOT explained: {least}{where}; {margin}"
+
+
+def _of_length(fit: Fitted) -> Iterator[_Finding]:
+    """Say what is too short."""
+    fit_s, test_s = sum(recording.duration_s for recording in fit.fitted), fit.tested.duration_s
+    if fit_s < _SHORTEST_FIT_S or test_s < _SHORTEST_TEST_S:
+        yield _Finding(
+            f"too short: {fit_s:.2g} s fitted and {test_s:.2g} s tested, {_SHORTEST_FIT_S:g} and {_SHORTEST_TEST_S:g} "
+            "s are the least, 10 s a good beginning",
+            "record more, in which every joint turns fast and slow, both ways",
+            is_against=True,
+        )
+
+
+def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[_Finding]:
+    """Name the mistake of the map that explains at least such a share of the torque."""
+    fitted = [stretch.record for recording in fit.fitted for stretch in recording.stretches]
+    tested = [stretch.record for stretch in fit.tested.stretches]
+    readings = find_readings(fit.described, fit.model, fit.settings, fitted, tested)
+    if not readings or readings[0].share < least:
+        return
+    text = ", or ".join(reading.text for reading in readings[:3])
+    told, where = percent(min(joint.share for joint in joints)), " at the worst joint" if len(joints) > 1 else ""
+    yield _Finding(
+        f"{text}: so {percent(readings[0].share)} of the torque is explained{where}, {told} as the map has it",
+        f"in the map: {', or '.join(dict.fromkeys(reading.remedy for reading in readings[:3]))}",
+        is_against=True,
+    )
+
+
+def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
+    """Name torques in which nothing of the motion is, or little."""
+    related, is_noise = _related_to_motion(fit), _is_noise(fit, joints)
+    empty = [
+        i for i, joint in enumerate(joints) if not joint.share >= NOTHING and (is_noise[i] or related[i] < NOTHING)
+    ]
+    has_others = any(joint.is_explained for joint in joints)
+    passive = [
+        i
+        for i, joint in enumerate(joints)
+        if is_noise[i] and has_others and joint.margin >= 1.0 and not joint.is_explained
+    ]
+    for chosen, text in (
+        (
+            passive,
+            "the torque of {names} is noise, and by the model of the others there is hardly any: a passive joint, or "
+            "what drives it is less than the noise",
+        ),
+        (
+            [i for i in empty if is_noise[i] and i not in passive],
+            "the torque of {names} is noise: nothing of the motion is in it. The sensor is dead, the column is another "
+            "one's, or nothing drives the joint",
+        ),
+        (
+            [i for i in empty if not is_noise[i] and i not in passive],
+            "nothing of the torque of {names} is explained: the sensor is dead, the column is another one's, nothing "
+            "drives the joint, or it moves in the test as it never did in the fit",
+        ),
+    ):
+        if chosen:
+            names = joined_names([joints[i].name for i in chosen], len(joints))
+            remedy = f"check the sensor of {names}, and {_column(fit.described, 'tau_J', chosen)}"
+            yield _Finding(text.format(names=names), remedy, is_against=True)
+    weak = [
+        joint.name
+        for i, joint in enumerate(joints)
+        if i not in (*empty, *passive) and not joint.is_explained and joint.margin >= 1.0
+    ]
+    if weak:
+        yield _Finding(
+            f"the torque of {joined_names(weak, len(joints))} is mostly noise: what the motion makes of it is smaller",
+            "move faster and farther",
+            is_against=True,
+        )
+
+
+def _related_to_motion(fit: Fitted) -> Vector:
+    """Return the share (n,) of each torque that plain terms of the joint's own motion explain, whatever the model is.
+
+    By least squares on fit or test, told by the other one, whichever does better: filtered position, its sine and
+    cosine, velocity, its sign, and acceleration.
+    """
+    n = fit.model.joints
+    period_s, cutoff = fit.settings.period_s, fit.settings.fit_cutoff_rad_s
+    decay = math.exp(-cutoff * period_s)
+    shares = np.zeros(n)
+    parts = [
+        [stretch.record for recording in group for stretch in recording.stretches]
+        for group in (fit.fitted, (fit.tested,))
+    ]
+    for i in range(n):
+        tables = []
+        for records in parts:
+            rows = []
+            for record in records:
+                q, dq = record.q[:, i], record.dq[:, i]
+                terms = np.column_stack([np.ones_like(q), np.sin(q), np.cos(q), q, dq, np.sign(dq), record.tau_J[:, i]])
+                smooth = _low_pass(_low_pass(terms, decay), decay)
+                rate = cutoff * (_low_pass(terms[:, 4:5], decay) - smooth[:, 4:5])
+                rows.append(np.hstack([smooth[:, :6], rate, smooth[:, 6:]]))
+            tables.append(np.concatenate(rows))
+        shares[i] = max(_told_share(*tables), _told_share(*tables[::-1]))
+    return shares
+
+
+def _told_share(told: Vector, tested: Vector) -> float:
+    """Return the share of the last column of a table that a fit of the others to another table explains."""
+    coefficients = np.linalg.lstsq(told[:, :-1], told[:, -1], rcond=1e-6)[0]
+    unit, torque = tested[:, 0], tested[:, -1]
+    spread = torque - unit * (unit @ torque) / max(float(unit @ unit), 1e-18)
+    left = torque - tested[:, :-1] @ coefficients
+    return 1.0 - float(left @ left) / max(float(spread @ spread), 1e-18)
+
+
+def _low_pass(values: Vector, decay: float) -> Vector:
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([1.0 - decay], [1.0, -decay], values, axis=0))
+
+
+def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
+    """Compare the torques with the masses of the URDF, and the inertia with that of any arm of this reach."""
+    scale, sigma = _scale_of_urdf(fit)
+    mass_kg = _mass_at_reach(fit)
+    units, least = fit.described.units, min(joint.share for joint in joints)
+    if scale is not None and abs(scale) > _SIGMAS * sigma and least > _MOSTLY:
+        text = f"the torques are {scale:.3g} times those that the masses of the URDF need"
+        meant = _milli(abs(scale), mass_kg, units.tau_J)
+        turns = {"rad": 180.0 / math.pi, "deg": math.pi / 180.0}
+        angle = [unit for unit, factor in turns.items() if unit != units.q and 0.8 < abs(scale) / factor < 1.25]
+        if meant:
+            yield _Finding(f"{text}: they are {meant}", f'in the map: `units.tau_J` = "{meant}"', is_against=True)
+            return
+        if angle and least >= WHOLE:
+            remedy = f'in the map: `units.q` = "{angle[0]}"'
+            yield _Finding(f"{text}: the positions are {UNITS[angle[0]]}", remedy, is_against=True)
+            return
+        if not 1.0 / _ODD_SCALE <= abs(scale) <= _ODD_SCALE:
+            yield _Finding(
+                f"{text}: a unit, a gear or a gain is wrong, or the masses of the URDF are", "", is_against=False
+            )
+    if mass_kg is not None and least >= HALF and not _LIGHTEST_KG <= mass_kg <= _HEAVIEST_KG:
+        yield _Finding(
+            f"the inertia about {joints[0].name} is that of {mass_kg:.2g} kg at the arm's reach",
+            "correct `units` and `scale` of positions and torques",
+            is_against=True,
+        )
+
+
+def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
+    """Return the unit that torques are meant in if they are off by 1000; "" if they aren't.
+
+    Some URDFs have masses of a thousandth to please a simulator: an inertia that an arm can have is none of mNm.
+    """
+    low, high = _MILLI
+    if low <= scale <= high and unit in ("Nm", "A") and (mass_kg is None or mass_kg > _HEAVY_KG):
+        return f"m{unit}"
+    if low <= 1.0 / scale <= high and unit in ("mNm", "mA") and (mass_kg is None or mass_kg < _LIGHT_KG):
+        return unit[1:]
+    return ""
+
+
+def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
+    """Return by what the URDF's masses have to be multiplied, with its deviation; None where it has none."""
+    theta_full = fit.described.urdf.theta_full
+    base = fit.model.place_of("base")
+    told = fit.model.base.map @ theta_full
+    if not np.any(told):
+        return None, 0.0
+    P = fit.estimate.P[base, base]
+    spread = _ODD_MASSES * np.maximum(np.abs(told), 0.1 * np.abs(told).max())
+    weighed = np.linalg.solve(P + np.diag(spread**2), told)
+    along = float(weighed @ told)
+    return float(weighed @ fit.estimate.theta[base]) / along, math.sqrt(float(weighed @ P @ weighed)) / along
+
+
+def _mass_at_reach(fit: Fitted) -> float | None:
+    """Return the mass that the inertia about the first joint is of, at the distance of the outermost joint."""
+    arm = fit.described.urdf.chain
+    reach_m = float(np.sum(np.linalg.norm(arm.translation[1:], axis=1)))
+    if reach_m <= 0.0 or np.any(arm.is_prismatic):
+        return None
+    record = fit.tested.stretches[0].record
+    unit = np.eye(fit.model.joints)[0]
+    poses = record.q[:: max(1, len(record.q) // 8)]
+    inertia = max(float(offline.mass_terms(fit.model, pose, unit) @ fit.estimate.theta) for pose in poses)
+    return inertia / reach_m**2 if inertia > 0.0 else None
+
+
+def _of_inertia(fit: Fitted) -> Iterator[_Finding]:
+    """Say where no masses make the inertia that was found: kinetic energy would be negative."""
+    names = fit.described.urdf.joint_names
+    n = fit.model.joints
+    record = fit.tested.stretches[0].record
+    worst: tuple[float, int, float, float] | None = None
+    for pose in record.q[:: max(1, len(record.q) // 16)]:
+        for joint, unit in enumerate(np.eye(n)):
+            row = offline.mass_terms(fit.model, pose, unit)
+            inertia, sigma = float(row @ fit.estimate.theta), float(np.sqrt(np.sum((row * fit.deviation) ** 2)))
+            if inertia < -_SIGMAS * sigma and (worst is None or inertia / sigma < worst[0]):
+                worst = (inertia / sigma, joint, inertia, sigma)
+    if worst is not None:
+        _, joint, inertia, sigma = worst
+        unit_text = "kg" if fit.described.urdf.chain.is_prismatic[joint] else "kg m²"
+        yield _Finding(
+            f"the inertia about {names[joint]} is negative, {inertia:.3g} ± {sigma:.1g} {unit_text}: no masses make it",
+            "check signs and order of the columns, and the URDF",
+            is_against=True,
+        )
+
+
+def _of_friction(fit: Fitted) -> Iterator[_Finding]:
+    """Say where friction drives a joint on, or one of its two terms is negative."""
+    record = np.concatenate([stretch.record.dq for stretch in fit.tested.stretches])
+    speed = np.abs(record)
+    theta, deviation = fit.estimate.theta, fit.deviation
+    for joint, name in enumerate(fit.described.urdf.joint_names):
+        F_v, F_c = (fit.model.place_of(kind).start + joint for kind in ("F_v", "F_c"))
+        power = theta[F_c] * speed[:, joint].mean() + theta[F_v] * (speed[:, joint] ** 2).mean()
+        sigma = math.hypot(deviation[F_c] * speed[:, joint].mean(), deviation[F_v] * (speed[:, joint] ** 2).mean())
+        if power < -_SIGMAS * sigma:
+            yield _Finding(
+                f"friction drives {name} on: F_v {theta[F_v]:.3g} ± {deviation[F_v]:.1g} Nm s/rad, F_c "
+                f"{theta[F_c]:.3g} ± {deviation[F_c]:.1g} Nm",
+                "",
+                is_against=False,
+            )
+        for place, unit in ((F_v, "Nm s/rad"), (F_c, "Nm")):
+            if power >= -_SIGMAS * sigma and theta[place] < -_SIGMAS * deviation[place]:
+                yield _Finding(
+                    f"{fit.model.parameter_names[place]} of {name} is negative, {theta[place]:.3g} ± "
+                    f"{deviation[place]:.1g} {unit}: the friction's curve is not a straight line",
+                    "",
+                    is_against=False,
+                )
+
+
+def _of_excitation(fit: Fitted) -> Iterator[_Finding]:
+    """Name parameters that the motion tells little of, as noisy as the residual is."""
+    before, after = (np.sqrt(np.diag(estimate.P)) for estimate in (fit.before, fit.estimate))
+    noise = np.maximum(fit.certificate.threshold_Nm / fit.settings.deviations, 1e-12)
+    worse = max(1.0, float(np.max(fit.certificate.residual_rms_Nm / noise)))
+    unknown = np.array(fit.model.parameter_names)[worse * after > _UNKNOWN * before].tolist()
+    if unknown:
+        some = ", ".join(unknown[:6]) + (f" and {len(unknown) - 6} more" if len(unknown) > 6 else "")
+        yield _Finding(
+            f"too little excitation: the motion tells next to nothing of {some}",
+            "record motion of every joint, fast and slow, both ways",
+            is_against=False,
+        )
+
+
+def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
+    """Say which joints are not explained where nothing says why."""
+    for i, joint in enumerate(joints):
+        if joint.is_explained or math.isnan(joint.share):
+            continue
+        torque = np.concatenate(
+            [part.record.tau_J[:, i] for each in (*fit.fitted, fit.tested) for part in each.stretches]
+        )
+        bound = plateau(torque)
+        largest, rms = fit.certificate.residual_max_Nm[i], fit.certificate.residual_rms_Nm[i]
+        yield _Finding(
+            f"{joint.name}: {percent(joint.share)} is explained, {100.0 * WHOLE:.0f} % are needed; the residual "
+            f"reaches {largest:.3g} Nm ({rms:.2g} rms), {_times_threshold(joint.margin)}"
+            + (
+                f"; the torque stays at {bound[0]:.3g} Nm for {percent(bound[1])} of the time, as if clipped"
+                if bound
+                else ""
+            ),
+            CLIPPED_REMEDY if bound else _lack_remedy(fit),
+            is_against=True,
+        )
+
+
+def _lack_remedy(fit: Fitted) -> str:
+    if fit.described.units.tau_J in ("A", "mA") and not fit.described.arm.has_rotors:
+        return "torques of motors turn the rotors, too: `arm.has_rotors` = true"
+    return (
+        "look at the picture of --out where the residual is large: reversals say friction, fast motion says lengths, "
+        "elasticity or late velocities"
+    )
+
+
+def _times_threshold(margin: float) -> str:
+    if margin >= 1.0:
+        return "within its threshold"
+    return f"{1.0 / margin:.2g} times its threshold" if margin > 0.0 else "far beyond its threshold"
+
+
+def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
+    """Say what contacts show where the model lacks more than noise, or noise is more than the torque."""
+    certificate = fit.certificate
+    contact_Nm = np.hypot(certificate.threshold_Nm, fit.settings.deviations * certificate.lack_Nm)
+    over = [i for i, joint in enumerate(joints) if joint.margin < 1.0]
+    loud = [i for i, joint in enumerate(joints) if i not in over and certificate.threshold_Nm[i] > joint.torque_Nm]
+    if over:
+        each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in over)
+        yield _Finding(
+            f"what the model lacks is more than noise: contacts show from about {each} on", "", is_against=False
+        )
+    if loud:
+        each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in loud)
+        noise = fit.settings.velocity_noise_rad_s
+        source = f" of the velocities, {noise:.2g} rad/s," if noise and fit.described.columns.dq else ""
+        remedy = "; without `columns.dq` they are derived from the positions" if source else ""
+        yield _Finding(
+            f"noise{source} hides contacts smaller than the torque itself: they show from about {each} on{remedy}",
+            "",
+            is_against=False,
+        )
+
+
+def _column(described: RecordingMap, key: str, joints: Sequence[int]) -> str:
+    """Name a key of the map with the columns of some joints."""
+    columns = getattr(described.columns, key)
+    named = f" ({', '.join(columns[i] for i in joints)})" if columns else ""
+    return f"`columns.{key}`{named}"

@@ -1,0 +1,284 @@
+"""What a CSV file seems to be: its delimiter, head and decimals, and what its columns are, by heads and by values.
+
+A head is taken apart into words, a number and a unit: `pos_meas_2`, `j1_deg`, `actual_qd_0`, `effort [mNm]`. Columns
+with the same words and other numbers, or the arm's joints, are a group; a group of as many as the arm has joints is
+positions, velocities or torques by one of its words. Where a file has no heads, positions are the columns whose slope
+others are.
+"""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from adacd_hil.lab.offline.csv_recording import (
+    DELIMITERS,
+    is_iso_time,
+    is_number,
+    opened_text,
+    read_number,
+    split_rows,
+)
+from adacd_hil.lab.offline.recording_map import unit_of
+from adacd_hil.log.log_files import LogError
+from adacd_hil.records import Vector
+
+_SEEN_ROWS: Final = 20_000
+_HEAD_ROWS: Final = 60
+"""Rows in which the head is looked for."""
+_FULL_ROWS: Final = 4
+"""Rows of numbers in a row that are the beginning of the data."""
+_ROLES: Final = {
+    "time": ("t", "time", "timestamp", "stamp", "sec", "secs", "seconds", "clock"),
+    "dq": ("dq", "qd", "vel", "velocity", "velocities", "qdot", "speed", "omega", "rate"),
+    "tau_J": ("tau", "torque", "torques", "effort", "efforts", "trq", "moment", "load"),
+    "current": ("current", "currents", "curr", "cur", "i", "amp", "amps"),
+    "q": ("q", "pos", "position", "positions", "angle", "angles", "theta"),
+    "contact": ("contact", "touched", "touch", "collision"),
+}
+_OTHERS: Final = ("ddq", "qdd", "acc", "acceleration", "temp", "temperature", "voltage", "error", "err")
+"""Words of columns that are none of these, whatever else their heads say."""
+_NOT_MEASURED: Final = ("des", "desired", "cmd", "command", "commanded", "con", "ref", "target", "goal", "set", "fric",
+                        "friction", "filt", "filtered", "ff", "ext", "external", "model")  # fmt: skip
+_UNIT_ROLES: Final = {
+    **dict.fromkeys(("rad", "deg", "rev"), "q"),
+    **dict.fromkeys(("rad/s", "deg/s", "rpm"), "dq"),
+    **dict.fromkeys(("Nm", "mNm"), "tau_J"),
+    **dict.fromkeys(("A", "mA"), "current"),
+    **dict.fromkeys(("s", "ms", "us", "ns"), "time"),
+}
+_ALIKE: Final = 0.9
+
+
+class TableForm(NamedTuple):
+    """How a file is written, as `[csv]` of a map has it; units: of a row below the head, "" where there are none."""
+
+    delimiter: str
+    decimal: str
+    has_header: bool
+    skip_rows: int
+    heads: tuple[str, ...]  # "1", "2" without a head
+    units: tuple[str, ...]
+
+
+@dataclass
+class TableGuess:
+    """What a file seems to be. columns, units: by role, as heads say them. reasons: why, of guesses."""
+
+    form: TableForm
+    values: Vector  # (k, columns) as far as they are looked at; what is no number is nan
+    is_iso: bool = False
+    columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+    def of(self, role: str) -> Vector:
+        """Return the values of a role (k, c)."""
+        return self.values[:, [self.form.heads.index(name) for name in self.columns[role]]]
+
+
+class _Head(NamedTuple):
+    """A head taken apart."""
+
+    place: int
+    words: tuple[str, ...]
+    order: float  # number or place of the joint; nan where it has none
+    unit: str
+
+
+def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
+    """Look at a CSV file of an arm with such joints. Raises LogError."""
+    with opened_text(path) as file:
+        lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
+    form, first = _form(path, lines)
+    values, is_iso = _values(_split(path, lines[first:], form.delimiter), form)
+    guess = TableGuess(form, values, is_iso)
+    if form.has_header:
+        _by_heads(guess, joint_names)
+    else:
+        _by_values(guess, len(joint_names))
+    return guess
+
+
+def _split(path: Path, lines: list[str], delimiter: str) -> list[list[str]]:
+    return [[cell.strip() for cell in cells] for cells in split_rows(path, lines, delimiter)]
+
+
+def _is_full(cells: list[str], decimal: str) -> bool:
+    """Tell whether a row has numbers, the first perhaps a date."""
+    return all(is_number(cell, decimal) for cell in cells[1:]) and (
+        is_number(cells[0], decimal) or is_iso_time(cells[0])
+    )
+
+
+def _form(path: Path, lines: list[str]) -> tuple[TableForm, int]:
+    """Find the form with the most columns, and the line in which the data begin. Raises LogError."""
+    best: tuple[int, TableForm, int] | None = None
+    for delimiter in DELIMITERS:
+        for decimal in (".", ",") if delimiter != "," else (".",):
+            rows = [_trimmed(cells) for cells in _split(path, lines[:_HEAD_ROWS], delimiter)]
+            first = next((k for k in range(len(rows)) if _begins(rows[k : k + _FULL_ROWS], decimal)), None)
+            if first is not None and (best is None or len(rows[first]) > best[0]):
+                best = (len(rows[first]), _form_at(rows, first, delimiter, decimal), first)
+    if best is None:
+        raise LogError(f"recording {path}: no rows of numbers in its first {_HEAD_ROWS} lines")
+    return best[1], best[2]
+
+
+def _trimmed(cells: list[str]) -> list[str]:
+    while len(cells) > 1 and not cells[-1]:
+        cells = cells[:-1]
+    return cells
+
+
+def _begins(rows: list[list[str]], decimal: str) -> bool:
+    """Tell whether rows of equally many numbers begin here, at least three a row."""
+    count = len(rows[0]) if rows else 0
+    return len(rows) == _FULL_ROWS and count >= 3 and all(len(row) == count and _is_full(row, decimal) for row in rows)
+
+
+def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) -> TableForm:
+    """Describe a file whose data begin at a row: the head is above, and perhaps a row of units between."""
+    count = len(rows[first])
+    above = [k for k in range(first) if len(rows[k]) == count and rows[k][0].removeprefix("#").strip()]
+    units: tuple[str, ...] = ("",) * count
+    if len(above) > 1 and any(map(unit_of, rows[above[-1]])):
+        units = tuple(map(unit_of, rows[above.pop()]))
+    if not above:
+        return TableForm(delimiter, decimal, False, first, tuple(str(k + 1) for k in range(count)), units)
+    heads = [cell.strip() for cell in rows[above[-1]]]
+    heads[0] = heads[0].removeprefix("#").strip()
+    return TableForm(delimiter, decimal, True, above[-1], tuple(heads), units)
+
+
+def _values(rows: list[list[str]], form: TableForm) -> tuple[Vector, bool]:
+    """Read the data; whether the first column has dates, which are left as nan."""
+    count = len(form.heads)
+    table: list[list[float]] = []
+    is_iso = False
+    for cells in rows[:_SEEN_ROWS]:
+        if len(cells) >= count:
+            is_iso |= not table and not is_number(cells[0], form.decimal)
+            table.append([_number(cell, form.decimal) for cell in cells[:count]])
+    return np.array(table).reshape(-1, count), is_iso
+
+
+def _number(cell: str, decimal: str) -> float:
+    return read_number(cell, decimal) if is_number(cell, decimal) else math.nan
+
+
+# By heads.
+
+
+def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
+    heads = [_taken_apart(place, text, joint_names) for place, text in enumerate(guess.form.heads)]
+    heads = [head._replace(unit=guess.form.units[head.place] or head.unit) for head in heads]
+    groups: dict[tuple[tuple[str, ...], str], list[_Head]] = {}
+    for head in heads:
+        groups.setdefault((head.words, head.unit), []).append(head)
+    n = len(joint_names)
+    chosen: dict[str, tuple[tuple[int, int, int], list[_Head]]] = {}
+    others: dict[str, list[str]] = {}
+    for (words, unit), group in groups.items():
+        role = _role(words, unit)
+        if role in ("time", "contact"):
+            members = group[:1]
+        else:
+            members = sorted((head for head in group if not math.isnan(head.order)), key=lambda head: head.order)
+            if len(members) != n:
+                continue
+        rank = (sum(word in _NOT_MEASURED for word in words), len(words), members[0].place)
+        if role:
+            others.setdefault(role, []).append(guess.form.heads[members[0].place])
+        if role and (role not in chosen or rank < chosen[role][0]):
+            chosen[role] = (rank, members)
+    if "tau_J" not in chosen and "current" in chosen:
+        chosen["tau_J"] = chosen["current"]
+        guess.reasons["tau_J"] = "currents: `scale.tau_J` needs the gain of each joint, Nm/A"
+        guess.units["tau_J"] = chosen["current"][1][0].unit or "A"
+    for role, (_, members) in chosen.items():
+        if role != "current":
+            guess.columns[role] = tuple(guess.form.heads[head.place] for head in members)
+            if len(others.get(role, ())) > 1:
+                guess.reasons.setdefault(role, f"one of {', '.join(others[role])}")
+            if members[0].unit:
+                guess.units.setdefault(role, members[0].unit)
+
+
+def _taken_apart(place: int, text: str, joint_names: Sequence[str]) -> _Head:
+    """Take a head apart."""
+    unit, order = "", math.nan
+    if match := re.search(r"[\[(]([^\])]*[^\])\d][^\])]*)[\])]", text):
+        unit = unit_of(match[1])
+        text = text.replace(match[0], " ") if unit else text
+    for joint, name in sorted(enumerate(joint_names), key=lambda pair: -len(pair[1])):
+        if re.search(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", text, re.IGNORECASE):
+            order = float(joint)
+            text = re.sub(re.escape(name), " ", text, count=1, flags=re.IGNORECASE)
+            break
+    if not unit and (parts := text.rsplit("_", 1)) and len(parts) == 2 and len(parts[1]) > 1 and unit_of(parts[1]):
+        text, unit = parts[0], unit_of(parts[1])
+    words = re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", text)
+    numbers = [float(word) for word in words if word.isdigit()]
+    if math.isnan(order) and numbers:
+        order = numbers[-1]
+    return _Head(place, tuple(word.casefold() for word in words if not word.isdigit()), order, unit)
+
+
+def _role(words: tuple[str, ...], unit: str) -> str:
+    """Return what a column with such words is; "" where nothing says it."""
+    if any(word in _OTHERS for word in words):
+        return ""
+    found = (role for role, known in _ROLES.items() if any(word in known for word in words))
+    return next(found, "") or _UNIT_ROLES.get(unit, "")
+
+
+# By values.
+
+
+def _by_values(guess: TableGuess, n: int) -> None:
+    """Take the first column that grows for the time; positions are the n columns whose slope the n behind them are."""
+    values, heads = guess.values, guess.form.heads
+    grows = [place for place in range(values.shape[1]) if np.all(np.diff(values[:, place]) > 0.0)]
+    first = 0
+    if grows and grows[0] == 0:
+        guess.columns["time"], guess.reasons["time"] = (heads[0],), "it grows from row to row"
+        first = 1
+    blocks = [tuple(range(begin, begin + n)) for begin in range(first, values.shape[1] - n + 1)]
+    time = values[:, 0] if first else np.arange(len(values), dtype=np.float64)
+    for q in blocks:
+        for dq in (block for block in blocks if block[0] >= q[-1] + 1):
+            if _is_slope(time, values[:, q], values[:, dq]):
+                _take(guess, "q", q, "others are their slope")
+                _take(guess, "dq", dq, "they are the slope of the positions")
+                torques = [block for block in blocks if block[0] >= dq[-1] + 1]
+                if torques:
+                    _take(guess, "tau_J", torques[0], "they come next")
+                return
+    if len(blocks) > n:
+        _take(guess, "q", blocks[0], "they come first")
+        _take(guess, "tau_J", blocks[n], "they come next")
+
+
+def _take(guess: TableGuess, role: str, block: tuple[int, ...], reason: str) -> None:
+    guess.columns[role] = tuple(guess.form.heads[place] for place in block)
+    guess.reasons[role] = reason
+
+
+def _is_slope(time: Vector, q: Vector, dq: Vector) -> bool:
+    """Tell whether columns are the slope of others, in whatever unit."""
+    slope = np.gradient(q, axis=0) / np.gradient(time)[:, None]
+    moving = np.ptp(q, axis=0) > 0.0
+    if not moving.any() or np.any(np.ptp(dq[:, moving], axis=0) == 0.0):
+        return False
+    pairs = zip(slope[:, moving].T, dq[:, moving].T, strict=True)
+    return all(abs(float(np.corrcoef(_smooth(one), _smooth(other))[0, 1])) > _ALIKE for one, other in pairs)
+
+
+def _smooth(column: Vector) -> Vector:
+    return np.convolve(column, np.full(5, 0.2), "valid")

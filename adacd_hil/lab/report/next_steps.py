@@ -1,0 +1,113 @@
+"""What a reader of a report may do next: a sentence each, with the command for it, the gravest first.
+
+Commands are for the folder of the log: they name it by its file name alone, so that the same log gives the same page
+wherever it lies. Whatever a log says of itself is quoted for the shell.
+"""
+
+import shlex
+from typing import NamedTuple
+
+from adacd_hil.lab.report.page import went_wrong
+from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked
+from adacd_hil.log.logged_run import EMBEDDED, Run
+from adacd_hil.score.metrics import Metrics, ReportSource
+from adacd_hil.settings.toml_files import builtin_names
+from adacd_hil.terminal import in_line
+
+
+class NextStep(NamedTuple):
+    """What a reader may do next, and the command for it; empty where there is none."""
+
+    text: str
+    command: str = ""
+
+
+def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]:
+    """Say what to do next, the gravest first."""
+    log = _quoted(source.log_name)
+    steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(source.problem)
+    if run.cycle.size == 0:
+        return [*steps, _checked(run, "The arm was not moved. Mend what the sentence above names.")]
+    steps += _repairs(metrics, run, log)
+    if metrics.is_clean and not steps:
+        steps.append(NextStep("Nothing went wrong.", ""))
+    if metrics.contacts:
+        steps.append(NextStep("Choose a contact below to see the torques of that moment."))
+    if run.truth is None and metrics.contacts:
+        steps.append(NextStep("Nobody recorded when the arm was touched: compare the detections with what you did."))
+    key = "filter.a_rad_s=20" if metrics.evidence is None else "certified.noise_sigmas=8"
+    return [
+        *steps,
+        NextStep("Check that the log gives the same decisions again.", f"adacd-hil replay {log}"),
+        NextStep("See what another setting would have decided.", f"adacd-hil replay {log} --set {key}"),
+    ]
+
+
+def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
+    """Say what to do about each kind of thing that went wrong."""
+    has_stopped = bool(metrics.fault) or not metrics.adaptation_s
+    stopped = _checked(run, "The run was stopped: the sentence above and the notices below say why.")
+    late = _checked(run, "Frames came late or were lost, more than allowed.")
+    rows = (
+        (has_stopped, stopped),
+        (not has_stopped and bool(metrics.data.excesses), late),
+        (
+            is_revoked(metrics.evidence),
+            NextStep("What was learned was taken back. Remove the cause, then let the arm learn anew, untouched."),
+        ),
+        (
+            not has_stopped and None in metrics.adaptation_s.values(),
+            NextStep("The model was not learned: the notices below may say why. Another motion may show it better.",
+                     f"adacd-hil excitation --config {_configuration(run)}"),
+        ),
+        (
+            (any(metrics.adaptation_s.values()) and bool(metrics.false_alarms)) or is_margin_below_1(metrics.evidence),
+            NextStep("Nobody touched the arm, and a threshold was crossed: find thresholds from untouched motion.",
+                     f"adacd-hil thresholds {log}"),
+        ),
+        (
+            any(went_wrong(contact) for contact in metrics.contacts),
+            NextStep("Some contacts were missed, or their link or direction is wrong (marked below): try other "
+                     "thresholds and filters.", f"adacd-hil tune {log}"),
+        ),
+    )  # fmt: skip
+    return [step for is_so, step in rows if is_so]
+
+
+def _checked(run: Run, text: str) -> NextStep:
+    """Send a reader to the check of host, bus and arm; of an arm in the host's own process there is none."""
+    interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
+    if interface in ("", EMBEDDED):
+        played = f" --scenario {_quoted(run.metadata['scenario'])}" if run.metadata.get("scenario") else ""
+        return NextStep(f"{text} Play it again.", f"adacd-hil demo --config {_configuration(run)}{played}")
+    bus = f"-i {_quoted(interface)} -c {_quoted(channel or 'can0')}"
+    return NextStep(
+        f"{text} Check host, bus and arm before the next run.", f"adacd-hil doctor {bus} --config {_configuration(run)}"
+    )
+
+
+def _configuration(run: Run) -> str:
+    """Name the configuration as a command takes it: a built-in one, or the file that bears the arm's name."""
+    name = run.metadata.get("config", "")
+    return _quoted(name) if name in builtin_names() else _quoted(f"{name or 'my-arm'}.toml")
+
+
+def _quoted(text: str) -> str:
+    return shlex.quote(in_line(text))
+
+
+def origin_words(run: Run) -> list[str]:
+    """Name the arm, where it is, and what was played."""
+    said = run.metadata
+    name, profile, interface = said.get("config", ""), said.get("profile", ""), said.get("interface", "")
+    is_own = name not in builtin_names()
+    words = [f"arm {name}" if is_own else f"configuration {name}, arm profile {profile}"] if name else []
+    if interface == EMBEDDED:
+        words.append("emulated arm" + (", simulated time" if said.get("clock") == "lockstep" else ""))
+    elif interface:
+        words.append(f"on {interface} {said.get('channel', '')}".strip())
+    if said.get("scenario"):
+        words.append(f"scenario {said['scenario']}")
+    if "version" in said:
+        words.append(f"adacd-hil {said['version']}")
+    return words

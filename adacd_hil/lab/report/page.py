@@ -1,0 +1,246 @@
+"""Pages from the Jinja2 templates in `templates`: words, forms and limits that all share; the only place that renders.
+
+A page needs nothing from outside and allows nothing but what it brings: its styles and scripts by their digests, no
+inline style, no request (content security policy). Every value is escaped; where a template marks one as safe, it says
+why it is. A template that asks for a value that it isn't given is an error. Pages follow the reader's light or dark
+scheme and print in the light one.
+
+The size of a report is bounded, whatever the length of the run. The tables as CSV and JSON are complete.
+"""
+
+import hashlib
+import math
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from functools import cache
+from importlib import resources
+from typing import Any, Final, NamedTuple
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from adacd_hil.log.logged_run import StretchOfRun
+from adacd_hil.score.metrics import Beside, Metrics, ReportedContact
+from adacd_hil.score.wording import NONE, number_text, pair_text, signs_text, why_not_found, yes_text
+from adacd_hil.terminal import keep_units
+
+TRACED_CONTACTS: Final = 60
+
+
+SECTION_TITLES: Final = {
+    "adaptation": "adaptation",
+    "detection": "collision detection",
+    "payload": "payload change",
+    "fault": "fault",
+}
+SECTIONS: Final = 60
+"""Sections with a row in the tables of sections and margins."""
+CONTACTS: Final = 200
+"""Contacts with a row in the table of contacts, and so many more that went wrong."""
+PRINTED_CONTACTS: Final = 40
+"""The same for a terminal and on paper."""
+NOTICES: Final = 12
+"""Notices in words below the timeline."""
+ADAPTATIONS: Final = 8
+"""Adaptations with a figure, and with columns in the tables of parameters."""
+MARKS: Final = 1_500
+"""Stays and contacts on the timeline, each; beyond, those that are narrower than a mark are drawn as one."""
+
+
+_PACKAGE: Final = "adacd_hil.lab.report"
+
+
+class Heading(NamedTuple):
+    """The head of a page: a line over the title, the title, and what is wrong, a line each."""
+
+    over: str
+    title: str
+    problems: Sequence[str]
+    is_good: bool
+
+
+class Cell(NamedTuple):
+    """The content of a table's cell, and its class."""
+
+    content: object
+    kind: str = ""
+
+
+class Table(NamedTuple):
+    """A table; columns are aligned right but those of `left`. head: empty where it has none."""
+
+    head: Sequence[Cell]
+    rows: Sequence[Sequence[Cell]]
+    left: Sequence[int]
+
+
+def make_table(head: Sequence[object], rows: Iterable[Sequence[object]], left: Sequence[int] = (0,)) -> Table:
+    """Make a table of cells, and of contents of cells without a class."""
+
+    def line(contents: Sequence[object]) -> list[Cell]:
+        return [content if isinstance(content, Cell) else Cell(content) for content in contents]
+
+    return Table(line(head), [line(row) for row in rows], left)
+
+
+class _Asset(NamedTuple):
+    """A style or a script, and the digest by which the content security policy allows it."""
+
+    text: str
+    digest: str
+
+
+def render_page(
+    template: str, title: str, heading: Heading, styles: Sequence[str] = (), scripts: Sequence[str] = (), **values: Any
+) -> str:
+    """Write a page whose template extends `page.html.j2`; styles, scripts: further assets, by name."""
+    sheets, programs = ([_asset(name) for name in names] for names in ((*styles, "report.css"), scripts))
+    return render(template, title=title, heading=heading, styles=sheets, scripts=programs, **values)
+
+
+def render(template: str, **values: Any) -> str:
+    """Write a template with these values."""
+    return _environment().get_template(template).render(values) + "\n"
+
+
+@cache
+def _environment() -> Environment:
+    loader = PackageLoader(_PACKAGE)
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    bounds = {"ADAPTATIONS": ADAPTATIONS, "CONTACTS": CONTACTS, "NOTICES": NOTICES, "SECTIONS": SECTIONS}
+    environment.globals["bounds"] = bounds
+    environment.filters |= {"number": number_text, "keep_units": lambda text: keep_units(text, "\u00a0")}
+    environment.policies["json.dumps_kwargs"] = {
+        "ensure_ascii": False, "allow_nan": False, "separators": (",", ":"),
+    }  # fmt: skip
+    return environment
+
+
+@cache
+def _asset(name: str) -> _Asset:
+    text = f"\n{resources.files(_PACKAGE).joinpath('assets', name).read_text(encoding='utf-8').strip()}\n"
+    return _Asset(text, b64encode(hashlib.sha256(text.encode()).digest()).decode())
+
+
+_CONTACT_HEAD: Final = (
+    "contact", "section", "link", "found", "at alarm", "onset s", "delay ms", "law ms", "ideal ms", "direction",
+    "direction right", "true Nm", "peak ratio",
+)  # fmt: skip
+
+
+def _contact_words(contact: ReportedContact) -> tuple[str, ...]:
+    delay = number_text(contact.delay_ms, 0)
+    if contact.detected_s is None:
+        delay = why_not_found(contact.is_armed)
+    onset_s = contact.detected_s if contact.onset_s is None else contact.onset_s
+    return (
+        str(contact.number),
+        contact.section or NONE,
+        number_text(contact.link, 0),
+        number_text(contact.link_detected, 0),
+        number_text(contact.link_at_alarm, 0),
+        number_text(onset_s, 3),
+        delay,
+        number_text(contact.law_ms, 1),
+        number_text(contact.ideal_ms, 0),
+        signs_text(contact.direction),
+        yes_text(contact.direction_ok),
+        pair_text(contact.tau_ext_Nm, 2),
+        number_text(contact.torque_error_ratio, 2),
+    )
+
+
+def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
+    """Choose the first contacts to be listed, and of the others as many that went wrong."""
+    later = [contact for contact in metrics.contacts[most:] if went_wrong(contact)]
+    return (*metrics.contacts[:most], *later[:most])
+
+
+def went_wrong(contact: ReportedContact) -> bool:
+    """Tell whether a contact was missed, or its link or direction is not the true one."""
+    is_missed = contact.is_armed and contact.detected_s is None
+    is_wrong_link = contact.link is not None and contact.link_detected not in (None, contact.link)
+    return is_missed or is_wrong_link or contact.direction_ok is False
+
+
+def left_out_text(metrics: Metrics, most: int) -> str:
+    """Say which contacts are not listed; nothing where all are."""
+    count, shown = len(metrics.contacts), len(shown_contacts(metrics, most))
+    if shown == count:
+        return ""
+    wrong = f" and {shown - most} more that went wrong" if shown > most else ""
+    return f"The first {most}{wrong} of {count} contacts; all are in contacts.csv."
+
+
+def contact_rows(
+    metrics: Metrics, contacts: Sequence[ReportedContact]
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Give head and rows of a list of contacts, where it is known with the delay of the paper's scheme beside."""
+    rows = [_contact_words(contact) for contact in contacts]
+    beside = shown_beside(metrics)
+    if beside is None or not beside.contacts:
+        return _CONTACT_HEAD, rows
+    delays = {c.number: number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts}
+    return (*_CONTACT_HEAD, "paper's ms"), [
+        (*row, delays[contact.number]) for row, contact in zip(rows, contacts, strict=True)
+    ]
+
+
+def has_paper(metrics: Metrics) -> bool:
+    """Tell whether the run is of the paper's experiment."""
+    return any(row.paper is not None for row in metrics.paper)
+
+
+def shown_beside(metrics: Metrics) -> Beside | None:
+    """Give the result of the paper's scheme on the same stream, which is shown where the paper's experiment was played.
+
+    report.json has it of every run.
+    """
+    return metrics.evidence.paper_beside if metrics.evidence is not None and has_paper(metrics) else None
+
+
+def paper_head(metrics: Metrics) -> tuple[str, ...]:
+    """Name the columns of paper against measured; the paper's own is there where its experiment was played."""
+    if metrics.evidence is None:
+        return ("", "paper", "measured") if has_paper(metrics) else ("", "measured")
+    paper = ("paper (printed)", "paper's scheme, same stream") if has_paper(metrics) else ()
+    return ("", *paper, "certified")
+
+
+_PLAIN_NAMES: Final = {
+    "Frozen residual, first detection section, joints 1 / 2": "Largest unexplained torque, first detection section",
+    "Frozen residual, second detection section, joints 1 / 2": "Largest unexplained torque, second detection section",
+    "The CAD model's, first detection section": "The same with the CAD model, first detection section",
+    "The CAD model's, second detection section": "The same with the CAD model, second detection section",
+    "Bound β of eq. (15)": "Residual that learning must come below",
+    "Hold T of eq. (15)": "How long it must stay there, or was tested",
+    "Filter a / b": "Filter of the residual",
+    "Smallest threshold / residual": "Smallest margin: threshold over unexplained torque",
+}
+"""Names of quantities for a reader who has nothing of the paper before him; report.json keeps the others."""
+
+
+def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
+    """Write a row per quantity."""
+    rows = []
+    for row in metrics.paper:
+        if row.paper is None and row.measured == NONE:
+            continue
+        beside = () if metrics.evidence is None or row.paper is None else (row.beside or NONE,)
+        quantity = row.quantity if row.paper is not None else _PLAIN_NAMES.get(row.quantity, row.quantity)
+        rows.append((quantity, *(() if row.paper is None else (row.paper,)), *beside, row.measured))
+    return rows
+
+
+def stretch_text(stretch: StretchOfRun) -> str:
+    """Say which stretch of a log was taken, and why it is not the one that was asked for."""
+    start_s, end_s = stretch.found
+    text = (
+        "the log"
+        + ("" if math.isinf(start_s) else f" from {start_s:.2f} s")
+        + ("" if math.isinf(end_s) else f" until {end_s:.2f} s")
+    )
+    if stretch.found == stretch.asked:
+        return text
+    return f"{text}, widened so that no contact and no adaptation is cut"

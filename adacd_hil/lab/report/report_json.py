@@ -1,0 +1,94 @@
+"""The numbers of a run as plain values for other programs: the content of report.json.
+
+It draws nothing, so that lists of runs read it quickly; the keys are described in `adacd_hil.score.metrics`.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from adacd_hil.log.logged_run import StretchOfRun
+from adacd_hil.score.metrics import CertifiedEvidence, Metrics, ReportSource
+
+JSON_NAME: Final = "report.json"
+SCHEMA: Final = 3
+"""Version of report.json; goes up when a key changes its meaning or disappears."""
+_DIGITS: Final = 6
+
+
+def report_json(
+    metrics: Metrics, metadata: Mapping[str, str], source: ReportSource, stretch: StretchOfRun | None = None
+) -> dict[str, Any]:
+    """Give the content of report.json; the keys are described in `adacd_hil.score.metrics`."""
+    fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
+    plain: dict[str, Any] = _plain(
+        {
+            "schema": SCHEMA,
+            "verdict": metrics.verdict,
+            "is_clean": metrics.is_clean,
+            "time_zero": "first cycle in ADAPT (motion start)",
+            "adaptation_s": metrics.adaptation_s,
+            "sections": {
+                section.label: {**dataclasses.asdict(section), "duration_s": section.duration_s}
+                for section in metrics.sections
+            },
+            "frozen_residual_max_Nm": {
+                label: dataclasses.asdict(residual) for label, residual in metrics.frozen_residual_max_Nm.items()
+            },
+            "contacts": [dataclasses.asdict(contact) for contact in metrics.contacts],
+            "false_alarms": metrics.false_alarms,
+            "false_alarms_s": metrics.false_alarms_s,
+            "false_alarm_bound_per_h": metrics.false_alarm_bound_per_h,
+            "missed": metrics.missed,
+            "parameters": metrics.parameters,
+            "payload_kg": metrics.payload_kg,
+            "certified": None if metrics.evidence is None else _evidence_json(metrics.evidence),
+            "fault": fault,
+            "cycle": dataclasses.asdict(metrics.cycle),
+            "timing": metrics.timing.as_json(),
+            "data": metrics.data.as_json(),
+            "log": {
+                "name": source.log_name,
+                "frames": metrics.frames,
+                "dropped": metrics.dropped,
+                "is_complete": source.is_complete,
+                "problem": source.problem,
+            },
+            "stretch": None if stretch is None else _stretch_json(stretch),
+            "paper": [row._asdict() for row in metrics.paper],
+            "run": dict(sorted(metadata.items())),
+        }
+    )
+    return plain
+
+
+def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
+    """Give a stretch, s since the beginning of the log; null where it is not bounded."""
+    return {
+        "from_s": stretch.found.start_s,
+        "until_s": stretch.found.end_s,
+        "asked_from_s": stretch.asked.start_s,
+        "asked_until_s": stretch.asked.end_s,
+        "motion_start_s": stretch.motion_start_s,
+    }
+
+
+def _evidence_json(evidence: CertifiedEvidence) -> dict[str, Any]:
+    """Give what only the certified scheme has; the keys are described in `adacd_hil.score.margins`."""
+    certificates = [certificate._asdict() for certificate in evidence.certificates]
+    margin = evidence.smallest_margin
+    return {**dataclasses.asdict(evidence), "smallest_margin": margin, "certificates": certificates}
+
+
+def _plain(value: Any) -> Any:
+    """Make a value of JSON's types: numbers with six digits, null for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
+    return value

@@ -1,0 +1,298 @@
+"""The tables of a report's page, those of the timing evidence included, those of contacts not."""
+
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from string import ascii_letters
+from typing import Final, NamedTuple
+
+from adacd_hil.lab.report.page import (
+    ADAPTATIONS,
+    SECTION_TITLES,
+    SECTIONS,
+    Cell,
+    Table,
+    make_table,
+    paper_cells,
+    paper_head,
+    stretch_text,
+)
+from adacd_hil.lab.score.evaluation import OLDEST_CYCLES
+from adacd_hil.log.logged_run import QUANTITIES, Quantity, Run
+from adacd_hil.records import PARAMETER_UNITS
+from adacd_hil.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
+from adacd_hil.score.metrics import (
+    CertifiedEvidence,
+    ChannelMargin,
+    CyclicData,
+    Metrics,
+    ReportSource,
+    Residual,
+    TimingEvidence,
+)
+from adacd_hil.score.wording import (
+    NONE,
+    number_of,
+    number_text,
+    pair_text,
+    percent_text,
+    rate_sentence,
+    signed_text,
+)
+
+
+def paper_table(metrics: Metrics) -> Table:
+    """Put what the paper printed beside what was measured."""
+    rows = [[*cells[:-1], Cell(cells[-1], "strong")] for cells in paper_cells(metrics)]
+    head = paper_head(metrics)
+    return make_table(head, rows, left=range(len(head)))
+
+
+def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
+    """List threshold over residual of each channel and section."""
+    if evidence is None or not evidence.margins:
+        return None
+    head = ("section", "filter, rad/s", "", "largest residual, Nm", "threshold, Nm", "margin")
+    rows: list[Sequence[object]] = []
+    for label, channels in _first_and_worst(evidence).items():
+        for row in channels:
+            cutoff = f"{row.cutoff_rad_s:g}"
+            kind = "bare" if row.smoothing_rad_s is None else "smoothed"
+            margin = Cell(pair_text(row.margin, 1), "bad" if min(row.margin) < 1.0 else "strong")
+            pairs = (pair_text(row.residual_max_Nm, 3), pair_text(row.threshold_Nm, 3))
+            name = Cell(label, "strong") if row is channels[0] else ""
+            rows.append((name, cutoff, kind, *pairs, margin))
+    return make_table(head, rows, left=(0, 2))
+
+
+def push_table(evidence: CertifiedEvidence | None) -> Table | None:
+    """Give how small a push is found, and the threshold in force."""
+    push = None if evidence is None else evidence.smallest_push
+    if push is None:
+        return None
+    names = {"p50": "median", "p99": "99 %", "max": "worst"}
+    rows = [
+        (what, *(pair_text([joint[name] for joint in joints], 3) for name in names))
+        for what, joints in (
+            ("smallest push found within 100 ms, estimated", push.push_Nm),
+            ("threshold in force", push.threshold_Nm),
+        )
+    ]
+    return make_table(("joint 1 / joint 2, Nm", *names.values()), rows)
+
+
+def counted_sentence(metrics: Metrics) -> str:
+    """Say what false alarms there were, and which rate that leaves possible; empty where nobody knows."""
+    bound = metrics.false_alarm_bound_per_h
+    return "" if bound is None else rate_sentence(metrics.armed_false_alarms or 0, bound)
+
+
+def _first_and_worst(evidence: CertifiedEvidence) -> dict[str, tuple[ChannelMargin, ...]]:
+    """Choose the first sections, and the one with the smallest margin."""
+    labels = list(evidence.margins)
+    worst = min(labels, key=lambda label: min(min(row.margin) for row in evidence.margins[label]))
+    shown = {*labels[:SECTIONS], worst}
+    return {label: margins for label, margins in evidence.margins.items() if label in shown}
+
+
+def further_table(evidence: CertifiedEvidence | None) -> Table | None:
+    """List all parameters of the certified scheme with the standard deviations that it gives them."""
+    if evidence is None or not evidence.estimates:
+        return None
+    estimates = dict(islice(evidence.estimates.items(), ADAPTATIONS))
+    head = ["", "unit"]
+    for label in estimates:
+        head += [f"certified ({label})", "±"]
+    rows = []
+    for name in next(iter(estimates.values())):
+        cells: list[object] = [_symbol(name), PARAMETER_UNITS.get(name, "Nm")]
+        for found in estimates.values():
+            cells += [Cell(number_text(found[name].value, 5), "strong"), number_text(found[name].std, 5)]
+        rows.append(cells)
+    return make_table(head, rows, left=(0, 1))
+
+
+def sections_table(metrics: Metrics, run: Run) -> Table:
+    """Make a row per section, with its frozen residuals."""
+    threshold = run.settings.detector.threshold_Nm
+    rows = []
+    for section in metrics.sections[:SECTIONS]:
+        residual = metrics.frozen_residual_max_Nm.get(section.label, Residual(None, None, 0))
+        rows.append(
+            (
+                Cell(section.label, "strong"),
+                SECTION_TITLES[section.kind]
+                + ("" if section.is_complete or section.kind != "adaptation" else ", not finished"),
+                number_text(section.start_s, 3),
+                number_text(section.end_s, 3),
+                number_text(section.duration_s, 3),
+                _judged(residual.identified, threshold),
+                _judged(residual.cad, threshold),
+                str(residual.cycles) if residual.cycles else NONE,
+            )
+        )
+    head = (
+        "section", "", "from, s", "to, s", "lasts, s", "largest unexplained torque, Nm", "with the CAD model, Nm",
+        "cycles judged",
+    )  # fmt: skip
+    return make_table(head, rows, left=(0, 1))
+
+
+def _judged(values: tuple[float, float] | None, threshold: tuple[float, float]) -> Cell:
+    if values is None:
+        return Cell(NONE)
+    is_over = any(value > bound for value, bound in zip(values, threshold, strict=True))
+    return Cell(pair_text(values, 3), "bad" if is_over else "")
+
+
+def _symbol(name: str) -> tuple[str, str]:
+    """Part a parameter's name from its index: F_v1, a1, offset1."""
+    stem, index = name.split("_", 1) if "_" in name else (name.rstrip("0123456789"), name.lstrip(ascii_letters))
+    return stem, index
+
+
+def parameters_table(metrics: Metrics, run: Run) -> Table | None:
+    """Put the identified parameters beside the true ones and the CAD model's."""
+    if not metrics.parameters:
+        return None
+    cad = dict(zip(run.parameter_names, run.settings.arm.cad_theta, strict=True)) if run.has_cad else {}
+    head = ["", "unit", "CAD"]
+    for label, payload_kg in islice(metrics.payload_kg.items(), ADAPTATIONS):
+        with_payload = "" if payload_kg is None else f", {payload_kg:g} kg"
+        head += [f"true ({label}{with_payload})", f"identified ({label})", "error"]
+    rows = []
+    for name in run.parameter_names:
+        cells: list[object] = [_symbol(name), PARAMETER_UNITS[name], number_text(cad.get(name), 4)]
+        for found in islice(metrics.parameters.values(), ADAPTATIONS):
+            true, identified = found[name]
+            error = f"{signed_text(100.0 * (identified - true) / true)} %" if true else NONE
+            cells += [number_text(true, 4), Cell(number_text(identified, 4), "strong"), error]
+        rows.append(cells)
+    return make_table(head, rows, left=(0, 1))
+
+
+def data_table(data: CyclicData) -> Table | None:
+    """List how much of the cyclic data came in time."""
+    if not data.cycles:
+        return None
+    rows = [
+        (name, _share(share), _share(worst))
+        for name, share, worst in (
+            ("cycles that lacked a frame in time", data.incomplete, data.worst_incomplete),
+            ("cycles that went by older data", data.aged, None),
+        )
+    ]
+    for name, shares in data.devices.items():
+        rows.append((f"{name}: no new data", _share(shares.no_new_data), _share(shares.worst_no_new_data)))
+        rows.append((f"{name}: repeated", _share(shares.repeated), _share(shares.worst_repeated)))
+    return make_table(("", "share", "worst second"), rows)
+
+
+def _share(share: float | None) -> str:
+    return NONE if share is None else percent_text(share)
+
+
+def origin_table(metrics: Metrics, run: Run, source: ReportSource) -> Table:
+    """List where the run comes from."""
+    log = [("log", source.log_name), ("frames", metrics.frames), ("packets dropped", metrics.dropped)]
+    if run.stretch is not None:
+        log.append(("stretch", stretch_text(run.stretch)))
+    rows = [(label, NONE if value is None else str(value)) for label, value in log]
+    rows += [(key.replace("_", " "), value or NONE) for key, value in sorted(run.metadata.items())]
+    return make_table(("", ""), rows, left=(0, 1))
+
+
+_ABSENT: Final = "not in this log"
+_COUNTS: Final = {
+    "overruns": "periods skipped (overruns)",
+    "frames_missing": "cyclic frames missing or refused",
+    "commands_late": "commands late: act one SYNC later",
+    "frames_lost": "received frames dropped by the kernel",
+}
+_QUEUES: Final = {
+    "receive": "receive queue of the bus",
+    "transmit": "transmit queue of the bus",
+    "log": "queue to the log's writer",
+}
+
+
+class TimingTables(NamedTuple):
+    """The tables; queues: None where there are none. is_modelled: times are those of a model."""
+
+    is_modelled: bool
+    times: Table
+    counts: Table
+    queues: Table | None
+    ages: Table
+
+
+def timing_tables(evidence: TimingEvidence) -> TimingTables | None:
+    """Make the tables: percentiles, counts, queues and ages. None without a cycle."""
+    if not evidence.cycles:
+        return None
+    return TimingTables(
+        is_modelled=evidence.is_modelled,
+        times=_times_table(evidence),
+        counts=_counts_table(evidence),
+        queues=None if evidence.is_modelled else _queues_table(evidence),
+        ages=_ages_table(evidence),
+    )
+
+
+def _times_table(evidence: TimingEvidence) -> Table:
+    """Make a row per time; slack at the end under a head of its own, because its small values are the bad ones."""
+    reserves = [quantity for quantity in QUANTITIES if quantity.is_reserve]
+    rows = [_time_row(quantity, evidence, PERCENTILE_NAMES) for quantity in QUANTITIES if not quantity.is_reserve]
+    reaction = evidence.reaction
+    if reaction is not None:
+        label = ("Reaction", f"detection decision to first reaction frame, {number_of(reaction.count, 'reaction')}")
+        rows.append((label, *_values(reaction.percentiles, PERCENTILE_NAMES)))
+    head = [None, *(Cell(name, "head") for name in LOW_PERCENTILE_NAMES)]
+    rows += [head, *(_time_row(quantity, evidence, LOW_PERCENTILE_NAMES) for quantity in reserves)]
+    return make_table(("µs", *PERCENTILE_NAMES), rows)
+
+
+def _time_row(quantity: Quantity, evidence: TimingEvidence, names: Sequence[str]) -> Sequence[object]:
+    label = (quantity.title, quantity.meaning)
+    statistics = evidence.times[quantity.name]
+    if statistics is None:
+        reason = NONE if evidence.is_modelled and quantity.name == "lateness" else _ABSENT
+        return (label, *[""] * (len(names) - 1), reason)
+    cells: list[object] = [*_values(statistics.percentiles, names)]
+    if quantity.is_reserve and statistics.percentiles.get("min", 0.0) < 0.0:
+        cells[-1] = Cell(cells[-1], "bad")
+    return (label, *cells)
+
+
+def _values(found: Mapping[str, float], names: Sequence[str]) -> list[str]:
+    return [number_text(found.get(name), 1) for name in names]
+
+
+def _counts_table(evidence: TimingEvidence) -> Table:
+    rows: list[Sequence[object]] = []
+    for name, words in _COUNTS.items():
+        count = evidence.counts[name]
+        if count is None:
+            rows.append((words, "", _ABSENT))
+            continue
+        rows.append((words, Cell(count.total, "bad" if count.total else ""), number_text(count.per_100000, 1)))
+    return make_table((f"in {evidence.cycles} cycles", "count", "per 100 000"), rows)
+
+
+def _queues_table(evidence: TimingEvidence) -> Table:
+    rows: list[Sequence[object]] = []
+    for name, words in _QUEUES.items():
+        depth = evidence.queues_bytes[name]
+        values = ["", _ABSENT] if depth is None else [number_text(depth.get(key), 0) for key in ("p99", "max")]
+        rows.append((words, *values))
+    return make_table(("bytes", "p99", "max"), rows)
+
+
+def _ages_table(evidence: TimingEvidence) -> Table:
+    ages = evidence.data_age
+    head = ("age of the oldest value used", "cycles", "share")
+    if ages is None:
+        return make_table(head, [("", "", _ABSENT)])
+    labels = [f"{age}" if age < OLDEST_CYCLES else f"{age} or more" for age in range(len(ages))]
+    shares = zip(labels, ages, strict=True)
+    rows = [(label, str(count), f"{100.0 * count / evidence.cycles:.3f} %") for label, count in shares if count]
+    return make_table(head, rows)

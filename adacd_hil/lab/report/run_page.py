@@ -1,0 +1,413 @@
+"""The page of a report, put together, and its cards of contacts."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from adacd_hil.lab.drawing import Drawing
+from adacd_hil.lab.report.next_steps import next_steps, origin_words
+from adacd_hil.lab.report.page import (
+    CONTACTS,
+    TRACED_CONTACTS,
+    Cell,
+    Heading,
+    Table,
+    contact_rows,
+    has_paper,
+    left_out_text,
+    make_table,
+    render_page,
+    shown_beside,
+    shown_contacts,
+    stretch_text,
+)
+from adacd_hil.lab.report.report_tables import (
+    counted_sentence,
+    data_table,
+    further_table,
+    margins_table,
+    origin_table,
+    paper_table,
+    parameters_table,
+    push_table,
+    sections_table,
+    timing_tables,
+)
+from adacd_hil.lab.report.timeline import (
+    SCRIPTS,
+    STYLES,
+    certificates_of,
+    notices_of,
+    state_key,
+    timeline_of,
+    traces_of,
+)
+from adacd_hil.lab.score.verdict import LISTED
+from adacd_hil.log.logged_run import Run
+from adacd_hil.records import DETECTOR_EVENT, Location, Vector
+from adacd_hil.score.judge import row_at
+from adacd_hil.score.metrics import Beside, Metrics, ReportedContact, ReportSource
+from adacd_hil.score.wording import (
+    NONE,
+    number_text,
+    percent_text,
+    scaled,
+    signs_text,
+    state_words,
+    uncertain_text,
+)
+
+_Point = tuple[float, float]
+
+
+class Push(NamedTuple):
+    """A force at right angles to a link: how far from the link's joint, and how strong, of the strongest to be shown.
+
+    lever_m, lever_sigma_m: None where the place is not known; the arrow then points at the middle, or at `lever_m`
+    without its spread, and is dashed. side: +1 toward +q, -1, or 0 where not known.
+    """
+
+    link: int
+    side: int
+    share: float
+    lever_m: float | None
+    lever_sigma_m: float | None
+
+
+class Stroke(NamedTuple):
+    """A straight line, and its class."""
+
+    start: _Point
+    end: _Point
+    kind: str
+
+
+@dataclass(frozen=True)
+class ArmDrawing:
+    """The picture's content. view: its left, top, width and height with y down; force: strokes of arrow and spread."""
+
+    description: str
+    view: tuple[float, float, float, float]
+    reach: float
+    links: tuple[Stroke, Stroke]
+    force: list[Stroke]
+    arrowhead: list[_Point]
+
+
+def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, description: str) -> ArmDrawing:
+    """Draw the arm at the joint angles q, rad (2,)."""
+    angles = (float(q[0]), float(q[0] + q[1]))
+    l1, l2 = (1000.0 * length for length in length_m)
+    elbow = _along((0.0, 0.0), angles[0], l1)
+    tip = _along(elbow, angles[1], l2)
+    reach = l1 + l2
+    touched = 0 if push is None else push.link
+    lines = (((0.0, 0.0), elbow), (elbow, tip))
+    kinds = ("link touched" if number == touched else "link" for number in (1, 2))
+    first, second = (Stroke(*line, kind) for line, kind in zip(lines, kinds, strict=True))
+    force, arrowhead = ([], []) if push is None else _arrow(push, (first, second), angles, reach)
+    tails = [stroke.start for stroke in force if stroke.kind.startswith("force")]
+    xs, ys = zip((0.0, 0.0), elbow, tip, *tails, strict=True)
+    width, height = 1.5 * reach, 1.1 * reach
+    left = 0.5 * (min(xs) + max(xs)) - 0.5 * width
+    top = -0.5 * (min(ys) + max(ys)) - 0.5 * height
+    return ArmDrawing(description, (left, top, width, height), reach, (first, second), force, arrowhead)
+
+
+def _along(start: _Point, angle: float, distance: float) -> _Point:
+    return (start[0] + distance * math.cos(angle), start[1] + distance * math.sin(angle))
+
+
+def _arrow(
+    push: Push, links: tuple[Stroke, Stroke], angles: tuple[float, float], reach: float
+) -> tuple[list[Stroke], list[_Point]]:
+    """Draw the force and the spread of its place; give the strokes, and the corners of the arrowhead."""
+    start, end, _ = links[push.link - 1]
+    angle = angles[push.link - 1]
+    lever = 0.5 * math.dist(start, end) if push.lever_m is None else 1000.0 * push.lever_m
+    head = _along(start, angle, lever)
+    strokes = []
+    if push.lever_sigma_m is not None:
+        spread = 1000.0 * push.lever_sigma_m
+        strokes.append(Stroke(_along(start, angle, lever - spread), _along(start, angle, lever + spread), "spread"))
+    if push.side == 0:
+        return strokes, []
+    outward = angle - push.side * 0.5 * math.pi
+    tail = _along(head, outward, (0.14 + 0.22 * float(np.clip(push.share, 0.0, 1.0))) * reach)
+    neck = _along(head, outward, 0.085 * reach)
+    strokes.append(Stroke(tail, neck, "force" if push.lever_sigma_m is not None else "force guessed"))
+    return strokes, [head, *(_along(neck, angle, side * 0.04 * reach) for side in (-1.0, 1.0))]
+
+
+CARDS: Final = 48
+"""Contacts with a card of their own; the table has all."""
+
+
+class ContactCard(NamedTuple):
+    """The known data of a contact: the report with its uncertainty, the truth, the arm.
+
+    stretch_s: the part of the traces that a script shows.
+    """
+
+    number: int
+    link: int | None
+    at_s: float
+    stretch_s: tuple[float, float]
+    is_wrong: bool
+    kind: str
+    entries: list[tuple[str, str]]
+    arm: ArmDrawing | None
+
+
+def contacts_table(metrics: Metrics) -> Table | None:
+    """Make a row per contact, marked where something went wrong; None without contacts."""
+    if not metrics.contacts:
+        return None
+    rows: list[list[object]] = []
+    contacts = shown_contacts(metrics, CONTACTS)
+    head, words = contact_rows(metrics, contacts)
+    for contact, row in zip(contacts, words, strict=True):
+        wrong = {
+            3: contact.link is not None and contact.link_detected not in (None, contact.link),
+            6: contact.detected_s is None,
+            10: contact.direction_ok is False,
+        }
+        rows.append([Cell(word, "bad") if wrong.get(column) else word for column, word in enumerate(row)])
+    return make_table(head, rows, left=())
+
+
+def contact_cards(metrics: Metrics, run: Run) -> list[ContactCard]:
+    """Make a card for each of the first contacts."""
+    contacts = metrics.contacts[:CARDS]
+    strongest_N = max((abs(contact.force_N) for contact in contacts if contact.force_N is not None), default=0.0)
+    return [_card(contact, run, strongest_N) for contact in contacts]
+
+
+_PLACES: Final = {
+    "KNOWN": "one contact on the link",
+    "LINK_1": "only the moment is known: the least force that has it",
+    "SINGULAR": "not known: the elbow stands square",
+    "UNCERTAIN": "too weak for a lever arm",
+    "BEYOND_TIP": "lever arm past the tip",
+    "INCONSISTENT": "no single contact without friction",
+    "NOT_SOUGHT": "not sought",
+}
+
+
+def _card(contact: ReportedContact, run: Run, strongest_N: float) -> ContactCard:
+    entries = _found(contact) if contact.detected_s is not None else [("found", _why_not(contact))]
+    entries += _finders(contact, run) + _torques(contact)
+    if contact.link is not None:
+        force = number_text(contact.true_force_N, 1, "N") if contact.true_force_N is not None else NONE
+        entries.append(("truth", f"link {contact.link}, {force}"))
+    is_right = contact.detected_s is not None and contact.link in (None, contact.link_detected)
+    return ContactCard(
+        number=contact.number,
+        link=contact.link if contact.link_detected is None else contact.link_detected,
+        at_s=contact.at_s,
+        stretch_s=(contact.at_s - 0.15, contact.at_s + 0.6),
+        is_wrong=contact.is_armed and not is_right,
+        kind=_kind(contact),
+        entries=[(term, text) for term, text in entries if text != NONE],
+        arm=_arm(contact, run, strongest_N),
+    )
+
+
+def _kind(contact: ReportedContact) -> str:
+    words = [contact.level, contact.kind if contact.kind != "UNKNOWN" else None, contact.reaction]
+    kind = " · ".join(word.lower().replace("_", " ") for word in words if word)
+    return kind + (" · two-sided" if contact.is_two_sided else "")
+
+
+def _why_not(contact: ReportedContact) -> str:
+    return "missed" if contact.is_armed else f"detection was off: {state_words(contact.state)}"
+
+
+def _found(contact: ReportedContact) -> list[tuple[str, str]]:
+    """Give what the report says."""
+    lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
+    return [
+        ("found after", number_text(contact.delay_ms, 0, "ms")),
+        ("pushes joints 1 / 2 to", signs_text(contact.direction)),
+        _force(contact),
+        ("lever arm", lever),
+        ("place", _PLACES.get(contact.location or "", NONE)),
+        ("blind within", number_text(contact.blind_deg, 1, "°")),
+    ]
+
+
+def _finders(contact: ReportedContact, run: Run) -> list[tuple[str, str]]:
+    """Say who has found a contact, where live detectors say so, as they do in the cycle of its detection."""
+    if contact.detected_s is None:
+        return []
+    said = [(t_ns, event.message) for t_ns, event in run.events if event.name == DETECTOR_EVENT]
+    period_s = run.settings.bus.period_s
+    return [
+        ("found by", message.partition(" by ")[2])
+        for t_ns, message in said
+        if abs((t_ns - run.zero_ns) * 1e-9 - contact.detected_s) < 0.5 * period_s
+    ]
+
+
+def _force(contact: ReportedContact) -> tuple[str, str]:
+    """Give the force as far as it is known: with its deviation, as a lower bound, or not at all."""
+    location = Location[contact.location or Location.NOT_SOUGHT.name]
+    if contact.force_N is None:
+        return "force", NONE
+    text = location.force_text(contact.force_N)
+    if text == NONE:
+        return "force", "not known"
+    if location is Location.LINK_1:
+        spread = contact.force_sigma_N
+        return "force", f"{text} N" if spread is None else f"{text} ± {number_text(spread, 1)} N"
+    return "force at right angles", uncertain_text(contact.force_N, contact.force_sigma_N, 1, "N")
+
+
+def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
+    """Give each joint's peak and impulse; a peak without its deviation where that is not told."""
+    unknown = (None, None)
+    impulses = contact.impulse_Nm_s or unknown
+    impulse_sigmas = contact.impulse_sigma_Nm_s or unknown
+    peak_sigmas = contact.tau_ext_peak_sigma_Nm or unknown
+    entries = []
+    for joint, peak_Nm in enumerate(contact.tau_ext_peak_hat_Nm or ()):
+        peak = uncertain_text(peak_Nm, peak_sigmas[joint], 2, "Nm")
+        impulse = uncertain_text(impulses[joint], impulse_sigmas[joint], 3, "Nm s")
+        entries.append((f"joint {joint + 1}: peak", number_text(peak_Nm, 2, "Nm") if peak == NONE else peak))
+        entries.append((f"joint {joint + 1}: impulse", impulse))
+    return entries
+
+
+def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> ArmDrawing | None:
+    """Draw the arm where it was when the contact was found, or began; None without measured positions."""
+    if run.motion is None:
+        return None
+    at_s = contact.at_s if contact.detected_s is None else contact.detected_s
+    q: Vector = run.motion.q[row_at(run, at_s)]
+    push = _push(contact, strongest_N, run.settings.arm.link_length_m[0])
+    words = [f"Arm at contact {contact.number}", f"joints at {q[0]:.2f} and {q[1]:.2f} rad"]
+    if push is not None:
+        words.append(f"link {push.link} touched")
+    return draw_arm(q, run.settings.arm.link_length_m, push, ", ".join(words))
+
+
+def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Push | None:
+    """Say where the force of a contact is drawn: as reported, else as true, else not at all."""
+    link = contact.link if contact.link_detected is None else contact.link_detected
+    if link is None:
+        return None
+    if contact.location in ("KNOWN", "LINK_1") and contact.force_N is not None:
+        side = 1 if contact.force_N > 0.0 else -1
+        share = abs(contact.force_N) / strongest_N if strongest_N > 0.0 else 0.0
+        if contact.location == "KNOWN":
+            return Push(link, side, share, contact.lever_m, contact.lever_sigma_m)
+        return Push(link, side, share, length1_m, None)
+    side = 0 if contact.direction is None else contact.direction[link - 1]
+    return Push(link, side, 0.5, None, None)
+
+
+def report_page(
+    metrics: Metrics, run: Run, source: ReportSource, drawings: Sequence[Drawing], timing: Sequence[Drawing]
+) -> str:
+    """Write the page. drawings, timing: the figures of the run and of its times."""
+    figures = {drawing.name: drawing for drawing in drawings}
+    traces = traces_of(run, metrics)
+    since_ns = None if run.log_start_ns is None else run.zero_ns - run.log_start_ns
+    return render_page(
+        "run_page.html.j2",
+        f"{_name(run, source)} – run report",
+        _heading(metrics, run, source),
+        STYLES if traces else (),
+        SCRIPTS if traces else (),
+        run=run,
+        metrics=metrics,
+        next_steps=next_steps(metrics, run, source),
+        tiles=_tiles(metrics),
+        timeline=timeline_of(run, metrics),
+        state_key=state_key(run),
+        notices=notices_of(run, metrics),
+        certificates=certificates_of(run),
+        residuals=figures.get("fig5"),
+        has_paper=has_paper(metrics),
+        paper=paper_table(metrics),
+        sections=sections_table(metrics, run),
+        margins=margins_table(metrics.evidence),
+        push=push_table(metrics.evidence),
+        counted=counted_sentence(metrics),
+        close_ups=figures.get("contacts"),
+        contacts=contacts_table(metrics),
+        left_out=left_out_text(metrics, CONTACTS),
+        cards=contact_cards(metrics, run),
+        adaptations=[figures[name] for name in figures if name.removeprefix("fig") not in (name, "5")],
+        parameters=parameters_table(metrics, run),
+        further=further_table(metrics.evidence),
+        traces=traces,
+        traced_contacts=TRACED_CONTACTS,
+        data=data_table(metrics.data),
+        timing=timing_tables(metrics.timing),
+        timing_figures=timing,
+        origin=origin_table(metrics, run, source),
+        settling_s=f"{10.0 / run.a_rad_s:g}",
+        motion_start_s=None if since_ns is None else since_ns * 1e-9,
+    )
+
+
+def _name(run: Run, source: ReportSource) -> str:
+    words = [run.metadata.get("config", ""), run.metadata.get("profile", "")]
+    return " ".join(filter(None, words)) or source.log_name
+
+
+def _heading(metrics: Metrics, run: Run, source: ReportSource) -> Heading:
+    words = origin_words(run)
+    if run.stretch is not None:
+        words.append(stretch_text(run.stretch))
+    problems = [f"The log is not whole: {source.problem}"] if source.problem else []
+    if not problems and metrics.dropped:
+        problems = [f"{metrics.dropped} packets are not in the log."]
+    over = " · ".join(["run report", *words])
+    return Heading(over, metrics.verdict, problems, metrics.is_clean)
+
+
+def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
+    """Give the handful of numbers to be read first: what each is, the number, its unit."""
+    armed = [contact for contact in metrics.contacts if contact.is_armed]
+    seen = [contact for contact in armed if contact.detected_s is not None]
+    times_s = _listed([number_text(value, 2) for value in metrics.adaptation_s.values()])
+    delays_ms = [contact.delay_ms for contact in seen if contact.delay_ms is not None]
+    laws_ms = [contact.law_ms for contact in seen if contact.law_ms is not None]
+    frozen = [max(r.identified) for r in metrics.frozen_residual_max_Nm.values() if r.identified is not None]
+    links = [contact for contact in seen if contact.link is not None]
+    right = sum(contact.link == contact.link_detected for contact in links)
+    has_truth, evidence = metrics.missed is not None, metrics.evidence
+    tiles = [
+        ("identified in" if evidence is None else "certified in", " · ".join(times_s) or NONE, "s"),
+        ("the paper's scheme, same stream", _beside_times(shown_beside(metrics)), "s"),
+        ("contacts detected", f"{len(seen)} of {len(armed)}", "") if has_truth else ("detections", str(len(seen)), ""),
+        ("false alarms", NONE if metrics.false_alarms is None else str(metrics.false_alarms), ""),
+        ("link right", f"{right} of {len(links)}" if links else NONE, ""),
+        ("median delay", number_text(float(np.median(delays_ms)), 1) if delays_ms else NONE, "ms"),
+        ("of which the filter's", number_text(float(np.median(laws_ms)), 1) if laws_ms else NONE, "ms"),
+        ("largest unexplained torque", number_text(max(frozen), 3) if frozen else NONE, "Nm"),
+        ("incomplete cycles", _share_number(metrics.data.incomplete), "%"),
+        ("smallest margin", NONE if evidence is None else number_text(evidence.smallest_margin, 2), "×"),
+    ]
+    return [tile for tile in tiles if tile[1] != NONE]
+
+
+def _share_number(share: float | None) -> str:
+    return NONE if share is None else percent_text(share).removesuffix(" %")
+
+
+def _beside_times(beside: Beside | None) -> str:
+    if beside is None:
+        return NONE
+    times_s = [number_text(time_s, 2) for time_s in beside.adaptation_s.values()]
+    return " · ".join(_listed(times_s)) or NONE
+
+
+def _listed(times: list[str]) -> list[str]:
+    """Leave out all but the first of many."""
+    return times if len(times) <= LISTED else [*times[:LISTED], "…"]

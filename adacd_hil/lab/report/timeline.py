@@ -1,0 +1,324 @@
+"""A run over time on a page: marks of the timeline, on the lanes of a drawing 1000 wide, and what a script draws below.
+
+Lanes are states, contacts and notices; below them the script draws the traces. A mark carries the stretch that it
+stands for, s since motion start, so that a script can enlarge the stretch; without a script the mark still shows its
+words.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from adacd_hil.lab.report.page import MARKS
+from adacd_hil.lab.report.traces import Packed, TracePanel, pack, panels_of, step_of
+from adacd_hil.log.logged_run import Run
+from adacd_hil.records import SchemeState
+from adacd_hil.score.metrics import Metrics, ReportedContact
+from adacd_hil.score.wording import STATE_WORDS, number_text
+
+STATE_COLOURS: Final = {
+    SchemeState.ADAPT: "adaptation",
+    SchemeState.CERTIFY: "certify",
+    SchemeState.REACT: "react",
+    SchemeState.STOPPED: "stopped",
+    SchemeState.PAYLOAD: "payload",
+    SchemeState.FAULT: "fault",
+}
+"""Variables of the page; a state that is not here has the ground's colour."""
+
+_LEFT, _RIGHT = 78.0, 996.0
+_LETTER: Final = 6.4
+"""Width of a letter and room beside it."""
+_NARROWEST: Final = 1.5
+_APART: Final = 15.0
+"""Numbers of contacts that are nearer than this would overlap."""
+_DIGIT: Final = 8.0
+"""Width of a digit of a number, and room beside it."""
+_TICKS: Final = 12
+_MOST_NOTICES: Final = 300
+
+
+class Stay(NamedTuple):
+    """A stretch in one state, s."""
+
+    state: SchemeState
+    start_s: float
+    end_s: float
+
+
+class Notice(NamedTuple):
+    """Something that went wrong, or nearly: a warning or an error of the log, a fault, a false alarm."""
+
+    at_s: float
+    is_bad: bool
+    text: str
+
+
+class Mark(NamedTuple):
+    """A mark on a lane: the stretch that it stands for, its words, its place, colour or class, and what it shows."""
+
+    from_s: float
+    to_s: float
+    title: str
+    left: float
+    width: float
+    look: str
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The content of each lane. ticks: place and label; is_thinned: what is narrower than a mark is drawn together."""
+
+    left: float
+    width: float
+    states: list[Mark]
+    contacts: list[Mark]
+    notices: list[Mark]
+    ticks: list[tuple[float, str]]
+    is_thinned: bool
+
+
+def stays_of(run: Run) -> list[Stay]:
+    """Split a run by its states."""
+    if run.state.size == 0:
+        return []
+    edges = np.flatnonzero(run.state[1:] != run.state[:-1]) + 1
+    starts = np.concatenate(([0], edges))
+    time_s = run.time_s()
+    ends_s = [*time_s[edges].tolist(), float(time_s[-1])]
+    return [
+        Stay(SchemeState(int(run.state[row])), float(time_s[row]), end_s)
+        for row, end_s in zip(starts, ends_s, strict=True)
+    ]
+
+
+def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
+    """List what went wrong in the order of time, at most `_MOST_NOTICES`, the bad ones first to stay."""
+    notices = [
+        Notice((t_ns - run.zero_ns) * 1e-9, event.level == "error", f"{event.name}: {event.message}")
+        for t_ns, event in run.events
+        if event.level in ("warning", "error")
+    ]
+    notices += [
+        Notice(stay.start_s, True, STATE_WORDS[SchemeState.FAULT])
+        for stay in stays_of(run)
+        if stay.state is SchemeState.FAULT
+    ]
+    notices += [Notice(at_s, True, "false alarm") for at_s in metrics.false_alarms_s or ()]
+    notices.sort(key=lambda notice: not notice.is_bad)
+    return sorted(notices[:_MOST_NOTICES])
+
+
+class CertificateNote(NamedTuple):
+    """What the log says of a certificate: given, or taken back, and each thing that it tells."""
+
+    at_s: float
+    is_taken_back: bool
+    clauses: list[str]
+
+
+def certificates_of(run: Run) -> list[CertificateNote]:
+    """List the certificates that were given and taken back, in the order of time."""
+    return [
+        CertificateNote((t_ns - run.zero_ns) * 1e-9, event.name == "revoked", event.message.split("; "))
+        for t_ns, event in run.events
+        if event.name in ("certificate", "revoked")
+    ]
+
+
+def state_key(run: Run) -> list[tuple[str, str]]:
+    """Give colour and name of the states that the run has been in."""
+    there = {stay.state for stay in stays_of(run)}
+    return [(colour, STATE_WORDS[state]) for state, colour in STATE_COLOURS.items() if state in there]
+
+
+def timeline_of(run: Run, metrics: Metrics) -> Timeline | None:
+    """Lay out the marks; None of a run without cycles."""
+    if run.state.size == 0:
+        return None
+    time_s, stays = run.time_s(), stays_of(run)
+    scale = _Scale(float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-3))
+    return Timeline(
+        left=_LEFT,
+        width=_RIGHT - _LEFT,
+        states=list(_state_marks(stays, scale)),
+        contacts=list(_contact_marks(metrics, scale)),
+        notices=list(_notice_marks(notices_of(run, metrics), scale)),
+        ticks=list(_ticks(scale)),
+        is_thinned=max(len(stays), len(metrics.contacts)) > MARKS,
+    )
+
+
+class _Scale(NamedTuple):
+    start_s: float
+    end_s: float
+
+    def x(self, time_s: float) -> float:
+        share = (time_s - self.start_s) / (self.end_s - self.start_s)
+        return _LEFT + min(max(share, 0.0), 1.0) * (_RIGHT - _LEFT)
+
+
+class _Narrow(NamedTuple):
+    """Stays that are drawn as one."""
+
+    stays: list[Stay]
+
+    @property
+    def gravest(self) -> Stay:
+        """A stay from the first to the last, with the gravest state: the last one of `STATE_COLOURS`."""
+        order = list(STATE_COLOURS)
+        state = max((stay.state for stay in self.stays), key=lambda state: state in order and 1 + order.index(state))
+        return Stay(state, self.stays[0].start_s, self.stays[-1].end_s)
+
+
+def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[Stay | _Narrow]:
+    """Give the stays as they are drawn: of many, those that are narrower than a mark together."""
+    group: list[Stay] = []
+    for stay in stays:
+        is_narrow = len(stays) > MARKS and scale.x(stay.end_s) - scale.x(stay.start_s) < _NARROWEST
+        if group and (not is_narrow or scale.x(stay.end_s) - scale.x(group[0].start_s) > _NARROWEST):
+            yield _Narrow(group)
+            group = []
+        if is_narrow:
+            group.append(stay)
+        else:
+            yield stay
+    if group:
+        yield _Narrow(group)
+
+
+def _state_marks(stays: list[Stay], scale: _Scale) -> Iterator[Mark]:
+    for drawn in _drawn_stays(stays, scale):
+        stay = drawn.gravest if isinstance(drawn, _Narrow) else drawn
+        left, right = scale.x(stay.start_s), scale.x(stay.end_s)
+        name, width = STATE_WORDS[stay.state], max(right - left, _NARROWEST)
+        label = name if width > _LETTER * len(name) + 8 else ""
+        margin_s = 0.05 * (stay.end_s - stay.start_s) + 0.005
+        if isinstance(drawn, _Narrow):
+            name = f"{len(drawn.stays)} states"
+        title = f"{name}, {number_text(stay.start_s, 2)} to {number_text(stay.end_s, 2, 's')}"
+        colour = STATE_COLOURS.get(stay.state, "paper")
+        yield Mark(stay.start_s - margin_s, stay.end_s + margin_s, title, left, width, colour, label)
+
+
+def _contact_marks(metrics: Metrics, scale: _Scale) -> Iterator[Mark]:
+    labelled = drawn = -1e9
+    is_crowded = len(metrics.contacts) > MARKS
+    for contact in metrics.contacts:
+        at_s = contact.at_s
+        left = scale.x(at_s)
+        is_right = contact.detected_s is not None or not contact.is_armed
+        if is_crowded and is_right and left - drawn < _NARROWEST:
+            continue  # it would cover the one before
+        drawn = left
+        end_s = contact.end_s if contact.end_s is not None else at_s
+        width = max(scale.x(end_s) - left, 2.5)
+        look = "touch" if contact.detected_s is not None else "touch missed"
+        label = str(contact.number)
+        if left - labelled >= max(_APART, _DIGIT * len(label)):
+            labelled = left
+        else:
+            label = ""
+        title = _contact_title(contact, at_s)
+        yield Mark(at_s - 0.15, max(at_s + 0.6, end_s + 0.15), title, left, width, look, label)
+
+
+def _contact_title(contact: ReportedContact, at_s: float) -> str:
+    words = [f"contact {contact.number} at {number_text(at_s, 2, 's')}"]
+    if contact.link is not None:
+        words.append(f"on link {contact.link}")
+    if contact.detected_s is None:
+        words.append("missed" if contact.is_armed else "detection not armed")
+    else:
+        words.append(f"found on link {number_text(contact.link_detected, 0)}")
+        if contact.delay_ms is not None:
+            words.append(f"after {number_text(contact.delay_ms, 0, 'ms')}")
+    return ", ".join(words)
+
+
+def _notice_marks(notices: list[Notice], scale: _Scale) -> Iterator[Mark]:
+    for at_s, is_bad, text in notices:
+        title = f"{text}, at {number_text(at_s, 2, 's')}"
+        yield Mark(at_s - 0.25, at_s + 0.25, title, scale.x(at_s), 0.0, "bad" if is_bad else "warn")
+
+
+def _ticks(scale: _Scale) -> Iterator[tuple[float, str]]:
+    span_s = scale.end_s - scale.start_s
+    step_s = next(
+        step
+        for power in range(-4, 9)
+        for step in (10.0**power, 2.0 * 10.0**power, 5.0 * 10.0**power)
+        if span_s / step <= _TICKS
+    )
+    digits = max(0, -int(np.floor(np.log10(step_s))))
+    for number in range(int(np.ceil(scale.start_s / step_s)), int(scale.end_s / step_s) + 1):
+        yield scale.x(number * step_s), number_text(number * step_s, digits)
+
+
+STYLES: Final = ("uplot-1.6.32.min.css",)
+
+SCRIPTS: Final = ("uplot-1.6.32.iife.min.js", "traces.js")
+"""uPlot is Leon Sorokin's, MIT licence, from npm; its licence lies beside it."""
+
+_TIME_STEP_S: Final = 1e-5
+
+
+class Traces(NamedTuple):
+    """The data of the traces. blocks: the series as text, by name; plan: what the script draws of them."""
+
+    panels: tuple[TracePanel, ...]
+    blocks: dict[str, str]
+    plan: dict[str, Any]
+
+
+def traces_of(run: Run, metrics: Metrics) -> Traces | None:
+    """Pack the series; None of a run of less than two cycles."""
+    panels = panels_of(run)
+    if run.cycle.size < 2 or not panels:
+        return None
+    is_next = None if run.all_cycles is None else np.diff(run.cycle, prepend=run.cycle[0] - 2) == 1
+    time = pack(run.time_s(), _TIME_STEP_S)
+    blocks = {"trace-t": time.text}
+    drawn = []
+    for panel in panels:
+        curves = []
+        for number, trace in enumerate(panel.traces):
+            packed = pack(trace.values, step_of(trace.values, trace.finest, is_next))
+            name = f"trace-{panel.name}-{number}"
+            blocks[name] = packed.text
+            curves.append(
+                {
+                    **_numbers(name, packed),
+                    "label": trace.label,
+                    "colour": trace.colour,
+                    "isDashed": trace.is_dashed,
+                    "isMirrored": trace.is_mirrored,
+                }
+            )
+        drawn.append(
+            {"name": panel.name, "unit": panel.unit, "near": panel.near, "levels": panel.levels, "curves": curves}
+        )
+    plan = {
+        "count": int(run.cycle.size),
+        "period": run.settings.bus.period_s,
+        "time": _numbers("trace-t", time),
+        "panels": drawn,
+        "bands": [
+            [round(stay.start_s, 4), round(stay.end_s, 4), STATE_COLOURS[stay.state]]
+            for stay in stays_of(run)
+            if stay.state in STATE_COLOURS
+        ],
+        "contacts": [
+            [round(contact.at_s, 4), round(contact.end_s or contact.at_s, 4), contact.number]
+            for contact in metrics.contacts
+        ],
+        "faults": [round(notice.at_s, 4) for notice in notices_of(run, metrics) if notice.is_bad],
+    }
+    return Traces(panels, blocks, plan)
+
+
+def _numbers(name: str, packed: Packed) -> dict[str, Any]:
+    return {"id": name, "low": packed.low, "step": packed.step, "order": packed.order, "planes": packed.planes}

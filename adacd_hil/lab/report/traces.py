@@ -1,0 +1,202 @@
+"""The traces of a run, at its full rate: what is drawn in which panel, how finely it is written down, how it is packed.
+
+Times in s since motion start, on the rows of the run.
+
+A series x (n,) becomes whole numbers, 0 where x is not finite, else 1 + round((x - low) / step). Of their first or
+second differences, whichever is smaller (32 bits, they wrap), the sign goes to the lowest bit (zigzag); the bytes of
+all numbers, the lowest first, lie one plane after the other; the planes are compressed by zlib and written in base64.
+Smooth series take a fraction of a bit per sample, noise about four.
+"""
+
+import zlib
+from base64 import b64encode
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.log.logged_run import CertifiedStream, Run
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
+from adacd_hil.scheme.model.filter_bank import channels_of
+
+FINEST: Final = {
+    "rad": 2e-5,
+    "rad/s": 5e-4,
+    "Nm": 1e-3,
+    "×": 0.02,
+}
+"""Steps that nobody reads finer, by unit: the encoders' own, a fortieth of a threshold, a hundredth of its margin."""
+_PARAMETER_STEP: Final = 1e-5
+_NEAR: Final = 3.0
+"""The range near zero, in thresholds."""
+_BANK_COLOURS: Final = ("identified", "cad", "joint1", "beside", "joint2")
+
+
+class Trace(NamedTuple):
+    """One curve (n,). colour: a variable of the page. is_dashed: a bound. is_mirrored: drawn at ± the values."""
+
+    label: str
+    values: Vector
+    finest: float
+    colour: str
+    is_dashed: bool = False
+    is_mirrored: bool = False
+
+
+class TracePanel(NamedTuple):
+    """Curves on one ordinate. levels: values with a line of their own; near: half the range near zero, if any."""
+
+    name: str
+    title: str
+    unit: str
+    traces: tuple[Trace, ...]
+    levels: tuple[float, ...] = ()
+    near: float | None = None
+
+
+def panels_of(run: Run) -> tuple[TracePanel, ...]:
+    """List the panels that the run has something for."""
+    return (*_motion(run), *_residuals(run), *_channels(run), *_parameters(run))
+
+
+def _motion(run: Run) -> Iterator[TracePanel]:
+    if run.motion is None:
+        return
+    for name, title, unit in (
+        ("q", "Measured position q", "rad"),
+        ("dq", "Measured velocity dq", "rad/s"),
+        ("tau_J", "Measured joint torque tau_J", "Nm"),
+    ):
+        values = getattr(run.motion, name)
+        traces = (Trace(f"joint {j + 1}", values[:, j], FINEST[unit], f"joint{j + 1}") for j in range(JOINTS))
+        yield TracePanel(name, title, unit, tuple(traces))
+
+
+def _residuals(run: Run) -> Iterator[TracePanel]:
+    """Give each joint's residual of every model against the thresholds."""
+    finest = FINEST["Nm"]
+    ours = "identified" if run.certified is None else "certified"
+    for joint in range(JOINTS):
+        residual = run.tau_ext_hat[:, joint]
+        traces = []
+        if run.has_cad:
+            traces.append(Trace("CAD model", run.tau_ext_hat_cad[:, joint], finest, "cad"))
+        if run.beside is not None:
+            traces.append(Trace("paper's", run.beside.tau_ext_hat[:, joint], finest, "beside"))
+            bound = _in_view(run.beside.threshold[:, joint], residual)
+            traces.append(Trace("its threshold", bound, finest, "beside", True, True))
+        bound = _in_view(run.threshold[:, joint], residual)
+        traces.append(Trace(ours, residual, finest, "identified"))
+        traces.append(Trace("threshold", bound, finest, "ink", True, True))
+        finite = bound[np.isfinite(bound)]
+        near = _NEAR * float(np.median(finite)) if finite.size else None
+        title = f"Estimated external torque tau_ext_hat, joint {joint + 1}"
+        yield TracePanel(f"residual{joint + 1}", title, "Nm", tuple(traces), near=near)
+
+
+def _in_view(threshold: Vector, residual: Vector) -> Vector:
+    """Leave out of a threshold what is above every residual, as while a model is uncertain, or infinite."""
+    largest = float(np.max(np.abs(residual[np.isfinite(residual)]), initial=0.0))
+    finite = threshold[np.isfinite(threshold)]
+    ceiling = max(largest, _NEAR * float(finite.min())) if finite.size else 0.0
+    return np.where(threshold <= ceiling, threshold, np.nan)
+
+
+def _channels(run: Run) -> Iterator[TracePanel]:
+    """Give the channels of the certified scheme's bank, and the largest part of its threshold that any reaches."""
+    stream = run.certified
+    if stream is None:
+        return
+    labels = [
+        f"{cutoff:g} rad/s{'' if smoothing is None else ' smoothed'}" for cutoff, smoothing in channels_of(run.settings)
+    ]
+    for joint in range(JOINTS):
+        traces = tuple(
+            Trace(label, stream.tau_ext[:, channel, joint], FINEST["Nm"], _BANK_COLOURS[channel % len(_BANK_COLOURS)])
+            for channel, label in enumerate(labels)
+        )
+        yield TracePanel(f"channels{joint + 1}", f"Residual channels, joint {joint + 1}", "Nm", traces[::-1])
+    shares = _shares(stream)
+    traces = tuple(Trace(f"joint {j + 1}", shares[:, j], FINEST["×"], f"joint{j + 1}") for j in range(JOINTS))
+    title = "Largest residual over its threshold, any channel (an alarm at 1)"
+    yield TracePanel("share", title, "×", traces, levels=(1.0,), near=1.5)
+
+
+def _shares(stream: CertifiedStream) -> Vector:
+    shares = np.zeros((len(stream.tau_ext), JOINTS))
+    for channel in range(stream.tau_ext.shape[1]):
+        with np.errstate(over="ignore"):  # a damaged log's threshold of next to nothing
+            np.maximum(shares, np.abs(stream.tau_ext[:, channel]) / stream.threshold[:, channel], out=shares)
+    return shares
+
+
+def _parameters(run: Run) -> Iterator[TracePanel]:
+    """Give the estimates theta_hat, a panel per unit."""
+    names = run.parameter_names
+    for unit in dict.fromkeys(PARAMETER_UNITS[name] for name in names):
+        chosen = [name for name in names if PARAMETER_UNITS[name] == unit]
+        traces = tuple(
+            Trace(name, run.theta_hat[:, names.index(name)], _PARAMETER_STEP, colour)
+            for name, colour in zip(chosen, _BANK_COLOURS, strict=False)
+        )
+        yield TracePanel(f"theta-{chosen[0]}", f"Identified parameters theta_hat: {', '.join(chosen)}", unit, traces)
+
+
+STEPS_PER_SIGMA: Final = 2.0
+"""A rounding error of 0.14 standard deviations: it makes the noise 1 % larger."""
+_LARGEST_CODE: Final = 2**30
+_THIRD_DIFFERENCE: Final = 20.0**0.5
+"""Standard deviation of the third difference of white noise, over its own."""
+_NORMAL: Final = 1.4826
+"""Standard deviation of normal noise over its median absolute value."""
+
+
+class Packed(NamedTuple):
+    """A series as text: `low` and `step` in its unit, how often it was differenced, bytes per number."""
+
+    low: float
+    step: float
+    order: int
+    planes: int
+    text: str
+
+
+def noise_of(values: Vector, is_next: NDArray[np.bool_] | None = None) -> float:
+    """Estimate the standard deviation of a series' white noise by its third differences, which motion hardly has.
+
+    is_next (n,): samples that follow the one before at once; None: all do.
+    """
+    is_finite = np.isfinite(values)
+    differences = np.diff(values[is_finite], 3)
+    if is_next is not None:
+        follows = is_next[is_finite]
+        differences = differences[follows[3:] & follows[2:-1] & follows[1:-2]]
+    return float(_NORMAL * np.median(np.abs(differences)) / _THIRD_DIFFERENCE) if differences.size else 0.0
+
+
+def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
+    """Choose a step: half the noise's standard deviation, see `noise_of`, but no finer than what anybody reads."""
+    return max(finest, noise_of(values, is_next) / STEPS_PER_SIGMA)
+
+
+def pack(values: Vector, step: float) -> Packed:
+    """Pack a series (n,) in steps of `step`, or coarser where its range asks for more than 2^30 of them."""
+    is_finite = np.isfinite(values)
+    finite = values[is_finite]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    step = max(step, (high - low) / _LARGEST_CODE)
+    codes = np.zeros(values.size, np.int32)
+    codes[is_finite] = 1 + np.rint((finite - low) / step).astype(np.int32)
+    candidates = [_zigzag(np.diff(codes, order, prepend=np.zeros(order, np.int32))) for order in (1, 2)]
+    order = int(np.argmin([candidate.sum(dtype=np.float64) for candidate in candidates]))
+    numbers = candidates[order]
+    count = max(1, -(-int(numbers.max(initial=0)).bit_length() // 8))
+    planes = numbers.astype("<u4").view(np.uint8).reshape(-1, 4).T[:count]
+    squeezer = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE)  # noise repeats nothing but zeros
+    squeezed = squeezer.compress(planes.tobytes()) + squeezer.flush()
+    return Packed(low, step, order + 1, count, b64encode(squeezed).decode("ascii"))
+
+
+def _zigzag(numbers: NDArray[np.int32]) -> NDArray[np.uint32]:
+    return ((numbers << 1) ^ (numbers >> 31)).view(np.uint32)

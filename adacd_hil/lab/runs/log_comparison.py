@@ -1,0 +1,399 @@
+"""Two runs beside each other: settings, decisions field by field, states, contacts, parameters, timing.
+
+The comparison pairs cycles that lie equally long after *motion start*, the first cycle in ADAPT; where there is none,
+after the first of the log. It matches contacts by the time of their detection since then. It reads logs in pieces and
+keeps a digest of each run.
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.log.logged_run import Milestones, Progress, settings_of
+from adacd_hil.log.reader import LogStream, Series, begin_of_log
+from adacd_hil.records import SchemeState
+from adacd_hil.score.distribution import Distribution
+from adacd_hil.settings.configuration import Settings, changed_keys
+
+_TOPICS: Final = ("/scheme", "/cycle", "/contact")
+_TIMES: Final = ("lateness_ns", "feedback_ns", "command_ns", "compute_ns", "slack_ns")
+_NOT_METADATA: Final = ("epoch_ns",)
+
+
+class ComparedContact(NamedTuple):
+    """What a run reported of a contact in the end; time since motion start."""
+
+    time_s: float
+    link: int
+    level: int
+    kind: int
+    tau_ext_peak: tuple[float, ...]
+    force_N: float
+    location: int = 0  # records.Location: what force_N is
+
+
+@dataclass(frozen=True)
+class RunDigest:
+    """The kept data of one run."""
+
+    path: Path
+    settings: Settings
+    metadata: dict[str, str]
+    problem: str
+    cycles: int
+    states: list[tuple[float, str]]
+    contacts: list[ComparedContact]
+    parameters: dict[str, list[float]]
+    timing_us: dict[str, dict[str, float]]
+
+
+class RunReader:
+    """One of the logs: rows of /scheme with their cycle since motion start, and what is kept of it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._zero = _motion_start(path)
+        self._stream = LogStream(path, _TOPICS)
+        self.settings = settings_of(path, self._stream.attachments)
+        self.cycles = 0
+        self._states: list[tuple[float, str]] = []
+        self._contacts: dict[int, ComparedContact] = {}
+        self._parameters: dict[str, list[float]] = {}
+        self._times = {name: Distribution() for name in _TIMES}
+        self._bounds: tuple[int, int] | None = None
+
+    @property
+    def zero_cycle(self) -> int:
+        """Cycle at motion start."""
+        return self._zero[0]
+
+    @property
+    def zero_ns(self) -> int:
+        """Motion start, ns of the run's clock."""
+        return self._zero[1]
+
+    def only(self, first: int, end: int) -> None:
+        """Read nothing but the cycles between two numbers since motion start."""
+        self._bounds = first + self.zero_cycle, end + self.zero_cycle
+
+    def _wanted(self, series: Series) -> Series:
+        """Give the records of the cycles that are to be read."""
+        if self._bounds is None or "cycle" not in series.fields:
+            return series
+        cycle = series.records["cycle"].astype(np.int64)
+        return series.part((cycle >= self._bounds[0]) & (cycle < self._bounds[1]))
+
+    def _is_over(self, series: Series) -> bool:
+        """Tell whether all that is to be read has been."""
+        return self._bounds is not None and bool(len(series)) and int(series.records["cycle"][0]) >= self._bounds[1]
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        """Give the records of /scheme, piece by piece."""
+        zero_ns = self.zero_ns
+        for piece in self._stream:
+            if self._is_over(piece.series["/scheme"]):
+                return
+            scheme = self._wanted(piece.series["/scheme"])
+            t_s = (scheme.t_ns - zero_ns) * 1e-9
+            records = scheme.records
+            self.cycles += len(records)
+            for row in np.flatnonzero(records["state"] != records["previous_state"]).tolist():
+                self._states.append((float(t_s[row]), _name_of(int(records["state"][row]))))
+                if records["state"][row] == SchemeState.MONITOR:
+                    self._keep_parameters(records[row])
+            if len(records):
+                self._last = records[-1].copy()
+            contacts = self._wanted(piece.series["/contact"])
+            for time_ns, record in zip(contacts.t_ns.tolist(), contacts.records, strict=True):
+                self._take_contact((time_ns - zero_ns) * 1e-9, record)
+            cycles = self._wanted(piece.series["/cycle"])
+            for name in _TIMES:
+                if name in cycles.fields:
+                    self._times[name].add(cycles.records[name] / 1e3)
+            yield records
+
+    def _keep_parameters(self, record: Any) -> None:
+        for name, value in zip(self.settings.estimator.parameter_names, record["theta_hat"].tolist(), strict=False):
+            self._parameters.setdefault(name, []).append(value)
+
+    def _take_contact(self, time_s: float, record: Any) -> None:
+        """Keep the last report of each contact, with the time of its first one."""
+        key = int(record["cycle"])
+        before = self._contacts.get(key)
+        names = record.dtype.names or ()
+        told = ("level", "kind", "force_N", "location")
+        level, kind, force, location = (record[name].item() if name in names else 0 for name in told)
+        self._contacts[key] = ComparedContact(
+            time_s if before is None else before.time_s,
+            int(record["link"]),
+            int(level),
+            int(kind),
+            tuple(record["tau_ext_peak"].tolist()),
+            float(force),
+            int(location),
+        )
+
+    def digest(self) -> RunDigest:
+        """Return what is kept, once everything has been read."""
+        if not self._parameters and self.cycles:
+            self._keep_parameters(self._last)
+        timing = {}
+        for name, times in self._times.items():
+            found = times.low_percentiles() if name == "slack_ns" else times.percentiles()
+            timing[name.removesuffix("_ns")] = found
+        return RunDigest(
+            self.path,
+            self.settings,
+            {key: value for key, value in self._stream.metadata.items() if key not in _NOT_METADATA},
+            self._stream.problem,
+            self.cycles,
+            self._states,
+            sorted(self._contacts.values()),
+            self._parameters,
+            timing,
+        )
+
+
+def _name_of(state: int) -> str:
+    return SchemeState(state).name if state in SchemeState.__members__.values() else str(state)
+
+
+def _motion_start(path: Path) -> tuple[int, int]:
+    """Return cycle and time of the first ADAPT, else of the first cycle. Raises LogError."""
+    first: tuple[int, int] | None = None
+    for piece in LogStream(path, ("/scheme",)):
+        scheme = piece.series["/scheme"]
+        if not len(scheme):
+            continue
+        rows = np.flatnonzero(scheme.records["state"] == SchemeState.ADAPT)
+        row = int(rows[0]) if rows.size else 0
+        here = int(scheme.records["cycle"][row]), int(scheme.t_ns[row])
+        first = first or here
+        if rows.size:
+            return here
+    if first is None:
+        raise LogError(f"log {path} has no /scheme")
+    return first
+
+
+MATCH_S: Final = 0.5
+"""Detections of one contact in two runs lie closer together than this."""
+
+
+class FieldDifference(NamedTuple):
+    """A field of /scheme that differs: first where, s since motion start, in how many cycles, and by how much at most.
+
+    largest: 0.0 for values that are named, infinite where one is not a number and the other is.
+    """
+
+    field: str
+    first_cycle: int
+    first_s: float
+    cycles: int
+    largest: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values; `largest` is None where it is infinite."""
+        return self._asdict() | {"largest": self.largest if math.isfinite(self.largest) else None}
+
+
+class ContactPair(NamedTuple):
+    """A contact in both runs, or in one."""
+
+    first: ComparedContact | None
+    second: ComparedContact | None
+
+
+@dataclass(frozen=True)
+class LogComparison:
+    """How two runs differ. settings, metadata: by key, both values. cycles: compared, of `only` in one of them.
+
+    stretch: of the first log, to which all but settings and metadata is limited.
+    """
+
+    first: RunDigest
+    second: RunDigest
+    settings: dict[str, tuple[str, str]]
+    metadata: dict[str, tuple[str, str]]
+    fields: tuple[FieldDifference, ...]
+    contacts: tuple[ContactPair, ...]
+    cycles: int
+    only: tuple[int, int]
+    notes: tuple[str, ...]
+    stretch: TimeWindow = WHOLE
+
+    @property
+    def is_same(self) -> bool:
+        """Whether both runs decided the same in the same cycles."""
+        return not self.fields and self.only == (0, 0)
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        runs = [
+            {
+                "log": str(run.path),
+                "cycles": run.cycles,
+                "problem": run.problem,
+                "states": run.states,
+                "parameters": run.parameters,
+                "timing_us": run.timing_us,
+            }
+            for run in (self.first, self.second)
+        ]
+        return {
+            **self.stretch.as_json(),
+            "runs": runs,
+            "is_same": self.is_same,
+            "settings": self.settings,
+            "metadata": self.metadata,
+            "cycles": self.cycles,
+            "only": list(self.only),
+            "fields": [field.as_json() for field in self.fields],
+            "contacts": [{"first": a and a._asdict(), "second": b and b._asdict()} for a, b in self.contacts],
+            "notes": list(self.notes),
+        }
+
+
+class _Differences:
+    """Counts what differs, field by field."""
+
+    def __init__(self, period_s: float, zero_cycle: int) -> None:
+        self.found: dict[str, FieldDifference] = {}
+        self.missing: set[str] = set()
+        self._period_s = period_s
+        self._zero_cycle = zero_cycle
+
+    def take(self, first: NDArray[Any], second: NDArray[Any], since: NDArray[np.int64]) -> None:
+        """Compare rows of equal cycles since motion start (n,)."""
+        names, others = _fields(first), _fields(second)
+        self.missing |= set(names) ^ set(others)
+        for name in names:
+            if name in others:
+                self._compare(name, first[name], second[name], since)
+
+    def _compare(self, name: str, first: NDArray[Any], second: NDArray[Any], since: NDArray[np.int64]) -> None:
+        if first.shape != second.shape:
+            self.missing.add(name)
+            return
+        is_real = first.dtype.kind == "f"
+        differs = (first != second) & ~((first != first) & (second != second))  # noqa: PLR0124 (not a number)
+        rows = np.flatnonzero(differs.reshape(len(first), -1).any(axis=1))
+        if not rows.size:
+            return
+        largest = 0.0
+        if is_real:
+            with np.errstate(invalid="ignore"):
+                off = np.abs(first[differs] - second[differs])
+            largest = float(np.where(np.isnan(off), np.inf, off).max())
+        row = int(rows[0])
+        before = self.found.get(name)
+        place = (int(since[row]) + self._zero_cycle, float(since[row]) * self._period_s)
+        if before is not None:
+            place = before.first_cycle, before.first_s
+        count = len(rows) + (before.cycles if before else 0)
+        self.found[name] = FieldDifference(name, *place, count, max(largest, before.largest if before else 0.0))
+
+
+def _fields(records: NDArray[Any]) -> list[str]:
+    skipped = ("record_length", "log_time", "publish_time", "sec", "nanosec", "cycle")
+    return [name for name in records.dtype.names or () if name not in skipped]
+
+
+def compare_logs(
+    first: Path, second: Path, progress: Progress = lambda _: None, stretch: TimeWindow = WHOLE
+) -> LogComparison:
+    """Compare two logs. Raises LogError, ConfigError.
+
+    stretch: of the first log; of the second the cycles that lie equally long after its motion start. LogError is also
+    raised when one of them has none.
+    """
+    readers = RunReader(first), RunReader(second)
+    period_s = readers[0].settings.bus.period_s
+    if not stretch.is_whole:
+        since_ns = [bound_ns - readers[0].zero_ns for bound_ns in stretch.bounds_ns(begin_of_log(first))]
+        bounds = [math.ceil(bound_ns * 1e-9 / period_s - 1e-6) for bound_ns in since_ns]
+        for reader in readers:
+            reader.only(*bounds)
+    differences = _Differences(period_s, readers[0].zero_cycle)
+    cycles, only = _walk_together(readers, differences, progress)
+    one, two = (reader.digest() for reader in readers)
+    for run in (one, two):
+        if not stretch.is_whole and not run.cycles:
+            raise LogError(f"log {run.path} has no cycle {stretch.text}")
+    keys = [*one.metadata, *(key for key in two.metadata if key not in one.metadata)]
+    metadata = {key: (one.metadata.get(key, ""), two.metadata.get(key, "")) for key in keys}
+    notes = [f"{run.path}: {run.problem}" for run in (one, two) if run.problem]
+    if differences.missing:
+        notes.append(f"not in both, or not of one size: {', '.join(sorted(differences.missing))}")
+    return LogComparison(
+        one,
+        two,
+        changed_keys(one.settings, two.settings),
+        {key: pair for key, pair in metadata.items() if pair[0] != pair[1]},
+        tuple(sorted(differences.found.values(), key=lambda field: (field.first_s, field.field))),
+        tuple(match_contacts(one.contacts, two.contacts)),
+        cycles,
+        only,
+        tuple(notes),
+        stretch,
+    )
+
+
+def _walk_together(
+    readers: tuple[RunReader, RunReader], differences: _Differences, progress: Progress
+) -> tuple[int, tuple[int, int]]:
+    """Compare what both logs have; return how many cycles that were, and how many only one of them has."""
+    streams = iter(readers[0]), iter(readers[1])
+    first, second = (_next_rows(stream) for stream in streams)
+    common = 0
+    milestones = Milestones(lambda count: progress(f"{count} cycles compared"))
+    while first is not None and second is not None:
+        mine, theirs = (
+            rows["cycle"].astype(np.int64) - reader.zero_cycle
+            for rows, reader in zip((first, second), readers, strict=True)
+        )
+        end = min(mine[-1], theirs[-1])
+        numbers, ours, others = np.intersect1d(mine, theirs, return_indices=True)
+        common += len(numbers)
+        if len(numbers):
+            differences.take(first[ours], second[others], numbers)
+        milestones.reach(common)
+        first = first[mine > end] if mine[-1] > end else _next_rows(streams[0])
+        second = second[theirs > end] if theirs[-1] > end else _next_rows(streams[1])
+    for stream in streams:
+        for _ in stream:
+            progress(f"{common} cycles compared")
+    return common, (readers[0].cycles - common, readers[1].cycles - common)
+
+
+def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
+    """Return the next rows that there are; None at the end."""
+    return next((rows for rows in stream if len(rows)), None)
+
+
+def match_contacts(first: list[ComparedContact], second: list[ComparedContact]) -> list[ContactPair]:
+    """Match detections by time, the nearest ones first; what has no counterpart stands alone. In order of time."""
+    order = sorted(range(len(second)), key=lambda k: second[k].time_s)
+    times_s = [second[k].time_s for k in order]
+    distances = []
+    for i, a in enumerate(first):
+        for place in range(bisect_left(times_s, a.time_s - MATCH_S), len(order)):
+            if times_s[place] - a.time_s > MATCH_S:
+                break
+            distances.append((abs(a.time_s - times_s[place]), i, order[place]))
+    partner: dict[int, int] = {}
+    taken: set[int] = set()
+    for distance, i, k in sorted(distances):
+        if distance <= MATCH_S and i not in partner and k not in taken:
+            partner[i] = k
+            taken.add(k)
+    pairs = [ContactPair(a, second[partner[i]] if i in partner else None) for i, a in enumerate(first)]
+    pairs += [ContactPair(None, b) for k, b in enumerate(second) if k not in taken]
+    return sorted(pairs, key=lambda pair: min(each.time_s for each in pair if each is not None))

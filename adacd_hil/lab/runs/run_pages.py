@@ -1,0 +1,108 @@
+"""Pages over many runs: the list that leads to their reports, and what an arm's figures did from run to run."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+from urllib.parse import quote
+
+from adacd_hil.lab.drawing import Drawing, HistoryPanel, history_figure
+from adacd_hil.lab.report.page import Heading, Table, make_table, render_page
+from adacd_hil.lab.runs.run_summary import BROKEN, RunSummary
+from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, cells, count_text
+from adacd_hil.lab.runs.run_trend import Trend
+
+INDEX_NAME: Final = "index.html"
+_SHOWN: Final = 60
+"""Changes of a quantity that a page lists, the last ones."""
+
+
+class ListedRun(NamedTuple):
+    """A run of the list: where its report is, None without one, and why it was left alone, "" where it was not."""
+
+    run: RunSummary
+    report: Path | None
+    problem: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """The verdict, in a line."""
+        return f"The log can't be reported: {self.problem}" if self.problem else self.run.verdict
+
+
+class _RunRow(NamedTuple):
+    listed: ListedRun
+    place: str
+    cells: Sequence[str]
+
+
+def runs_page(folder: Path, listed: Sequence[ListedRun]) -> str:
+    """Write the list, which lies in `folder`."""
+    runs = [each.run for each in listed]
+    count = count_text(runs)
+    heading = Heading("adacd-hil runs", f"{count[0].upper()}{count[1:]}.", (), all(run.is_clean for run in runs))
+    rows = [_RunRow(each, _place(folder, each.report), cells(each.run)[1:]) for each in listed]
+    right = [place - 1 for place in NUMBERS]
+    return render_page("runs_page.html.j2", f"{count} – runs", heading, rows=rows, head=HEAD[1:], right=right)
+
+
+def _place(folder: Path, report: Path | None) -> str:
+    return "" if report is None else quote(Path(os.path.relpath(report, folder)).as_posix())
+
+
+class _TrendSection(NamedTuple):
+    trend: Trend
+    figure: Drawing | None
+    changes: Table
+    runs: Table
+
+
+def trend_page(found: Sequence[Trend]) -> str:
+    """Write a page with a section for each arm."""
+    sections = [
+        _TrendSection(trend, draw_trend(trend, f"trend{number}"), _changes_table(trend), _runs_table(trend))
+        for number, trend in enumerate(found)
+    ]
+    broken = [run.name for trend in found for run in trend.left_out if run.status == BROKEN]
+    problems = (f"Left out, as the log is broken: {', '.join(broken)}",) if broken else ()
+    title = found[0].sentence if len(found) == 1 else f"{len(found)} arms"
+    heading = Heading("adacd-hil trend", title, problems, not broken)
+    return render_page("trend_page.html.j2", "Trend over runs", heading, sections=sections)
+
+
+def draw_trend(trend: Trend, name: str = "trend") -> Drawing | None:
+    """Draw thresholds, friction, offsets and margins over the dates of the runs; None with fewer than two dates."""
+    dated = [row for row, run in enumerate(trend.runs) if run.started is not None]
+    if len(dated) < 2:
+        return None
+    joints = ("joint 1", "joint 2")
+    places = {id(trend.runs[row]): place for place, row in enumerate(dated)}
+    panels = []
+    for each in trend.quantities:
+        marks = tuple(sorted({places[id(change.run)] for change in each.changes if id(change.run) in places}))
+        panels.append(HistoryPanel(each.title, joints, each.values[dated], each.std[dated], marks))
+    margins = trend.margins[dated]
+    panels.append(
+        HistoryPanel("Margin: smallest threshold over residual", ("run",), margins, margins * float("nan"), level=1.0)
+    )
+    dates = [run.started.replace(tzinfo=None).isoformat() for run in trend.runs if run.started is not None]
+    caption = (
+        "Bars: two deviations of the certificate. Dashed: a change beyond what explains it. Dotted: a margin of 1."
+    )
+    return history_figure(dates, panels, name, trend.arm, caption)
+
+
+def _changes_table(trend: Trend) -> Table:
+    rows = [
+        (each.title, change.run.name, str(change.joint), f"{change.value_before:.4f}", f"{change.value:.4f}",
+         "–" if change.sigmas is None else f"{change.sigmas:.1f}", change.before.name)
+        for each in trend.quantities
+        for change in each.changes[-_SHOWN:]
+    ]  # fmt: skip
+    return make_table(("quantity", "changed with", "joint", "from", "to", "deviations", "since"), rows, left=(0, 1, 6))
+
+
+def _runs_table(trend: Trend) -> Table:
+    runs = (*trend.runs, *trend.left_out)
+    left = [place for place in range(len(HEAD)) if place not in NUMBERS]
+    return make_table(HEAD, [cells(run) for run in runs], left=left)

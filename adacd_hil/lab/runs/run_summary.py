@@ -1,0 +1,435 @@
+"""What a run came to, in one line of figures, without reading its log where a report has them.
+
+A run's figures are those of the judge (`adacd_hil.lab.score`), as report.json beside the log has them. A report of
+a stretch, of another log or of another version of the file's layout is left alone. Without a report there is what the
+log's index and its events say; `judged` reads the whole log.
+
+Friction and torque offsets are those of the first certificate that no payload was announced for, thresholds those of
+the watching after the first adaptation. Friction is at `FRICTION_AT_RAD_S`; offsets have the configuration's included.
+A log of an earlier version has no certificate in numbers: then friction is F_c + speed F_v, and its deviation the
+largest that those of F_c and F_v leave, whatever their correlation.
+
+Torques in Nm, a value per joint.
+"""
+
+import dataclasses
+import json
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from adacd_hil.file_access import InUseError, check_unused, read_input
+from adacd_hil.lab.report.report_json import JSON_NAME, SCHEMA
+from adacd_hil.log.log_files import EPOCH_KEY, LOG_NAME, PLANNED_ENDINGS, TRUTH_NAME, LogError, parts_of
+from adacd_hil.log.log_info import LogInfo, attachment, read_info
+from adacd_hil.log.logged_run import settings_of
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.terminal import one_line
+
+DEEPEST: Final = 4
+"""Levels below a folder in which its runs are looked for."""
+FRICTION_AT_RAD_S: Final = 0.6
+_AT: Final = slice(1, None, 3)
+"""Of a certificate's friction, at 0.2, 0.6 and 1.2 rad/s joint by joint."""
+GOOD, NOT_GOOD, NOT_JUDGED, BROKEN, RUNNING = STATUSES = ("good", "not good", "not judged", "broken", "running")
+CERTIFIED, IDENTIFIED, TAKEN_BACK, NO_CERTIFICATE = CERTIFICATES = ("certified", "identified", "taken back", "none")
+"""`identified`: by the paper's scheme, which certifies nothing."""
+_MOST_REPORT_BYTES: Final = 64 << 20
+_DATED: Final = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:]?(\d\d)[-:]?(\d\d)")
+_MOTION_START: Final = "-> ADAPT"
+_TO_MONITOR: Final = ("ADAPT -> MONITOR", "CERTIFY -> MONITOR")
+_DAMAGES: Final = (LookupError, TypeError, ValueError, AttributeError)
+"""What a value of a report raises that is not what it should be."""
+
+Pair = tuple[float, float]
+
+
+class CertificateState(NamedTuple):
+    """The last of `given` certificates of a run: its state, of CERTIFICATES, and when, s since motion start."""
+
+    state: str
+    at_s: float | None
+    given: int = 0
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """One run. None: not known, or not there.
+
+    name: of its folder, from the folder that was looked through. started: local time, by `started_by`: "log" where the
+    log has the date, "folder" where its name has, else "file". status: of STATUSES; verdict: the reason in a sentence.
+    expected: contacts that there were while detection was armed, None on a real arm. margin: smallest threshold over
+    residual. duration_s: from the log's first message to its last.
+    """
+
+    name: str
+    log: Path
+    status: str
+    verdict: str
+    started: datetime | None = None
+    started_by: str = ""
+    arm: str = ""
+    config: str = ""
+    profile: str = ""
+    scenario: str = ""
+    interface: str = ""
+    version: str = ""
+    certificate: CertificateState | None = None
+    threshold_Nm: Pair | None = None
+    margin: float | None = None
+    found: int | None = None
+    expected: int | None = None
+    false_alarms: int | None = None
+    friction_Nm: Pair | None = None
+    friction_std_Nm: Pair | None = None
+    offset_Nm: Pair | None = None
+    offset_std_Nm: Pair | None = None
+    duration_s: float | None = None
+    settings: Settings | None = None
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether the run was good and its log is whole."""
+        return self.status == GOOD
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether the figures are the judge's."""
+        return self.status in (GOOD, NOT_GOOD)
+
+
+def find_runs(folder: Path) -> Iterator[Path]:
+    """Give the folders of runs in a folder, by name, itself alone if it is one; links are left alone.
+
+    One whose log lacks its first part is one, too. A folder that can't be read is given as if it were a run, so that it
+    is told of.
+    """
+    if _has_run(folder, [entry.name for entry in folder.iterdir()] if folder.is_dir() else []):
+        yield folder
+        return
+    unreadable: list[Path] = []
+    for place, names, files in os.walk(folder, onerror=lambda error: unreadable.append(Path(str(error.filename)))):
+        here = Path(place)
+        if _has_run(here, files):
+            yield here
+        if len(here.relative_to(folder).parts) >= DEEPEST:
+            names.clear()
+        names.sort()
+    yield from unreadable
+
+
+def _has_run(folder: Path, names: Sequence[str]) -> bool:
+    return LOG_NAME in names or (
+        any(re.fullmatch(r"run_\d{3,5}\.mcap", name) for name in names) and bool(parts_of(folder / LOG_NAME))
+    )
+
+
+def summarise(folder: Path, name: str = "") -> RunSummary:
+    """Tell what the run in a folder came to, in some milliseconds where it was reported. Raises nothing."""
+    log = folder / LOG_NAME
+    started, started_by = _started(log)
+    broken = RunSummary(folder.resolve().name if name in ("", ".") else name, log, BROKEN, "", started, started_by)
+    try:
+        if not log.exists():
+            folder.stat()
+            next(folder.iterdir(), None)
+        check_unused(log)
+        info = read_info(log, is_brief=True)
+    except InUseError as error:
+        return dataclasses.replace(broken, status=RUNNING, verdict=one_line(error))
+    except LogError as error:
+        return dataclasses.replace(broken, verdict=one_line(error))
+    except OSError as error:
+        return dataclasses.replace(broken, verdict=one_line(f"{folder} can't be read: {error.strerror}"))
+    headed = _headed(broken, info, _settings(log))
+    if info.problems:
+        return dataclasses.replace(headed, verdict=one_line("; ".join(info.problems)), duration_s=None)
+    return _figured(headed, info)
+
+
+def _figured(headed: RunSummary, info: LogInfo) -> RunSummary:
+    """Add the figures: of the report, else what the events say."""
+    try:
+        table = _report_of(headed.log.parent, info)
+        return _unjudged(headed, "") if table is None else _with_report(headed, table)
+    except LogError as error:
+        return _unjudged(headed, str(error))
+    except _DAMAGES as error:
+        return _unjudged(headed, _damage(error))
+
+
+def judged(summary: RunSummary) -> RunSummary:
+    """Read the whole log of a run that is not judged, and judge it, against the emulator's truth where it has one."""
+    from adacd_hil.lab.report.report_json import report_json
+    from adacd_hil.lab.report.run_reading import read_run  # it compiles
+    from adacd_hil.lab.score.evaluation import evaluate
+
+    if summary.status != NOT_JUDGED:
+        return summary
+    truth = summary.log.parent / TRUTH_NAME
+    try:
+        run, gathered, source = read_run(summary.log, truth if truth.exists() else None)
+        return _with_report(summary, report_json(evaluate(run, gathered), run.metadata, source))
+    except (LogError, ValueError) as error:  # a ConfigError is one
+        return dataclasses.replace(summary, status=BROKEN, verdict=one_line(error))
+
+
+def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
+    """Tell what a report of the run in a folder says, whichever stretch it is of. table: as in report.json."""
+    log = folder / LOG_NAME
+    empty = RunSummary(name, log, BROKEN, "")
+    try:
+        return _with_report(_headed(empty, read_info(log, is_brief=True), _settings(log)), table)
+    except LogError as error:
+        return dataclasses.replace(empty, verdict=one_line(error))
+
+
+def _settings(log: Path) -> Settings | None:
+    text = attachment(log, "config.toml")
+    try:
+        return None if text is None else settings_of(log, {"config.toml": text})
+    except LogError:  # of a version that has other settings
+        return None
+
+
+def _headed(summary: RunSummary, info: LogInfo, settings: Settings | None) -> RunSummary:
+    """Add what head and end of the log say."""
+    said = info.metadata
+    config, profile = said.get("config", ""), said.get("profile", "")
+    started, started_by = _started(summary.log, info.start_ns if info.metadata.get(EPOCH_KEY, "0") != "0" else 0)
+    return dataclasses.replace(
+        summary,
+        started=started,
+        started_by=started_by,
+        arm=said.get("arm") or "/".join(filter(None, (config, profile))),
+        config=config,
+        profile=profile,
+        scenario=said.get("scenario", ""),
+        interface=said.get("interface", ""),
+        version=said.get("version", ""),
+        duration_s=info.duration_s,
+        settings=settings,
+    )
+
+
+def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
+    """Tell when a run began, local time, and by what. start_ns: by the log, 0 in lockstep, which has no date."""
+    try:
+        if start_ns:
+            return datetime.fromtimestamp(start_ns // 1_000_000_000).astimezone(), "log"
+        if match := _DATED.search(log.parent.resolve().name):
+            return datetime.fromisoformat(f"{match[1]}T{match[2]}:{match[3]}:{match[4]}").astimezone(), "folder"
+    except (ValueError, OverflowError, OSError):  # no date of this calendar
+        pass
+    try:
+        return datetime.fromtimestamp(int(log.stat().st_mtime)).astimezone(), "file"
+    except (OSError, ValueError, OverflowError):
+        return None, ""
+
+
+def _report_of(folder: Path, info: LogInfo) -> dict[str, Any] | None:
+    """Give report.json where it is of the whole of this log; None without one. Raises LogError, which says why not."""
+    path = folder / JSON_NAME
+    if not path.exists():
+        return None
+    try:
+        table: dict[str, Any] = json.loads(read_input(path, _MOST_REPORT_BYTES))
+        said, layout, stretch = table["run"], table["schema"], table["stretch"]
+        counts = (table["cycle"]["count"], table["log"]["frames"])
+        is_own = counts == (info.cycles, info.frames) and info.metadata.items() <= said.items()
+    except OSError as error:
+        raise LogError(f"{JSON_NAME} can't be read: {error.strerror}") from None
+    except (*_DAMAGES, RecursionError) as error:
+        raise LogError(_damage(error)) from None
+    if layout != SCHEMA:
+        raise LogError(f"{JSON_NAME} has layout {layout}, {SCHEMA} is read")
+    if stretch is not None:
+        raise LogError(f"{JSON_NAME} is of a stretch of the log")
+    if not is_own:
+        raise LogError(f"{JSON_NAME} is of another log")
+    return table
+
+
+def _damage(error: BaseException) -> str:
+    return f"{JSON_NAME} is damaged: {type(error).__name__} {error}"
+
+
+def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
+    """Add what the events of a log say."""
+    try:
+        info = read_info(summary.log)
+    except LogError as error:
+        return dataclasses.replace(summary, status=BROKEN, verdict=one_line(error))
+    if info.problems:
+        return dataclasses.replace(summary, status=BROKEN, verdict=one_line("; ".join(info.problems)))
+    said = [problem] if problem else []
+    said += [f"error {info.faults[0]}"] if info.faults else []
+    said += [] if info.cycles else ["no cycle was run"]
+    said += [f"ended: {info.ending}"] if info.ending not in PLANNED_ENDINGS else []
+    return dataclasses.replace(
+        summary,
+        status=NOT_JUDGED,
+        verdict=one_line("; ".join(said)),
+        certificate=_told_certificate(info),
+        found=info.contacts,
+    )
+
+
+def _told_certificate(info: LogInfo) -> CertificateState:
+    """Find the last certificate in the events."""
+    found = CertificateState(NO_CERTIFICATE, None)
+    start_ns: int | None = None
+    for t_ns, event in info.milestones:
+        if event.name == "supervisor" and event.message.endswith(_MOTION_START) and start_ns is None:
+            start_ns = t_ns
+        at_s = None if start_ns is None else round((t_ns - start_ns) * 1e-9, 6)
+        if event.name == "supervisor" and event.message in _TO_MONITOR:
+            state = CERTIFIED if event.message.startswith("CERTIFY") else IDENTIFIED
+            found = CertificateState(state, at_s, found.given + 1)
+        elif event.name == "revoked":
+            found = CertificateState(TAKEN_BACK, at_s, found.given)
+    return found
+
+
+def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
+    """Add what a report says. Raises LookupError, TypeError, ValueError, AttributeError for one that is damaged."""
+    log, certified = table["log"], table["certified"]
+    is_good = _flag(table["is_clean"]) and _flag(log["is_complete"])
+    missing = f" The log is not whole: {_text(log['problem'])}" if log["problem"] else ""
+    armed = [contact for contact in table["contacts"] if _flag(contact["is_armed"])]
+    false_alarms = table["false_alarms"]
+    has_truth = false_alarms is not None
+    model = _first_model(summary, table)
+    return dataclasses.replace(
+        summary,
+        status=GOOD if is_good else NOT_GOOD,
+        verdict=one_line(_text(table["verdict"]) + missing),
+        certificate=_reported_certificate(summary, table),
+        threshold_Nm=_threshold(table) if certified is not None else _configured_threshold(summary.settings),
+        margin=None if certified is None else _number(certified["smallest_margin"]),
+        found=sum(contact["detected_s"] is not None for contact in armed),
+        expected=len(armed) if has_truth else None,
+        false_alarms=int(false_alarms) if has_truth else None,
+        friction_Nm=model.friction_Nm,
+        friction_std_Nm=model.friction_std_Nm,
+        offset_Nm=model.offset_Nm,
+        offset_std_Nm=model.offset_std_Nm,
+    )
+
+
+def _reported_certificate(summary: RunSummary, table: Mapping[str, Any]) -> CertificateState:
+    certified = table["certified"]
+    if certified is not None and certified["revoked"]:
+        return _told_certificate(read_info(summary.log))
+    ends = [_number(section["end_s"]) for section in _sections(table, "adaptation") if _flag(section["is_complete"])]
+    if not ends:
+        return CertificateState(NO_CERTIFICATE, None)
+    return CertificateState(IDENTIFIED if certified is None else CERTIFIED, ends[-1], len(ends))
+
+
+def _sections(table: Mapping[str, Any], kind: str) -> list[Mapping[str, Any]]:
+    return [section for section in table["sections"].values() if section["kind"] == kind]
+
+
+def _first_adaptation(table: Mapping[str, Any]) -> str | None:
+    """Name the section with the first model that was certified or identified."""
+    return next((_text(each["label"]) for each in _sections(table, "adaptation") if _flag(each["is_complete"])), None)
+
+
+def _threshold(table: Mapping[str, Any]) -> Pair | None:
+    """Give the smallest of the channels' median thresholds while the arm was watched for the first time."""
+    margins = table["certified"]["margins"]
+    for section in _sections(table, "detection"):
+        if channels := margins.get(section["label"]):
+            rows = [_pair(channel["threshold_Nm"]) for channel in channels]
+            return min(row[0] for row in rows), min(row[1] for row in rows)
+    return None
+
+
+def _configured_threshold(settings: Settings | None) -> Pair | None:
+    return None if settings is None else settings.detector.threshold_Nm
+
+
+class _Model(NamedTuple):
+    """The first model of a run: its friction and its torque offsets, with their deviations."""
+
+    friction_Nm: Pair | None = None
+    friction_std_Nm: Pair | None = None
+    offset_Nm: Pair | None = None
+    offset_std_Nm: Pair | None = None
+
+
+def _first_model(summary: RunSummary, table: Mapping[str, Any]) -> _Model:
+    """Take the first certificate, as the log has it in numbers, else the parameters of the first adaptation."""
+    certified, section = table["certified"], _first_adaptation(table)
+    if certified is None:
+        return _Model(_identified_friction(table["parameters"], section))
+    own = [each for each in certified.get("certificates", ()) if not _flag(each["is_payload"])]
+    if own:
+        names = ("friction_Nm", "friction_std_Nm", "offset_Nm", "offset_std_Nm")
+        return _Model(*(_pair(own[0][name][_AT if name.startswith("friction") else slice(None)]) for name in names))
+    estimates = {} if section is None else certified["estimates"].get(section, {})
+    coulomb, coulomb_std = _estimated(estimates, "F_c")
+    viscous, viscous_std = _estimated(estimates, "F_v")
+    offset, offset_std = _estimated(estimates, "offset")
+    if coulomb is None or viscous is None or coulomb_std is None or viscous_std is None:
+        return _Model()
+    model = _Model(_at_speed(coulomb, viscous), _at_speed(coulomb_std, viscous_std))
+    if offset is None or summary.settings is None:
+        return model
+    configured = summary.settings.arm.torque_offset_Nm
+    return model._replace(offset_Nm=(offset[0] + configured[0], offset[1] + configured[1]), offset_std_Nm=offset_std)
+
+
+def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> Pair | None:
+    """Give the friction that the paper's scheme has identified; it knows no deviation."""
+    if section is None or section not in parameters:
+        return None
+    values = {name: _number(pair[1]) for name, pair in parameters[section].items()}
+    coulomb, viscous = ([values[f"{name}{joint}"] for joint in (1, 2)] for name in ("F_c", "F_v"))
+    return None if None in coulomb or None in viscous else _at_speed(_pair(coulomb), _pair(viscous))
+
+
+def _at_speed(coulomb: Pair, viscous: Pair) -> Pair:
+    return coulomb[0] + FRICTION_AT_RAD_S * viscous[0], coulomb[1] + FRICTION_AT_RAD_S * viscous[1]
+
+
+def _estimated(estimates: Mapping[str, Any], name: str) -> tuple[Pair | None, Pair | None]:
+    """Give an estimate of each joint and its deviation."""
+    found = [estimates.get(f"{name}{joint}") for joint in (1, 2)]
+    if any(each is None or each["value"] is None or each["std"] is None for each in found):
+        return None, None
+    return _pair([each["value"] for each in found if each]), _pair([each["std"] for each in found if each])
+
+
+def _number(value: Any) -> float | None:
+    """Take a number. Raises TypeError for what is none."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is no number")
+    return float(value) if math.isfinite(value) else None
+
+
+def _pair(values: Any) -> Pair:
+    first, second = (_number(value) for value in values)
+    if first is None or second is None:
+        raise ValueError("a value per joint is missing")
+    return first, second
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError(f"{value!r} is neither true nor false")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value

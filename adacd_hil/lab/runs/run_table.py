@@ -1,0 +1,198 @@
+"""Lists of runs: those that are asked for, as rows for a terminal, a page, JSON, CSV and Parquet.
+
+CSV and Parquet have the same columns, a value per joint in columns of its own (`threshold_1_Nm`); what is not known is
+empty. Parquet's columns have fixed types, so that tables of several folders can be read as one.
+"""
+
+import csv
+import fnmatch
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from adacd_hil.file_access import replace_files, replacing
+from adacd_hil.lab.logs.signal_tables import import_pyarrow
+from adacd_hil.lab.runs.run_summary import CERTIFIED, GOOD, NO_CERTIFICATE, NOT_JUDGED, RUNNING, RunSummary
+from adacd_hil.log.log_files import failing_as
+from adacd_hil.score.wording import NONE, found_text, number_text, pair_text
+
+
+class Column(NamedTuple):
+    """A column of the table: its value of a run, and its type in Parquet; `joints`: one for each joint."""
+
+    name: str
+    kind: str
+    value: Callable[[RunSummary], Any]
+    joints: bool = False
+
+
+def _pair_column(name: str) -> Column:
+    return Column(name, "float64", lambda run: getattr(run, name), joints=True)
+
+
+def _text_column(name: str) -> Column:
+    return Column(name, "string", lambda run: getattr(run, name) or None)
+
+
+def _certificate_column(name: str, kind: str, field: str) -> Column:
+    return Column(name, kind, lambda run: None if run.certificate is None else getattr(run.certificate, field))
+
+
+COLUMNS: Final = (
+    Column("run", "string", lambda run: run.name),
+    Column("log", "string", lambda run: str(run.log)),
+    _text_column("status"),
+    _text_column("verdict"),
+    Column("started", "string", lambda run: None if run.started is None else run.started.isoformat(timespec="seconds")),
+    _text_column("started_by"),
+    _text_column("arm"),
+    _text_column("config"),
+    _text_column("profile"),
+    _text_column("scenario"),
+    _text_column("interface"),
+    _text_column("version"),
+    Column("duration_s", "float64", lambda run: run.duration_s),
+    _certificate_column("certificate", "string", "state"),
+    _certificate_column("certified_s", "float64", "at_s"),
+    _certificate_column("certificates", "int64", "given"),
+    _pair_column("threshold_Nm"),
+    Column("margin", "float64", lambda run: run.margin),
+    Column("found", "int64", lambda run: run.found),
+    Column("expected", "int64", lambda run: run.expected),
+    Column("false_alarms", "int64", lambda run: run.false_alarms),
+    *(_pair_column(name) for name in ("friction_Nm", "friction_std_Nm", "offset_Nm", "offset_std_Nm")),
+)
+
+HEAD: Final = (
+    "run", "started", "verdict", "certificate", "thresholds Nm", "margin", "contacts", "lasts s", "arm", "scenario",
+)  # fmt: skip
+NUMBERS: Final = (5, 6, 7)
+"""Columns of HEAD that are aligned right."""
+
+
+@dataclass(frozen=True)
+class RunFilter:
+    """Which runs are asked for; what is None or empty lets all through.
+
+    arms: names as in the list, configurations, or patterns of them. since, until: bounds of the beginning, both
+    included; a run without a date is in none.
+    """
+
+    arms: tuple[str, ...] = ()
+    statuses: tuple[str, ...] = ()
+    scenarios: tuple[str, ...] = ()
+    since: datetime | None = None
+    until: datetime | None = None
+
+    def takes(self, run: RunSummary) -> bool:
+        """Tell whether a run is asked for."""
+        if self.arms and not any(is_arm(run, arm) for arm in self.arms):
+            return False
+        if self.statuses and run.status not in self.statuses:
+            return False
+        if self.scenarios and run.scenario not in self.scenarios:
+            return False
+        if self.since is None and self.until is None:
+            return True
+        if run.started is None:
+            return False
+        is_late_enough = self.since is None or run.started >= self.since
+        return is_late_enough and (self.until is None or run.started <= self.until)
+
+
+def is_arm(run: RunSummary, arm: str) -> bool:
+    """Tell whether a run is of an arm: its name in the list, its configuration, or a pattern such as `lab-*`."""
+    return any(name and fnmatch.fnmatchcase(name, arm) for name in (run.arm, run.config))
+
+
+def in_order(runs: Iterable[RunSummary]) -> list[RunSummary]:
+    """Sort runs by their beginnings, the oldest first; those without a date come before."""
+    return sorted(runs, key=lambda run: (run.started is not None, run.started and run.started.timestamp(), run.name))
+
+
+def count_text(runs: Sequence[RunSummary]) -> str:
+    """Say how many runs there are, and how many of them are not good."""
+    text = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+    bad = sum(run.status not in (GOOD, NOT_JUDGED, RUNNING) for run in runs)
+    parts = [f"{bad} not good"] if bad else []
+    for status in (NOT_JUDGED, RUNNING):
+        if count := sum(run.status == status for run in runs):
+            parts.append(f"{count} {status}")
+    return f"{text}, {', '.join(parts) or 'all good'}" if runs else "no run"
+
+
+def cells(run: RunSummary) -> tuple[str, ...]:
+    """Write a run under HEAD."""
+    return (
+        run.name,
+        NONE if run.started is None else f"{run.started:%Y-%m-%d %H:%M}",
+        run.status,
+        certificate_text(run),
+        pair_text(run.threshold_Nm, 3),
+        number_text(run.margin, 2),
+        NONE if run.found is None else str(run.found) if run.expected is None else found_text(run.found, run.expected),
+        number_text(run.duration_s, 1),
+        run.arm or NONE,
+        run.scenario or NONE,
+    )
+
+
+def certificate_text(run: RunSummary) -> str:
+    """Say of a run's last certificate what it is, and when it was given or taken back, since motion start."""
+    if run.certificate is None:
+        return NONE
+    state, at_s, given = run.certificate
+    if state == NO_CERTIFICATE:
+        return "none"
+    when = "" if at_s is None else f" at {at_s:.1f} s"
+    return f"{state}{when}" + (f", {given} in all" if given > 1 and state == CERTIFIED else "")
+
+
+def as_json(runs: Sequence[RunSummary]) -> list[dict[str, Any]]:
+    """Give a table for each run, a list where there is a value for each joint."""
+    return [{column.name: column.value(run) for column in COLUMNS} for run in runs]
+
+
+def _flat(column: Column) -> list[str]:
+    """Name a column, or those of each joint."""
+    if not column.joints:
+        return [column.name]
+    stem, unit = column.name.rsplit("_", 1)
+    return [f"{stem}_{joint}_{unit}" for joint in (1, 2)]
+
+
+def _values(column: Column, run: RunSummary) -> Sequence[Any]:
+    value = column.value(run)
+    return (value,) if not column.joints else (None, None) if value is None else value
+
+
+def as_csv(runs: Sequence[RunSummary]) -> str:
+    """Write the table as CSV."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([name for column in COLUMNS for name in _flat(column)])
+    writer.writerows([[value for column in COLUMNS for value in _values(column, run)] for run in runs])
+    return out.getvalue()
+
+
+def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
+    """Write the table as Parquet, in one step. Raises LogError without pyarrow, or when it can't be written."""
+    arrow, parquet = import_pyarrow()
+    columns: Mapping[str, Any] = {
+        name: arrow.array([_values(column, run)[place] for run in runs], type=getattr(arrow, column.kind)())
+        for column in COLUMNS
+        for place, name in enumerate(_flat(column))
+    }
+    with failing_as(f"{path} can't be written"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as beside:
+            parquet.write_table(arrow.table(columns), beside, compression="zstd")
+
+
+def write_result(content: bytes | str, path: Path) -> None:
+    """Write a file in one step. Raises LogError when it can't be written."""
+    with failing_as(f"{path} can't be written"):
+        replace_files(path.parent, {path.name: content})

@@ -1,0 +1,261 @@
+"""How an arm's figures went on from run to run, and when they last changed beyond what explains it.
+
+A run is compared with the first one since the last change, so that slow drift adds up and is found. A **threshold** has
+changed when it differs by more than a share of it, `THRESHOLD_SHARE` unless asked otherwise: from run to run it varies
+with what was learnt. Where settings of the detection differ from those of the run before, a quarter of that is enough.
+**Friction and torque offsets** have changed when they differ by more than `LAST_SIGMAS` standard
+deviations of both certificates together, the bound by which a run doubts the last certificate. The friction that the
+paper's scheme identifies has no deviation, so nothing is said of it. Margins are drawn only.
+
+Runs of an emulated arm in the same process are apart from those of the arm on a bus.
+
+Shapes: n runs in order of their beginnings, a column for each joint (n, 2).
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from adacd_hil.lab.runs.run_summary import FRICTION_AT_RAD_S, RunSummary
+from adacd_hil.lab.runs.run_table import in_order
+from adacd_hil.log.logged_run import EMBEDDED
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.identify.certificate import LAST_SIGMAS
+from adacd_hil.settings.configuration import changed_keys
+
+THRESHOLD_SHARE: Final = 0.4
+"""Eight demos that differed in their seeds only had thresholds up to 27 % apart, 2026-11-25."""
+_MEANT_SHARE: Final = 0.25
+_DETECTION: Final = ("certified.", "detector.", "estimator.", "filter.", "scheme")
+"""Settings that thresholds follow from."""
+_TOLD_KEYS: Final = 3
+_OF_A_RUN: Final = ("name", "history.", "operator.", "log.", "realtime.")
+"""Settings that differ from run to run and say nothing of the detection."""
+
+
+class TrendChange(NamedTuple):
+    """A run whose value differs from that of an earlier one, `before`; joint from 1; sigmas: None for a threshold."""
+
+    run: RunSummary
+    before: RunSummary
+    joint: int
+    value_before: float
+    value: float
+    sigmas: float | None
+
+
+@dataclass(frozen=True)
+class TrendQuantity:
+    """A quantity over the runs of an arm: values and deviations (n, 2), nan where not known, and its changes."""
+
+    name: str
+    title: str
+    values: Vector
+    std: Vector
+    changes: tuple[TrendChange, ...]
+
+
+@dataclass(frozen=True)
+class Trend:
+    """The runs of an arm with a judge's figures, the oldest first; left_out: those without.
+
+    sentence: when the thresholds last changed; further: when friction and offsets did.
+    """
+
+    arm: str
+    runs: tuple[RunSummary, ...]
+    left_out: tuple[RunSummary, ...]
+    thresholds: TrendQuantity
+    friction: TrendQuantity
+    offsets: TrendQuantity
+    margins: Vector
+    sentence: str
+    further: tuple[str, ...]
+
+    @property
+    def quantities(self) -> tuple[TrendQuantity, ...]:
+        """The quantities that may have changed."""
+        return self.thresholds, self.friction, self.offsets
+
+    def as_json(self) -> dict[str, Any]:
+        """Give values, deviations and changes by quantity; null where not known."""
+        names = [run.name for run in self.runs]
+        return {
+            "arm": self.arm,
+            "runs": names,
+            "started": [None if run.started is None else run.started.isoformat() for run in self.runs],
+            "left_out": [{"run": run.name, "status": run.status, "verdict": run.verdict} for run in self.left_out],
+            "margin": _plain(self.margins),
+            **{
+                each.name: {
+                    "values": _plain(each.values),
+                    "std": _plain(each.std),
+                    "changes": [_change_json(change) for change in each.changes],
+                }
+                for each in self.quantities
+            },
+            "thresholds_last_changed": self.sentence,
+            "drift": list(self.further),
+        }
+
+
+def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE) -> list[Trend]:
+    """Make the trend of each arm among judged runs, by name of the arm. Those that are not judged are left out."""
+    by_arm: dict[str, list[RunSummary]] = {}
+    for run in in_order(runs):
+        by_arm.setdefault(arm_of(run), []).append(run)
+    return [_trend(arm, found, threshold_share) for arm, found in sorted(by_arm.items())]
+
+
+def arm_of(run: RunSummary) -> str:
+    """Name the arm of a run; one that was emulated in the host's process is another."""
+    return f"{run.arm or 'unknown arm'}{', emulated' if run.interface == EMBEDDED else ''}"
+
+
+def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Trend:
+    judged = [run for run in runs if run.is_judged]
+    unknown = [None] * len(judged)
+    speed = f"{FRICTION_AT_RAD_S:g} rad/s"
+    thresholds = _columns([run.threshold_Nm for run in judged])
+    friction, friction_std = (
+        _columns([getattr(run, name) for run in judged]) for name in ("friction_Nm", "friction_std_Nm")
+    )
+    offset, offset_std = (_columns([getattr(run, name) for run in judged]) for name in ("offset_Nm", "offset_std_Nm"))
+
+    def quantity(name: str, title: str, values: Vector, std: Vector, share: float | None) -> TrendQuantity:
+        return TrendQuantity(name, title, values, std, _changes(judged, values, std, share))
+
+    found = (
+        quantity("threshold_Nm", "Smallest threshold, median, Nm", thresholds, _columns(unknown), threshold_share),
+        quantity("friction_Nm", f"Friction at {speed}, Nm", friction, friction_std, None),
+        quantity("offset_Nm", "Torque offset, Nm", offset, offset_std, None),
+    )
+    drifts = (_drift_sentence(found[1], "friction"), _drift_sentence(found[2], "torque offsets")) if judged else ()
+    return Trend(
+        arm,
+        tuple(judged),
+        tuple(run for run in runs if not run.is_judged),
+        *found,
+        margins=np.array([[math.nan if run.margin is None else run.margin] for run in judged]).reshape(-1, 1),
+        sentence=_threshold_sentence(judged, found[0]),
+        further=drifts,
+    )
+
+
+def _columns(pairs: Sequence[tuple[float, float] | None]) -> Vector:
+    rows = [(math.nan,) * JOINTS if pair is None else pair for pair in pairs]
+    return np.array(rows, np.float64).reshape(-1, JOINTS)
+
+
+def _changes(runs: Sequence[RunSummary], values: Vector, std: Vector, share: float | None) -> tuple[TrendChange, ...]:
+    """Find the runs whose value differs too much from the first one since the last change; share: of that value."""
+    found: list[TrendChange] = []
+    for joint in range(JOINTS):
+        first: int | None = None
+        for row in np.flatnonzero(np.isfinite(values[:, joint])).tolist():
+            if first is None:
+                first = row
+                continue
+            before, value = float(values[first, joint]), float(values[row, joint])
+            both = math.hypot(std[first, joint], std[row, joint])
+            sigmas = abs(value - before) / both if both > 0.0 else math.nan
+            bound = 0.0 if share is None else share * abs(before)
+            if share is not None and _is_meant(runs[row], runs[row - 1]):
+                bound *= _MEANT_SHARE
+            is_changed = sigmas > LAST_SIGMAS if share is None else abs(value - before) > bound
+            if is_changed:
+                found.append(
+                    TrendChange(runs[row], runs[first], joint + 1, before, value, None if share is not None else sigmas)
+                )
+                first = row
+    order = {id(run): place for place, run in enumerate(runs)}
+    return tuple(sorted(found, key=lambda change: (order[id(change.run)], change.joint)))
+
+
+def _is_meant(run: RunSummary, before: RunSummary) -> bool:
+    """Tell whether settings of the detection differ from those of the run before."""
+    return any(key.startswith(_DETECTION) for key in _changed(run, before))
+
+
+def _changed(run: RunSummary, before: RunSummary) -> dict[str, tuple[str, str]]:
+    """Give the settings that a run changed against the one before it, but for those that say nothing."""
+    if run.settings is None or before.settings is None or run.settings == before.settings:
+        return {}
+    changed = changed_keys(before.settings, run.settings)
+    return {key: pair for key, pair in changed.items() if not key.startswith(_OF_A_RUN)}
+
+
+def _threshold_sentence(runs: Sequence[RunSummary], thresholds: TrendQuantity) -> str:
+    """Say when thresholds last changed, from what to what, and which settings changed with them."""
+    known = int(np.isfinite(thresholds.values).all(axis=1).sum())
+    if not runs:
+        return "No run is judged."
+    if len(runs) == 1:
+        return "Thresholds can't be compared: there is one run."
+    if known < 2:
+        return f"Thresholds can't be compared: {known} of {len(runs)} runs {'has' if known == 1 else 'have'} any."
+    if not thresholds.changes:
+        return f"Thresholds have not changed since {_when(runs[0])}: {known} runs."
+    run, parts = _last_changes(thresholds)
+    return f"Thresholds last changed with {_when(run)}: {parts}; {_settings_text(runs, run)}."
+
+
+def _last_changes(quantity: TrendQuantity) -> tuple[RunSummary, str]:
+    """Give the run of the last changes, and in words what changed at each joint."""
+    run = quantity.changes[-1].run
+    parts = []
+    for each in quantity.changes:
+        if each.run is run:
+            since = "" if each.sigmas is None else f", {each.sigmas:.1f} deviations since {each.before.name}"
+            parts.append(f"joint {each.joint} {each.value_before:.3f} → {each.value:.3f} Nm{since}")
+    return run, "; ".join(parts)
+
+
+def _settings_text(runs: Sequence[RunSummary], run: RunSummary) -> str:
+    """Say which settings a run changed against the one before it."""
+    place = next(number for number, each in enumerate(runs) if each is run)
+    if run.settings is None or runs[place - 1].settings is None:
+        return "the settings are not known"
+    keys = _changed(run, runs[place - 1])
+    if not keys:
+        return "the settings are those of the run before"
+    told = [f"{key} {one} → {two}" for key, (one, two) in list(keys.items())[:_TOLD_KEYS]]
+    more = len(keys) - len(told)
+    return f"settings changed there: {', '.join(told)}" + (f" and {more} more" if more else "")
+
+
+def _drift_sentence(quantity: TrendQuantity, what: str) -> str:
+    known = np.isfinite(quantity.values) & np.isfinite(quantity.std)
+    rows = int(known.all(axis=1).sum())
+    if rows < 2:
+        there = f"there {'is' if rows == 1 else 'are'} {rows}"
+        return f"{what.capitalize()} can't be compared: that takes two certificates with a deviation, {there}."
+    if not quantity.changes:
+        return f"{what.capitalize()}: no change beyond what the certificates' uncertainty explains."
+    run, parts = _last_changes(quantity)
+    return f"{what.capitalize()} changed beyond the certificates' uncertainty, last with {_when(run)}: {parts}."
+
+
+def _when(run: RunSummary) -> str:
+    date = "" if run.started is None else f" of {run.started:%Y-%m-%d %H:%M}"
+    return f"run {run.name}{date}"
+
+
+def _plain(values: Vector) -> list[Any]:
+    """Give rows as lists, a plain number where a row has one; null where not known."""
+    rows = [[value if math.isfinite(value) else None for value in row] for row in values.tolist()]
+    return [row[0] for row in rows] if values.shape[1] == 1 else rows
+
+
+def _change_json(change: TrendChange) -> dict[str, Any]:
+    return {
+        "run": change.run.name,
+        "before": change.before.name,
+        "joint": change.joint,
+        "from": change.value_before,
+        "to": change.value,
+        "sigmas": change.sigmas,
+    }

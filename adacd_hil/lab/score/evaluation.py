@@ -1,0 +1,402 @@
+"""The evaluation of a run: pure functions from its arrays to the results that `metrics` defines.
+
+Timing evidence comes from the columns of /cycle, records.CycleRecord. Percentiles are values that occurred: of what
+must be small p50, p99, p99.9 and the largest; of slack, which must be large, p50, p1, p0.1 and the smallest. *Reaction
+latency* is the compute time of each cycle in which the state becomes REACT: from the data that decided to the first
+command that reacts.
+"""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.lab.score.run_faults import find_causes, find_faults, gather_data
+from adacd_hil.lab.score.verdict import compare_with_paper, give_verdict, is_margin_below_1, is_revoked
+from adacd_hil.log.logged_run import (
+    COMPUTE,
+    LATENESS,
+    QUANTITIES,
+    CycleColumns,
+    Cycles,
+    Quantity,
+    Run,
+    Section,
+    is_realtime,
+    rows_of,
+    section_at,
+    split_sections,
+)
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
+from adacd_hil.scheme.contact.contact_report import KIND_S
+from adacd_hil.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
+from adacd_hil.score.judge import (
+    JudgedContact,
+    LoggedDetection,
+    Score,
+    TruthTouch,
+    channels_at,
+    find_detections,
+    ideal_response,
+    judge_run,
+    row_at,
+    true_contacts,
+)
+from adacd_hil.score.margins import evaluate_certified, gather_untouched, last_row
+from adacd_hil.score.metrics import (
+    Count,
+    CycleStatistics,
+    Gathered,
+    Metrics,
+    ReactionLatency,
+    ReportedContact,
+    TimeStatistics,
+    TimingEvidence,
+)
+
+
+def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
+    """Compute all metrics of a run. gathered: of a run that does not have all of its cycles."""
+    gathered = gathered or Gathered(gather_untouched(run, [run]), timing_evidence(run), gather_data(run))
+    touches = true_contacts(run)
+    detections = find_detections(run)
+    score = judge_run(run, touches, detections)
+    sections = split_sections(run)
+    contacts = list_contacts(run, sections, touches, detections, score)
+    residuals = gathered.untouched.residuals
+    evidence = evaluate_certified(run, sections, gathered.untouched)
+    adaptation_s = {
+        section.label: section.duration_s if section.is_complete else None
+        for section in sections
+        if section.kind == "adaptation"
+    }
+    has_truth = run.truth is not None
+    false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
+    missed = score.missed
+    faults, causes, data = find_faults(run), find_causes(run), gathered.data
+    payload_kg = _payloads(run, sections)
+    is_identified = bool(adaptation_s) and all(value is not None for value in adaptation_s.values())
+    has_false = has_truth and len(false_s) > 0
+    return Metrics(
+        sections=sections,
+        adaptation_s=adaptation_s,
+        frozen_residual_max_Nm=residuals,
+        contacts=contacts,
+        false_alarms=len(false_s) if has_truth else None,
+        false_alarms_s=false_s if has_truth else None,
+        missed=missed if has_truth else None,
+        parameters=_parameters(run, sections),
+        payload_kg=payload_kg,
+        fault=faults[0].reason if faults else None,
+        fault_s=faults[0].at_s if faults else None,
+        cycle=cycle_statistics(run, gathered.timing.cycles),
+        timing=gathered.timing,
+        data=data,
+        frames=run.frames,
+        dropped=run.dropped,
+        evidence=evidence,
+        paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
+        verdict=give_verdict(run, sections, score, adaptation_s, payload_kg, evidence, faults, causes, data),
+        is_clean=is_identified
+        and missed == 0
+        and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),
+        armed_false_alarms=score.armed_false_alarms if has_truth else None,
+    )
+
+
+def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, tuple[float | None, float]]]:
+    """Give true and identified parameters at the end of each adaptation."""
+    found = {}
+    for section in sections:
+        if section.kind != "adaptation":
+            continue
+        row = last_row(run, section)
+        theta = true_parameters(run, int(run.cycle[row]))
+        found[section.label] = {
+            name: (theta.get(name), float(run.theta_hat[row, column]))
+            for column, name in enumerate(run.parameter_names)
+        }
+    return found
+
+
+def true_parameters(run: Run, cycle: int) -> dict[str, float]:
+    """Give the true parameters in a cycle by name; empty without the truth."""
+    row = None if run.truth is None else run.truth.model_row(cycle)
+    if run.truth is None or row is None:
+        return {}
+    return dict(zip(PARAMETER_NAMES, run.truth.theta[row].tolist(), strict=True))
+
+
+def _payloads(run: Run, sections: tuple[Section, ...]) -> dict[str, float | None]:
+    """Give the true payload at the end of each adaptation, kg."""
+    payloads: dict[str, float | None] = {}
+    time_s = run.time_s()
+    for section in sections:
+        if section.kind == "adaptation":
+            row = rows_of(time_s, section, float(time_s[-1])).stop - 1
+            payloads[section.label] = _payload_at(run, int(run.cycle[row]))
+    return payloads
+
+
+def _payload_at(run: Run, cycle: int) -> float | None:
+    row = None if run.truth is None else run.truth.model_row(cycle)
+    return None if run.truth is None or row is None else float(run.truth.payload_kg[row])
+
+
+def cycle_statistics(run: Run, count: int) -> CycleStatistics:
+    """Give the statistics of all cycles, `count` of them, those before motion start included."""
+    return CycleStatistics(
+        count=count,
+        duration_s=float((run.t_ns[-1] - run.t_ns[0]) * 1e-9) if run.t_ns.size else 0.0,
+        clock=run.metadata.get("clock"),
+        scheduler=run.metadata.get("scheduler"),
+    )
+
+
+def timing_evidence(run: Run) -> TimingEvidence:
+    """Sum up the times of all cycles, those before motion start included."""
+    reactions = find_reactions(run.timing, run.cycle, run.state)
+    return collect_evidence(run.timing, run.settings.bus.period_us, not is_realtime(run), reactions)
+
+
+def list_contacts(
+    run: Run,
+    sections: tuple[Section, ...],
+    touches: tuple[TruthTouch, ...],
+    detections: tuple[LoggedDetection, ...],
+    score: Score,
+) -> tuple[ReportedContact, ...]:
+    """List the true contacts with the detection that found each; without the truth the detections."""
+    if run.truth is None:
+        return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
+    raised = {detection.raised.t_ns: detection for detection in detections}
+    return tuple(
+        _contact(run, sections, touch, judged, None if judged.detected_ns is None else raised[judged.detected_ns])
+        for touch, judged in zip(touches, score.contacts, strict=True)
+    )
+
+
+def _reported(detection: LoggedDetection | None) -> dict[str, Any]:
+    """Give what the reports of a detection say."""
+    if detection is None:
+        return {}
+    said: dict[str, Any] = {"detected_s": detection.detected_s}
+    last = detection.final or detection.alarm
+    if detection.alarm is None or last is None:
+        return said
+    said |= {
+        "link_at_alarm": detection.alarm.link,
+        "link_detected": last.link,
+        "direction": last.direction,
+        "tau_ext_peak_hat_Nm": last.tau_ext_peak,
+        "impulse_Nm_s": last.impulse,
+    }
+    return said if last.location is Location.NOT_SOUGHT else said | _told(last)
+
+
+def _told(report: ContactReport) -> dict[str, Any]:
+    """Give what only the certified scheme tells."""
+    return {
+        "level": report.level.name,
+        "kind": report.kind.name,
+        "reaction": report.reaction.name,
+        "location": report.location.name,
+        "is_two_sided": report.is_two_sided,
+        "tau_ext_peak_sigma_Nm": tuple(map(_finite, report.tau_ext_peak_sigma)),
+        "impulse_sigma_Nm_s": tuple(map(_finite, report.impulse_sigma)),
+        "force_N": report.force_N if math.isfinite(report.force_sigma) else None,
+        "force_sigma_N": _finite(report.force_sigma),
+        "lever_m": report.lever_m if math.isfinite(report.lever_sigma) else None,
+        "lever_sigma_m": _finite(report.lever_sigma),
+        "blind_deg": math.degrees(report.blind_rad),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _state_at(run: Run, time_s: float) -> SchemeState:
+    """Give the state in the cycle before a time."""
+    return SchemeState(run.state[max(row_at(run, time_s) - 1, 0)])
+
+
+def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: LoggedDetection) -> ReportedContact:
+    return ReportedContact(
+        number=number,
+        section=section_at(sections, detection.detected_s),
+        state=_state_at(run, detection.detected_s).name,
+        is_armed=True,
+        **_reported(detection),
+    )
+
+
+def _contact(
+    run: Run, sections: tuple[Section, ...], touch: TruthTouch, judged: JudgedContact, detection: LoggedDetection | None
+) -> ReportedContact:
+    truth = run.truth
+    assert truth is not None
+    rows = slice(touch.first, touch.last + 1)
+    tau_ext = truth.tau_ext[rows]
+    since_s = run.truth_time_s(rows) - touch.onset_s
+    delay_s = detection.detected_s - touch.onset_s if detection else math.inf
+    # What the host can have seen: up to the detection for the delay, up to the end of the window for the rest.
+    until_alarm = np.abs(tau_ext[since_s <= delay_s]).max(axis=0)
+    is_seen = since_s <= delay_s + _window_s(run)
+    until_final = tau_ext[is_seen]
+    channels = channels_at(run, touch.onset_s)
+    steps_s = [delay for channel in channels if (delay := channel.step_delay_s(until_alarm)) is not None]
+    is_over = [np.abs(ideal_response(run, touch, channel)) > channel.threshold for channel in channels]
+    over = np.flatnonzero(np.any(is_over, axis=(0, 2)))
+    ideal_ms = None
+    if over.size:
+        crossing = touch.first + int(over[0])
+        ideal_ms = float(run.truth_time_s(slice(crossing, crossing + 1))[0] - touch.onset_s) * 1e3
+    peak = until_final[np.argmax(np.abs(until_final), axis=0), range(JOINTS)]
+    reported = _reported(detection)
+    return ReportedContact(
+        number=judged.number,
+        section=section_at(sections, touch.onset_s),
+        state=_state_at(run, touch.onset_s).name,
+        link=judged.link,
+        onset_s=touch.onset_s,
+        end_s=touch.end_s,
+        is_armed=judged.is_armed,
+        delay_ms=judged.delay_ms,
+        law_ms=min(steps_s) * 1e3 if steps_s else None,
+        ideal_ms=ideal_ms,
+        direction_ok=_is_direction_right(reported.get("direction"), until_final.sum(axis=0)),
+        tau_ext_Nm=(float(peak[0]), float(peak[1])),
+        torque_error_ratio=_torque_ratio(reported.get("tau_ext_peak_hat_Nm"), peak),
+        true_force_N=None if truth.force_N is None else float(truth.force_N[rows][is_seen].max()),
+        **reported,
+    )
+
+
+def _window_s(run: Run) -> float:
+    """Give how long after the detection a report is made final."""
+    return run.settings.detector.isolation_window_s if run.certified is None else KIND_S
+
+
+def _is_direction_right(direction: tuple[int, int] | None, impulse: Vector) -> bool | None:
+    """Tell whether every joint with a direction was pushed that way, and one at least has a direction."""
+    if direction is None:
+        return None
+    told = [joint for joint in range(JOINTS) if direction[joint]]
+    return bool(told) and all(direction[joint] == np.sign(impulse[joint]) for joint in told)
+
+
+def _torque_ratio(peak_hat: tuple[float, float] | None, peak: Vector) -> float | None:
+    joint = int(np.argmax(np.abs(peak)))
+    if peak_hat is None or peak[joint] == 0.0:
+        return None
+    return float(peak_hat[joint] / peak[joint])
+
+
+OLDEST_CYCLES: Final = 10
+"""Data ages from here on are counted as one."""
+PER_CYCLES: Final = 100_000
+"""Counts are given per so many cycles, too."""
+
+
+QUEUES: Final = {"receive": "receive_queue_bytes", "transmit": "transmit_queue_bytes", "log": "log_queue_bytes"}
+"""Queues and their columns."""
+_RUNNING: Final = ("overruns", "frames_lost")
+"""Columns that count since the run began."""
+_PER_CYCLE: Final = ("frames_missing", "commands_late")
+"""Columns that count within a cycle."""
+
+
+class TimingGatherer:
+    """Sums up /cycle piece by piece, in bounded memory; `exact` as in `Distribution`."""
+
+    def __init__(self, period_us: float, is_modelled: bool, exact: int = EXACT) -> None:
+        self._period_us = period_us
+        self._is_modelled = is_modelled
+        self._exact = exact
+        self._cycles = 0
+        self._times: dict[str, Distribution] = {}
+        self._histograms: dict[str, LogHistogram] = {}
+        self._depths: dict[str, Distribution] = {}
+        self._ages: Cycles | None = None
+        self._totals: dict[str, int] = {}
+        self._last: dict[str, int] = {}  # value of each running count
+        self._reactions: Distribution | None = None
+
+    def add(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
+        """Take in the next cycles. reactions: see `collect_evidence`."""
+        self._cycles += len(columns)
+        for quantity in QUANTITIES:
+            self._add_times(quantity, columns)
+        for name, column in QUEUES.items():
+            if column in columns and not self._is_modelled:  # lockstep has no queues
+                self._depths.setdefault(name, Distribution(self._exact)).add(columns[column])
+        if "data_age" in columns:
+            ages = np.bincount(np.minimum(columns["data_age"], OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
+            self._ages = ages if self._ages is None else self._ages + ages
+        for name in (name for name in (*_RUNNING, *_PER_CYCLE) if name in columns):
+            added = columns.steps(name, self._last.get(name, 0)) if name in _RUNNING else columns[name]
+            self._totals[name] = self._totals.get(name, 0) + int(added.sum())
+            if len(columns):
+                self._last[name] = int(columns[name][-1])
+        if reactions is not None and (compute_us := columns.times_us(COMPUTE)) is not None:
+            self._reactions = self._reactions or Distribution(self._exact)
+            self._reactions.add(compute_us[reactions])
+
+    def _add_times(self, quantity: Quantity, columns: CycleColumns) -> None:
+        values_us = columns.times_us(quantity)
+        if values_us is None or (self._is_modelled and quantity is LATENESS):  # lockstep has no grid to be late on
+            return
+        self._times.setdefault(quantity.name, Distribution(self._exact)).add(values_us)
+        found = log_histogram(values_us)
+        before = self._histograms.get(quantity.name)
+        self._histograms[quantity.name] = found if before is None else before.joined(found)
+
+    def evidence(self) -> TimingEvidence:
+        """Sum up what has been taken in."""
+        reactions = self._reactions
+        return TimingEvidence(
+            period_us=self._period_us,
+            is_modelled=self._is_modelled,
+            cycles=self._cycles,
+            times={quantity.name: self._statistics(quantity) for quantity in QUANTITIES},
+            reaction=None if reactions is None else ReactionLatency(reactions.count, reactions.percentiles()),
+            data_age=None if self._ages is None else tuple(self._ages.tolist()),
+            queues_bytes={name: self._depths[name].percentiles() if name in self._depths else None for name in QUEUES},
+            counts={name: self._count(name) for name in (*_RUNNING, *_PER_CYCLE)},
+        )
+
+    def _statistics(self, quantity: Quantity) -> TimeStatistics | None:
+        values = self._times.get(quantity.name)
+        if values is None:
+            return None
+        found = values.low_percentiles() if quantity.is_reserve else values.percentiles()
+        return TimeStatistics(found, self._histograms[quantity.name])
+
+    def _count(self, name: str) -> Count | None:
+        if name not in self._totals:
+            return None
+        total = self._totals[name]
+        return Count(total, total * PER_CYCLES / self._cycles if self._cycles else None)
+
+
+def collect_evidence(
+    columns: CycleColumns, period_us: float, is_modelled: bool, reactions: NDArray[np.bool_] | None = None
+) -> TimingEvidence:
+    """Sum up the columns. reactions: the cycles in which the state becomes REACT (n,); None where there is no state."""
+    gatherer = TimingGatherer(period_us, is_modelled)
+    gatherer.add(columns, reactions)
+    return gatherer.evidence()
+
+
+def find_reactions(
+    columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8], before: int = SchemeState.INIT
+) -> NDArray[np.bool_]:
+    """Mark the cycles of `columns` in which the state becomes REACT; cycle, state: those of /scheme (k,).
+
+    before: the state in the cycle before the first.
+    """
+    is_reacting = state == SchemeState.REACT
+    begins = is_reacting & ~np.concatenate(([before == SchemeState.REACT], is_reacting[:-1]))
+    return np.isin(columns["cycle"], cycle[begins])

@@ -1,0 +1,187 @@
+"""The failures of a run, by its log: faults and their logged causes, and cyclic data that did not come in time.
+
+Cyclic data is counted while the drives are to have torque. *Incomplete*: a cyclic frame was missing, late or wrong.
+*Aged*: the oldest value used was older than the cycle. Windows are the host's own, of one second (`device.arm_report`),
+and the limits those of the configuration's `[data]`. By device, the checks' running counts tell how many cycles had no
+new frame or a repeated one; they are logged once a second, so the counts of the last second, which a fault may have
+ended, are missing.
+"""
+
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.device.arm_report import SHORTEST_SHARE, WINDOW_S
+from adacd_hil.log.logged_run import CheckCounts, CycleColumns, Cycles, Mask, Run
+from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.scheme.supervisor.supervisor import POWERED
+from adacd_hil.score.metrics import CyclicData, DeviceShares, Fault
+from adacd_hil.score.wording import percent_text
+from adacd_hil.settings.arm_settings import DataSettings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.terminal import one_line
+from adacd_hil.wire.e2e import E2eStatus
+
+_RUN = "run"
+"""Who says in /events what ended an attempt without a fault: no boot-up, a bus that failed."""
+_SUPERVISOR = "supervisor"
+_NEAR_NS = 2_000_000
+"""How far the event of a fault may lie from its cycle's time."""
+_MOST_LETTERS = 300
+
+
+def find_faults(run: Run) -> tuple[Fault, ...]:
+    """List the faults of a run; it has the cycles in which the state changes."""
+    is_fault = run.state == SchemeState.FAULT
+    before = np.concatenate(([False], is_fault[:-1]))
+    time_s = run.time_s()
+    faults = []
+    for row in np.flatnonzero(is_fault & ~before).tolist():
+        is_last = bool(is_fault[row:].all())
+        faults.append(
+            Fault(FaultReason(int(run.fault[row])).name, float(time_s[row]), _cause(run, int(run.t_ns[row])), is_last)
+        )
+    return tuple(faults)
+
+
+def _cause(run: Run, t_ns: int) -> str:
+    """Find what the supervisor said of a fault, without state and reason, which are known."""
+    for logged in run.events:
+        event = logged.event
+        if event.name == _SUPERVISOR and event.level == "error" and abs(logged.t_ns - t_ns) <= _NEAR_NS:
+            return _shortened(event.message.partition("; ")[2])
+    return ""
+
+
+def find_causes(run: Run) -> tuple[str, ...]:
+    """List what ended attempts, or the log, without a fault, each once."""
+    said = [
+        logged.event.message for logged in run.events if logged.event.name == _RUN and logged.event.level == "error"
+    ]
+    if run.broken_off:
+        said.append(run.broken_off)
+    return tuple(dict.fromkeys(map(_shortened, said)))
+
+
+def _shortened(text: str) -> str:
+    line = one_line(text)
+    return line if len(line) <= _MOST_LETTERS else f"{line[:_MOST_LETTERS]} …"
+
+
+_POWERED: Final = tuple(int(state) for state in POWERED)
+
+
+class CyclicDataGatherer:
+    """Sums up the cycles of a run, piece by piece, in constant memory."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._window = max(1, round(WINDOW_S / settings.bus.period_s))
+        self._counted = {"frames_missing": 0, "data_age": 0}
+        self._cycles = 0  # with powered drives
+        self._logged = 0  # of which /cycle tells how they went
+        self._worst = 0.0
+        self._present = (0, 0, -1)  # of the window under way: cycles, incomplete ones, the last cycle's number
+
+    def add(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
+        """Take in the next cycles. cycle, state: those of /scheme (k,)."""
+        is_powered = np.isin(state, _POWERED)
+        self._cycles += int(np.count_nonzero(is_powered))
+        if "cycle" not in columns:
+            return
+        powered = columns.rows(np.flatnonzero(np.isin(columns["cycle"], cycle[is_powered])))
+        if not len(powered):
+            return
+        self._logged += len(powered)
+        for name in [name for name in self._counted if name not in powered]:
+            del self._counted[name]  # an older log does not have it
+        for name in self._counted:
+            self._counted[name] += int(np.count_nonzero(powered[name]))
+        if "frames_missing" in powered:
+            self._add_windows(powered["cycle"], powered["frames_missing"] > 0)
+
+    def _add_windows(self, cycle: Cycles, is_incomplete: Mask) -> None:
+        """Judge what is whole of the windows of cycles that follow each other."""
+        edges = np.flatnonzero(np.diff(cycle, prepend=self._present[2]) != 1)
+        counted = np.concatenate(([0], np.cumsum(is_incomplete)))
+        bounds = np.unique(np.concatenate(([0], edges, [len(cycle)]))).tolist()
+        for start, end in pairwise(bounds):
+            if start in edges:
+                self._end_window()
+            first = start
+            while first < end:
+                cycles, incomplete, _ = self._present
+                last = min(end, first + self._window - cycles)
+                self._present = cycles + last - first, incomplete + int(counted[last] - counted[first]), 0
+                first = last
+                if self._present[0] == self._window:
+                    self._end_window()
+        self._present = (*self._present[:2], int(cycle[-1]))
+
+    def _end_window(self) -> None:
+        cycles, incomplete, last = self._present
+        if cycles >= SHORTEST_SHARE * self._window:
+            self._worst = max(self._worst, incomplete / cycles)
+        self._present = 0, 0, last
+
+    def data(self, run: Run) -> CyclicData:
+        """Sum up what has been taken in. run: has the cycles in which the state changes."""
+        self._end_window()
+        limits = run.settings.data
+        shares = {name: count / self._logged for name, count in self._counted.items()} if self._logged else {}
+        incomplete = shares.get("frames_missing")
+        worst = None if incomplete is None else self._worst
+        devices = _device_shares(run.checks, run)
+        return CyclicData(
+            cycles=self._cycles,
+            incomplete=incomplete,
+            worst_incomplete=worst,
+            aged=shares.get("data_age"),
+            devices=devices,
+            excesses=tuple(_excesses(worst, devices, limits)),
+        )
+
+
+def gather_data(run: Run) -> CyclicData:
+    """Sum up a run that has all of its cycles."""
+    gatherer = CyclicDataGatherer(run.settings)
+    gatherer.add(run.timing, run.cycle, run.state)
+    return gatherer.data(run)
+
+
+def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShares]:
+    """Tell the cycles of each device apart, from counts that begin anew in each attempt."""
+    if checks is None or len(checks.cycle) < 2 or not run.cycle.size:
+        return {}
+    cycles = np.diff(checks.cycle)
+    added = np.diff(checks.counts.astype(np.int64), axis=0)
+    row = np.searchsorted(run.cycle, checks.cycle[1:], side="right") - 1
+    is_told = (cycles > 0) & (added >= 0).all(axis=(1, 2)) & (row >= 0) & np.isin(run.state[row], _POWERED)
+    if not is_told.any():
+        return {}
+    cycles, added = cycles[is_told], added[is_told]
+    found = {}
+    for place, name in enumerate(checks.devices):
+        missed, repeated = added[:, place, E2eStatus.NO_NEW_DATA], added[:, place, E2eStatus.REPEATED]
+        found[name] = DeviceShares(
+            cycles=int(cycles.sum()),
+            no_new_data=float(missed.sum() / cycles.sum()),
+            repeated=float(repeated.sum() / cycles.sum()),
+            worst_no_new_data=float((missed / cycles).max()),
+            worst_repeated=float((repeated / cycles).max()),
+        )
+    return found
+
+
+def _excesses(worst: float | None, devices: dict[str, DeviceShares], limits: DataSettings) -> list[str]:
+    """Say what was over its limit in some second."""
+    judged = [("incomplete cycles", worst, limits.incomplete_share)]
+    for name, shares in devices.items():
+        judged.append((f"no new data of {name}", shares.worst_no_new_data, limits.no_new_data_share))
+        judged.append((f"repeated frames of {name}", shares.worst_repeated, limits.repeated_share))
+    return [
+        f"{name}: {percent_text(share)} of the cycles of a second, {percent_text(limit)} allowed"
+        for name, share, limit in judged
+        if share is not None and share > limit
+    ]

@@ -1,0 +1,351 @@
+"""The verdict on a run in one sentence, failures first; and the run beside the paper's printed figures.
+
+The paper's numbers are those of its experiment: a run that played anything else is shown without them. Beside them
+stands the result of the paper's scheme on the same stream, where it ran beside.
+"""
+
+import itertools
+from collections.abc import Sequence
+from functools import cache
+from typing import Final, TypeGuard
+
+import numpy as np
+
+from adacd_hil.log.logged_run import Run, Section
+from adacd_hil.score.judge import Score
+from adacd_hil.score.metrics import (
+    Beside,
+    CertifiedEvidence,
+    CyclicData,
+    Fault,
+    PaperRow,
+    ReportedContact,
+    Residual,
+)
+from adacd_hil.score.wording import NONE, found_text, number_of, percent_text, score_sentence
+from adacd_hil.settings.arm_settings import ArmSettings
+from adacd_hil.settings.configuration import load_settings
+
+LISTED: Final = 4
+"""Adaptations that are listed one by one."""
+
+
+def give_verdict(
+    run: Run,
+    sections: tuple[Section, ...],
+    score: Score,
+    adaptation_s: dict[str, float | None],
+    payload_kg: dict[str, float | None],
+    evidence: CertifiedEvidence | None,
+    faults: tuple[Fault, ...],
+    causes: tuple[str, ...],
+    data: CyclicData,
+) -> str:
+    """Say in one sentence how the run went. causes: what ended attempts without a fault."""
+    if run.cycle.size == 0:
+        cause = "; ".join(causes) or "the log does not say why"
+        return f"No cycle was run: {cause}."
+    done = "identified" if evidence is None else "certified"
+    identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
+    found = score_sentence(score)
+    if run.truth is None:
+        found = f"{number_of(len(score.false_alarms), 'detection')}, whose truth is not recorded"
+    text = f"{found}; {identified}"
+    if evidence is not None and not evidence.is_anchored:
+        text += ", with torque offsets that nothing anchors"
+    if evidence is not None and evidence.paper_beside is not None and is_papers_experiment(run):
+        text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
+    if is_margin_below_1(evidence):
+        text = f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}; {text}"
+    if is_revoked(evidence):
+        text = "; ".join((*evidence.revoked, text))
+    broken = f"the run was broken off: {'; '.join(causes)}" if causes else ""
+    text = "; ".join(filter(None, (*_fault_texts(faults), broken, text, data_text(data))))
+    return text[:1].upper() + text[1:] + "."
+
+
+def is_margin_below_1(evidence: CertifiedEvidence | None) -> bool:
+    """Tell whether some residual was over its threshold while nobody touched the arm."""
+    return evidence is not None and evidence.smallest_margin is not None and evidence.smallest_margin < 1.0
+
+
+def is_revoked(evidence: CertifiedEvidence | None) -> TypeGuard[CertifiedEvidence]:
+    """Tell whether some certificate was taken back."""
+    return evidence is not None and bool(evidence.revoked)
+
+
+def _margin_text(evidence: CertifiedEvidence | None) -> str:
+    margin = None if evidence is None else evidence.smallest_margin
+    return "" if margin is None else f"smallest margin {margin:.2f}"
+
+
+def _fault_texts(faults: tuple[Fault, ...]) -> list[str]:
+    """Say which faults there were: the first, and the one that the run ended in."""
+    if not faults:
+        return []
+    last = faults[-1]
+    listed = [faults[0]] if len(faults) == 1 else [faults[0], last]
+    count = f"{len(faults)} faults, the first and the last: " if len(faults) > 2 else ""
+    texts = []
+    for fault in listed:
+        how = "the run ended in FAULT" if fault.is_last else "FAULT"
+        cause = f": {fault.cause}" if fault.cause else ""
+        after = "" if fault.is_last else ", after which it began anew"
+        texts.append(f"{how} ({fault.reason}) at {fault.at_s:.2f} s{cause}{after}")
+    return [count + texts[0], *texts[1:]]
+
+
+def _beside_text(times_s: list[float | None]) -> str:
+    if not any(time_s is not None for time_s in times_s):
+        return ""
+    if len(times_s) > LISTED:
+        return f"; the paper's scheme on the same stream took {_summary(times_s, 'did not end')}"
+    took = " and ".join("did not end" if time_s is None else f"took {time_s:.2f} s" for time_s in times_s)
+    if None not in times_s:
+        took = took.replace(" and took", " and")
+    return f"; the paper's scheme on the same stream {took}"
+
+
+def _summary(times_s: list[float | None], failed: str) -> str:
+    """Sum up many adaptations, of which some took their time: the shortest, the longest, and how many failed."""
+    took_s = [time_s for time_s in times_s if time_s is not None]
+    text = f"{min(took_s):.2f} to {max(took_s):.2f} s, {len(took_s)} times"
+    return text if len(took_s) == len(times_s) else f"{text}, and {failed} {len(times_s) - len(took_s)} times"
+
+
+def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:
+    """Name the adaptations with which the arm began again after a fault, or after what broke an attempt off."""
+    pairs = itertools.pairwise(sections)
+    return frozenset(now.label for before, now in pairs if now.kind == "adaptation" and before.kind != "payload")
+
+
+def identified_text(
+    adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None], anew: frozenset[str], done: str
+) -> str:
+    """Say how long the model took to be `done`, identified or certified. anew: see `begun_anew`."""
+    if not adaptation_s:
+        return "the arm never moved to adapt"
+    labels = list(adaptation_s)
+    if all(time_s is None for time_s in adaptation_s.values()):
+        return f"the model was not {done}"
+    if len(labels) > LISTED:
+        return f"the model was {done} in {_summary(list(adaptation_s.values()), f'not {done}')}"
+    if adaptation_s[labels[0]] is None:
+        later_s = [time_s for time_s in adaptation_s.values() if time_s is not None]
+        return f"the model was not {done} at first, then in {' and in '.join(f'{time_s:.2f} s' for time_s in later_s)}"
+    text = f"the model was {done} in {adaptation_s[labels[0]]:.2f} s"
+    for before, label in itertools.pairwise(labels):
+        old, new, time_s = payload_kg[before], payload_kg[label], adaptation_s[label]
+        change = "it began anew" if label in anew else "the payload change"
+        if old is not None and new is not None and new != old:
+            change = f"{new - old:g} kg" if new > old else f"taking off {old - new:g} kg"
+        text += f", but not again after {change}" if time_s is None else f" and again in {time_s:.2f} s after {change}"
+    return text
+
+
+_EXPERIMENT = "paper"
+"""The scenario that is the paper's experiment, and the configuration that has its arm."""
+_ELSEWHERE = {
+    "Adaptation after the payload change": "Second adaptation",
+    "Payload": "Payload in the second adaptation",
+    "Frozen residual without payload, joints 1 / 2": "Frozen residual, first detection section, joints 1 / 2",
+    "Frozen residual with payload, joints 1 / 2": "Frozen residual, second detection section, joints 1 / 2",
+    "The CAD model's, without payload": "The CAD model's, first detection section",
+    "The CAD model's, with payload": "The CAD model's, second detection section",
+}
+"""Quantities by the names that hold for any run."""
+
+
+def is_papers_experiment(run: Run) -> bool:
+    """Tell whether the emulator played the paper's experiment, with its arm; of a real arm nobody knows."""
+    played = (run.metadata.get("scenario"), run.metadata.get("emulator_scenario"))
+    arm, papers = run.settings.arm, _papers_arm(run.settings.arm.profile)
+    return _EXPERIMENT in played and (arm.link_length_m, arm.cad_theta) == (papers.link_length_m, papers.cad_theta)
+
+
+@cache
+def _papers_arm(profile: str) -> ArmSettings:
+    return load_settings(_EXPERIMENT, profile).arm
+
+
+def compare_with_paper(
+    run: Run,
+    sections: tuple[Section, ...],
+    adaptation_s: dict[str, float | None],
+    residuals: dict[str, Residual],
+    contacts: tuple[ReportedContact, ...],
+    false_alarms: int,
+    payload_kg: dict[str, float | None],
+    evidence: CertifiedEvidence | None,
+) -> tuple[PaperRow, ...]:
+    """Set what was measured beside what the paper printed, where it is the same experiment."""
+    settings = run.settings
+    times_s = list(adaptation_s.values())
+    detections = [section.label for section in sections if section.kind == "detection"]
+    frozen = [residuals[label] for label in detections]
+    identified, cad = [residual.identified for residual in frozen], [residual.cad for residual in frozen]
+    adaptations = list(adaptation_s)
+    payload = payload_kg.get(adaptations[1]) if len(adaptations) > 1 else None
+    law = {"least_squares": "least squares", "gradient": "gradient"}[settings.estimator.law]
+    a, b = settings.filter.a_rad_s, settings.filter.b_rad_s
+    within = "within ±0.15"
+    seen = [contact.detected_s for contact in contacts if contact.detected_s is not None]
+    first = f"{seen[0]:.2f} s" if seen else NONE
+    kilograms = NONE if payload is None else f"{payload:g} kg"
+    settled = (
+        ("Bound β of eq. (15)", "0.1 Nm", f"{settings.termination.beta_Nm:g} Nm"),
+        ("Hold T of eq. (15)", "5 s", f"{settings.termination.hold_s:g} s"),
+        ("Threshold, joints 1 / 2", "0.15 Nm", _pair(settings.detector.threshold_Nm)),
+        ("Filter a / b", "10 / 10 rad/s", f"{a:g} / {b:g} rad/s"),
+        ("Estimator", "least squares", law),
+    )
+    rate = f"{1e3 / settings.bus.period_us:g} kHz"
+    names = (
+        ("First adaptation", "5.2 s"),
+        ("Adaptation after the payload change", "about 5.3 s"),
+        ("Payload", "1 kg"),
+        ("Frozen residual without payload, joints 1 / 2", within),
+        ("Frozen residual with payload, joints 1 / 2", within),
+        ("The CAD model's, without payload", "larger; joint 2 good"),
+        ("The CAD model's, with payload", "much larger, both joints"),
+        ("First contact detected at", "10 s"),
+    )
+    measured = (
+        _seconds(times_s, 0),
+        _seconds(times_s, 1),
+        kilograms,
+        _residual_text(identified, 0),
+        _residual_text(identified, 1),
+        _residual_text(cad, 0),
+        _residual_text(cad, 1),
+        first,
+    )
+    if evidence is None:
+        plain = [(*name, value) for name, value in zip(names, measured, strict=True)]
+        plain += [*settled, ("Control rate", "1 kHz", rate)]
+        return _of_what_was_played(run, [PaperRow(quantity, paper, None, value) for quantity, paper, value in plain])
+    beside = _beside_values(evidence.paper_beside, detections, (kilograms, *measured[5:7]))
+    rows = [(*name, theirs, value) for name, theirs, value in zip(names, beside[:8], measured, strict=True)]
+    armed = [contact for contact in contacts if contact.is_armed]
+    found = [contact for contact in armed if contact.delay_ms is not None]
+    has_truth = run.truth is not None
+    rows += [
+        ("Contacts detected", NONE, beside[8], found_text(len(found), len(armed)) if has_truth else str(len(contacts))),
+        ("Median delay", NONE, beside[9], _median_text([c.delay_ms for c in found if c.delay_ms is not None])),
+        ("False alarms", NONE, beside[10], str(false_alarms) if has_truth else NONE),
+    ]
+    ours = (
+        f"{settings.certified.beta_Nm:g} Nm, of the frozen model",
+        _tests_text(list(evidence.test_s.values())),
+        _threshold_text(evidence, detections),
+        f"{', '.join(f'{cutoff:g}' for cutoff in settings.certified.cutoffs_rad_s)} rad/s",
+        "least squares from a prior",
+    )
+    rows += [(quantity, paper, theirs, value) for (quantity, paper, theirs), value in zip(settled, ours, strict=True)]
+    margin = evidence.smallest_margin
+    rows.append(("Smallest threshold / residual", NONE, NONE, NONE if margin is None else f"{margin:.2f}"))
+    rows.append(("Smallest push found within 100 ms, estimated, joints 1 / 2", NONE, NONE, _push_text(evidence)))
+    rows.append(("Control rate", "1 kHz", rate, rate))
+    return _of_what_was_played(run, [PaperRow(*row) for row in rows])
+
+
+def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, ...]:
+    """Leave out the paper's numbers, and lines that then say nothing, where anything else was played."""
+    if is_papers_experiment(run):
+        return tuple(rows)
+    return tuple(
+        row._replace(quantity=_ELSEWHERE.get(row.quantity, row.quantity), paper=None)
+        for row in rows
+        if {row.beside, row.measured} - {None, NONE}
+    )
+
+
+def _tests_text(times_s: list[float | None]) -> str:
+    """Say how long the tests took; of many the shortest and the longest."""
+    found = [time_s for time_s in times_s if time_s is not None]
+    if len(times_s) > LISTED and found:
+        return f"tests of {min(found):.2f} to {max(found):.2f} s"
+    return "test of " + (" and ".join(NONE if t is None else f"{t:.2f} s" for t in times_s) or NONE)
+
+
+def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str, str, str]) -> tuple[str, ...]:
+    """Give the column of the paper's scheme on the same stream; same: payload and the CAD model's residuals."""
+    if beside is None:
+        return (NONE,) * 11
+    times_s = list(beside.adaptation_s.values())
+    frozen = [beside.frozen_residual_max_Nm[label] for label in detections]
+    armed = [contact for contact in beside.contacts if contact.is_armed]
+    found = [contact for contact in armed if contact.detected_s is not None]
+    seen = [contact.detected_s for contact in beside.contacts if contact.detected_s is not None]
+    return (
+        _seconds(times_s, 0),
+        _seconds(times_s, 1),
+        same[0],
+        _residual_text(frozen, 0),
+        _residual_text(frozen, 1),
+        *same[1:],
+        f"{seen[0]:.2f} s" if seen else NONE,
+        NONE if beside.missed is None else found_text(len(found), len(armed)),
+        _median_text([contact.delay_ms for contact in found if contact.delay_ms is not None]),
+        NONE if beside.false_alarms is None else str(beside.false_alarms),
+    )
+
+
+def _threshold_text(evidence: CertifiedEvidence, detections: list[str]) -> str:
+    """Say where the thresholds of the slowest channel lie: the smallest and the largest median of a section."""
+    found = [h for label in detections for row in evidence.margins.get(label, ())[:1] for h in row.threshold_Nm]
+    return f"{min(found):.3f} to {max(found):.3f} Nm" if found else NONE
+
+
+def _push_text(evidence: CertifiedEvidence) -> str:
+    """Say how small a push is found, in the middle and at the worst moment."""
+    if evidence.smallest_push is None:
+        return NONE
+    median, worst = (
+        " / ".join(f"{joint[name]:.2f}" for joint in evidence.smallest_push.push_Nm) for name in ("p50", "max")
+    )
+    return f"median {median}, at worst {worst} Nm"
+
+
+def _median_text(delays_ms: list[float]) -> str:
+    return f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else NONE
+
+
+def _seconds(times_s: list[float | None], index: int) -> str:
+    if index >= len(times_s):
+        return NONE
+    value = times_s[index]
+    return "not finished" if value is None else f"{value:.2f} s"
+
+
+def _pair(values: tuple[float, float] | None) -> str:
+    if values is None:
+        return NONE
+    return f"{values[0]:g} Nm" if values[0] == values[1] else f"{values[0]:g} / {values[1]:g} Nm"
+
+
+def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
+    values = frozen[index] if index < len(frozen) else None
+    return NONE if values is None else f"{values[0]:.3f} / {values[1]:.3f} Nm"
+
+
+def data_text(data: CyclicData) -> str:
+    """Say in a clause of the verdict how much of the data came; nothing where the drives never had torque."""
+    if not data.cycles:
+        return ""
+    if data.incomplete is None:
+        return "whether cyclic data was late or lost is not in the log"
+    said = []
+    if data.incomplete:
+        said.append(f"{percent_text(data.incomplete)} of the cycles lacked a frame in time")
+    if data.aged:
+        said.append(f"{percent_text(data.aged)} went by older data")
+    missed = {name: shares.no_new_data for name, shares in data.devices.items() if shares.no_new_data}
+    repeated = {name: shares.repeated for name, shares in data.devices.items() if shares.repeated}
+    for what, found in (("no new data of", missed), ("repeated frames of", repeated)):
+        if found:
+            name, share = max(found.items(), key=lambda entry: entry[1])
+            said.append(f"{what} {name} in {percent_text(share)}")
+    if not said:
+        return "no cyclic data was late or lost"
+    return ", ".join(said) + (", more than allowed" if data.excesses else "")

@@ -1,0 +1,252 @@
+"""Detectors compared on one stream: delay against the size of a step, at equal predicted rates of false alarms.
+
+The stream is recorded contact-free motion; a step of external torque is added to it at many instants, as a velocity
+that lags makes of it: 1 - (1 + x) e^-x with x = 2 t / lag, a critically damped tracking loop. Everything here is linear
+up to the statistics, so the sum is the recording that a push would have given, but for the motion that it causes.
+
+A delay is from the onset to the sample with which the detector is over, in ms; one bus cycle until the host has that
+sample is not in it. A step that is not found within `HORIZON_S` has a delay of more than that.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
+from adacd_hil.lab.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
+from adacd_hil.lab.thresholds.recorded_thresholds import BLOCK_S, Statistics
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.detect import detectors
+
+STEPS_NM: Final = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
+ROC_STEP_NM: Final = 0.1
+ROC_WITHIN_S: Final = 0.03
+HORIZON_S: Final = 0.1
+LOOP_LAG_S: Final = 1.6e-3
+"""Of a 200 Hz tracking loop, with which the step reaches the measured velocity."""
+WARM_UP_S: Final = 0.6  # until the slowest filter knows nothing of what was before
+_ONSETS: Final = 200
+_ROC_RATES_PER_H: Final = tuple(10.0 ** (0.25 * k) for k in range(-12, 9))
+NAME: Final = "detectors"
+_LATE: Final = math.inf
+
+
+@dataclass(frozen=True)
+class DelayRow:
+    """One detector and joint: median delay of each step of `STEPS_NM`, ms, and the share found within the horizon."""
+
+    detector: str
+    joint: int
+    delay_ms: tuple[float, ...]
+    found: tuple[float, ...]
+    roc: tuple[float, ...]  # share of steps of ROC_STEP_NM found in ROC_WITHIN_S, per rate of the comparison
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All detectors at one rate of false alarms. The first of `ranking` is the one that wins."""
+
+    rate_per_h: float
+    hours: float
+    rates_per_h: tuple[float, ...]
+    rows: tuple[DelayRow, ...]
+    missing: tuple[str, ...]
+    """Detectors whose tail the motion can't tell."""
+
+    @property
+    def ranking(self) -> tuple[str, ...]:
+        """Detectors by the geometric mean of their median delays over steps and joints; never is ten horizons."""
+        scores: dict[str, list[float]] = {}
+        for row in self.rows:
+            delays = np.minimum(np.maximum(row.delay_ms, 0.1), 1e4 * HORIZON_S)
+            scores.setdefault(row.detector, []).extend(np.log(delays).tolist())
+        return tuple(sorted(scores, key=lambda name: sum(scores[name]) / len(scores[name])))
+
+    def as_json(self) -> dict[str, Any]:
+        """Give the table; a delay that is never is null."""
+        return {
+            "rate_per_h": self.rate_per_h,
+            "hours": self.hours,
+            "steps_Nm": list(STEPS_NM),
+            "roc_step_Nm": ROC_STEP_NM,
+            "roc_within_s": ROC_WITHIN_S,
+            "roc_rates_per_h": list(self.rates_per_h),
+            "ranking": list(self.ranking),
+            "missing": list(self.missing),
+            "rows": [
+                {
+                    "detector": row.detector,
+                    "joint": row.joint,
+                    "delay_ms": [delay if math.isfinite(delay) else None for delay in row.delay_ms],
+                    "found": list(row.found),
+                    "roc": list(row.roc),
+                }
+                for row in self.rows
+            ],
+        }
+
+    def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+        """Give head and rows for a terminal, best detector first; a dash where fewer than half are found."""
+        head = ("detector", "joint", *(f"{torque:g} Nm" for torque in STEPS_NM), f"found at {STEPS_NM[0]:g} Nm")
+        order = {name: place for place, name in enumerate(self.ranking)}
+        rows = [
+            (
+                row.detector,
+                str(row.joint),
+                *(f"{delay:.1f}" if math.isfinite(delay) else "–" for delay in row.delay_ms),
+                f"{100.0 * row.found[0]:.0f} %",
+            )
+            for row in sorted(self.rows, key=lambda row: (order[row.detector], row.joint))
+        ]
+        return head, rows
+
+
+def step_shape(samples: int, onset_s: float, lag_s: float, period_s: float) -> Vector:
+    """Give a unit step of external torque as the stream shows it (samples,), its onset `onset_s` after sample 0.
+
+    The stream is the mean over the interval that ends with the sample.
+    """
+    t = np.arange(-1, samples) * period_s - onset_s
+    x = np.maximum(2.0 * t / max(lag_s, 1e-9), 0.0)
+    # the integral of 1 - (1 + x) e^-x over t
+    impulse = 0.5 * max(lag_s, 1e-9) * (x - 2.0 + (x + 2.0) * np.exp(-x))
+    return np.asarray(np.diff(impulse) / period_s)
+
+
+def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _ONSETS, seed: int = 0) -> Comparison:
+    """Calibrate all detectors for one rate and add steps to the stream.
+
+    Raises TooLittleMotionError if no detector can be calibrated or no stretch of motion is long enough.
+    """
+    found, missing = calibrate_all(statistics, rate_per_h)
+    period_s = statistics.motion.period_s
+    before, after = round(WARM_UP_S / period_s), round(HORIZON_S / period_s) + 2
+    bad = np.r_[0, np.cumsum(~statistics.is_free)]
+    starts = np.arange(len(statistics.z) - before - after)
+    starts = starts[bad[starts + before + after] == bad[starts]]
+    if starts.size == 0:
+        raise TooLittleMotionError(f"no contact-free stretch is as long as {WARM_UP_S + HORIZON_S:g} s")
+    generator = np.random.default_rng(seed)
+    chosen = starts[np.sort(generator.integers(0, starts.size, onsets))]
+    phases_s = generator.uniform(0.0, period_s, onsets)
+    ratios = np.stack(
+        [_ratios(statistics, found, chosen, phases_s, torque, before, after) for torque in STEPS_NM]
+    )  # (steps, detectors, onsets, after, n), largest ratio so far
+    delays_ms = _delays_ms(ratios, phases_s, period_s)
+    until = round(ROC_WITHIN_S / period_s)
+    largest = _ratios(statistics, found, chosen, phases_s, ROC_STEP_NM, before, after)[:, :, until]
+    rows = []
+    for place, (name, calibrated) in enumerate(found.items()):
+        tail = calibrated.calibration.tail
+        factors = np.array([tail.threshold_at(rate) for rate in _ROC_RATES_PER_H])
+        for i in range(JOINTS):
+            delays = delays_ms[:, place, :, i]
+            rows.append(
+                DelayRow(
+                    name,
+                    i + 1,
+                    tuple(float(np.median(delay)) for delay in delays),
+                    tuple(np.isfinite(delays).mean(axis=1).tolist()),
+                    tuple((largest[place, :, i] > factor).mean().item() for factor in factors),
+                )
+            )
+    return Comparison(rate_per_h, statistics.hours, _ROC_RATES_PER_H, tuple(rows), missing)
+
+
+def calibrate_all(statistics: Statistics, rate_per_h: float) -> tuple[dict[str, DetectorCalibration], tuple[str, ...]]:
+    """Calibrate each detector; name those whose tail can't be told. Raises TooLittleMotionError when that is all."""
+    found: dict[str, DetectorCalibration] = {}
+    missing: list[str] = []
+    for name, places in statistics.settings.detectors.items():
+        try:
+            found[name] = calibrate_detector(statistics.peaks[:, list(places), :], BLOCK_S, rate_per_h)
+        except TooLittleMotionError as error:
+            missing.append(name)
+            problem = error
+    if not found:
+        raise problem
+    return found, tuple(missing)
+
+
+def _ratios(
+    statistics: Statistics,
+    found: dict[str, DetectorCalibration],
+    starts: Vector,
+    phases_s: Vector,
+    torque_Nm: float,
+    before: int,
+    after: int,
+) -> Vector:
+    """Give the largest ratio of statistic to threshold since the onset (detectors, onsets, after, n)."""
+    period_s = statistics.motion.period_s
+    largest = np.zeros((len(found), len(starts), after, JOINTS))
+    for k, (start, phase_s) in enumerate(zip(starts.tolist(), phases_s.tolist(), strict=True)):
+        z = statistics.z[start : start + before + after].copy()
+        z[before:] += torque_Nm * step_shape(after, phase_s, LOOP_LAG_S, period_s)[:, None]
+        held_Nm = statistics.held_Nm[start : start + before + after]
+        shown = detectors.DetectorBank(statistics.settings, statistics.weights, period_s).take(z, held_Nm)
+        for place, (name, calibrated) in enumerate(found.items()):
+            rows = list(statistics.settings.detectors[name])
+            over = (shown[before:, rows] / calibrated.thresholds).max(axis=1)
+            largest[place, k] = np.maximum.accumulate(over, axis=0)
+    return largest
+
+
+def _delays_ms(ratios: Vector, phases_s: Vector, period_s: float) -> Vector:
+    """Turn the ratios since the onset (..., onsets, after, n) into delays (..., onsets, n), ms; infinite if late."""
+    over = ratios > 1.0
+    first = over.argmax(axis=-2) * period_s - phases_s[:, None]
+    return np.where(over[..., -1, :], np.maximum(first, 0.0) * 1e3, _LATE)
+
+
+_LOOKS: Final = ("alarm", "cad", "identified", "joint1", "joint2", "bar", "queue_log", "muted")
+
+
+def draw_comparison(comparison: Comparison) -> Drawing:
+    """Draw delay against step size and the share found against the rate of false alarms, a column per joint."""
+    with style():
+        figure = Figure(figsize=(10.0, 7.2))
+        grid = figure.subplots(2, JOINTS)
+        figure.subplots_adjust(left=0.065, right=0.985, bottom=0.075, top=0.86, wspace=0.16, hspace=0.42)
+        colours = {name: COLOURS[_LOOKS[place % len(_LOOKS)]] for place, name in enumerate(comparison.ranking)}
+        lines = {}
+        for row in comparison.rows:
+            delays, shares = grid[0, row.joint - 1], grid[1, row.joint - 1]
+            look = {"color": colours[row.detector], "linewidth": 2.0 if row.detector == comparison.ranking[0] else 1.1}
+            shown = np.where(np.isfinite(row.delay_ms), row.delay_ms, np.nan)
+            (lines[row.detector],) = delays.plot(STEPS_NM, shown, marker="o", markersize=3.0, **look)
+            shares.plot(comparison.rates_per_h, np.array(row.roc) * 100.0, **look)
+        for i in range(JOINTS):
+            delays, shares = grid[0, i], grid[1, i]
+            delays.set(xscale="log", yscale="log", xlabel="step of external torque, Nm", ylabel="median delay, ms")
+            delays.set_title(f"Joint {i + 1}")
+            delays.set_xticks(STEPS_NM, [f"{torque:g}" for torque in STEPS_NM])
+            delays.set_yticks([1, 2, 5, 10, 20, 50, 100], ["1", "2", "5", "10", "20", "50", "100"])
+            delays.minorticks_off()
+            shares.set(xscale="log", ylim=(-3.0, 103.0), xlabel="predicted false alarms per hour", ylabel="found, %")
+            shares.set_title(f"Joint {i + 1}")
+            shares.axvline(comparison.rate_per_h, color=COLOURS["muted"], linewidth=0.8, linestyle=":")
+            note(delays, f"at {comparison.rate_per_h:g} false alarms per hour")
+            note(shares, f"steps of {ROC_STEP_NM:g} Nm, within {1e3 * ROC_WITHIN_S:.0f} ms")
+        figure.legend(
+            [lines[name] for name in comparison.ranking],
+            comparison.ranking,
+            loc="upper right",
+            bbox_to_anchor=(0.985, 0.985),
+            ncols=4,
+        )
+        caption = (
+            f"Thresholds of every channel and joint for {comparison.rate_per_h:g} false alarms per hour of a detector, "
+            f"predicted from {comparison.hours:.2f} h of motion. A curve ends where fewer than half of the steps are "
+            f"found within {1e3 * HORIZON_S:.0f} ms. Best over all steps: {comparison.ranking[0]}."
+        )
+        return Drawing(NAME, "Detectors on one stream", caption, figure)
+
+
+def write_comparison(comparison: Comparison, out_dir: Path) -> tuple[Path, ...]:
+    """Write detectors.json, .png and .svg into a folder. Raises LogError when they can't be written."""
+    return write_figures(out_dir, NAME, comparison.as_json(), [draw_comparison(comparison)])

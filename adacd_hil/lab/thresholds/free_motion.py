@@ -1,0 +1,244 @@
+"""Recorded motion: the samples of logs, and which of them nobody touched, piece by piece, in bounded memory.
+
+The samples of a log count that lie in MONITOR at least `APART_S` after its beginning, after a gap and after a contact,
+and at least as long before one. A touch that no detector flagged counts as motion.
+
+Of each of N samples one byte is kept: whether it is free. All other data is read again from the log when it is needed.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+
+from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_info import attachment
+from adacd_hil.log.logged_run import Milestones, Progress, settings_of
+from adacd_hil.log.reader import LogStream, Series, begin_of_log
+from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
+from adacd_hil.scheme.detect import detectors
+
+APART_S: Final = 0.6
+"""Six time constants of the slowest filter."""
+MOST_SAMPLES: Final = 1_000_000
+"""Samples that are looked at together; of more motion, some windows."""
+WINDOW: Final = 10_000
+"""Samples of such a window."""
+TOPICS: Final = ("/scheme",)
+_NEAR: Final = (0.5, 1.5)  # shares of the period: the shortest and longest interval of samples that follow each other
+_PERIODS: Final = 1_000_000
+"""Intervals of which the median is the period."""
+
+Mask = NDArray[np.bool_]
+Watch = Callable[[Series], None]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A recording of n samples; `is_free` (n,) where nobody touched the arm and the model was frozen."""
+
+    q: Vector  # q1 from the level
+    dq: Vector
+    tau_J: Vector
+    theta: Vector  # (n, p)
+    interval_s: Vector  # (n,), 0 after a gap
+    is_free: Mask
+    period_s: float
+
+
+_COLUMNS: Final = ("q", "dq", "tau_J", "theta", "interval_s")
+
+
+@dataclass(frozen=True)
+class LoggedMotion:
+    """The motion in a log, or in a stretch of it: N samples at `period_s`, with p parameters; is_free (N,).
+
+    level_rad: q1 at which link 1 is level; 0 where gravity does not act.
+    """
+
+    path: Path
+    period_s: float
+    parameters: int
+    is_free: Mask
+    bounds_ns: tuple[int, int] | None = None
+    level_rad: float = 0.0
+
+    def pieces(self) -> Iterator[Motion]:
+        """Read the samples, in order. Raises LogError."""
+        place, before = 0, None
+        for scheme in schemes(self.path, self.bounds_ns):
+            end = place + len(scheme)
+            cycle = scheme["cycle"].astype(np.int64).reshape(-1)
+            yield Motion(
+                q=scheme["q"] - np.array((self.level_rad, 0.0)),
+                dq=scheme["dq"],
+                tau_J=scheme["tau_J"],
+                theta=scheme["theta_hat"],
+                interval_s=_intervals(scheme, cycle, before, self.period_s),
+                is_free=self.is_free[place:end],
+                period_s=self.period_s,
+            )
+            place, before = end, int(cycle[-1])
+
+
+def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
+    """Read /scheme of a log, or what of it lies between two times, in pieces that are not empty. Raises LogError."""
+    stream = LogStream(path, TOPICS)
+    for piece in stream:
+        scheme = piece.series["/scheme"]
+        if bounds_ns is not None and len(scheme):
+            t_ns = scheme.t_ns
+            if t_ns[0] >= bounds_ns[1]:
+                return
+            scheme = scheme.part((t_ns >= bounds_ns[0]) & (t_ns < bounds_ns[1]))
+        if len(scheme):
+            yield scheme
+
+
+def read_motion(
+    path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, watch: Watch = lambda _: None
+) -> LoggedMotion:
+    """Find the contact-free motion in a log, or in a stretch of it. Raises LogError when there is none.
+
+    watch: is shown all of its /scheme, piece by piece.
+    """
+    bounds_ns = None
+    where = ""
+    if not stretch.is_whole:
+        bounds_ns, where = stretch.bounds_ns(begin_of_log(path)), f" {stretch.text}"
+    period_s = _period(path, bounds_ns, where)
+    parts: list[Mask] = []
+    before: int | None = None
+    parameters = count = 0
+    milestones = Milestones(lambda at: progress(f"{path}: looking for motion that nobody touched, {at} cycles"))
+    for scheme in schemes(path, bounds_ns):
+        watch(scheme)
+        cycle = scheme["cycle"].astype(np.int64).reshape(-1)
+        is_good = (scheme["state"].reshape(-1) == SchemeState.MONITOR) & (scheme["contact_joints"].reshape(-1) == 0)
+        is_good &= _intervals(scheme, cycle, before, period_s) > 0.0
+        for name in ("q", "tau_J", "dq", "theta_hat"):
+            is_good &= np.isfinite(scheme[name]).all(axis=1)
+        parts.append(is_good)
+        before, parameters, count = int(cycle[-1]), scheme["theta_hat"].shape[1], count + len(cycle)
+        milestones.reach(count)
+    is_free = ~_spread(~np.concatenate(parts), round(APART_S / period_s))
+    if not is_free.any():
+        raise LogError(f"log {path} has no motion in MONITOR that is free of contact{where}")
+    level_rad = _level_rad(path) if parameters > len(PARAMETER_NAMES) else 0.0
+    return LoggedMotion(path, period_s, parameters, is_free, bounds_ns, level_rad)
+
+
+def _level_rad(path: Path) -> float:
+    text = attachment(path, "config.toml")
+    return 0.0 if text is None else settings_of(path, {"config.toml": text}).level_rad
+
+
+def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:
+    """Give the median of the measured periods, of a long log those of its beginning."""
+    measured: list[Vector] = []
+    rows = 0
+    for scheme in schemes(path, bounds_ns):
+        interval_s = scheme["period_s"].reshape(-1)
+        measured.append(interval_s[interval_s > 0.0])
+        rows += len(interval_s)
+        if sum(map(len, measured)) >= _PERIODS:
+            break
+    if not rows:
+        raise LogError(f"log {path} has no /scheme{where}")
+    if not any(map(len, measured)):
+        raise LogError(f"log {path} has no measured period{where}")
+    return float(np.median(np.concatenate(measured)[:_PERIODS]))
+
+
+def _intervals(scheme: Any, cycle: NDArray[np.int64], before: int | None, period_s: float) -> Vector:
+    """Give the time since the sample before (n,), s; 0 where that is not the cycle before."""
+    interval_s: Vector = scheme["period_s"].reshape(-1).copy()
+    is_near = (interval_s >= _NEAR[0] * period_s) & (interval_s <= _NEAR[1] * period_s)
+    interval_s[~is_near | (np.diff(cycle, prepend=cycle[0] - 2 if before is None else before) != 1)] = 0.0
+    return interval_s
+
+
+def _spread(is_bad: Mask, samples: int) -> Mask:
+    """Tell which samples have a bad one within so many samples."""
+    spread = maximum_filter1d(is_bad.view(np.uint8), 2 * samples + 1, mode="constant", cval=0)
+    return np.asarray(spread.view(np.bool_))
+
+
+def check_together(logs: Sequence[LoggedMotion]) -> None:
+    """Raise LogError unless periods and parameters of the logs fit together."""
+    first = logs[0]
+    for other in logs[1:]:
+        if abs(other.period_s - first.period_s) > 0.02 * first.period_s:
+            raise LogError(f"periods of {1e3 * first.period_s:.3f} and {1e3 * other.period_s:.3f} ms don't go together")
+        if other.parameters != first.parameters:
+            raise LogError(f"{first.parameters} and {other.parameters} parameters don't go together")
+
+
+def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
+    """Give all motion of the logs, one after the other, or of more than `MOST_SAMPLES` some windows with free motion.
+
+    The windows are spread evenly over those that have some. Raises LogError.
+    """
+    check_together(logs)
+    chosen = _windows(logs)
+    parts: list[Motion] = []
+    for log, is_chosen in zip(logs, chosen, strict=True):
+        place = 0
+        was_chosen = False
+        for motion in log.pieces():
+            rows = is_chosen[place : place + len(motion.q)]
+            place += len(motion.q)
+            if rows.any():
+                parts.append(_part(motion, rows, was_chosen))
+            was_chosen = bool(rows[-1])
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in (*_COLUMNS, "is_free")}
+    return Motion(**columns, period_s=logs[0].period_s)
+
+
+def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
+    """Choose samples of each log (N,)."""
+    if sum(len(log.is_free) for log in logs) <= MOST_SAMPLES:
+        return [np.ones(len(log.is_free), np.bool_) for log in logs]
+    has_free = [np.logical_or.reduceat(log.is_free, np.arange(0, len(log.is_free), WINDOW)) for log in logs]
+    candidates = np.flatnonzero(np.concatenate(has_free))
+    places = np.linspace(0, len(candidates) - 1, min(MOST_SAMPLES // WINDOW, len(candidates))).astype(np.int64)
+    is_chosen = np.zeros(sum(map(len, has_free)), np.bool_)
+    is_chosen[candidates[places]] = True
+    ends = np.cumsum([len(windows) for windows in has_free])[:-1]
+    return [
+        np.repeat(windows, WINDOW)[: len(log.is_free)]
+        for log, windows in zip(logs, np.split(is_chosen, ends), strict=True)
+    ]
+
+
+def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
+    """Take some samples; one whose predecessor is not taken follows a gap, and is not free."""
+    if rows.all() and was_chosen:
+        return motion
+    is_first = rows & ~np.concatenate(([was_chosen], rows[:-1]))
+    part = replace(motion, interval_s=np.where(is_first, 0.0, motion.interval_s), is_free=motion.is_free & ~is_first)
+    return replace(part, **{name: getattr(part, name)[rows] for name in (*_COLUMNS, "is_free")})
+
+
+class TorqueStream:
+    """Gives the stream of `scheme.detectors` of motion that comes piece by piece."""
+
+    def __init__(self, lag_s: float, standstill_rad_s: float) -> None:
+        self._lag_s = lag_s
+        self._standstill_rad_s = standstill_rad_s
+        self._last: list[Vector] | None = None  # sample of the piece before
+
+    def add(self, motion: Motion) -> tuple[Vector, Vector]:
+        """Take in the next piece; give its z and the friction that may hold, (n, 2) each, Nm."""
+        columns = [getattr(motion, name) for name in _COLUMNS]
+        last, self._last = self._last, [column[-1:].copy() for column in columns]
+        if last is not None:
+            columns = [np.concatenate(pair) for pair in zip(last, columns, strict=True)]
+        q, dq, tau_J, theta, interval_s = columns
+        z, held_Nm = detectors.make_stream(q, dq, tau_J, theta, interval_s, self._lag_s, self._standstill_rad_s)
+        skipped = int(last is not None)
+        return z[skipped:], held_Nm[skipped:]

@@ -1,0 +1,315 @@
+"""Thresholds from logs: recorded motion that nobody touched, each detector's statistics on it, and the thresholds.
+
+`free_motion` defines the motion that counts. A touch that no detector flagged counts, and raises thresholds.
+
+The detectors run over all of this motion, and thresholds come from all of their statistics. The velocity's lag (what
+the filtered slope of the torque explains of the stream), the stream's covariance and the sources of a threshold are
+found from the same motion, of more than `MOST_SAMPLES` from some windows.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from adacd_hil.lab.thresholds.false_alarms import (
+    Limits,
+    Prediction,
+    Sensing,
+    TooLittleMotionError,
+    calibrate_detector,
+    clusters,
+    counted_hours,
+    find_limits,
+    gains,
+    low_pass,
+    mean_square,
+    resolution,
+    white_noise,
+)
+from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, TorqueStream, read_motion, sample_of
+from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.log.logged_run import Milestones, Progress
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.scheme.detect import detectors
+from adacd_hil.scheme.model.regressor import mass_matrix
+from adacd_hil.settings.schema import setting
+
+BLOCK_S: Final = 0.1
+_LONGEST_LAG_S: Final = 5e-3
+_MODEL_RAD_S: Final = 20.0
+"""Below this the model's errors stand out of the noise."""
+_CHECKED_ALARMS: Final = 20.0  # of the held-out half: so many are counted well enough to compare with the prediction
+
+
+def find_lag(motion: Motion) -> tuple[float, Vector]:
+    """Identify the velocity's lag behind the torque, s: of both joints together, and of each (n,); from 0 to 5 ms.
+
+    Where the torque never changes, the lag is the usual one.
+    """
+    z, _ = detectors.make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
+    moving = motion.is_free & (np.abs(motion.dq) > 0.02).all(axis=1)
+    _, slope_gain = gains((_MODEL_RAD_S,), motion.period_s, 0.0)
+    top, bottom = np.zeros(JOINTS), np.zeros(JOINTS)
+    for i in range(JOINTS):
+        slope = np.diff(motion.tau_J[:, i], prepend=motion.tau_J[0, i]) / motion.period_s
+        explained, by = (
+            low_pass(series * motion.is_free, (_MODEL_RAD_S,), motion.period_s)[moving] for series in (z[:, i], slope)
+        )
+        top[i] = -float(explained @ by)
+        # the noise of the torque has a slope too, of which the stream knows nothing
+        bottom[i] = float(by @ by) - by.size * (slope_gain * white_noise(motion.tau_J[:, i])) ** 2
+    if not (bottom > 0.0).any():
+        return detectors.VELOCITY_LAG_S, np.full(JOINTS, detectors.VELOCITY_LAG_S)
+    known = np.maximum(bottom, 0.0)
+    lag_s = min(max(float(top[known > 0.0].sum() / known.sum()), 0.0), _LONGEST_LAG_S)
+    each = np.where(known > 0.0, top / np.where(known > 0.0, known, 1.0), lag_s)
+    return lag_s, np.clip(each, 0.0, _LONGEST_LAG_S)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """The detectors' statistics on contact-free motion, and N samples of it with the stream that they come from."""
+
+    settings: detectors.DetectorBankSettings
+    weights: Vector  # (n, ages, L), of the likelihood channels
+    peaks: Vector  # (B, channels, n), of all motion; NaN where not all samples of a block are free
+    z: Vector  # (N, n), 0 where not free
+    held_Nm: Vector
+    is_free: Mask
+    motion: Motion
+    lag_s: float
+    lag_of_joint_s: Vector  # (n,)
+
+    @property
+    def hours(self) -> float:
+        """Contact-free time, h."""
+        return counted_hours(self.peaks[:, 0, 0], BLOCK_S)
+
+
+def run_detectors(
+    logs: Sequence[LoggedMotion], settings: detectors.DetectorBankSettings, progress: Progress = lambda _: None
+) -> Statistics:
+    """Run every detector over the motion of logs. Raises LogError, TooLittleMotionError."""
+    motion = sample_of(logs)
+    lag_s, lag_of_joint_s = find_lag(motion)
+    z, held_Nm = TorqueStream(lag_s, settings.standstill_rad_s).add(motion)
+    free = motion.is_free
+    z[~free] = 0.0
+    held_Nm[~free] = 0.0
+    try:
+        weights = detectors.likelihood_weights(z[free], settings, lag_s, motion.period_s)
+    except ValueError as error:
+        raise TooLittleMotionError(f"{free.sum()} contact-free samples: {error}") from None
+    bank = detectors.DetectorBank(settings, weights, motion.period_s)
+    peaks = _peaks(logs, bank, lag_s, settings, progress)
+    return Statistics(settings, weights, peaks, z, held_Nm, free, motion, lag_s, lag_of_joint_s)
+
+
+def _peaks(
+    logs: Sequence[LoggedMotion],
+    bank: detectors.DetectorBank,
+    lag_s: float,
+    settings: detectors.DetectorBankSettings,
+    progress: Progress,
+) -> Vector:
+    """Run the detectors over all motion, the logs one after the other (B, channels, n); NaN unless a block is free."""
+    block = round(BLOCK_S / logs[0].period_s)
+    free = np.concatenate([log.is_free for log in logs])
+    peaks = np.zeros((-(-len(free) // block), len(settings.channels), JOINTS))
+    rest = np.empty((0, JOINTS)), np.empty((0, JOINTS))  # less than a block
+    place = 0
+    milestones = Milestones(lambda count: progress(f"{log.path}: running the detectors, {count} of {len(free)} cycles"))
+    for log in logs:
+        stream = TorqueStream(lag_s, settings.standstill_rad_s)
+        for motion in log.pieces():
+            new = stream.add(motion)
+            for column in new:
+                column[~motion.is_free] = 0.0
+            z, held_Nm = (np.concatenate(pair) for pair in zip(rest, new, strict=True))
+            end = place + len(z) // block
+            whole = (end - place) * block
+            peaks[place:end] = bank.take(z[:whole], held_Nm[:whole], block)
+            rest, place = (z[whole:], held_Nm[whole:]), end
+            milestones.reach(place * block)
+    peaks[place:] = bank.take(*rest, block)
+    peaks[~np.logical_and.reduceat(free, np.arange(0, len(free), block))] = np.nan
+    return peaks
+
+
+@dataclass(frozen=True)
+class ChannelRow:
+    """One channel of a detector, a row of the thresholds file."""
+
+    detector: str = setting(meaning="name of the detector")
+    channel: str = setting(meaning="name of the channel")
+    threshold: tuple[float, ...] = setting(low=0.0, meaning="per joint; Nm, but sigmas of likelihood and Nm s of cusum")
+    limit: tuple[str, ...] = setting(meaning="what keeps it up, per joint; empty where it can't be split")
+    achievable_Nm: tuple[float, ...] = setting(
+        unit="Nm", low=0.0, meaning="per joint, with an exact model; empty where it can't be split"
+    )
+
+
+@dataclass(frozen=True)
+class DetectorRow:
+    """The joint effect of all thresholds of a detector, a row of the thresholds file."""
+
+    name: str = setting(meaning="name of the detector")
+    rate_bound_per_h: float = setting(unit="1/h", low=0.0, meaning="upper 95 % bound of the rate of false alarms")
+    bound_ratio: float = setting(low=0.0, meaning="factor on the thresholds with which the bound is the wanted rate")
+    predicted_per_h: float | None = setting(
+        None, unit="1/h", low=0.0, meaning="rate predicted from one half of the motion; absent: too short"
+    )
+    measured_per_h: float | None = setting(None, unit="1/h", low=0.0, meaning="rate counted in the other half")
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Thresholds for a wanted rate of false alarms, and how sure they are."""
+
+    rate_per_h: float = setting(unit="1/h", low=1e-6, high=1e4, meaning="wanted false alarms per hour of a detector")
+    hours: float = setting(unit="h", low=0.0, meaning="contact-free motion that they come from")
+    is_extrapolated: bool = setting(meaning="less than one alarm is expected in that motion")
+    lag_s: float = setting(unit="s", low=0.0, high=1.0, meaning="lag of the velocity, identified")
+    logs: tuple[str, ...] = setting(meaning="where the motion is from")
+    missing: tuple[str, ...] = setting(meaning="detectors whose tail this motion can't tell")
+    detectors: tuple[DetectorRow, ...] = setting(meaning="the detectors")
+    channels: tuple[ChannelRow, ...] = setting(meaning="their channels")
+
+
+def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence[str] = ()) -> Thresholds:
+    """Calibrate all detectors. Raises TooLittleMotionError."""
+    rows, channels, missing = [], [], []
+    problem: TooLittleMotionError | None = None
+    limits = channel_limits(statistics, rate_per_h)
+    is_extrapolated = False
+    for name, places in statistics.settings.detectors.items():
+        peaks = statistics.peaks[:, list(places), :]
+        try:
+            found = calibrate_detector(peaks, BLOCK_S, rate_per_h)
+        except TooLittleMotionError as error:
+            problem = error
+            missing.append(name)
+            continue
+        check = check_prediction(peaks)
+        is_extrapolated = is_extrapolated or found.calibration.is_extrapolated
+        rows.append(
+            DetectorRow(
+                name,
+                found.calibration.rate_bound_per_h,
+                found.calibration.bound / found.calibration.threshold,
+                None if check is None else check.predicted_per_h,
+                None if check is None else check.measured_per_h,
+            )
+        )
+        for row, place in enumerate(places):
+            split = limits.get(statistics.settings.channels[place], ())
+            channels.append(
+                ChannelRow(
+                    name,
+                    statistics.settings.channels[place],
+                    tuple(found.thresholds[row].tolist()),
+                    tuple(limit.limit for limit in split),
+                    tuple(limit.achievable_Nm for limit in split),
+                )
+            )
+    if problem is not None and not rows:
+        raise problem
+    return Thresholds(
+        rate_per_h=rate_per_h,
+        hours=statistics.hours,
+        is_extrapolated=is_extrapolated,
+        lag_s=statistics.lag_s,
+        logs=tuple(logs),
+        missing=tuple(missing),
+        detectors=tuple(rows),
+        channels=tuple(channels),
+    )
+
+
+def check_prediction(peaks: Vector) -> Prediction | None:
+    """Calibrate a detector on every other tenth of the motion for a rate that the rest can count; count it there.
+
+    None if half of the motion is too little.
+    """
+    tenth = -(-len(peaks) // 10)
+    is_first = np.arange(len(peaks)) // tenth % 2 == 0
+    seen, held_out = peaks.copy(), peaks.copy()
+    seen[~is_first] = np.nan
+    held_out[is_first] = np.nan
+    hours = counted_hours(held_out[:, 0, 0], BLOCK_S)
+    try:
+        rate = _CHECKED_ALARMS / hours
+        found = calibrate_detector(seen, BLOCK_S, rate)
+    except (TooLittleMotionError, ZeroDivisionError):
+        return None
+    return Prediction(rate, clusters(found.ratio(held_out), 1.0, BLOCK_S).size, hours)
+
+
+def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple[Limits, ...]]:
+    """Split the thresholds of the low-pass channels by their sources; per channel a tuple over the joints."""
+    settings, motion, free = statistics.settings, statistics.motion, statistics.is_free
+    places = np.flatnonzero(free)
+    masses = np.array([mass_matrix(motion.q[k], motion.theta[k]) for k in places[:: max(1, places.size // 200)]])
+    largest = np.linalg.norm(masses, axis=2).max(axis=0)
+    sensing = []
+    for i in range(JOINTS):
+        torque_LSB = resolution(motion.tau_J[free, i])
+        moves = statistics.held_Nm[free, i] == 0.0
+        x = low_pass(statistics.z[free, i], (_MODEL_RAD_S,), motion.period_s)[moves]
+        direction = low_pass(np.sign(motion.dq[free, i]), (_MODEL_RAD_S,), motion.period_s)[moves]
+        velocity_LSB = resolution(motion.dq[free, i])
+        # the slope of the velocity's noise rules in single samples: nothing else is as fast
+        torque_gain, momentum_gain = gains((), motion.period_s, statistics.lag_s)
+        noise = white_noise(motion.tau_J[free, i])
+        fast = mean_square(statistics.z[free, i][moves]) - (torque_gain * noise) ** 2
+        rest = fast / momentum_gain**2 - (float(largest[i]) * velocity_LSB) ** 2 / 12.0
+        sensing.append(
+            Sensing(
+                torque_noise_Nm=max(noise**2 - torque_LSB**2 / 12.0, 0.0) ** 0.5,
+                torque_LSB_Nm=torque_LSB,
+                velocity_LSB_rad_s=velocity_LSB,
+                mass_row_kg_m2=float(largest[i]),
+                momentum_noise_Nms=max(rest, 0.0) ** 0.5,
+                lag_error_s=float(statistics.lag_of_joint_s[i] - statistics.lag_s),
+                friction_error_Nm=float(x @ direction) / max(float(direction @ direction), 1e-300),
+            )
+        )
+    more = (settings.smoothing_rad_s,)
+    kinds: tuple[tuple[str, tuple[float, ...]], ...] = (("first-order", ()), ("smoothed", more))
+    return {
+        f"{kind} {cutoff:g}": tuple(
+            find_limits(
+                statistics.z[free, i],
+                motion.tau_J[free, i],
+                statistics.held_Nm[free, i],
+                sensing[i],
+                (cutoff, *poles),
+                motion.period_s,
+                statistics.lag_s,
+                rate_per_h,
+            )
+            for i in range(JOINTS)
+        )
+        for kind, poles in kinds
+        for cutoff in settings.cutoff_rad_s
+    }
+
+
+def thresholds_of_logs(
+    paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None
+) -> tuple[Thresholds, Statistics]:
+    """Read logs, or a stretch of each, and calibrate all detectors on what nobody touched.
+
+    Raises LogError for a log that can't be used, TooLittleMotionError when all together are too short.
+    """
+    logs = []
+    for path in paths:
+        log = read_motion(path, stretch, progress)
+        if log.parameters < len(PARAMETER_NAMES):
+            raise LogError(f"log {path} has {log.parameters} parameters")
+        logs.append(log)
+    statistics = run_detectors(logs, detectors.DetectorBankSettings(), progress)
+    return compute_thresholds(statistics, rate_per_h, [str(path) for path in paths]), statistics

@@ -1,0 +1,382 @@
+"""A sweep on Dask: tasks go to workers, rows come back and are kept at once; processes of this machine, or a cluster.
+
+The client holds a few tasks per worker in flight and writes what comes back every few seconds, so that memory doesn't
+grow with the plan. A worker that dies costs its tasks, which go to another; a task that raises is tried again; after
+that its rows say what it raised. Workers need the package and, of replays, the logs at the same paths.
+
+Results are parts as they come, one Parquet table in the end. The sweep writes a part beside and renames it, so that a
+sweep that is killed leaves whole parts only. Columns are those of all rows; a row that lacks one has null there.
+Readers: `duckdb`, `pandas.read_parquet`, `pyarrow.parquet`.
+
+The plan says which logs or scenarios, with which settings and seeds; its rows, and the tasks they go out in. Every row
+has a key made of all that its result depends on. A sweep that is begun again computes the keys that its folder lacks. A
+log that has changed, other settings, and another version of the package or of the code make other keys.
+"""
+
+import hashlib
+import json
+import statistics
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.file_access import replace_file, replacing
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.logged_run import Progress
+from adacd_hil.records import SchemeState
+from adacd_hil.remedies import install_command
+from adacd_hil.replay.log_source import LogSource
+from adacd_hil.replay.replay import replay_many
+from adacd_hil.replay.replayed_outcome import Replay
+from adacd_hil.settings.configuration import Settings, apply_settings, keep_facts, load_settings
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.wire.codec import CodecError
+
+Changes = tuple[tuple[str, str], ...]
+"""Settings that differ, as `key`, TOML value."""
+
+
+class Subject(NamedTuple):
+    """The subject of one task: a log, or a scenario with a seed. `stamp`: the state of a log when the plan was made."""
+
+    log: str = ""
+    stamp: str = ""
+    scenario: str = ""
+    seed: int = 0
+
+
+class SweepRow(NamedTuple):
+    """One run or replay of the sweep."""
+
+    key: str
+    changes: Changes
+
+
+@dataclass(frozen=True)
+class Task:
+    """Rows about one subject: a worker opens it once for all of them."""
+
+    subject: Subject
+    config: str  # name or file; empty: the log's own
+    profile: str
+    rows: tuple[SweepRow, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A whole sweep. `version`: of the code, a part of every key."""
+
+    subjects: tuple[Subject, ...]
+    variants: tuple[Changes, ...]
+    config: str
+    profile: str
+    version: str
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return len(self.subjects) * len(self.variants)
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Keys of the settings that are varied."""
+        return tuple(dict.fromkeys(key for changes in self.variants for key, _ in changes))
+
+    def tasks(self, done: frozenset[str], rows_per_task: int) -> Iterator[Task]:
+        """Give the tasks whose rows are not done, lazily, subject by subject."""
+        for subject in self.subjects:
+            rows = [SweepRow(self._key(subject, changes), changes) for changes in self.variants]
+            rows = [row for row in rows if row.key not in done]
+            for start in range(0, len(rows), rows_per_task):
+                yield Task(subject, self.config, self.profile, tuple(rows[start : start + rows_per_task]))
+
+    def row_keys(self) -> Iterator[str]:
+        """Give the keys of all rows."""
+        return (self._key(subject, changes) for subject in self.subjects for changes in self.variants)
+
+    def _key(self, subject: Subject, changes: Changes) -> str:
+        text = json.dumps([subject, sorted(changes), self.config, self.profile, self.version])
+        return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def plan_logs(
+    logs: Sequence[Path], variants: Sequence[Mapping[str, str]], config: str, profile: str, version: str
+) -> Plan:
+    """Plan replays of logs. Raises OSError when one can't be looked at."""
+    subjects = []
+    for path in logs:
+        status = path.stat()
+        subjects.append(Subject(log=str(path.resolve()), stamp=f"{status.st_size}/{status.st_mtime_ns}"))
+    return Plan(tuple(dict.fromkeys(subjects)), _tuples(variants), config, profile, version)
+
+
+def plan_scenarios(
+    scenarios: Sequence[str],
+    seeds: Sequence[int],
+    variants: Sequence[Mapping[str, str]],
+    config: str,
+    profile: str,
+    version: str,
+) -> Plan:
+    """Plan runs of the emulated arm."""
+    subjects = (Subject(scenario=scenario, seed=seed) for scenario in scenarios for seed in seeds)
+    return Plan(tuple(dict.fromkeys(subjects)), _tuples(variants), config, profile, version)
+
+
+def _tuples(variants: Sequence[Mapping[str, str]]) -> tuple[Changes, ...]:
+    return tuple(dict.fromkeys(tuple(changes.items()) for changes in variants)) or ((),)
+
+
+SET: Final = "set."
+"""Prefix of the columns of varied settings."""
+REFUSALS: Final = (ConfigError, CodecError, LogError)
+"""What makes a row of its own that says why, however often it is tried."""
+
+Value = str | int | float | bool | None
+Values = dict[str, Value]
+
+
+def row_labels(subject: Subject, row: SweepRow) -> Values:
+    """Name a row: its key, its subject, and the settings that are varied."""
+    changes: Mapping[str, str] = dict(row.changes)
+    return {
+        "key": row.key,
+        "log": subject.log or None,
+        "scenario": subject.scenario or None,
+        "seed": subject.seed if subject.scenario else None,
+        **{SET + key: value for key, value in changes.items()},
+    }
+
+
+def failed(subject: Subject, row: SweepRow, error: str) -> Values:
+    """Make a row that says why there is no result."""
+    return row_labels(subject, row) | {"status": "failed", "error": " ".join(error.split())}
+
+
+def replay_task(task: Task) -> list[Values]:
+    """Replay a log with the settings of each row; it is decoded once for all of them."""
+    subject = task.subject
+    path = Path(subject.log)
+    found: dict[str, Values] = {}
+    variants: dict[str, Settings] = {}
+    try:
+        own = LogSource(path).settings
+        base = keep_facts(own, load_settings(task.config, task.profile or own.arm.profile)) if task.config else own
+    except REFUSALS as refusal:
+        return [failed(subject, row, str(refusal)) for row in task.rows]
+    for row in task.rows:
+        try:
+            variants[row.key] = apply_settings(base, dict(row.changes))
+        except ConfigError as refusal:
+            found[row.key] = failed(subject, row, str(refusal))
+    rows = [row for row in task.rows if row.key in variants]
+    for row, result in zip(rows, _replay_all(path, list(variants.values())), strict=True):
+        found[row.key] = failed(subject, row, result) if isinstance(result, str) else finished(subject, row, result)
+    return [found[row.key] for row in task.rows]
+
+
+def _replay_all(path: Path, variants: list[Settings]) -> list[Replay | str]:
+    """Replay with each of the settings, or say why one can't be."""
+    try:
+        return list(replay_many(path, variants))
+    except REFUSALS as refusal:
+        if len(variants) == 1:
+            return [str(refusal)]
+    return [result for settings in variants for result in _replay_all(path, [settings])]
+
+
+def finished(subject: Subject, row: SweepRow, found: Replay) -> Values:
+    """Make a row of a replay."""
+    score = found.score
+    delays_ms = () if score is None else score.delays_ms
+    took_s = found.adaptation_s
+    last = found.states[-1] if found.states else None
+    return row_labels(subject, row) | {
+        "status": "ok",
+        "error": None,
+        "cycles": found.cycles,
+        "attempts": found.attempts,
+        "identical": found.is_identical if found.compared else None,
+        "ends_in": last.state.name if last else SchemeState.INIT.name,
+        "fault": last.fault.name if last else "NONE",
+        "adaptations": sum(each is not None for each in took_s),
+        "adaptation_first_s": took_s[0] if took_s else None,
+        "adaptation_last_s": took_s[-1] if took_s else None,
+        "monitored_s": found.monitored_s,
+        "detections": len(found.detections_ns),
+        "touches_armed": None if score is None else score.armed,
+        "touches_found": None if score is None else len(delays_ms),
+        "missed": None if score is None else score.missed,
+        "false_alarms": None if score is None else len(score.false_alarms),
+        "delay_median_ms": statistics.median(delays_ms) if delays_ms else None,
+        "delay_max_ms": max(delays_ms, default=None),
+        **{f"theta_hat.{name}": value for name, value in found.parameters.items()},
+    }
+
+
+TABLE_NAME = "sweep.parquet"
+PLAN_NAME = "plan.json"
+_PARTS = "parts"
+
+
+class SweepStore:
+    """The folder of a sweep."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open or create it. Raises LogError where pyarrow is missing, OSError where it can't be written."""
+        self.folder = folder
+        self._parts = folder / _PARTS
+        self._parquet = _parquet()
+        self._parts.mkdir(parents=True, exist_ok=True)
+        self._next = 1 + max((int(path.stem) for path in self._parts.glob("[0-9]*.parquet")), default=-1)
+
+    def done(self) -> frozenset[str]:
+        """Return the keys of the rows that are there and didn't fail."""
+        keys: set[str] = set()
+        for path in self._paths():
+            table = self._read(path, ["key", "status"])
+            keys.update(
+                key
+                for key, status in zip(*(table[name].to_pylist() for name in table.column_names), strict=True)
+                if status == "ok"
+            )
+        return frozenset(keys)
+
+    def add(self, rows: Iterable[Values]) -> None:
+        """Write a part."""
+        path = self._parts / f"{self._next:06d}.parquet"
+        self._next += 1
+        _write(self._parquet, path, _table(list(rows)))
+
+    def join(self, keys: Iterable[str], about: Mapping[str, str]) -> Path:
+        """Write the table of these rows in this order, the last result of each; return its path."""
+        rows: dict[str, Values] = {}
+        for path in self._paths():
+            for row in self._read(path).to_pylist():
+                if row["status"] == "ok" or rows.get(row["key"], row)["status"] != "ok":
+                    rows[row["key"]] = row
+        table = _table([rows[key] for key in keys if key in rows])
+        metadata = {f"adacd_hil.{name}": text for name, text in about.items()}
+        path = self.folder / TABLE_NAME
+        _write(self._parquet, path, table.replace_schema_metadata(metadata))
+        replace_file(self.folder / PLAN_NAME, json.dumps(about, indent=2))
+        return path
+
+    def _paths(self) -> list[Path]:
+        return sorted(self._parts.glob("[0-9]*.parquet"))
+
+    def _read(self, path: Path, columns: list[str] | None = None) -> Any:
+        try:
+            return self._parquet.read_table(path, columns=columns)
+        except (OSError, ValueError) as error:  # of pyarrow, too
+            raise LogError(f"sweep {path}: {str(error).splitlines()[0]}; remove it to compute its rows again") from None
+
+
+def _parquet() -> Any:
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise LogError(f"sweep needs pyarrow and dask: {install_command('sweep')}") from None
+    return parquet
+
+
+def _table(rows: list[Values]) -> Any:
+    import pyarrow as pa
+
+    names = dict.fromkeys(name for row in rows for name in row)
+    return pa.table({name: pa.array([row.get(name) for row in rows], from_pandas=False) for name in names})
+
+
+def _write(parquet: Any, path: Path, table: Any) -> None:
+    with replacing(path) as beside:
+        parquet.write_table(table, beside, compression="zstd")
+
+
+ROWS_PER_TASK = 20
+"""So many replays share the decoding of a log; more would make a lost worker cost more."""
+RETRIES = 2
+_IN_FLIGHT = 4  # tasks per worker, so that none waits for the client
+_WRITE_NS = 5_000_000_000
+
+Work = Callable[[Task], list[Values]]
+
+
+class SweepOutcome(NamedTuple):
+    """The outcome of a sweep: rows that were computed, found done before, and failed."""
+
+    computed: int
+    found: int
+    failed: int
+    elapsed_s: float
+
+
+def run_sweep(
+    plan: Plan,
+    work: Work,
+    store: SweepStore,
+    client: Any,
+    progress: Progress,
+    rows_per_task: int = ROWS_PER_TASK,
+) -> SweepOutcome:
+    """Compute the rows that the store lacks. client: of dask.distributed. Raises LogError when the cluster is lost."""
+    from distributed import as_completed
+
+    clock = MonotonicClock()
+    begin_ns = written_ns = clock.now_ns()
+    done = store.done()
+    wanted = sum(key not in done for key in plan.row_keys())
+    tasks = plan.tasks(done, rows_per_task)
+    flying: dict[Any, Task] = {}
+    completed = as_completed(loop=client.loop)
+    rows: list[Values] = []
+    computed = failures = 0
+
+    def launch() -> None:
+        workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+        while len(flying) < _IN_FLIGHT * workers and (task := next(tasks, None)) is not None:
+            future = client.submit(work, task, retries=RETRIES, pure=False)
+            flying[future] = task
+            completed.add(future)
+
+    try:
+        launch()
+        while flying:
+            future = next(completed)
+            found = _result(future, flying.pop(future))
+            future.release()
+            rows += found
+            computed += len(found)
+            failures += sum(row["status"] != "ok" for row in found)
+            launch()
+            now_ns = clock.now_ns()
+            if now_ns - written_ns >= _WRITE_NS:
+                store.add(rows)
+                rows, written_ns = [], now_ns
+                progress(_describe(computed, wanted, failures, (now_ns - begin_ns) * 1e-9))
+    finally:
+        if rows:
+            store.add(rows)
+    elapsed_s = (clock.now_ns() - begin_ns) * 1e-9
+    progress(_describe(computed, wanted, failures, elapsed_s))
+    return SweepOutcome(computed, plan.size - wanted, failures, elapsed_s)
+
+
+def _result(future: Any, task: Task) -> list[Values]:
+    """Return the rows of a task; of one that raised every time, rows that say what."""
+    if future.status == "cancelled":
+        raise LogError("sweep: the scheduler is gone; begin again to go on with what is missing")
+    error = future.exception()
+    if error is None:
+        found: list[Values] = future.result()
+        return found
+    text = f"{type(error).__name__}: {error}"
+    return [failed(task.subject, row, text) for row in task.rows]
+
+
+def _describe(computed: int, wanted: int, failures: int, elapsed_s: float) -> str:
+    rate = computed / max(elapsed_s, 1e-9)
+    left_s = (wanted - computed) / rate if computed else 0.0
+    text = f"{computed} of {wanted} rows, {rate:.1f} rows/s, {left_s:.0f} s left"
+    return text + (f", {failures} failed" if failures else "")

@@ -1,0 +1,353 @@
+"""Thresholds, filter and gain found from logs: candidates, how each is judged, which one is suggested, as TOML.
+
+Every candidate gets the thresholds that one half of the logs gives it for the wanted rate of false alarms: those at
+which the tail's upper 95 % bound is that rate. Then the logs are replayed with it, thresholds and all. A candidate is
+fit if it adapts as often as the logs' own settings do, misses none of the contacts that those were armed for, and has
+no more false alarms than the wanted rate allows. The suggestion is the fit candidate with the smallest median delay.
+Where a wanted rate is extrapolated too far, the bounds of the tails differ more by chance than the candidates do: then
+filter and gain stay as they are. Without the truth nobody knows a delay: only thresholds are found then, too.
+
+The suggestion names what it extends and the keys that change, with their origin as comments. Figures show what is found
+against false alarms, and how late.
+"""
+
+import json
+import math
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from adacd_hil import __version__
+from adacd_hil.clock import wall_ns
+from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
+from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError
+from adacd_hil.lab.tune.tune_candidates import (
+    candidates,
+    name_of,
+    observe_candidates,
+    observe_detectors,
+    thresholds_as_changes,
+)
+from adacd_hil.lab.tune.tune_roc import (
+    Candidate,
+    Changes,
+    Choice,
+    Found,
+    TunedLog,
+    Tuning,
+    TuningOutcome,
+    choose,
+    free_hours,
+    read_logs,
+)
+from adacd_hil.log.log_files import WHOLE, TimeWindow
+from adacd_hil.log.logged_run import Progress
+from adacd_hil.replay.replay import replay_many
+from adacd_hil.replay.replayed_outcome import Replay
+from adacd_hil.score.judge import least_rate_per_h
+from adacd_hil.score.wording import delay_figures, delays_phrase, number_of, rate_phrase, share_phrase
+from adacd_hil.settings.configuration import Settings, apply_settings, changed_keys, keep_facts, load_settings
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.toml_files import builtin_names, to_toml
+
+FARTHEST: Final = 100.0
+"""Extrapolation beyond which filters and gains are not told apart: thresholds of equal ones differ by a factor of 4."""
+
+
+def tune(
+    paths: Sequence[Path],
+    rate_per_h: float,
+    config: str | None,
+    progress: Progress,
+    stretch: TimeWindow = WHOLE,
+) -> Tuning:
+    """Find thresholds, filter and gain. config: name or file of the settings to start from.
+
+    stretch: of each log; the replays begin with the log, and what comes of them in the stretch counts.
+
+    Raises LogError, ConfigError, CodecError, TooLittleMotionError.
+    """
+    progress(f"reading {number_of(len(paths), 'log')}")
+    logs = read_logs(paths, config, stretch, progress)
+    has_truth = any(log.windows is not None for log in logs)
+    notes = [] if has_truth else ["no truth.mcap beside the logs: contacts and delays are not known, and an alarm of a "
+                                  "logged run counts as a contact"]  # fmt: skip
+    detectors: list[Choice] = []
+    try:
+        detectors = [choose(observed, rate_per_h) for observed in observe_detectors(logs, progress)]
+    except TooLittleMotionError as error:
+        notes.append(f"the detectors can't be compared: {error}")
+    tried = candidates(logs[0].settings) if has_truth else [{}]
+    settings = logs[0].settings
+    tried, choices = _choices(logs, tried, rate_per_h, progress, notes)
+    changes = [
+        filter_and_gain | thresholds_as_changes(apply_settings(settings, filter_and_gain), choice.thresholds)
+        for filter_and_gain, choice in zip(tried, choices, strict=True)
+    ]
+    own, *outcomes = replay_all(logs, [{}, *changes], progress)
+    judged = [
+        Candidate(name_of(filter_and_gain), change, choice, outcome, _problems(choice, outcome, own, rate_per_h))
+        for filter_and_gain, change, choice, outcome in zip(tried, changes, choices, outcomes, strict=True)
+    ]
+    if len(judged) > 1 and judged[0].choice.extrapolation > FARTHEST:
+        notes.append(f"a rate of {rate_per_h:g} per hour is too far from this motion to choose filter and gain by it")
+    return Tuning(rate_per_h, tuple(logs), own, tuple(judged), _best(judged), tuple(detectors), tuple(notes))
+
+
+def _choices(
+    logs: Sequence[TunedLog],
+    tried: Sequence[Changes],
+    rate_per_h: float,
+    progress: Progress,
+    notes: list[str],
+) -> tuple[list[Changes], list[Choice]]:
+    """Choose thresholds for each filter and gain; leave out, with a note, what never monitors untouched motion."""
+    chosen: list[tuple[Changes, Choice]] = []
+    for changes, observed in zip(tried, observe_candidates(logs, tried, progress), strict=True):
+        try:
+            chosen.append((changes, choose(observed, rate_per_h)))
+        except TooLittleMotionError as error:
+            if not changes:
+                raise TooLittleMotionError(f"{error}, with the settings to start from") from None
+            notes.append(f"{name_of(changes)}: {error}")
+    return [changes for changes, _ in chosen], [choice for _, choice in chosen]
+
+
+def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Progress) -> list[TuningOutcome]:
+    """Replay all logs with each of the variants. Raises LogError, ConfigError, CodecError."""
+    results: list[list[tuple[TunedLog, Replay]]] = [[] for _ in variants]
+    for log in logs:
+        progress(f"replaying {log.path} with the thresholds found")
+        settings = [apply_settings(log.settings, changes) for changes in variants]
+        replays = replay_many(log.path, settings, progress, stretch=log.stretch)
+        for gathered, found in zip(results, replays, strict=True):
+            gathered.append((log, found))
+    return [_outcome(gathered) for gathered in results]
+
+
+def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
+    took_s = [each for _, found in replays for each in found.adaptation_s]
+    judged = [(found, found.score) for _, found in replays if found.score is not None]
+    armed = {(log.path, window.number) for log, _ in replays for window in log.windows or () if window.is_armed}
+    contacts = [
+        contact
+        for log, found in replays
+        for contact in (() if found.score is None else found.score.contacts)
+        if (log.path, contact.number) in armed
+    ]
+    delays = [contact.delay_ms for contact in contacts if contact.delay_ms is not None]
+    return TuningOutcome(
+        adaptation_s=tuple(each for each in took_s if each is not None),
+        unfinished=sum(each is None for each in took_s),
+        missed=len(armed) - len(delays) if judged else None,
+        false_alarms=sum(len(score.false_alarms) for _, score in judged) if judged else None,
+        hours=sum(found.monitored_s for found, _ in judged) / 3600.0,
+        delays_ms=tuple(delays),
+        armed_false_alarms=sum(score.armed_false_alarms for _, score in judged),
+    )
+
+
+def _problems(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_per_h: float) -> tuple[str, ...]:
+    """Say why a candidate is not fit."""
+    problems = []
+    if choice.calibration is None:
+        problems.append("too little motion for a tail")
+    if len(outcome.adaptation_s) < len(own.adaptation_s):
+        problems.append(f"{len(own.adaptation_s) - len(outcome.adaptation_s)} adaptations don't finish")
+    if outcome.missed:
+        problems.append(f"{outcome.missed} missed")
+    if least_rate_per_h(choice.checked.alarms, choice.checked.hours) > rate_per_h:
+        problems.append(f"{choice.checked.alarms} false alarms in the half to check on")
+    elif least_rate_per_h(outcome.armed_false_alarms, outcome.hours) > rate_per_h:
+        problems.append(f"{outcome.armed_false_alarms} false alarms")
+    return tuple(problems)
+
+
+def _best(judged: Sequence[Candidate]) -> Candidate | None:
+    """Return the fit candidate with the smallest median delay of the half that thresholds are chosen on.
+
+    Of a rate that is extrapolated too far, only the logs' own filter and gain, which come first, are looked at.
+    """
+    looked_at = judged[:1] if judged[0].choice.extrapolation > FARTHEST else judged
+    fit = [candidate for candidate in looked_at if not candidate.problems]
+    return min(fit, key=_delays, default=None)
+
+
+def _delays(candidate: Candidate) -> tuple[float, ...]:
+    """Give median, 90th percentile and largest, by which equal medians are told apart; infinite of no contact."""
+    figures = delay_figures(candidate.choice.chosen.delays_ms)
+    return tuple(math.inf if each is None else each for each in figures)
+
+
+def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
+    """Find the configuration that a suggestion extends. config: as the user named it; None: the log's own.
+
+    Raises ConfigError when the log's own isn't one that comes with the package.
+    """
+    name = settings.name if config is None else config
+    if config is None and name not in builtin_names():
+        raise ConfigError(f"the logs' configuration {name!r} isn't built in: name its file with --config")
+    return name, load_settings(name, settings.arm.profile)
+
+
+def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settings) -> str:
+    """Write a suggestion as TOML that `load_settings` reads."""
+    own = tuning.logs[0].settings
+    table = tomllib.loads(to_toml(apply_settings(base, best.changes)))
+    differing = [key for key in changed_keys(keep_facts(own, base), own) if key != "name"]
+    lines = [*_provenance(tuning, best)]
+    if differing:
+        lines.append(f"the logs' settings differ from {base_name} in {', '.join(differing)}")
+    text = [*(f"# {line}" for line in lines), "", f"extends = {json.dumps(base_name, ensure_ascii=False)}"]
+    sections: dict[str, list[str]] = {}
+    if own.arm.profile != load_settings(base_name).arm.profile:
+        sections["arm"] = [f"profile = {json.dumps(own.arm.profile)}"]
+    for key in changed_keys(base, apply_settings(base, best.changes)):
+        section, _, last = key.rpartition(".")
+        value: Any = table
+        for part in key.split("."):
+            value = value[part]
+        sections.setdefault(section, []).append(f"{last} = {value}")
+    for section, entries in sections.items():
+        text += ["", f"[{section}]", *entries]
+    return "\n".join(text) + "\n"
+
+
+def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
+    date = datetime.fromtimestamp(wall_ns() // 1_000_000_000, tz=UTC).strftime("%Y-%m-%d %H:%M UTC")
+    choice, tail = best.choice, best.choice.calibration
+    lines = [
+        f"Suggested by adacd-hil tune, version {__version__}, {date}.",
+        f"From {len(tuning.logs)} logs, {sum(map(free_hours, tuning.logs)):.4f} h of motion that nobody touched:",
+        *(f"  {_plain(log.path)}, SHA-256 {log.digest}, {free_hours(log):.4f} h" for log in tuning.logs),
+        f"Wanted: {tuning.rate_per_h:g} false alarms per hour. Thresholds: {choice.method}, whose upper 95 % bound is "
+        "the wanted rate.",
+    ]
+    if tail is not None:
+        lines.append(f"  The tail is fitted to {tail.tail.count} peaks of {tail.tail.hours:.4f} h.")
+    lines += [
+        f"Chosen on:  {in_words(choice.chosen)}",
+        f"Checked on: {in_words(choice.checked)}",
+        "Counted alone, the wanted rate is "
+        + ("shown." if tuning.is_shown else "not shown: that needs 3 / rate hours without an alarm."),
+        f"Replayed with these settings: {outcome_in_words(best)}",
+    ]
+    return lines
+
+
+def _plain(path: Path) -> str:
+    """Return a path without anything that would end a comment."""
+    return "".join(letter if letter.isprintable() else "?" for letter in str(path))
+
+
+def in_words(found: Found) -> str:
+    """Say what thresholds come to in one half."""
+    text = rate_phrase(found.alarms, found.hours, found.rate_bound_per_h)
+    if found.contacts is None:
+        return text
+    return f"{text}; {share_phrase(found.delays_ms, found.contacts, found.share_bounds)}"
+
+
+def outcome_in_words(candidate: Candidate) -> str:
+    """Say what the replay of all logs with a candidate came to."""
+    outcome = candidate.outcome
+    text = f"{len(outcome.adaptation_s)} adaptations"
+    if outcome.adaptation_s:
+        text += f" of {min(outcome.adaptation_s):.2f} to {max(outcome.adaptation_s):.2f} s"
+    if outcome.missed is None:
+        return text
+    return text + f", {outcome.missed} missed, {outcome.false_alarms} false alarms{delays_phrase(outcome.delays_ms)}"
+
+
+_LOOKS: Final = ("identified", "cad", "joint1", "joint2", "bar", "queue_log", "beside", "queue_receive", "muted")
+
+_LEAST_RATE: Final = 1e-6
+"""Per hour; what the model predicts below this nobody will ever check."""
+
+
+@contextmanager
+def _axes(title: str) -> Iterator[tuple[Figure, Axes]]:
+    """Give a figure and its axes, with room for a legend at the right."""
+    with style():
+        figure = Figure(figsize=(10.0, 4.6))
+        axes = figure.subplots()
+        figure.subplots_adjust(left=0.065, right=0.72, bottom=0.12, top=0.9)
+        axes.set_title(title)
+        yield figure, axes
+        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+
+
+def _curves(tuning: Tuning) -> Iterator[tuple[Choice, dict[str, Any]]]:
+    """Give what is drawn, and how: the suggestion or else the logs' own filter, then the detectors."""
+    scheme = tuning.best or tuning.candidates[0]
+    named = [(f"scheme: {scheme.name}", scheme.choice), *((choice.name, choice) for choice in tuning.detectors)]
+    for (name, choice), colour in zip(named, ("alarm", *_LOOKS), strict=False):
+        yield choice, {"color": COLOURS[colour], "linewidth": 2.0 if colour == "alarm" else 1.1, "label": name}
+
+
+def draw_roc(tuning: Tuning) -> Drawing:
+    """Draw the share of contacts found against the upper bound of the rate that was counted; without truth, rates."""
+    title = "False alarms and contacts found"
+    with _axes(title) as (figure, axes):
+        for place, (choice, look) in enumerate(_curves(tuning)):
+            found = [each for _, each, _ in choice.roc]
+            bounds = np.array([each.rate_bound_per_h for each in found])
+            if found[0].contacts is None:
+                axes.plot([factor for factor, _, _ in choice.roc], bounds, **look)
+                continue
+            shares = np.array([len(each.delays_ms) / max(each.contacts or 0, 1) for each in found])
+            axes.plot(bounds, 100.0 * shares, marker="o", markersize=3.0, **look)
+            predicted = [np.nan if rate is None or rate < _LEAST_RATE else rate for _, _, rate in choice.roc]
+            axes.plot(predicted, 100.0 * shares, linestyle=":", **(look | {"label": None}))
+            if place == 0:
+                low, high = np.array([each.share_bounds for each in found]).T
+                axes.fill_between(bounds, 100.0 * low, 100.0 * high, color=look["color"], alpha=0.12, linewidth=0.0)
+        has_truth = tuning.candidates[0].choice.chosen.contacts is not None
+        bound_label = "false alarms per hour, upper 95 % bound of what was counted"
+        if has_truth:
+            axes.set(xscale="log", ylim=(-3.0, 103.0), xlabel=bound_label, ylabel="contacts found, %")
+        else:
+            axes.set(xscale="log", yscale="log", xlabel="factor on the thresholds", ylabel=bound_label)
+        note(axes, "counted where nothing was chosen; dotted: the tail model's prediction")
+    hours = tuning.candidates[0].choice.checked.hours
+    caption = (
+        f"All thresholds of a detector times one factor. {hours:.3f} h without an alarm leave a bound of "
+        f"{3.0 / hours:.3g} per hour, further left nothing can be counted."
+        if hours > 0.0
+        else "All thresholds of a detector times one factor."
+    )
+    return Drawing("roc", title, caption, figure)
+
+
+def draw_delays(tuning: Tuning) -> Drawing:
+    """Draw the share of all contacts that is found within a time, at the chosen thresholds."""
+    title = "Delay at the chosen thresholds"
+    with _axes(title) as (figure, axes):
+        for choice, look in _curves(tuning):
+            delays, contacts = _all_delays(choice)
+            shares = 100.0 * np.arange(len(delays) + 1) / max(contacts, 1)
+            axes.step([0.0, *delays], shares, where="post", **look)
+        axes.set(ylim=(-3.0, 103.0), xlabel="time since the onset, ms", ylabel="contacts found, %")
+        note(axes, f"for {tuning.rate_per_h:g} false alarms per hour")
+    caption = "Contacts of all logs; what a curve lacks to 100 % is never found."
+    return Drawing("delays", title, caption, figure)
+
+
+def _all_delays(choice: Choice) -> tuple[Sequence[float], int]:
+    halves = (choice.chosen, choice.checked)
+    return sorted(delay for half in halves for delay in half.delays_ms), sum(half.contacts or 0 for half in halves)
+
+
+def write_tuning(tuning: Tuning, out_dir: Path) -> tuple[Path, ...]:
+    """Write tune.json, and the figures as PNG and SVG, into a folder. Raises LogError when they can't be written."""
+    drawings = [draw_roc(tuning)]
+    if tuning.candidates[0].choice.chosen.contacts:
+        drawings.append(draw_delays(tuning))
+    return write_figures(out_dir, "tune", tuning.as_json(), drawings)

@@ -1,0 +1,251 @@
+"""Candidates of tuning on the logs: the scheme with other filters and gains, replayed, and all detectors of the stream.
+
+The paper's scheme is replayed with thresholds that nothing exceeds, so that every candidate keeps monitoring and its
+residual is seen; the model is frozen while it does. The certified scheme keeps learning, but not from samples over a
+threshold: it is replayed with its own thresholds, and its statistic is the largest ratio to them, which grow with
+`certified.noise_sigmas` and `certified.model_sigmas` (but for the friction that is allowed at standstill).
+
+Detectors (`scheme.detectors`) take the stream with theta_hat as it is in the log and the lag as identified from all
+motion. Each contact is seen by detectors that were at rest `WARM_UP_S` before it.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.lab.thresholds.detector_comparison import WARM_UP_S
+from adacd_hil.lab.thresholds.free_motion import TorqueStream
+from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, run_detectors
+from adacd_hil.lab.tune.tune_roc import Changes, Observed, Touched, TunedLog, Window, rising
+from adacd_hil.log.logged_run import Progress
+from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.replay.replay import Watch, replay_many
+from adacd_hil.scheme.detect import detectors
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
+from adacd_hil.settings.configuration import Settings, apply_settings
+from adacd_hil.settings.schema import ConfigError
+
+_FILTER_FACTORS: Final = (1.0, 0.5, 2.0, 4.0)
+_GAIN_FACTORS: Final = (1.0, 0.3, 3.0)
+_NOTHING_EXCEEDS_Nm: Final = 100.0
+"""The largest threshold that a configuration may have."""
+
+Places = NDArray[np.int64]
+
+
+def candidates(settings: Settings) -> list[Changes]:
+    """List changes of filter and gain to try, none first; what a configuration can't have is left out."""
+    tried: list[Changes] = []
+    for filter_factor in _FILTER_FACTORS:
+        for gain_factor in _GAIN_FACTORS:
+            changes: Changes = {}
+            if filter_factor != 1.0:
+                changes |= _filter(settings, filter_factor)
+            if gain_factor != 1.0:
+                changes |= _gain(settings, gain_factor)
+            try:
+                apply_settings(settings, changes)
+            except ConfigError:
+                continue
+            tried.append(changes)
+    return tried
+
+
+def _filter(settings: Settings, factor: float) -> Changes:
+    """Change the cut-offs; of the paper's filter b, too, which keeps its gain at rest."""
+    if settings.scheme == "certified":
+        return {"certified.cutoffs_rad_s": in_toml([factor * each for each in settings.certified.cutoffs_rad_s])}
+    pair = {"a_rad_s": settings.filter.a_rad_s, "b_rad_s": settings.filter.b_rad_s}
+    return {f"filter.{name}": in_toml(factor * value) for name, value in pair.items()}
+
+
+def _gain(settings: Settings, factor: float) -> Changes:
+    """Change how much a sample corrects: P(0), or what is believed of a sample's residual, whose square divides."""
+    if settings.scheme == "certified":
+        return {"certified.residual_Nm": in_toml(settings.certified.residual_Nm / factor**0.5)}
+    return {"estimator.P0": in_toml([factor * each for each in settings.estimator.P0])}
+
+
+def in_toml(value: float | Sequence[float]) -> str:
+    """Write a number, or several, with four digits."""
+    if isinstance(value, int | float):
+        return repr(float(f"{value:.4g}"))
+    return "[" + ", ".join(in_toml(each) for each in value) + "]"
+
+
+def thresholds_as_changes(settings: Settings, thresholds: Vector) -> Changes:
+    """Say thresholds (1, n) of `observe_candidates` as settings, rounded up; within what a configuration may have."""
+    up = 1.0005  # four digits are never less than what was chosen
+    if settings.scheme == "certified":
+        factor = up * float(thresholds[0, 0])
+        own = {"noise_sigmas": settings.certified.noise_sigmas, "model_sigmas": settings.certified.model_sigmas}
+        return {f"certified.{name}": in_toml(min(max(factor * each, 1.0), 50.0)) for name, each in own.items()}
+    low, high = 1e-3, _NOTHING_EXCEEDS_Nm
+    return {"detector.threshold_Nm": in_toml([min(max(up * each, low), high) for each in thresholds[0].tolist()])}
+
+
+def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progress: Progress) -> list[Observed]:
+    """Replay the logs with every candidate. Raises LogError, ConfigError, CodecError."""
+    gathered: list[list[_Shown]] = [[] for _ in tried]
+    for log in logs:
+        progress(f"replaying {log.path} with {len(tried)} filters and gains")
+        variants = [_monitoring(apply_settings(log.settings, changes)) for changes in tried]
+        shown = [_Shown(log, settings) for settings in variants]
+        replay_many(log.path, variants, progress, watch=_show_to(shown), stretch=log.stretch)
+        for place, one in enumerate(shown):
+            gathered[place].append(one)
+    has_truth = any(log.windows is not None for log in logs)
+    return [
+        Observed(
+            name_of(changes),
+            np.concatenate([one.peaks() for one in all_logs]),
+            np.concatenate([log.is_chosen_on for log in logs]),
+            tuple(touched for one in all_logs for touched in one.touches()) if has_truth else None,
+        )
+        for changes, all_logs in zip(tried, gathered, strict=True)
+    ]
+
+
+def _show_to(shown: "Sequence[_Shown]") -> Watch:
+    return lambda place, ticks, batch: shown[place].take(ticks, batch)
+
+
+def name_of(changes: Mapping[str, str]) -> str:
+    """Name a candidate by what it changes."""
+    return ", ".join(f"{key}={value}" for key, value in changes.items() if key != "filter.b_rad_s") or "as it is"
+
+
+def _monitoring(settings: Settings) -> Settings:
+    """Return settings of the paper's scheme with which it never reacts; those of the certified scheme as they are."""
+    if settings.scheme == "certified":
+        return settings
+    thresholds = (_NOTHING_EXCEEDS_Nm, _NOTHING_EXCEEDS_Nm)
+    return dataclasses.replace(settings, detector=dataclasses.replace(settings.detector, threshold_Nm=thresholds))
+
+
+class _Shown:
+    """What one candidate shows on one log of N cycles, stretch by stretch."""
+
+    def __init__(self, log: TunedLog, settings: Settings) -> None:
+        self._log = log
+        self._is_certified = settings.scheme == "certified"
+        self._slices = layout_of(settings).slices
+        self._channels = 1 if self._is_certified else JOINTS
+        self._peaks = np.full((len(log.is_chosen_on), 1, self._channels), -np.inf)
+        self._windows = [window for window in log.windows or () if window.is_armed]
+        self._open = sorted(self._windows, key=lambda window: window.first)  # whose last cycle is yet to come
+        self._parts: dict[int, list[tuple[Vector, Vector]]] = {}  # by number of a window: since_s and statistic
+        self._touches: dict[int, Touched] = {}
+
+    def take(self, ticks: Ticks, batch: SchemeBatch) -> None:
+        """Take in a stretch; of cycles that the log knows nothing of, nothing is taken."""
+        rows = np.minimum(np.searchsorted(self._log.t_ns, ticks.t_ns), len(self._log.t_ns) - 1)
+        known = np.flatnonzero(self._log.t_ns[rows] == ticks.t_ns)
+        if known.size == 0:
+            return
+        rows, statistic = rows[known], self._statistic_of(batch.block[known])
+        is_armed = batch.previous_state[known] == SchemeState.MONITOR
+        counted = np.flatnonzero(is_armed & self._log.motion.is_free[rows])
+        if counted.size:
+            blocks = rows[counted] // self._log.block
+            starts = np.flatnonzero(np.diff(blocks, prepend=-1))
+            largest = np.maximum.reduceat(statistic[counted], starts, axis=0)
+            self._peaks[blocks[starts]] = np.maximum(self._peaks[blocks[starts]], largest)
+        for window in self._open:
+            if window.first > rows[-1]:
+                break
+            self._take_window(window, rows, statistic, is_armed)
+        for window in [window for window in self._open if window.last <= rows[-1]]:
+            self._close(window)
+
+    def _take_window(self, window: Window, rows: Places, statistic: Vector, is_armed: NDArray[np.bool_]) -> None:
+        """Take in what cycles show of a contact; of one for which it is not armed, nothing."""
+        first, end = np.searchsorted(rows, (window.first, window.last + 1)).tolist()
+        if first < len(rows) and rows[first] == window.first and is_armed[first]:
+            self._parts[window.number] = []
+        if window.number in self._parts:
+            since_s = (self._log.t_ns[rows[first:end]] - self._log.t_ns[window.first]) * 1e-9
+            self._parts[window.number].append((since_s, statistic[first:end].copy()))
+
+    def _close(self, window: Window) -> None:
+        """Keep of a contact what has been shown."""
+        self._open.remove(window)
+        parts = self._parts.pop(window.number, None) or [(np.zeros(0), np.zeros((0, 1, self._channels)))]
+        since_s, statistic = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        self._touches[window.number] = rising(Touched(since_s, statistic, window.is_chosen_on))
+
+    def _statistic_of(self, block: Vector) -> Vector:
+        """Return what is compared with the thresholds that are to be chosen (k, 1, channels)."""
+        if self._is_certified:
+            bank, threshold = (block[:, self._slices[name]] for name in ("tau_ext_bank", "threshold_bank"))
+            return np.asarray((np.abs(bank) / threshold).max(axis=1))[:, None, None]
+        allowance = block[:, self._slices["threshold"]] - _NOTHING_EXCEEDS_Nm
+        return np.asarray(np.abs(block[:, self._slices["tau_ext_hat"]]) - allowance)[:, None, :]
+
+    def peaks(self) -> Vector:
+        """Return the peaks (B, 1, channels), NaN where not all of a block could be counted."""
+        peaks = np.where(np.isfinite(self._peaks), self._peaks, np.nan)
+        whole = np.logical_and.reduceat(self._log.motion.is_free, np.arange(len(peaks)) * self._log.block)
+        peaks[~whole] = np.nan
+        return peaks
+
+    def touches(self) -> list[Touched]:
+        """Return what was shown of the contacts that the log's scheme was armed for."""
+        for window in list(self._open):
+            self._close(window)
+        return [self._touches[window.number] for window in self._windows]
+
+
+def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: None) -> list[Observed]:
+    """Run all detectors over logs. Raises LogError, TooLittleMotionError."""
+    settings = detectors.DetectorBankSettings()
+    statistics = run_detectors([log.motion for log in logs], settings, progress)
+    starts = np.cumsum([0, *(len(log.motion.is_free) for log in logs)])
+    places = np.minimum(np.arange(len(statistics.peaks)) * logs[0].block, starts[-1] - 1)
+    of_log = np.searchsorted(starts, places, side="right") - 1
+    is_chosen_on = np.array(
+        [
+            log.is_chosen_on[min((place - starts[k]) // log.block, len(log.is_chosen_on) - 1)]
+            for place, k in zip(places.tolist(), of_log.tolist(), strict=True)
+            for log in (logs[k],)
+        ]
+    )
+    touches: dict[str, list[Touched]] = {name: [] for name in settings.detectors}
+    for log in logs:
+        for touched in _touches(log, statistics):
+            for name, rows in settings.detectors.items():
+                touches[name].append(rising(touched._replace(statistic=touched.statistic[:, list(rows), :])))
+    has_truth = any(log.windows is not None for log in logs)
+    return [
+        Observed(name, statistics.peaks[:, list(rows), :], is_chosen_on, tuple(touches[name]) if has_truth else None)
+        for name, rows in settings.detectors.items()
+    ]
+
+
+def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:
+    """Run the detectors over each contact that the log's scheme was armed for."""
+    waiting = sorted((window for window in log.windows or () if window.is_armed), key=lambda window: window.first)
+    if not waiting:
+        return
+    before = round(WARM_UP_S / log.motion.period_s)
+    stream = TorqueStream(statistics.lag_s, statistics.settings.standstill_rad_s)
+    held = tuple(np.empty((0, statistics.z.shape[1])) for _ in range(2))  # what may still be needed of the stream
+    end = 0
+    for motion in log.motion.pieces():
+        held = tuple(np.concatenate(pair) for pair in zip(held, stream.add(motion), strict=True))
+        end += len(motion.q)
+        begin = end - len(held[0])
+        for window in [window for window in waiting if window.last < end]:
+            first = max(window.first - before, 0)
+            rows = slice(first - begin, window.last + 1 - begin)
+            bank = detectors.DetectorBank(statistics.settings, statistics.weights, log.motion.period_s)
+            shown = bank.take(held[0][rows], held[1][rows])
+            since_s = (log.t_ns[window.first : window.last + 1] - log.t_ns[window.first]) * 1e-9
+            yield Touched(since_s, shown[window.first - first :], window.is_chosen_on)
+        waiting = [window for window in waiting if window.last >= end]
+        needed = min((max(window.first - before, 0) for window in waiting), default=end)
+        held = tuple(column[max(min(needed, end - before) - begin, 0) :] for column in held)

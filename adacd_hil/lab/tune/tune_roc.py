@@ -1,0 +1,485 @@
+"""A detector's statistics on logs, its thresholds for a wanted rate, and their effect: contacts found, delays, alarms.
+
+A detector is over when some statistic of it is over its threshold: one per channel and joint. All its thresholds times
+one factor make its ROC. Alarms are counted where thresholds were not chosen; contacts are those of all logs.
+
+Thresholds are chosen on one half of the motion that nobody touched and checked on the other: of several logs, on every
+other log; of one log, on every other tenth of its time, and its contacts alternate.
+"""
+
+import dataclasses
+import hashlib
+import math
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.file_access import open_input
+from adacd_hil.lab.thresholds.false_alarms import (
+    TailCalibration,
+    TooLittleMotionError,
+    calibrate_detector,
+    clusters,
+    counted_hours,
+    largest_ratio,
+)
+from adacd_hil.lab.thresholds.free_motion import APART_S, LoggedMotion, read_motion, schemes
+from adacd_hil.lab.thresholds.recorded_thresholds import BLOCK_S
+from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
+from adacd_hil.log.logged_run import AttemptBegins, Progress, host_span
+from adacd_hil.log.reader import Series
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.replay.log_source import LogSource
+from adacd_hil.score.emulator_truth import HostCycles, TrueContact, contacts_beside, windows_of
+from adacd_hil.score.judge import Times, TouchWindow, explained_until, rate_bound_per_h, share_bounds
+from adacd_hil.score.wording import delay_figures
+from adacd_hil.settings.configuration import Settings, changed_keys, keep_facts, load_settings
+
+Changes = dict[str, str]
+
+
+FACTORS: Final = tuple(10.0 ** (k / 12.0) for k in range(-9, 19))
+"""Of the thresholds along a ROC: 0.18 to 32."""
+_LEAST: Final = 1e-9
+
+
+class Touched(NamedTuple):
+    """A detector's statistics on one true contact: since_s (k,) its onset, statistic (k, channels, n).
+
+    Both are empty where the detector was not armed, which counts as missed. Samples in which no statistic is larger
+    than before may be left out: no threshold is crossed there for the first time.
+    """
+
+    since_s: Vector
+    statistic: Vector
+    is_chosen_on: bool
+
+
+def rising(touched: Touched) -> Touched:
+    """Leave out the samples in which no statistic is larger than in all before."""
+    if not len(touched.since_s):
+        return touched
+    flat = touched.statistic.reshape(len(touched.since_s), -1)
+    before = np.fmax.accumulate(flat, axis=0)[:-1]
+    is_kept = np.concatenate(([True], ~(flat[1:] <= before).all(axis=1)))
+    return touched._replace(since_s=touched.since_s[is_kept], statistic=touched.statistic[is_kept])
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A detector's statistics: peaks (B, channels, n) per block of 0.1 s, NaN unless free; is_chosen_on (B,).
+
+    touches: the contacts for which the logged scheme was armed; None where no log says what touched the arm.
+    """
+
+    name: str
+    peaks: Vector
+    is_chosen_on: NDArray[np.bool_]
+    touches: tuple[Touched, ...] | None
+
+    def half(self, is_chosen_on: bool) -> Vector:
+        """Return the peaks of one half, NaN elsewhere."""
+        return np.where((self.is_chosen_on == is_chosen_on)[:, None, None], self.peaks, np.nan)
+
+
+class Found(NamedTuple):
+    """The effect of thresholds on some part of the logs. Delays in ms, of the contacts found; None of none."""
+
+    hours: float
+    alarms: int
+    contacts: int | None
+    delays_ms: tuple[float, ...]
+
+    @property
+    def rate_bound_per_h(self) -> float:
+        """Upper 95 % bound of the rate of false alarms."""
+        return rate_bound_per_h(self.alarms, self.hours)
+
+    @property
+    def share_bounds(self) -> tuple[float, float]:
+        """The 95 % interval of the share of contacts that is found."""
+        return share_bounds(len(self.delays_ms), self.contacts or 0)
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values; what is not known is null."""
+        bound = self.rate_bound_per_h
+        plain: dict[str, Any] = {
+            "hours": self.hours,
+            "false_alarms": self.alarms,
+            "rate_bound_per_h": bound if math.isfinite(bound) else None,
+            "contacts": self.contacts,
+        }
+        if self.contacts is None:
+            return plain
+        return plain | {
+            "found": len(self.delays_ms),
+            "share_bounds": self.share_bounds,
+            "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(self.delays_ms), strict=True)),
+        }
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Thresholds (channels, n) for a wanted rate, chosen on one half and checked on the other.
+
+    calibration: the tail's, None where the motion is too short for one: then they are the largest values seen.
+    """
+
+    name: str
+    thresholds: Vector
+    calibration: TailCalibration | None
+    chosen: Found
+    checked: Found
+    roc: tuple[tuple[float, Found, float | None], ...]
+    """Factor, what it comes to, and the rate that the tail predicts, of those factors that it can speak of."""
+
+    @property
+    def extrapolation(self) -> float:
+        """How far the wanted rate is below one alarm in the time thresholds are chosen on; infinite without a tail."""
+        if self.calibration is None:
+            return math.inf
+        return 1.0 / (self.calibration.rate_per_h * self.calibration.tail.hours)
+
+    @property
+    def method(self) -> str:
+        """Say where the thresholds come from."""
+        if self.calibration is None:
+            return "the largest value seen: too little motion for a tail"
+        if self.extrapolation <= 1.0:
+            return "tail model"
+        return f"tail model, extrapolated {self.extrapolation:.4g}-fold"
+
+
+def choose(observed: Observed, rate_per_h: float) -> Choice:
+    """Choose thresholds on the first half and count on the other. Raises TooLittleMotionError without any motion.
+
+    They are those at which the tail's upper 95 % bound is the wanted rate.
+    """
+    first = observed.half(True)
+    if np.isnan(first).all():
+        raise TooLittleMotionError("no contact-free motion in the half that thresholds are chosen on")
+    calibration = None
+    try:
+        calibrated = calibrate_detector(first, BLOCK_S, rate_per_h)
+        calibration = calibrated.calibration
+        thresholds = calibrated.thresholds * calibration.bound / calibration.threshold
+    except TooLittleMotionError:
+        thresholds = np.nanmax(first, axis=0)
+    thresholds = np.maximum(thresholds, _LEAST)
+    held_out = observed.half(False)
+    roc = tuple(
+        (factor, _count(held_out, observed.touches, factor * thresholds), _predicted(calibration, factor))
+        for factor in FACTORS
+    )
+    return Choice(
+        observed.name,
+        thresholds,
+        calibration,
+        _count(first, _half(observed.touches, True), thresholds),
+        _count(held_out, _half(observed.touches, False), thresholds),
+        roc,
+    )
+
+
+def _half(touches: tuple[Touched, ...] | None, is_chosen_on: bool) -> tuple[Touched, ...] | None:
+    return None if touches is None else tuple(each for each in touches if each.is_chosen_on == is_chosen_on)
+
+
+def _predicted(calibration: TailCalibration | None, factor: float) -> float | None:
+    """Give the tail's rate at a factor on the thresholds, None below its level."""
+    if calibration is None:
+        return None
+    ratio = factor * calibration.bound / calibration.threshold
+    return calibration.tail.rate_at(ratio) if ratio >= calibration.tail.level else None
+
+
+def _count(peaks: Vector, touches: tuple[Touched, ...] | None, thresholds: Vector) -> Found:
+    alarms = clusters(largest_ratio(peaks, thresholds), 1.0, BLOCK_S).size
+    delays = [delay_ms(touched, thresholds) for touched in touches or ()]
+    return Found(
+        counted_hours(peaks[:, 0, 0], BLOCK_S),
+        int(alarms),
+        None if touches is None else len(touches),
+        tuple(delay for delay in delays if delay is not None),
+    )
+
+
+def delay_ms(touched: Touched, thresholds: Vector) -> float | None:
+    """Give when some statistic is first over its threshold, ms after the onset; None: never."""
+    over = np.flatnonzero((touched.statistic > thresholds).any(axis=(1, 2)))
+    return float(touched.since_s[over[0]]) * 1e3 if over.size else None
+
+
+_TENTHS = 10
+
+
+class Window(NamedTuple):
+    """The rows [first, last] of a log in which a true contact explains an alarm, see `score.judge`."""
+
+    number: int
+    link: int
+    first: int
+    last: int
+    is_armed: bool  # in MONITOR at its onset
+    is_chosen_on: bool
+
+
+@dataclass(frozen=True)
+class TunedLog:
+    """A log of N cycles, or N of them. windows: of the true contacts that begin in those, None where nobody knows.
+
+    is_chosen_on (B,): of its blocks of 0.1 s.
+    """
+
+    path: Path
+    digest: str
+    settings: Settings
+    motion: LoggedMotion
+    t_ns: NDArray[np.int64]  # (N,)
+    windows: tuple[Window, ...] | None
+    is_chosen_on: NDArray[np.bool_]
+    stretch: TimeWindow = WHOLE
+
+    @property
+    def block(self) -> int:
+        """Cycles of a block."""
+        return round(BLOCK_S / self.motion.period_s)
+
+
+def read_logs(
+    paths: Sequence[Path],
+    config: str | None = None,
+    stretch: TimeWindow = WHOLE,
+    progress: Progress = lambda _: None,
+) -> list[TunedLog]:
+    """Read logs, or a stretch of each. config: name or file of the settings to start from, in place of the logs' own.
+
+    Raises LogError, ConfigError, CodecError; LogError also when their settings are not the same.
+    """
+    logs = [_read(path, place, len(paths), config, stretch, progress) for place, path in enumerate(paths)]
+    first = logs[0]
+    for other in logs[1:]:
+        differing = changed_keys(_tunable(first.settings), _tunable(other.settings))
+        if differing:
+            raise LogError(
+                f"logs {first.path} and {other.path} have different settings, such as {next(iter(differing))}: tune "
+                "them apart, or say with --config what to start from"
+            )
+    return logs
+
+
+def _tunable(settings: Settings) -> Settings:
+    """Return the settings with only those that the scheme's numbers depend on."""
+    names = ("scheme", "filter", "estimator", "termination", "detector", "certified")
+    return dataclasses.replace(Settings(), **{name: getattr(settings, name) for name in names})
+
+
+def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeWindow, progress: Progress) -> TunedLog:
+    own = LogSource(path).settings
+    parts = _Index()
+    motion = read_motion(path, stretch, progress, parts.add)
+    index = parts.joined()
+    truth = contacts_beside(path, progress)
+    blocks = -(-len(index.t_ns) // round(BLOCK_S / motion.period_s))
+    tenths = np.arange(blocks) * _TENTHS // blocks
+    is_chosen_on = np.full(blocks, place % 2 == 0) if count > 1 else tenths % 2 == 0
+    windows = None
+    if truth is not None:
+        begins = _begins(motion, parts)
+        contacts = [
+            contact
+            for contact in _on_cycles(truth.contacts, begins)
+            if stretch.is_whole or index.cycle[0] <= contact.onset
+        ]
+        windows = _windows(windows_of(contacts, index, own), index.t_ns, None if count == 1 else place)
+        is_free = motion.is_free & host_span(truth.span, np.array(begins)).covers(index.cycle)
+        apart = round(APART_S / motion.period_s)
+        for window in windows:
+            is_free[max(window.first - apart, 0) : window.last + apart] = False
+        motion = dataclasses.replace(motion, is_free=is_free)
+    with open_input(path) as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    settings = own if config is None else keep_facts(own, load_settings(config, own.arm.profile))
+    return TunedLog(path, digest, settings, motion, index.t_ns, windows, is_chosen_on, stretch)
+
+
+class _Index:
+    """Gathers the cycles of a log, in arrays that grow where they are: joined in the end, they would be there twice."""
+
+    def __init__(self) -> None:
+        self.attempts = AttemptBegins()
+        self._cycle, self._t_ns, self._before, self._threshold = array("q"), array("q"), array("B"), array("d")
+
+    def add(self, scheme: Series) -> None:
+        """Take in the next piece of /scheme."""
+        self.attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+        self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
+        self._t_ns.frombytes(scheme.t_ns.tobytes())
+        self._before.frombytes(scheme["previous_state"].astype(np.uint8).tobytes())
+        self._threshold.frombytes(scheme["threshold"].astype(np.float64).tobytes())
+
+    def joined(self) -> HostCycles:
+        """Give all of them; nothing can be added after that."""
+        return HostCycles(
+            np.frombuffer(self._cycle, np.int64),
+            np.frombuffer(self._t_ns, np.int64),
+            np.frombuffer(self._before, np.uint8),
+            np.frombuffer(self._threshold).reshape(-1, JOINTS),
+        )
+
+
+def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
+    """List the first cycle of each attempt, those before the stretch included."""
+    attempts = parts.attempts
+    if motion.bounds_ns is not None:
+        attempts = AttemptBegins()
+        for scheme in schemes(motion.path, (EVER_NS[0], motion.bounds_ns[1])):
+            attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+    begins: list[int] = attempts.begins.tolist()
+    return begins
+
+
+def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterator[TrueContact]:
+    """Give the contacts on the host's cycles, but for those of attempts that the log lacks."""
+    for contact in contacts:
+        if contact.attempt < len(begins):
+            yield contact.counted_from(begins[contact.attempt])
+
+
+def _windows(touches: Sequence[TouchWindow], t_ns: Times, place: int | None) -> tuple[Window, ...]:
+    """Give the rows of contacts. place: of the log; None where there is one log only."""
+    onsets_ns = np.array([touch.onset_ns for touch in touches], np.int64)
+    until_ns = explained_until(onsets_ns, np.array([touch.forgotten_ns for touch in touches], np.int64))
+    firsts = np.searchsorted(t_ns, onsets_ns).tolist()
+    lasts = (np.searchsorted(t_ns, until_ns, side="right") - 1).tolist()
+    return tuple(
+        Window(
+            number=touch.number,
+            link=touch.link,
+            first=first,
+            last=max(last, first),
+            is_armed=touch.is_armed,
+            is_chosen_on=(touch.number if place is None else place) % 2 == (1 if place is None else 0),
+        )
+        for touch, first, last in zip(touches, firsts, lasts, strict=True)
+    )
+
+
+LIMITS: Final = (
+    "The arm in the logs moved as its own scheme had it move. After a contact it braked when that scheme found it, the "
+    "excitation was the recorded one, and a payload was changed when it was: what an earlier reaction, another motion "
+    "or another arm would have come to is not in these figures. Delays are on the host's clock, from the true onset."
+)
+
+
+@dataclass(frozen=True)
+class TuningOutcome:
+    """The outcome of replays of all logs with the same settings. missed, false_alarms: None without the truth.
+
+    armed_false_alarms: of them those in MONITOR, where the hours are counted.
+    """
+
+    adaptation_s: tuple[float, ...]
+    unfinished: int
+    missed: int | None
+    false_alarms: int | None
+    hours: float
+    delays_ms: tuple[float, ...]
+    armed_false_alarms: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        return {
+            "adaptations": len(self.adaptation_s),
+            "unfinished": self.unfinished,
+            "adaptation_s": list(self.adaptation_s),
+            "missed": self.missed,
+            "false_alarms": self.false_alarms,
+            "monitored_h": self.hours,
+            "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(self.delays_ms), strict=True)),
+        }
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A filter and a gain with the thresholds chosen for them, their outcome, and why they are not fit."""
+
+    name: str
+    changes: Changes
+    choice: Choice
+    outcome: TuningOutcome
+    problems: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        return {
+            "name": self.name,
+            "changes": self.changes,
+            "problems": list(self.problems),
+            "thresholds": choice_as_json(self.choice),
+            "replayed": self.outcome.as_json(),
+        }
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """The result of tuning. detectors: those of `scheme.detectors`, empty where the motion is too short for them."""
+
+    rate_per_h: float
+    logs: tuple[TunedLog, ...]
+    own: TuningOutcome
+    candidates: tuple[Candidate, ...]
+    best: Candidate | None
+    detectors: tuple[Choice, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether the other half shows the wanted rate: its upper 95 % bound is not above it."""
+        return self.best is not None and self.best.choice.checked.rate_bound_per_h <= self.rate_per_h
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        return {
+            "rate_per_h": self.rate_per_h,
+            "is_shown": self.is_shown,
+            "logs": [
+                {
+                    "path": str(log.path),
+                    "sha256": log.digest,
+                    "free_h": free_hours(log),
+                    "contacts": None if log.windows is None else len(log.windows),
+                }
+                for log in self.logs
+            ],
+            "own": self.own.as_json(),
+            "suggested": None if self.best is None else self.best.as_json(),
+            "candidates": [candidate.as_json() for candidate in self.candidates],
+            "detectors": [choice_as_json(choice) | {"name": choice.name} for choice in self.detectors],
+            "notes": list(self.notes),
+            "limits": LIMITS,
+        }
+
+
+def free_hours(log: TunedLog) -> float:
+    """Give how long nobody touched the arm while it monitored, h."""
+    return float(log.motion.is_free.sum()) * log.motion.period_s / 3600.0
+
+
+def choice_as_json(choice: Choice) -> dict[str, Any]:
+    """Give thresholds and their ROC in plain values."""
+    return {
+        "thresholds": choice.thresholds.tolist(),
+        "method": choice.method,
+        "chosen_on": choice.chosen.as_json(),
+        "checked_on": choice.checked.as_json(),
+        "roc": [
+            {"factor": factor, "predicted_per_h": predicted} | found.as_json()
+            for factor, found, predicted in choice.roc
+        ],
+    }

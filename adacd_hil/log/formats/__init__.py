@@ -1,1 +1,0 @@
-"""Frames and tables in the forms of other programs, in and out."""

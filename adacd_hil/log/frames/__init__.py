@@ -1,0 +1,1 @@
+"""CAN frames in files of any format."""

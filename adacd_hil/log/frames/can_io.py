@@ -1,0 +1,382 @@
+"""The plugin of python-can for `.mcap`: `can_logger`, `can_player` and `can_logconvert` read and write our logs.
+
+python-can finds the two classes by the entry points `can.io.message_reader` and `can.io.message_writer`. The reader's
+messages carry their time in whole nanoseconds, which the writer uses; other messages have python-can's float: float64
+seconds, which stand 238 ns apart at today's dates. BLF and MF4 count from the start of the recording, so we read their
+nanoseconds without the start, and add the start as an integer.
+
+A channel of digits is a number to python-can and a name here: "0" is its 0, "" its None.
+"""
+
+import io
+import logging
+import os
+import re
+from collections.abc import Generator, Iterable, Iterator
+from decimal import Decimal
+from pathlib import Path
+from typing import IO, Any, cast
+
+import can
+import numpy as np
+from can.io import blf
+from can.io.asc import ASC_MESSAGE_REGEX
+from can.io.generic import BinaryIOMessageReader, BinaryIOMessageWriter, TextIOMessageReader
+from can.io.player import MESSAGE_READERS
+from numpy.typing import NDArray
+
+from adacd_hil.file_access import open_input
+from adacd_hil.log.frames.frame_log import ERROR_FLAG
+from adacd_hil.log.frames.mcap_frames import FrameWriter, McapFrames, RecordedFrame
+from adacd_hil.log.log_files import LogError, failing_as
+from adacd_hil.log.mcap.chunks import MOST_BYTES
+from adacd_hil.log.types.message_types import MAX_DATA
+from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
+
+
+class McapReader(BinaryIOMessageReader):
+    """The messages of an MCAP file, in its order; of a log of ours all parts.
+
+    `problem` names afterwards the missing data, "" for a whole file.
+    """
+
+    def __init__(self, file: Any, **_: Any) -> None:
+        """Open a path or take an open binary file. Raises LogError when it can't be read or isn't MCAP."""
+        super().__init__(file, mode="rb")
+        try:
+            is_path = isinstance(file, str | os.PathLike)
+            self._frames = McapFrames(Path(file) if is_path else cast("IO[bytes]", self.file))
+        except Exception:
+            self.file.close()
+            raise
+
+    @property
+    def problem(self) -> str:
+        """What is missing."""
+        return self._frames.problem
+
+    def __iter__(self) -> Generator[can.Message, None, None]:
+        for frames in self._frames:
+            yield from to_messages(frames, self._frames.channels, self._frames.epoch_ns)
+        self.stop()
+
+
+class McapWriter(BinaryIOMessageWriter):
+    """Writes messages to an MCAP file with the topics and types of our logs."""
+
+    def __init__(self, file: Any, append: bool = False, **_: Any) -> None:
+        """Create a file, or take an open binary one. Raises ValueError for `append`, FileExistsError for a log."""
+        if append:
+            raise ValueError("nothing can be appended to an MCAP file; log to another one")
+        if isinstance(file, str | os.PathLike) and Path(file).is_file() and Path(file).stat().st_size:
+            raise FileExistsError(f"{os.fspath(file)} is there already; log to another file")
+        super().__init__(file, mode="wb")
+        self._writer = FrameWriter(cast("IO[bytes]", self.file))
+        self._is_stopped = False
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """Write a message. Raises ValueError for what no frame has."""
+        self._writer.write(to_frame(msg))
+
+    def stop(self) -> None:
+        """End the file; twice is once."""
+        if not self._is_stopped:
+            self._is_stopped = True
+            self._writer.finish()
+            super().stop()
+
+
+_MOST_DIGITS = 9
+"""Of a channel that is a number."""
+
+
+class TimedMessage(can.Message):
+    """A message with its time in whole nanoseconds, besides python-can's `timestamp`."""
+
+    def __init__(self, t_ns: int, **fields: Any) -> None:
+        super().__init__(timestamp=t_ns / 1_000_000_000, **fields)
+        self.t_ns = t_ns
+
+
+def time_ns(message: can.Message) -> int:
+    """Return the time of a message: in whole nanoseconds if it knows it and nobody has changed `timestamp` since."""
+    seconds = message.timestamp or 0.0
+    t_ns = getattr(message, "t_ns", None)
+    if t_ns is not None and t_ns / 1_000_000_000 == seconds:
+        return int(t_ns)
+    return round(Decimal(repr(seconds)) * 1_000_000_000)  # the digits that a text had
+
+
+def channel_name(channel: object) -> str:
+    """Name a channel of python-can."""
+    return "" if channel is None else str(channel)
+
+
+def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
+    """Take a frame out of a message; `start_ns` is added to its time.
+
+    Raises ValueError for data, an identifier or a time that no frame has.
+    """
+    most = MAX_DATA if message.is_fd else CLASSIC_BYTES
+    data = bytes(message.data)
+    length = len(data)
+    if message.is_remote_frame or message.is_error_frame:  # their DLC goes up to 15
+        data, length = data[:most], min(message.dlc, most)
+    if length > most:
+        raise ValueError(f"frame 0x{message.arbitration_id:X} has {length} bytes of data")
+    if not 0 <= message.arbitration_id < 1 << 29:
+        raise ValueError(f"identifier 0x{message.arbitration_id:X} has more than 29 bits")
+    if not abs(message.timestamp or 0.0) + start_ns * 1e-9 < MOST_NS * 1e-9:  # nor is NaN
+        raise ValueError(f"time {message.timestamp:g} s is beyond the year 2116")
+    return RecordedFrame(
+        t_ns=time_ns(message) + start_ns,
+        can_id=message.arbitration_id,
+        data=data,
+        length=length,
+        channel=channel_name(message.channel),
+        is_tx=not message.is_rx,
+        is_error=message.is_error_frame,
+        is_extended=message.is_extended_id,
+        is_remote=message.is_remote_frame,
+        is_fd=message.is_fd,
+        has_rate_switch=message.is_fd and message.bitrate_switch,
+        has_error_state=message.is_fd and message.error_state_indicator,
+    )
+
+
+def to_messages(frames: NDArray[Any], channels: list[str], epoch_ns: int = 0) -> Iterator[TimedMessage]:
+    """Make a message of each row; `epoch_ns` is added to its time."""
+    names = [int(name) if name.isdecimal() and len(name) < _MOST_DIGITS else name or None for name in channels]
+    for row in frames:
+        (t_ns, _, can_id, is_tx, is_error, length, _, channel, is_extended, is_remote, is_fd, has_switch, has_error) = (
+            row.item()
+        )
+        yield TimedMessage(
+            t_ns + epoch_ns,
+            arbitration_id=can_id,
+            is_extended_id=is_extended,
+            is_remote_frame=is_remote,
+            is_error_frame=is_error,
+            channel=names[channel],
+            dlc=length,
+            data=b"" if is_remote else row["data"][:length].tobytes(),
+            is_fd=is_fd,
+            is_rx=not is_tx,
+            bitrate_switch=has_switch,
+            error_state_indicator=has_error,
+        )
+
+
+class _BlfReader(can.BLFReader):
+    """python-can's, but for an object of no size, at which it stays for ever, and frames that it passes over."""
+
+    def _parse_container(self, data: bytes) -> Iterator[can.Message]:
+        if len(data) > MOST_BYTES:
+            raise blf.BLFParseError(f"a container opens to {len(data)} bytes, more than {MOST_BYTES}")
+        objects, position, head = self._tail + data, 0, blf.OBJ_HEADER_BASE_STRUCT
+        while 0 <= (position := objects.find(b"LOBJ", position, position + 8)) <= len(objects) - head.size:
+            _, _, version, size, kind = head.unpack_from(objects, position)
+            if size < head.size:
+                raise blf.BLFParseError(f"an object of {size} bytes")
+            position += size
+            if position <= len(objects) and kind in _BLF_FRAMES and version not in (1, 2):
+                _LOGGER.warning("a frame of header version %d is not read", version)
+        yield from super()._parse_container(data)
+
+
+_BLF_FRAMES = (blf.CAN_MESSAGE, blf.CAN_MESSAGE2, blf.CAN_ERROR_EXT, blf.CAN_FD_MESSAGE, blf.CAN_FD_MESSAGE_64)
+
+
+class _AscReader(can.ASCReader):
+    """python-can's, but for what it gets wrong without a word.
+
+    It loses a first frame that follows a head without `internal events logged`, as BUSMASTER writes it, takes stamps
+    that count from the line before for stamps from the beginning, requests to send (TxRq) for frames, and passes over
+    frames with a negative stamp or a decimal comma.
+    """
+
+    def _extract_header(self) -> None:
+        base = re.search(r"^\W*base\s+(hex|dec)(\s+timestamps\s+relative)?", self.file.read(_ASC_HEAD), _ASC_FLAGS)
+        if base:
+            self._converted_base = self._check_base(base[1].lower())
+        self.file.seek(0)
+        self.file = cast("Any", _asc_lines(self.file, is_relative=base is not None and base[2] is not None))
+
+
+_ASC_HEAD, _ASC_FLAGS = 4096, re.IGNORECASE | re.MULTILINE
+_ASC_FRAME = re.compile(r"-?\d+[.,]\d+\s+(CANFD\s+)?\d+\s+\S+\s+(Rx|Tx|TxRq)\s", re.IGNORECASE)
+
+
+def _asc_lines(lines: Iterable[str], is_relative: bool) -> Iterator[str]:
+    """Give the lines of an ASC, with stamps from the beginning; say which frames python-can will pass over."""
+    time_s = Decimal(0)
+    for number, text in enumerate(lines, 1):
+        line = text.strip()
+        if is_relative and (stamp := re.match(r"(\d+\.\d+)\s", line)):
+            time_s += Decimal(stamp[1])
+            line = f"{time_s} {line[stamp.end() :]}"
+        if frame := _ASC_FRAME.match(line):
+            if frame[2].lower() == "txrq":
+                continue
+            if not ASC_MESSAGE_REGEX.match(line):
+                _LOGGER.warning("line %d is not read: %s", number, line)
+        yield line
+
+
+class _CandumpReader(can.CanutilsLogReader):
+    """python-can's, but a line that is no frame ends nothing, and error frames keep their class.
+
+    Of an error frame python-can makes data of a 29-bit identifier, or drops all but the time.
+    """
+
+    _number = 0
+    _line = ""
+    _is_error = False
+
+    def __iter__(self) -> Generator[can.Message, None, None]:
+        file = self.file
+        while True:
+            self.file = cast("Any", self._lines(file))
+            try:
+                for message in super().__iter__():
+                    if message.dlc < len(message.data):
+                        raise ValueError("an odd number of digits")
+                    if self._is_error:
+                        message.is_error_frame, message.is_extended_id = True, False
+                    yield message
+            except (ValueError, IndexError):
+                _LOGGER.warning("line %d is no frame: %s", self._number, self._line.strip()[:60])
+            else:
+                return
+
+    def _lines(self, file: Iterable[str]) -> Iterator[str]:
+        for self._line in file:
+            self._number += 1
+            error = re.search(r" ([23][0-9A-Fa-f]{7})#", self._line)
+            self._is_error = error is not None
+            line = self._line.replace(error[0], f" {int(error[1], 16) & ~ERROR_FLAG:08X}#") if error else self._line
+            yield re.sub(r"(#[0-9A-Fa-f]{16})_[0-9A-Fa-f]", r"\1", line)  # a raw DLC, which means 8
+
+
+class _PassedOver(logging.Handler):
+    """Counts the records that are not read, and keeps what is said of the first; also what python-can says of it."""
+
+    first = ""
+    count = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        words = record.getMessage()
+        if not words.startswith(_HARMLESS) and not words.endswith(" ''"):  # an empty line
+            self.pass_over(words)
+
+    def pass_over(self, words: str) -> None:
+        """Count a record."""
+        self.count += 1
+        self.first = self.first or " ".join(words.split())[:_LONGEST]
+
+
+_LOGGER = logging.getLogger("can.io")
+_LOGGER.addHandler(logging.NullHandler())  # python-can's words go through `_PassedOver`, not to the terminal
+_HARMLESS = ("Unknown object header version", "DLC vs Data Length mismatch")
+"""Objects that are no frames, or that `_BlfReader` counts; frames that are read."""
+_READERS: dict[str, Any] = {".blf": _BlfReader, ".asc": _AscReader, ".log": _CandumpReader}
+_FLAGS = slice(RecordedFrame._fields.index("is_extended"), None)
+"""Those that a row of RECORDED_FRAME_DTYPE ends with, too."""
+_STATUS_ID = 0xFFFFFFFF
+"""Of the lines of a TRC that tell the state of the bus."""
+_FORMS = {
+    ".log": "a candump log, as `candump -l` records it and SavvyCAN saves it",
+    ".csv": "a CSV as python-can writes it; SavvyCAN saves a candump log, too",
+    ".trc": "a TRC as PEAK's programs write it",
+    ".asc": "an ASC as Vector's programs write it",
+}
+
+
+class PythonCanFrames:
+    """The frames of a file that python-can reads: iterate once; `channels` and `problem` grow meanwhile."""
+
+    def __init__(self, path: Path) -> None:
+        """Look at the file. Raises LogError when it can't be read."""
+        self.channels: list[str] = []
+        self.epoch_ns = 0
+        self.problem = ""
+        self._path = path
+        with failing_as(f"{path} can't be read"):
+            open_input(path).close()
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        """Give the frames, (n,) of RECORDED_FRAME_DTYPE; what is no frame is left out, and the problem."""
+        passed_over = _PassedOver()
+        rows: list[tuple[Any, ...]] = []
+        count = 0
+        for message, start_ns in self._messages(passed_over):
+            try:
+                frame = to_frame(message, start_ns)
+                data = list(frame.data.ljust(MAX_DATA, b"\0"))
+                head = (frame.t_ns, frame.t_ns, frame.can_id, frame.is_tx, frame.is_error, frame.length, data)
+                rows.append((*head, self._channel(frame.channel), *tuple(frame)[_FLAGS]))
+            except ValueError as error:
+                passed_over.pass_over(str(error))
+                continue
+            count += 1
+            if len(rows) == PIECE_FRAMES:
+                yield np.array(rows, RECORDED_FRAME_DTYPE)
+                rows = []
+        if passed_over.count and not count:
+            form = _FORMS.get(self._path.suffix.lower(), f"a whole {self._path.suffix}")
+            raise LogError(f"{self._path} is not {form}: {passed_over.first}")
+        if passed_over.count:
+            more = f", and {passed_over.count - 1} more records" if passed_over.count > 1 else ""
+            self.problem = f"{self._path.name}: {passed_over.first}{more}"
+        elif not count:
+            self.problem = f"{self._path.name}: there is no frame in it"
+        if rows:
+            yield np.array(rows, RECORDED_FRAME_DTYPE)
+
+    def _messages(self, passed_over: _PassedOver) -> Iterator[tuple[can.Message, int]]:
+        """Give what python-can reads, each message with the start to add, up to an error."""
+        suffix = self._path.suffix.lower()
+        kind = _READERS.get(suffix) or MESSAGE_READERS[suffix]
+        count = 0
+        _LOGGER.addHandler(passed_over)
+        try:
+            file: Any = open_input(self._path)
+            if issubclass(
+                kind, TextIOMessageReader
+            ):  # vendors' tools write in the code of the country; frames are ASCII
+                file = io.TextIOWrapper(file, encoding="latin-1")
+            with file:
+                reader = kind(file)
+                start_ns = _take_start(reader)
+                for message in reader:
+                    if message.arbitration_id != _STATUS_ID:
+                        count += 1
+                        yield message, start_ns
+                if getattr(reader, "_tail", b"").strip(b"\0"):
+                    passed_over.pass_over(f"cut within an object, behind {count} frames")
+        except Exception as error:  # each reader has failures of its own
+            reason = str(error) or type(error).__name__
+            passed_over.pass_over(f"behind {count} frames nothing can be read: {reason}" if count else reason)
+        finally:
+            _LOGGER.removeHandler(passed_over)
+
+    def _channel(self, name: str) -> int:
+        if name not in self.channels:
+            if len(self.channels) == MOST_CHANNELS:
+                raise ValueError(f"there are more than {MOST_CHANNELS} channels")
+            self.channels.append(name)
+        return self.channels.index(name)
+
+
+def _take_start(reader: Any) -> int:
+    """Take the start out of a reader that would add it to each time as a float; return it in ns."""
+    for name in ("start_timestamp", "_start_timestamp"):
+        if isinstance(start_s := getattr(reader, name, None), float):
+            setattr(reader, name, 0.0)
+            return round(start_s * 1e3) * 1_000_000
+    return 0
+
+
+_LONGEST = 120
+"""Letters of a reason, which may hold a line of the file."""

@@ -1,0 +1,322 @@
+"""A log at a glance: from its summaries and the chunks with its events and contacts, without reading it all.
+
+A file whose summary can't be trusted is read whole, as far as it is readable.
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Statistics
+
+from adacd_hil.file_access import open_input
+from adacd_hil.log.log_files import (
+    CONTINUED,
+    DROPPED_KEY,
+    ENDING_KEY,
+    FIELDS_KEY,
+    PART_KEY,
+    RUN_METADATA,
+    SUMMARY_METADATA,
+    LogError,
+    failing_as,
+    part_path,
+    parts_of,
+    summary_count,
+)
+from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
+from adacd_hil.log.mcap.mcap_records import (
+    MAGIC,
+    MESSAGE_HEAD,
+    Definitions,
+    FileEnd,
+    RawRecord,
+    parse,
+    read_end,
+    read_record,
+    scan,
+)
+from adacd_hil.log.payload_sizes import payload_size
+from adacd_hil.log.reader import LoggedEvent
+from adacd_hil.log.salvage import Losses, Salvage
+from adacd_hil.log.types.message_types import LOG, log_time_ns, payload_dtype, unpack_log
+from adacd_hil.log.types.record_arrays import count_frames
+from adacd_hil.log.types.topics import CONTACT, EVENTS
+from adacd_hil.records import ContactLevel, Event
+
+_READ = (EVENTS.name, CONTACT.name)
+_MILESTONES = ("supervisor", "certificate", "revoked")
+"""Names of the events that are kept."""
+
+
+class TopicInfo(NamedTuple):
+    """A topic. `bytes`: of its payloads; None where that takes to read the whole file."""
+
+    topic: str
+    type: str
+    messages: int
+    rate_hz: float
+    bytes: int | None
+
+
+@dataclass
+class LogInfo:
+    """The content of a log. Times in ns of the log, s since its first message."""
+
+    path: Path
+    files: int = 0
+    size_bytes: int = 0
+    start_ns: int = 0
+    end_ns: int = 0
+    messages: int = 0
+    cycles: int = 0
+    frames: int = 0
+    dropped: int = 0
+    ending: str = ""
+    contacts: int = 0
+    collisions: int = 0
+    faults: list[str] = field(default_factory=list)  # events of level error
+    events: Counter[str] = field(default_factory=Counter)  # by level
+    topics: list[TopicInfo] = field(default_factory=list)
+    attachments: dict[str, int] = field(default_factory=dict)  # sizes
+    metadata: dict[str, str] = field(default_factory=dict)
+    summary: dict[str, str] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    milestones: list[LoggedEvent] = field(default_factory=list)  # changes of state, certificates; t_ns: of the log
+
+    @property
+    def duration_s(self) -> float:
+        """From the first message to the last."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
+def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
+    """Look at the log whose first part is `path`, with all its parts.
+
+    is_brief: without events and contacts, and of a damaged file no more than the metadata of the run: some 2 ms.
+    Raises LogError when a file can't be read, or has neither MCAP's magic nor anything of a log.
+    """
+    parts = parts_of(path)
+    info = LogInfo(path, files=len(parts))
+    view = _InfoView(info, is_brief)
+    is_mcap = False
+    missing = [part for part in range(max(parts)) if part not in parts]
+    for part in parts.values():
+        with failing_as(f"log {part} can't be read"), open_input(part) as file:
+            info.size_bytes += part.stat().st_size
+            is_mcap |= file.read(len(MAGIC)) == MAGIC
+            view.take(part, file)
+    if info.ending == CONTINUED:
+        missing.append(max(parts) + 1)
+    info.problems += [f"{part_path(path, part).name} is missing" for part in missing]
+    view.sum_up()
+    if not (is_mcap or info.topics or info.attachments or info.metadata or info.summary):
+        raise LogError(f"{path} is not an MCAP file")
+    return info
+
+
+class _InfoView:
+    """What has been seen of a log."""
+
+    def __init__(self, info: LogInfo, is_brief: bool) -> None:
+        self._info = info
+        self._is_brief = is_brief
+        self._opening = Opening()
+        self._channels: dict[str, tuple[str, int | None]] = {}  # by topic: type and size of payloads
+        self._counts: Counter[str] = Counter()
+        self._bytes: Counter[str] = Counter()  # where they were seen
+        self._is_read: set[str] = set(_READ)  # topics of which every message was seen
+        self._start_ns, self._end_ns = 2**64, 0
+        self._contact_cycles: dict[int, int] = {}  # level, by the cycle of the contact
+
+    def take(self, path: Path, file: IO[bytes]) -> None:
+        """Take in a file."""
+        self._info.ending = ""
+        end = read_end(file)
+        statistics = None
+        if end is not None:
+            records = [record for record in end.summary if record.opcode == Opcode.STATISTICS]
+            statistics = parse(Opcode.STATISTICS, records[0].body) if records else None
+            channels = {parse(Opcode.CHANNEL, r.body).id for r in end.summary if r.opcode == Opcode.CHANNEL}
+            if statistics is not None and not statistics.channel_message_counts.keys() <= channels:
+                statistics = None  # the summary doesn't say whose messages it counts
+        is_damaged = end is None
+        if end is not None and statistics is not None:
+            self._take_whole(file, end, statistics)
+        elif self._is_brief:
+            self._info.metadata = self._info.metadata or run_metadata(path)
+        else:
+            is_damaged |= self._take_each(path).is_any
+        if is_damaged:
+            self._info.problems.append(f"{path.name} is cut or damaged: `adacd-hil log check` says how")
+
+    def _take_each(self, path: Path) -> Losses:
+        """Read a file whole."""
+        salvage = Salvage(path)
+        for item in salvage:
+            if isinstance(item, Attachment):
+                self._info.attachments[item.name] = len(item.data)
+            elif isinstance(item, Metadata):
+                self._take_metadata(item)
+            else:
+                self._know(salvage.definitions)
+                topics = {number: channel.topic for number, channel in salvage.definitions.channels.items()}
+                sizes = item.ends - item.starts - MESSAGE_HEAD
+                for channel in np.unique(item.channels).tolist():
+                    is_own = item.channels == channel
+                    topic = topics.get(channel, "")
+                    self._counts[topic] += int(np.count_nonzero(is_own))
+                    self._bytes[topic] += 0 if topic in _READ else int(sizes[is_own].sum())
+                    self._is_read.add(topic)
+                if len(item.log_times):
+                    self._span(int(item.log_times.min()), int(item.log_times.max()))
+                self._read(item, salvage.definitions)
+        return salvage.losses
+
+    def _take_whole(self, file: IO[bytes], end: FileEnd, statistics: Statistics) -> None:
+        definitions = Definitions()
+        definitions.take(record for record in end.summary if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL))
+        self._know(definitions)
+        for channel, count in statistics.channel_message_counts.items():
+            topic = definitions.channels[channel].topic if channel in definitions.channels else ""
+            self._counts[topic] += count
+        if statistics.message_count:
+            self._span(statistics.message_start_time, statistics.message_end_time)
+        topics = () if self._is_brief else _READ
+        wanted = {number for number, channel in definitions.channels.items() if channel.topic in topics}
+        chunks = set()
+        for record in end.summary:
+            if record.opcode == Opcode.ATTACHMENT_INDEX:
+                index = parse(record.opcode, record.body)
+                self._info.attachments[index.name] = index.data_size
+            elif record.opcode == Opcode.METADATA_INDEX:
+                found = read_record(file, parse(record.opcode, record.body).offset)
+                self._take_metadata(parse(Opcode.METADATA, found.body))
+            elif record.opcode == Opcode.CHUNK_INDEX and wanted:
+                chunk = parse(record.opcode, record.body)
+                if wanted & chunk.message_index_offsets.keys() and chunk.chunk_start_offset not in chunks:
+                    chunks.add(chunk.chunk_start_offset)
+                    self._read_chunk(read_record(file, chunk.chunk_start_offset), definitions)
+
+    def _read_chunk(self, record: RawRecord, definitions: Definitions) -> None:
+        try:
+            self._read(read_contents(self._opening.open_checked(parse(Opcode.CHUNK, record.body))), definitions)
+        except ChunkError as error:
+            self._info.problems.append(f"the chunk at byte {record.offset} {error}")
+
+    def _know(self, definitions: Definitions) -> None:
+        for channel in definitions.channels.values():
+            schema = definitions.schemas.get(channel.schema_id)
+            name = schema.name if schema is not None else channel.message_encoding
+            self._channels.setdefault(channel.topic, (name, payload_size(channel, schema)))
+
+    def _span(self, start_ns: int, end_ns: int) -> None:
+        self._start_ns = min(self._start_ns, start_ns)
+        self._end_ns = max(self._end_ns, end_ns)
+
+    def _take_metadata(self, item: Metadata) -> None:
+        info = self._info
+        if item.name == RUN_METADATA and not info.metadata:
+            info.metadata = {key: text for key, text in item.metadata.items() if key != PART_KEY}
+        elif item.name == SUMMARY_METADATA:
+            info.summary = item.metadata
+            info.dropped += summary_count(item.metadata, DROPPED_KEY)
+            info.ending = item.metadata.get(ENDING_KEY, "")
+
+    def _read(self, contents: Contents, definitions: Definitions) -> None:
+        """Read the events and contacts of a chunk."""
+        for channel in definitions.channels.values():
+            if channel.topic not in _READ:
+                continue
+            payloads = list(_payloads(contents, channel.id))
+            self._bytes[channel.topic] += sum(map(len, payloads))
+            schema = definitions.schemas.get(channel.schema_id)
+            if schema is None:
+                continue
+            if channel.topic == EVENTS.name and schema.name == LOG.name:
+                self._take_events(payloads)
+            elif channel.topic == CONTACT.name and payload_size(channel, schema) is not None:
+                self._take_contacts(payloads, payload_dtype(schema.data.decode(), _fields(channel)))
+
+    def _take_events(self, payloads: list[bytes]) -> None:
+        for payload in payloads:
+            try:
+                event: Event = unpack_log(payload)
+            except (struct.error, IndexError):
+                continue
+            self._info.events[event.level] += 1
+            if event.name in _MILESTONES:
+                self._info.milestones.append(LoggedEvent(log_time_ns(payload), event))
+            if event.level == "error":
+                self._info.faults.append(f"{event.name}: {event.message}")
+
+    def _take_contacts(self, payloads: list[bytes], dtype: "np.dtype[Any]") -> None:
+        for payload in payloads:
+            if len(payload) == dtype.itemsize:
+                report = np.frombuffer(payload, dtype)[0]
+                level = int(report["level"]) if "level" in (dtype.names or ()) else 0
+                cycle = int(report["cycle"])
+                self._contact_cycles[cycle] = max(level, self._contact_cycles.get(cycle, 0))
+
+    def sum_up(self) -> None:
+        """Complete the view."""
+        info = self._info
+        if self._end_ns:
+            info.start_ns, info.end_ns = self._start_ns, self._end_ns
+        info.messages = self._counts.total()
+        info.cycles = self._counts["/cycle"]
+        topics = dict(enumerate(self._counts))
+        info.frames = count_frames(topics, {place: self._counts[topic] for place, topic in topics.items()})
+        info.contacts = len(self._contact_cycles)
+        info.collisions = sum(level == ContactLevel.COLLISION for level in self._contact_cycles.values())
+        for topic, (name, size) in self._channels.items():
+            count = self._counts[topic]
+            seen = self._bytes[topic] if topic in self._is_read else None
+            total = count * size if size is not None else seen
+            rate_hz = count / info.duration_s if info.duration_s > 0 else 0.0
+            info.topics.append(TopicInfo(topic, name, count, rate_hz, total))
+
+
+def _fields(channel: Channel) -> tuple[str, ...]:
+    return tuple(channel.metadata.get(FIELDS_KEY, "").split())
+
+
+def _payloads(contents: Contents, channel: int) -> Iterator[bytes]:
+    for place in np.flatnonzero(contents.channels == channel).tolist():
+        yield contents.payload(place)
+
+
+def attachment(path: Path, name: str) -> bytes | None:
+    """Return an attachment of an MCAP file by its name; None when it isn't among what precedes the first chunk."""
+    for record in _records_before_chunks(path):
+        if isinstance(record, Attachment) and record.name == name:
+            return record.data
+    return None
+
+
+def run_metadata(path: Path) -> dict[str, str]:
+    """Return the metadata of the run in an MCAP file; empty when they aren't among what precedes the first chunk."""
+    for record in _records_before_chunks(path):
+        if isinstance(record, Metadata) and record.name == RUN_METADATA:
+            return record.metadata
+    return {}
+
+
+def _records_before_chunks(path: Path) -> Iterator[Attachment | Metadata]:
+    """Give the records before the first chunk, as far as they are sound: who reads the log says what is wrong."""
+    try:
+        with open_input(path) as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                return
+            for record in scan(file):
+                if not isinstance(record, RawRecord) or record.opcode == Opcode.CHUNK:
+                    return
+                if record.opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
+                    yield parse(record.opcode, record.body)
+    except (OSError, LogError):
+        return

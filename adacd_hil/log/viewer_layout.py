@@ -1,0 +1,113 @@
+"""The layout of panels that a log brings along for its viewers, Foxglove and Lichtblick."""
+
+import base64
+import json
+from typing import Any
+
+from adacd_hil.log.robot_description import WORLD
+
+SCENE_TOPIC = "/scene"
+"""A topic that only the live view has."""
+LAYOUT_NAME = "viewer-layout.json"
+
+
+def _titled(title: str, panel: dict[str, Any]) -> dict[str, Any]:
+    """Give a panel its title: each of the two viewers has a key of its own."""
+    return {"lichtblickPanelTitle": title, "foxglovePanelTitle": title, **panel}
+
+
+def _plot(title: str, *paths: str) -> dict[str, Any]:
+    panel = {
+        "paths": [{"value": path, "enabled": True, "timestampMethod": "receiveTime"} for path in paths],
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "showLegend": True,
+        "legendDisplay": "floating",
+        "showPlotValuesInLegend": False,
+        "sidebarDimension": 240,
+        "isSynced": True,
+        "xAxisVal": "timestamp",
+    }
+    return _titled(title, panel)
+
+
+def _both_joints(field: str) -> tuple[str, str]:
+    return f"{field}[0]", f"{field}[1]"
+
+
+def _scene(robot: bytes) -> dict[str, Any]:
+    """Describe the arm in 3-D. Its URDF is in the layout itself: a log can't serve files, and needs no server."""
+    arm = {
+        "instanceId": "arm",
+        "layerId": "foxglove.Urdf",
+        "label": "Arm",
+        "visible": True,
+        "sourceType": "url",
+        "url": "data:text/xml;base64," + base64.b64encode(robot).decode(),
+        "controlMode": "jointStates",
+        "jointStatesTopic": "/joint_states",
+        "displayMode": "visual",
+        "framePrefix": "",
+    }
+    grid = {"instanceId": "grid", "layerId": "foxglove.Grid", "label": "Grid", "visible": True, "size": 2}
+    panel = {
+        "cameraState": {"distance": 1.8, "phi": 25, "thetaOffset": 0, "targetOffset": [0.3, 0, 0], "perspective": True},
+        "followTf": WORLD,
+        "layers": {"arm": arm, "grid": {**grid, "divisions": 20}},
+        "topics": {SCENE_TOPIC: {"visible": True}, "/joint_states": {"visible": True}},
+    }
+    return _titled("Arm", panel)
+
+
+def viewer_layout(robot: bytes = b"") -> bytes:
+    """Write the layout: torques against thresholds, motion, states, parameters, contacts, timing, queues, events.
+
+    robot: the arm's URDF, empty where it isn't known; then nothing is drawn in 3-D.
+    """
+    panels = {
+        "Plot!contact": _plot(
+            "External torque, Nm", *_both_joints("/scheme.tau_ext_hat"), *_both_joints("/scheme.threshold")
+        ),
+        "Plot!torque": _plot("Joint torque, Nm", *_both_joints("/scheme.tau_j"), *_both_joints("/control.tau_c")),
+        "Plot!motion": _plot("Position, rad", *_both_joints("/scheme.q"), *_both_joints("/control.q_d")),
+        "Plot!theta": _plot("Parameters", "/scheme.theta_hat[:]"),
+        "Plot!cycle": _plot(
+            "Cycle, ns", *(f"/cycle.{name}_ns" for name in ("lateness", "feedback", "command", "slack"))
+        ),
+        "Plot!queues": _plot(
+            "Queues, bytes", *(f"/cycle.{name}_queue_bytes" for name in ("receive", "transmit", "log"))
+        ),
+        "StateTransitions!state": _titled(
+            "State and fault",
+            {
+                "paths": [
+                    {"value": f"/scheme.{field}", "label": field, "enabled": True, "timestampMethod": "receiveTime"}
+                    for field in ("state", "fault")
+                ],
+                "isSynced": True,
+            },
+        ),
+        "RawMessages!contact": _titled("Last contact", {"topicPath": "/contact", "diffEnabled": False}),
+        "RosOut!events": _titled("Events", {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/events"}),
+    }
+    left: list[str] = ["Plot!contact", "Plot!torque", "Plot!motion", "Plot!theta"]
+    right = ["StateTransitions!state", "RosOut!events", "RawMessages!contact", "Plot!cycle", "Plot!queues"]
+    if robot:
+        panels["3D!arm"] = _scene(robot)
+        left.insert(0, "3D!arm")
+    layout = {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": {"direction": "row", "first": _stack(*left), "second": _stack(*right), "splitPercentage": 60},
+    }
+    return json.dumps(layout, indent=1).encode()
+
+
+def _stack(first: str, *others: str) -> Any:
+    """Put panels below each other, all equally high."""
+    if not others:
+        return first
+    share = 100.0 / (1 + len(others))
+    return {"direction": "column", "first": first, "second": _stack(*others), "splitPercentage": share}

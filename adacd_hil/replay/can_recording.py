@@ -1,0 +1,286 @@
+"""Frames that somebody else recorded on the bus, as the cycles of a run: candump, BLF, ASC, MF4, or our own log.
+
+A recording has the frames of the bus and their times; a log of ours has the host's decisions too. So the replay orders
+a recording as the host would have met it. SYNC begins a cycle, and its counter gives the cycle's number. The host would
+have read in the next cycle the frames that come after all cyclic frames of a cycle, or when the host no longer waits
+for them.
+
+**With a run's log** (`against`) cycles, times and requests are the run's, and all decisions are compared with it; the
+frames are the recording's. **Without** one, the user is played by the script of the configuration; cycles at the end in
+which the drives are told to be off are taken for the host's disabling, in which the scheme has no part.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.device.arm import FEEDBACK_SHARE
+from adacd_hil.device.drive import DISABLE_CYCLES
+from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.log.frames.frame_log import read_frames
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import LogStream, Piece, Series
+from adacd_hil.log.types.record_arrays import as_logged
+from adacd_hil.replay.log_source import (
+    FRAME_TOPICS,
+    NMT_ID,
+    RESET_COMMUNICATION,
+    CycleStretch,
+    LogSource,
+    Part,
+    Places,
+)
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
+
+_REALTIME: Final = (0.9, 1.1)
+"""Median interval of SYNC over the period, of a bus that runs in real time; in lockstep it runs as fast as it can."""
+_CYCLIC: Final = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
+_NOWHERE: Final = np.int64(2**62)
+
+
+class CanRecording(NamedTuple):
+    """A recording in the order in which the host met it.
+
+    frames (m,); owner (m,): the cycle in which the host met each, increasing, and below the first one before that;
+    since (m,), offset_ns (m,): the cycle of the SYNC that came before it on the bus, and the time since then. number
+    (n,), t_ns (n,): cycle and time of each SYNC.
+    """
+
+    frames: NDArray[Any]
+    owner: Places
+    since: Places
+    offset_ns: Places
+    number: Places
+    t_ns: Places
+    is_realtime: bool
+    problem: str
+
+    def in_time(self, number: Places, t_ns: Places, part: slice) -> NDArray[Any]:
+        """Return some of the frames with the times of the given cycles; those of other cycles lie in between."""
+        frames = self.frames[part].copy()
+        frames["t_ns"] = _time_of(self.since[part], number, t_ns) + self.offset_ns[part]
+        frames["cycle_t_ns"] = _time_of(self.owner[part], number, t_ns)
+        return frames
+
+
+def _time_of(wanted: Places, number: Places, t_ns: Places) -> Places:
+    place = np.searchsorted(number, wanted)
+    is_known = number[np.minimum(place, len(number) - 1)] == wanted
+    before = np.where(place > 0, t_ns[np.maximum(place - 1, 0)] + 1, t_ns[0] - 1)
+    return np.where(is_known, t_ns[np.minimum(place, len(number) - 1)], before)
+
+
+def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording:
+    """Read a recording and put it in order. Raises LogError."""
+    found = read_frames(path)
+    sync_id = codec.message("Sync").can_id
+    frames = as_logged(_of_busiest_channel(found.frames, sync_id))
+    frames["is_tx"] = np.isin(frames["can_id"], [m.can_id for m in codec.messages.values() if "HOST" in m.senders])
+    sync = np.flatnonzero((frames["can_id"] == sync_id) & ~frames["is_error"] & (frames["length"] > 0))
+    if sync.size == 0:
+        raise LogError(f"{path} has no SYNC (0x{sync_id:03X}) with a counter: nothing says what a cycle is")
+    t_ns = frames["t_ns"][sync]
+    period_ns = settings.bus.period_ns
+    share = float(np.median(np.diff(t_ns))) / period_ns if sync.size > 1 else 1.0
+    is_realtime = _REALTIME[0] <= share <= _REALTIME[1]
+    number = _unwrap(frames["data"][sync, 0].astype(np.int64), t_ns, period_ns if is_realtime else 0)
+    places = np.arange(len(frames))
+    before = np.searchsorted(sync, places, side="right") - 1
+    since = np.maximum(before, 0)
+    offset_ns = frames["t_ns"] - t_ns[since]
+    is_after = places > _complete(frames, sync, [codec.message(name).can_id for name in _CYCLIC])[since]
+    if is_realtime:
+        is_after |= offset_ns > FEEDBACK_SHARE * period_ns
+    resets = np.cumsum(_is_reset(frames))
+    is_boot = resets > resets[sync][since]  # what comes before the first SYNC of an attempt is read at once
+    is_moved = is_after & ~frames["is_tx"] & (before >= 0) & ~is_boot
+    numbers = np.concatenate(([number[0] - 1], number, [number[-1] + 1]))
+    owner = numbers[before + 1 + is_moved]
+    order = np.argsort(owner, kind="stable")
+    return CanRecording(
+        frames[order], owner[order], number[since][order], offset_ns[order], number, t_ns, is_realtime, found.problem
+    )
+
+
+def _is_reset(frames: NDArray[Any]) -> NDArray[np.bool_]:
+    is_nmt = frames["is_tx"] & (frames["can_id"] == NMT_ID) & ~frames["is_error"]
+    return np.asarray(is_nmt & (frames["data"][:, 0] == RESET_COMMUNICATION))
+
+
+def _of_busiest_channel(frames: NDArray[Any], sync_id: int) -> NDArray[Any]:
+    channels = frames["channel"][frames["can_id"] == sync_id]
+    return frames[frames["channel"] == np.bincount(channels).argmax()] if channels.size else frames
+
+
+def _unwrap(counter: Places, t_ns: Places, period_ns: int) -> Places:
+    """Count the cycles by the counter 1…240 of their SYNC; time says how often it went round, where it says so."""
+    steps = np.diff(counter) % SYNC_OVERFLOW
+    if period_ns:
+        periods = np.rint(np.diff(t_ns) / period_ns)
+        steps = steps + SYNC_OVERFLOW * np.maximum(np.rint((periods - steps) / SYNC_OVERFLOW), 0).astype(np.int64)
+    numbers = np.concatenate(([counter[0] - 1], np.where(steps == 0, 1, steps)))
+    return np.asarray(np.cumsum(numbers), np.int64)
+
+
+def _complete(frames: NDArray[Any], sync: Places, can_ids: list[int]) -> Places:
+    """Return the place of the frame with which each cycle has all its cyclic ones (n,); beyond all where it hasn't."""
+    ends = np.append(sync[1:], len(frames))
+    latest = np.zeros(len(sync), np.int64)
+    for can_id in can_ids:
+        places = np.append(np.flatnonzero((frames["can_id"] == can_id) & ~frames["is_error"]), _NOWHERE)
+        first = places[np.searchsorted(places, sync)]
+        latest = np.maximum(latest, np.where(first < ends, first, _NOWHERE))
+    return latest
+
+
+class RecordingAgainstLog(LogSource):
+    """A recording's frames in the cycles of a run's log."""
+
+    def __init__(self, path: Path, against: Path) -> None:
+        """Open both. Raises LogError, ConfigError, CodecError."""
+        super().__init__(against)
+        self._recording = load_recording(path, self.settings, self.codec)
+        self._recorded = path
+        self._align(_find_cycle(self._recording, self.codec, against))
+        self._given = 0
+        self._missing = 0
+
+    def _piece(self, piece: Piece) -> Piece:
+        """Put the recording's frames in place of the log's, and leave out the cycles that it lacks."""
+        cycles = piece.series["/cycle"]
+        number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
+        recording = self._recording
+        is_there = np.isin(number, recording.number)
+        self._missing += int((~is_there).sum())
+        series = dict(piece.series)
+        for name in ("/cycle", "/scheme"):
+            records = series[name].records
+            is_known = np.isin(records["publish_time"], cycles.records["publish_time"][is_there])
+            series[name] = Series(records[is_known], self._stream.epoch_ns)
+        if not is_there.any():
+            return piece._replace(series=series, frames=recording.frames[:0])
+        end = int(np.searchsorted(recording.owner, number[is_there][-1], side="right"))
+        frames = recording.in_time(number[is_there], t_ns[is_there], slice(self._given, end))
+        self._given = end
+        return piece._replace(series=series, frames=frames)
+
+    def _align(self, cycle: int) -> None:
+        """Let the recording's numbers be the run's, given the cycle that it begins with."""
+        recording = self._recording
+        shift = cycle - int(recording.number[0])
+        self._recording = recording._replace(
+            number=recording.number + shift, owner=recording.owner + shift, since=recording.since + shift
+        )
+
+    def notes(self) -> list[str]:
+        """Say what is missing."""
+        notes = super().notes()
+        if self._missing:
+            notes.insert(0, f"{self._missing} cycles of the run are not in {self._recorded.name}")
+        if self._recording.problem:
+            notes.insert(0, self._recording.problem)
+        return notes
+
+
+def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
+    """Return the cycle of the run that a recording begins with: where the devices answered the same, bit for bit.
+
+    The counter tells the cycle but for multiples of 240. Where no cycle fits, it is the nearest to the run's first.
+    """
+    wanted = _answers(recording.frames[recording.owner == recording.number[0]], codec)
+    first = int(recording.number[0])
+    for piece in LogStream(against, (*FRAME_TOPICS, "/cycle")):
+        cycles = piece.series["/cycle"]
+        number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
+        for row in np.flatnonzero((number - first) % SYNC_OVERFLOW == 0).tolist():
+            ends = np.searchsorted(piece.frames["cycle_t_ns"], (t_ns[row], t_ns[row] + 1))
+            if wanted and wanted == _answers(piece.frames[slice(*ends.tolist())], codec):
+                return int(number[row])
+    return first
+
+
+def _answers(frames: NDArray[Any], codec: Codec) -> dict[int, bytes]:
+    """Return the data of the first cyclic frame of each device."""
+    answers: dict[int, bytes] = {}
+    for can_id in (codec.message(name).can_id for name in _CYCLIC):
+        mine = frames[(frames["can_id"] == can_id) & ~frames["is_error"]]
+        if len(mine):
+            answers[can_id] = mine["data"][0, : int(mine["length"][0])].tobytes()
+    return answers
+
+
+class RecordingAlone:
+    """A recording without a log: nothing to compare with, and a user whom the configuration's script plays."""
+
+    def __init__(self, path: Path, settings: Settings, codec: Codec) -> None:
+        """Read the recording. Raises LogError."""
+        self._recording = load_recording(path, settings, codec)
+        self._path = path
+        self.codec = codec
+        self.metadata: Mapping[str, str] = {}
+        self.settings = settings
+        if not self._recording.is_realtime:
+            self.settings = replace(settings, realtime=replace(settings.realtime, sample_period="nominal"))
+        self._is_headless = False
+
+    @property
+    def start_ns(self) -> int:
+        """When the first SYNC was, ns of the clock of the cycles."""
+        return int(self._t_ns()[0])
+
+    def _t_ns(self) -> Places:
+        """Give the time of each cycle (n,): of its SYNC, or where the bus was in lockstep by its number."""
+        recording = self._recording
+        return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
+
+    def __iter__(self) -> Iterator[Part]:
+        """Give one part."""
+        yield Part(list(self._stretches()), {}, (), frozenset())
+
+    def _stretches(self) -> Iterator[CycleStretch]:
+        recording = self._recording
+        number, t_ns = recording.number, self._t_ns()
+        frames = recording.in_time(number, t_ns, slice(None))
+        resets = np.flatnonzero(_is_reset(frames))
+        rows = np.searchsorted(number, recording.owner[resets], side="right")
+        begins = {row: place for row, place in zip(rows.tolist(), resets.tolist(), strict=True) if row < len(number)}
+        self._is_headless = 0 not in begins
+        begins.setdefault(0, 0)
+        starts = sorted(begins)
+        for attempt, (start, end) in enumerate(pairwise([*starts, len(number)])):
+            mine = frames[begins[start] : begins.get(end, len(frames))]
+            kept = end - _disabling(mine, t_ns[start:end], self.codec)
+            if kept > start:
+                ticks = Ticks(
+                    number[start:kept], t_ns[start:kept], np.diff(number[start:kept], prepend=number[start] - 1)
+                )
+                yield CycleStretch(
+                    attempt=attempt, is_begin=True, is_exact=False, ticks=ticks, frames=mine, requests=None, scheme=None
+                )
+
+    def notes(self) -> list[str]:
+        """Say what is missing."""
+        notes = [self._recording.problem] if self._recording.problem else []
+        if self._is_headless:
+            notes.append(f"{self._path.name} begins in the middle of a run: the scheme begins with INIT there")
+        return notes
+
+
+def _disabling(frames: NDArray[Any], t_ns: Places, codec: Codec) -> int:
+    """Count the last cycles of an attempt in which both drives are told to be off; at most as many as a host sends."""
+    commands = [codec.message(name) for name in ("Drive1Command", "Drive2Command")]
+    for count, cycle_ns in enumerate(t_ns[: -DISABLE_CYCLES - 1 : -1].tolist()):
+        for message in commands:
+            is_mine = (frames["cycle_t_ns"] == cycle_ns) & (frames["can_id"] == message.can_id)
+            at = [signal.name for signal in message.signals].index("controlword")
+            data = [row[: message.length].tobytes() for row in frames["data"][is_mine]]
+            if any(message.decode(each)[at] for each in data):
+                return count
+    return min(DISABLE_CYCLES, len(t_ns))

@@ -1,0 +1,379 @@
+"""Replay: the raw frames of a log once more through codec, arm and scheme, and the result beside the log.
+
+The log is read in pieces, in constant memory. Each attempt of the run has an arm and a pipeline of its own, as it had
+on the arm. The log has the user's requests and the motion of the arm: a replay with other settings decides otherwise
+about the same motion.
+
+A replay of a stretch begins with the log too, because the state of filters and model depends on the cycles before. It
+ends with the stretch, and compares and reports only the cycles in it.
+"""
+
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.device.recorded_arm import RecordedArm, Ticks
+from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
+from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress
+from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
+from adacd_hil.replay.log_source import CycleStretch, LogSource, Part, ReplaySource
+from adacd_hil.replay.replayed_outcome import OutcomeGatherer, Replay
+from adacd_hil.replay.scheme_comparison import (
+    TOLERANCE,
+    Asking,
+    RequestCheck,
+    SchemeComparison,
+    ScriptOf,
+    different_arithmetic,
+)
+from adacd_hil.scheme.detect.live_detectors import describe_code
+from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch, arm_at
+from adacd_hil.score.emulator_truth import TrueContacts, contacts_beside
+from adacd_hil.score.wording import unjudged_sentence
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.wire.codec import Codec
+
+SCRIPTED: Final = "script"
+"""Of a log's metadata `operator`: nobody could type anything."""
+_PROGRESS_CYCLES: Final = 200_000
+
+Watch = Callable[[int, Ticks, SchemeBatch], None]
+"""Is shown the decisions of each variant, by its place among them, as they are made."""
+
+
+def replay(
+    path: Path,
+    settings: Settings | None = None,
+    progress: Progress = lambda _: None,
+    *,
+    tolerance: float | None = None,
+    script_of: ScriptOf | None = None,
+) -> Replay:
+    """Replay a log with its own settings, or with others. Raises LogError, ConfigError, CodecError.
+
+    tolerance: of the comparison; None: exact, or `TOLERANCE` where the log's numbers were computed otherwise.
+    script_of: plays the user of a configuration; with it, the requests of a run that nobody typed into are compared.
+    """
+    source = LogSource(path)
+    return replay_source(
+        source, [settings or source.settings], contacts_beside(path, progress), progress, tolerance, script_of
+    )[0]
+
+
+def replay_many(
+    path: Path,
+    variants: Sequence[Settings],
+    progress: Progress = lambda _: None,
+    *,
+    watch: Watch | None = None,
+    stretch: TimeWindow = WHOLE,
+) -> list[Replay]:
+    """Replay a log, or a stretch of it, once for each of the settings; the log is read and decoded once.
+
+    Raises LogError, ConfigError, CodecError.
+    """
+    return replay_source(
+        LogSource(path), variants, contacts_beside(path, progress), progress, watch=watch, stretch=stretch
+    )
+
+
+class _DecodedPart(NamedTuple):
+    """A part of a log, and the states of each of its stretches, for each of the variants."""
+
+    part: Part
+    arms: list[list[ArmBatch]]
+
+
+class _Player:
+    """One variant on its way through the log."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        truth: TrueContacts | None,
+        comparison: SchemeComparison | None,
+        asking: Asking | None,
+    ) -> None:
+        self.settings = settings
+        self.cycles = self.monitored = 0  # in the stretch
+        self.comparison = comparison
+        self.requests = RequestCheck()
+        self.gatherer = OutcomeGatherer(settings, truth)
+        self.attempts = 0
+        self._asking = asking
+        self._pipeline: Pipeline = Pipeline(settings)
+        self._state = SchemeState.INIT
+        self._reports: dict[int, ContactReport] = {}  # of this part, by time
+        self._cycles: dict[int, int] = {}
+
+    def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
+        """Take in a stretch of a part; return what the scheme decided. is_told: it is compared and counted."""
+        ticks = stretch.ticks
+        if stretch.is_begin:
+            self._begin()
+            self.gatherer.begin(stretch.attempt, int(ticks.cycle[0]))
+        batch = self._run(stretch, arms)
+        events = self._pipeline.take_events()
+        self.gatherer.take(ticks, batch)
+        asked = None
+        if self._asking is not None and stretch.requests is not None and stretch.is_exact:
+            asked = self._asking.requests(ticks, batch)
+        if is_told:
+            self.cycles += len(ticks.cycle)
+            self.monitored += int(np.count_nonzero(batch.state == SchemeState.MONITOR))
+            self._compare(stretch, batch, asked, part, events)
+        return batch
+
+    def _compare(
+        self,
+        stretch: CycleStretch,
+        batch: SchemeBatch,
+        asked: NDArray[np.uint8] | None,
+        part: Part,
+        events: Sequence[Event],
+    ) -> None:
+        """Compare a stretch with the log, where there is something to compare with."""
+        if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
+            return
+        ticks = stretch.ticks
+        self.comparison.compare(stretch.scheme, ticks, batch)
+        if asked is None:  # whatever a user could ask is believed
+            asked = _known(stretch.requests)
+        self.requests.compare(ticks, stretch.requests, asked)
+        times = ticks.t_ns[batch.contact_places].tolist()
+        self._reports |= zip(times, batch.contacts, strict=True)
+        self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
+        logged = [event for event in part.events if ticks.t_ns[0] <= event.t_ns <= ticks.t_ns[-1]]
+        replayed = [event for event in events if event.name in part.said]
+        self.comparison.compare_events(logged, replayed, int(ticks.cycle[0]))
+
+    def _begin(self) -> None:
+        self._pipeline = Pipeline(self.settings)
+        self._state = SchemeState.INIT
+        self.attempts += 1
+        if self._asking is not None:
+            self._asking.begin()
+
+    def _run(self, stretch: CycleStretch, arms: ArmBatch) -> SchemeBatch:
+        """Run the scheme; where nobody knows what was asked, the script says it cycle by cycle."""
+        if stretch.requests is not None:
+            return self._pipeline.run(arms, _known(stretch.requests))
+        outputs = []
+        for row, cycle in enumerate(stretch.ticks.cycle.tolist()):
+            request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)
+            output = self._pipeline.step(arm_at(arms, row), request)
+            if self._asking is not None:
+                self._asking.note(cycle, request, self._state, output.state)
+            self._state = output.state
+            outputs.append(output)
+        return _columns(outputs)
+
+    def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], exact: Sequence[tuple[int, int]]) -> None:
+        """Compare the reports of a part; exact: from when to when, ns, it can be compared."""
+        if self.comparison is not None:
+            judged = {t_ns: record for t_ns, record in logged.items() if any(a <= t_ns <= b for a, b in exact)}
+            self.comparison.compare_contacts(judged, self._reports, self._cycles)
+        self._reports, self._cycles = {}, {}
+
+
+def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
+    """Put the decisions of single cycles into columns."""
+    states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
+    wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
+    columns: dict[str, Any] = {
+        name: np.array([getattr(output, name) for output in outputs], kind) for name, kind in wholes
+    }
+    contacts = {row: output.contact for row, output in enumerate(outputs) if output.contact is not None}
+    return SchemeBatch(
+        **columns,
+        block=np.array([output.block for output in outputs]),
+        contacts=list(contacts.values()),
+        contact_places=np.array(list(contacts), np.int64),
+    )
+
+
+def replay_source(
+    source: ReplaySource,
+    variants: Sequence[Settings],
+    truth: TrueContacts | None = None,
+    progress: Progress = lambda _: None,
+    tolerance: float | None = None,
+    script_of: ScriptOf | None = None,
+    shown: int = SHOWN,
+    watch: Watch | None = None,
+    stretch: TimeWindow = WHOLE,
+) -> list[Replay]:
+    """Replay what a source gives, once for each of the settings; shown: mismatches that are kept.
+
+    stretch: what is compared and told; watch sees all from the beginning of the log on. Raises LogError, also when
+    nothing in the stretch can be replayed, ConfigError, CodecError.
+    """
+    bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
+    if tolerance is None:
+        tolerance = TOLERANCE if different_arithmetic(source.metadata) else 0.0
+    is_scripted = source.metadata.get("operator", SCRIPTED if not source.metadata else "") == SCRIPTED
+    players = []
+    for settings in variants:
+        comparison = SchemeComparison(settings, tolerance, shown) if settings == source.settings else None
+        asking = Asking(settings, script_of) if is_scripted and script_of is not None else None
+        players.append(_Player(settings, truth, comparison, asking))
+    decoders = _Decoders(source.codec, variants)
+    done = 0
+    milestones = Milestones(lambda count: progress(f"{count} cycles replayed"), _PROGRESS_CYCLES)
+    for part in _one_ahead(_decoded(source, decoders, bounds_ns[1])):
+        done += _replay_part(part, players, bounds_ns, watch)
+        milestones.reach(done)
+    if not stretch.is_whole and not players[0].cycles:
+        raise LogError(f"the log has no cycle {stretch.text} that can be replayed")
+    return [_result(player, source, tolerance, bounds_ns[0]) for player in players]
+
+
+def _decoded(source: ReplaySource, decoders: "_Decoders", end_ns: int) -> Generator[_DecodedPart]:
+    """Read and decode a source part by part, up to the stretch that has the end of what is told."""
+    for part in source:
+        stretches: list[CycleStretch] = []
+        arms: list[list[ArmBatch]] = []
+        is_over = False
+        for stretch in part.stretches:
+            stretches.append(stretch)
+            arms.append(decoders.read(stretch))
+            is_over = bool(stretch.ticks.t_ns[-1] >= end_ns)
+            if is_over:
+                break
+        yield _DecodedPart(part._replace(stretches=stretches), arms)
+        if is_over:
+            return
+
+
+def _one_ahead(parts: Generator[_DecodedPart]) -> Iterator[_DecodedPart]:
+    """Give what a generator gives, which a thread runs one part ahead; most of either's work needs no Python's lock.
+
+    That thread opens chunks, too: a third one would take a twentieth more of two processors' time.
+    """
+    with closing(parts), ThreadPoolExecutor(1, "replay-reader") as thread:
+        coming = thread.submit(next, parts, None)
+        while (part := coming.result()) is not None:
+            coming = thread.submit(next, parts, None)
+            yield part
+
+
+def _replay_part(
+    decoded: _DecodedPart,
+    players: Sequence[_Player],
+    bounds_ns: tuple[int, int],
+    watch: Watch | None,
+) -> int:
+    """Replay a part; return its cycles."""
+    exact: list[tuple[int, int]] = []
+    cycles, part = 0, decoded.part
+    for stretch, all_arms in zip(part.stretches, decoded.arms, strict=True):
+        for mine, rows, is_told in _split(stretch, bounds_ns):
+            for place, (player, arms) in enumerate(zip(players, all_arms, strict=True)):
+                batch = player.play(mine, _arms_of(arms, rows), part, is_told)
+                if watch is not None:
+                    watch(place, mine.ticks, batch)
+            if mine.is_exact and is_told:
+                exact.append((int(mine.ticks.t_ns[0]), int(mine.ticks.t_ns[-1])))
+        cycles += len(stretch.ticks.cycle)
+    for player in players:
+        player.compare_contacts(part.contacts, exact)
+    return cycles
+
+
+def _known(requests: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Give requests (n,), with NONE for what no request has."""
+    return np.where(requests <= max(Request), requests, np.uint8(Request.NONE))
+
+
+def _arms_of(arms: ArmBatch, rows: slice) -> ArmBatch:
+    columns: tuple[NDArray[Any], ...] = arms
+    return ArmBatch(*(column[rows] for column in columns))
+
+
+def _split(stretch: CycleStretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[CycleStretch, slice, bool]]:
+    """Part a stretch at the beginning of what is told; also give the rows of each part and whether it is told.
+
+    What comes after the end of that is left out. The frames stay with the whole.
+    """
+    first, end = np.searchsorted(stretch.ticks.t_ns, bounds_ns).tolist()
+    for rows, is_told in ((slice(0, first), False), (slice(first, end), True)):
+        if rows.start < rows.stop:
+            yield _rows_of(stretch, rows), rows, is_told
+
+
+def _rows_of(stretch: CycleStretch, rows: slice) -> CycleStretch:
+    scheme, requests = stretch.scheme, stretch.requests
+    return stretch._replace(
+        is_begin=stretch.is_begin and rows.start == 0,
+        ticks=Ticks(*(column[rows] for column in stretch.ticks)),
+        requests=None if requests is None else requests[rows],
+        scheme=None if scheme is None else scheme.part(rows),
+    )
+
+
+class _Decoders:
+    """Recorded arms: one for all settings that make the same of the frames."""
+
+    def __init__(self, codec: Codec, variants: Sequence[Settings]) -> None:
+        self._codec = codec
+        self._keys = [_decoding_key(settings) for settings in variants]
+        self._settings = dict(zip(self._keys, variants, strict=True))
+        self._arms: dict[Any, RecordedArm] = {}
+
+    def read(self, stretch: CycleStretch) -> list[ArmBatch]:
+        """Return the states of a stretch, for each of the variants."""
+        if stretch.is_begin:
+            self._arms = {key: RecordedArm(settings, self._codec) for key, settings in self._settings.items()}
+        batches = {key: arm.read(stretch.ticks, stretch.frames) for key, arm in self._arms.items()}
+        return [batches[key] for key in self._keys]
+
+
+def _decoding_key(settings: Settings) -> Any:
+    """Return what of the settings the arm goes by."""
+    arm = settings.arm
+    shape = (arm.sign, arm.zero_deg, arm.torque_offset_Nm, arm.rated_torque_Nm, arm.torque_limit_Nm)
+    return (*shape, settings.bus, settings.devices, settings.realtime)
+
+
+def _result(player: _Player, source: ReplaySource, tolerance: float, first_ns: int) -> Replay:
+    """Sum up what a player came to from a time on."""
+    gatherer, comparison, notes = player.gatherer, player.comparison, list(source.notes())
+    gatherer.end()
+    score = gatherer.score()
+    score = None if score is None else score.since(first_ns)
+    logged_code = source.metadata.get("detectors", "")
+    if logged_code and (here := describe_code(source.settings)) != logged_code:
+        notes.append(f"live detectors have other code here: {here}; in the log: {logged_code}")
+    if unjudged := unjudged_sentence(0 if score is None else len(score.unjudged)):
+        notes.append(unjudged)
+    if comparison is not None:
+        for cycle, t_ns, logged, asked in player.requests.unexplained:
+            comparison.add(Mismatch("/scheme", "request", "", cycle, t_ns, str(logged), str(asked)))
+        if comparison.missing_fields:
+            notes.append(f"/scheme lacks {', '.join(comparison.missing_fields)}, an older format")
+    return Replay(
+        settings=player.settings,
+        cycles=player.cycles,
+        monitored_s=player.monitored * player.settings.bus.period_s,
+        compared=0 if comparison is None else comparison.cycles,
+        attempts=player.attempts,
+        states=tuple(each for each in gatherer.transitions if each.t_ns >= first_ns),
+        contacts=tuple(each for each in gatherer.reports if each.t_ns >= first_ns),
+        adaptations=tuple(each for each in gatherer.adaptations if each.t_ns >= first_ns),
+        parameters=dict(zip(player.settings.estimator.parameter_names, gatherer.theta_hat, strict=False)),
+        score=score,
+        detections_ns=tuple(t_ns for t_ns in gatherer.detections_ns if t_ns >= first_ns),
+        mismatches=() if comparison is None else comparison.first(),
+        mismatch_count=0 if comparison is None else comparison.count,
+        mismatched_fields={} if comparison is None else dict(comparison.fields),
+        tolerance=tolerance,
+        zero_ns=next((each.t_ns for each in gatherer.transitions if each.state is SchemeState.ADAPT), 0),
+        ending=gatherer.transitions[-1] if gatherer.transitions else None,
+        sight=gatherer.sight,
+        notes=tuple(notes),
+    )

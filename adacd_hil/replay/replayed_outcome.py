@@ -1,0 +1,385 @@
+"""The outcome of a replay, gathered stretch by stretch in constant memory, and replays side by side.
+
+The judge of a run's alarms (`adacd_hil.score.judge`) judges those of a replay too. As the arm's motion is that
+of the log, a scheme with other settings may still be in REACT when the next contact comes: the first sample over a
+threshold then finds it.
+"""
+
+import itertools
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.log.logged_run import Mismatch, enters_react, host_span
+from adacd_hil.log.reader import LoggedContact
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, FaultReason, SchemeState, Vector
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
+from adacd_hil.scheme.supervisor.supervisor import LEARNING
+from adacd_hil.score.distribution import Distribution
+from adacd_hil.score.emulator_truth import HostCycles, TrueContact, TrueContacts, windows_of
+from adacd_hil.score.judge import Alarm, Score, TouchWindow, judge
+from adacd_hil.score.margins import PushGatherer
+from adacd_hil.score.wording import NONE, found_text, why_not_found
+from adacd_hil.settings.configuration import Settings
+
+
+class StateChange(NamedTuple):
+    """A change of state."""
+
+    cycle: int
+    t_ns: int
+    previous: SchemeState
+    state: SchemeState
+    fault: FaultReason
+
+
+class Adaptation(NamedTuple):
+    """An adaptation: its beginning, how long it took to MONITOR, None if it never got there, and what it came to."""
+
+    t_ns: int
+    took_s: float | None
+    theta_hat: tuple[float, ...]
+
+
+class Sight(NamedTuple):
+    """What detection sees in MONITOR from the beginning of the log: medians of each joint, Nm.
+
+    threshold: the lowest of all channels, nan where it never monitored. push: the smallest that is found within 100 ms,
+    an estimate; () of the paper's scheme.
+    """
+
+    threshold_Nm: tuple[float, ...]
+    push_Nm: tuple[float, ...]
+
+
+class OutcomeGatherer:
+    """Takes in the decisions of one replay. `truth`: the true contacts, None where nobody knows them."""
+
+    def __init__(self, settings: Settings, truth: TrueContacts | None) -> None:
+        self.transitions: list[StateChange] = []
+        self.reports: list[LoggedContact] = []
+        self.adaptations: list[Adaptation] = []
+        self.theta_hat: tuple[float, ...] = ()
+        self.state = SchemeState.INIT
+        self._settings = settings
+        self._truth = truth
+        self._contacts: list[TrueContact] = []  # of this attempt, on the host's cycles
+        self._kept: list[HostCycles] = []  # of this attempt
+        self._touches: list[TouchWindow] = []
+        self._alarms: list[tuple[int, Alarm]] = []  # with the cycle of each
+        self._begins: list[int] = []  # first cycle of each attempt
+        slices = layout_of(settings).slices
+        self._theta = slices["theta_hat"]
+        self._threshold = slices["threshold"]
+        self._bank = (slices["tau_ext_bank"], slices["threshold_bank"]) if "threshold_bank" in slices else None
+        self._push = PushGatherer(settings) if self._bank else None
+        self._thresholds = tuple(Distribution() for _ in range(JOINTS))
+        self._began: tuple[int, int] | None = None  # cycle and time of the adaptation in progress
+        self._crossings: list[int] = []  # times at which some joint crosses its threshold
+        self._was_over = False
+
+    def take(self, ticks: Ticks, batch: SchemeBatch) -> None:
+        """Take in a stretch."""
+        count = len(batch.cycle)
+        if count == 0:
+            return
+        over = batch.contact_joints != 0
+        self._keep(ticks, batch)
+        self._watch(batch, ~over)
+        rises = np.flatnonzero(over & ~np.concatenate(([self._was_over], over[:-1])))
+        self._was_over = bool(over[-1])
+        self._crossings += ticks.t_ns[rises].tolist()
+        over[batch.contact_places] |= np.array([r.cycle for r in batch.contacts]) == ticks.cycle[batch.contact_places]
+        for row in np.flatnonzero(enters_react(batch.previous_state, batch.state) & over).tolist():
+            is_armed = bool(batch.previous_state[row] == SchemeState.MONITOR)
+            self._alarms.append((int(ticks.cycle[row]), Alarm(int(ticks.t_ns[row]), is_armed)))
+        for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
+            self._enter(
+                StateChange(
+                    int(ticks.cycle[row]),
+                    int(ticks.t_ns[row]),
+                    SchemeState(batch.previous_state[row]),
+                    SchemeState(batch.state[row]),
+                    FaultReason(batch.fault[row]),
+                ),
+                batch.block[row, self._theta],
+            )
+        for row, report in zip(batch.contact_places.tolist(), batch.contacts, strict=True):
+            self.reports.append(LoggedContact(int(ticks.t_ns[row]), report))
+        self.theta_hat = tuple(batch.block[-1, self._theta].tolist())
+        self.state = SchemeState(batch.state[-1])
+
+    def _keep(self, ticks: Ticks, batch: SchemeBatch) -> None:
+        """Keep the cycles between which true contacts begin and end, and the first and the last one."""
+        if self._truth is None:
+            return
+        instants = [(contact.onset, contact.end) for contact in self._contacts]
+        after = np.searchsorted(ticks.cycle, np.array(instants, np.int64).reshape(-1))
+        rows = np.unique(np.clip(np.concatenate((after - 1, after, [0, len(ticks.cycle)])), 0, len(ticks.cycle) - 1))
+        threshold = batch.block[rows, self._threshold]
+        self._kept.append(HostCycles(ticks.cycle[rows], ticks.t_ns[rows], batch.previous_state[rows], threshold))
+
+    def _watch(self, batch: SchemeBatch, is_quiet: NDArray[np.bool_]) -> None:
+        """Take in the thresholds of the cycles of MONITOR in which no joint is over its own."""
+        monitors = (batch.state == SchemeState.MONITOR) & (batch.previous_state == SchemeState.MONITOR)
+        block = batch.block[monitors & is_quiet]
+        if not len(block):
+            return
+        if self._push is not None and self._bank is not None:
+            self._push.add(*(block[:, place].reshape(len(block), -1, JOINTS) for place in self._bank))
+        for joint, kept in enumerate(self._thresholds):
+            kept.add(block[:, self._threshold][:, joint])
+
+    @property
+    def sight(self) -> Sight:
+        """What was seen in MONITOR."""
+        pushes = None if self._push is None else self._push.smallest_push()
+        seen = tuple(kept.percentiles().get("p50", math.nan) for kept in self._thresholds)
+        if pushes is None:
+            return Sight(seen, ())
+        threshold, push = (tuple(joint["p50"] for joint in each) for each in (pushes.threshold_Nm, pushes.push_Nm))
+        return Sight(threshold, push)
+
+    def _enter(self, transition: StateChange, theta_hat: Vector) -> None:
+        self.transitions.append(transition)
+        state = transition.state
+        if state is SchemeState.ADAPT and self._began is None:
+            self._began = transition.cycle, transition.t_ns
+        elif state is SchemeState.MONITOR and transition.previous in LEARNING and self._began is not None:
+            took_s = (transition.t_ns - self._began[1]) * 1e-9
+            self.adaptations.append(Adaptation(self._began[1], took_s, tuple(theta_hat.tolist())))
+            self._began = None
+        elif state in (SchemeState.FAULT, SchemeState.PAYLOAD):
+            self._give_up()
+
+    def _give_up(self) -> None:
+        """End an adaptation that came to nothing."""
+        if self._began is not None:
+            self.adaptations.append(Adaptation(self._began[1], None, self.theta_hat))
+            self._began = None
+
+    def begin(self, attempt: int, cycle: int) -> None:
+        """Begin an attempt, by its number in the run and its first cycle."""
+        self.end()
+        self._begins += [cycle] * (attempt + 1 - len(self._begins))  # also of those that a recording lacks
+        if self._truth is not None:
+            mine = (contact for contact in self._truth.contacts if contact.attempt == attempt)
+            self._contacts = [contact.counted_from(cycle) for contact in mine]
+        self._was_over = False
+
+    def end(self) -> None:
+        """Take note that an attempt, or the log, has ended."""
+        self._give_up()
+        if self._kept:
+            host = HostCycles(*map(np.concatenate, zip(*self._kept, strict=True)))
+            self._touches += windows_of(self._contacts, host, self._settings)
+            self._kept = []
+
+    @property
+    def detections_ns(self) -> list[int]:
+        """Times of all alarms."""
+        return [alarm.t_ns for _, alarm in self._alarms]
+
+    def score(self) -> Score | None:
+        """Judge the alarms; None without the truth."""
+        if self._truth is None:
+            return None
+        span = host_span(self._truth.span, np.array(self._begins or [0]))
+        is_known = span.covers(np.array([cycle for cycle, _ in self._alarms], np.int64)).tolist()
+        alarms = [alarm._replace(is_known=known) for (_, alarm), known in zip(self._alarms, is_known, strict=True)]
+        return judge(self._touches, alarms, self._crossings)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The outcome of one replay.
+
+    cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 where the settings
+    are not the log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
+    `mismatched_fields`. parameters: of the end. score: of contacts and alarms that begin in the stretch, None where the
+    truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one.
+    ending: the last change of state, which may be before the stretch. attempts, sight: from the beginning of the log.
+    """
+
+    settings: Settings
+    cycles: int
+    monitored_s: float
+    compared: int
+    attempts: int
+    states: tuple[StateChange, ...]
+    contacts: tuple[LoggedContact, ...]
+    adaptations: tuple[Adaptation, ...]
+    parameters: dict[str, float]
+    score: Score | None
+    detections_ns: tuple[int, ...]
+    mismatches: tuple[Mismatch, ...]
+    mismatch_count: int
+    mismatched_fields: dict[str, int]
+    tolerance: float
+    zero_ns: int
+    ending: StateChange | None
+    sight: Sight
+    notes: tuple[str, ...] = ()
+    """What of the log could not be compared or judged, a line each."""
+
+    @property
+    def is_identical(self) -> bool:
+        """Whether something was compared and all of it was the same."""
+        return self.compared > 0 and self.mismatch_count == 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all that the log should have could be compared and judged."""
+        return not self.notes
+
+    @property
+    def adaptation_s(self) -> tuple[float | None, ...]:
+        """How long each adaptation took; None if it came to nothing."""
+        return tuple(adaptation.took_s for adaptation in self.adaptations)
+
+    def time_s(self, t_ns: int) -> float:
+        """Give a time since motion start."""
+        return (t_ns - self.zero_ns) * 1e-9
+
+
+NOTE: Final = (
+    "The arm in the log moved as it did, and the user asked for what was asked: what another scheme would have done "
+    "about a contact, and all that would have followed from it, is not in here."
+)
+
+Row = tuple[str, ...]
+
+
+def side_by_side(replays: Sequence[Replay]) -> list[Row]:
+    """Return a row per quantity: its name, then its value in each replay."""
+    rows = [("contacts detected", *map(_detected, replays))]
+    if any(each.score is None for each in replays):
+        rows.append(("detections at", *(_times(each, each.detections_ns) for each in replays)))
+    rows += _contact_rows(replays)
+    rows += [
+        ("missed", *(NONE if each.score is None else str(each.score.missed) for each in replays)),
+        ("false alarms", *map(_false_alarms, replays)),
+        ("median delay, ms", *map(_median_delay, replays)),
+    ]
+    rows.append(("threshold, Nm", *(_by_joint(each.sight.threshold_Nm) for each in replays)))
+    if any(each.sight.push_Nm for each in replays):
+        rows.append(("smallest push in 100 ms, Nm", *(_by_joint(each.sight.push_Nm) for each in replays)))
+    for index in range(max(len(each.adaptation_s) for each in replays)):
+        rows.append((f"adaptation {index + 1}, s", *(_adaptation(each, index) for each in replays)))
+    for name in dict.fromkeys(itertools.chain.from_iterable(each.parameters for each in replays)):
+        unit = PARAMETER_UNITS.get(name, "")
+        rows.append((f"{name}, {unit}", *(_number(each.parameters.get(name)) for each in replays)))
+    rows.append(("ends in", *map(_end, replays)))
+    return rows
+
+
+def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
+    contacts = [
+        {contact.number: contact for contact in (each.score.contacts if each.score else ())} for each in replays
+    ]
+    rows = []
+    for number in sorted(set().union(*contacts)):
+        known = [each.get(number) for each in contacts]
+        first = next(contact for contact in known if contact is not None)
+        name = f"contact {number}, link {first.link}, at {replays[0].time_s(first.onset_ns):.2f} s"
+        cells = (
+            NONE if contact is None
+            else f"after {contact.delay_ms:.1f} ms" if contact.delay_ms is not None
+            else why_not_found(contact.is_armed)
+            for contact in known
+        )  # fmt: skip
+        rows.append((name, *cells))
+    return rows
+
+
+def _detected(found: Replay) -> str:
+    if found.score is None:
+        return str(len(found.detections_ns))
+    return found_text(len(found.score.delays_ms), len(found.score.contacts))
+
+
+def _times(found: Replay, times_ns: Sequence[int]) -> str:
+    return ", ".join(f"{found.time_s(t_ns):.2f} s" for t_ns in times_ns) or NONE
+
+
+def _false_alarms(found: Replay) -> str:
+    if found.score is None:
+        return NONE
+    times_ns = [alarm.t_ns for alarm in found.score.false_alarms]
+    count = len(times_ns)
+    return f"{count}, at {_times(found, times_ns[:3])}{', …' if count > 3 else ''}" if count else "0"
+
+
+def _median_delay(found: Replay) -> str:
+    delays = () if found.score is None else found.score.delays_ms
+    return f"{statistics.median(delays):.1f}" if delays else NONE
+
+
+def _adaptation(found: Replay, index: int) -> str:
+    if index >= len(found.adaptation_s):
+        return NONE
+    took_s = found.adaptation_s[index]
+    return "not finished" if took_s is None else f"{took_s:.3f}"
+
+
+def _by_joint(values_Nm: Sequence[float]) -> str:
+    known = [value for value in values_Nm if math.isfinite(value)]
+    return " / ".join(f"{value:.3f}" for value in known) or NONE
+
+
+def _number(value: float | None) -> str:
+    return NONE if value is None else f"{value:.6g}"
+
+
+def _end(found: Replay) -> str:
+    last = found.ending
+    if last is None:
+        return SchemeState.INIT.name
+    fault = f" ({last.fault.name})" if last.state is SchemeState.FAULT else ""
+    return f"{last.state.name}{fault} since {found.time_s(last.t_ns):.2f} s"
+
+
+def as_json(found: Replay) -> dict[str, Any]:
+    """Give a replay in plain values; times in s since motion start."""
+    return {
+        "cycles": found.cycles,
+        "attempts": found.attempts,
+        "contacts": None
+        if found.score is None
+        else [
+            {
+                "number": contact.number,
+                "link": contact.link,
+                "onset_s": found.time_s(contact.onset_ns),
+                "is_armed": contact.is_armed,
+                "detected_s": None if contact.detected_ns is None else found.time_s(contact.detected_ns),
+                "delay_ms": contact.delay_ms,
+            }
+            for contact in found.score.contacts
+        ],
+        "detections_s": [found.time_s(t_ns) for t_ns in found.detections_ns],
+        "false_alarms_s": None
+        if found.score is None
+        else [found.time_s(alarm.t_ns) for alarm in found.score.false_alarms],
+        "missed": None if found.score is None else found.score.missed,
+        "adaptation_s": list(found.adaptation_s),
+        "threshold_Nm": [value for value in found.sight.threshold_Nm if math.isfinite(value)],
+        "smallest_push_Nm": list(found.sight.push_Nm),
+        "parameters": {name: value if math.isfinite(value) else None for name, value in found.parameters.items()},
+        "states": [
+            {
+                "cycle": each.cycle,
+                "time_s": found.time_s(each.t_ns),
+                "from": each.previous.name,
+                "to": each.state.name,
+                "fault": each.fault.name,
+            }
+            for each in found.states
+        ],
+    }

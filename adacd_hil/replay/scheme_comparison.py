@@ -1,0 +1,319 @@
+"""A replay's decisions against the log's: every field of /scheme, every contact report, events, the user's requests.
+
+Two values are the same if they have the same bits. Between machines whose arithmetic differs (`same_arithmetic`) a real
+value may be off by `TOLERANCE` of the largest one that its field has had so far, and by as much of one unit; then, too,
+counts, names, switches, and values that are infinite or not a number have to be the same.
+
+Where nobody typed anything, the configuration's script made the requests. The script depends on the time since the
+drives were enabled and on the state; the caller hands in its player, `control.operator` live.
+"""
+
+import itertools
+import math
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.log.log_files import LogError, arithmetic
+from adacd_hil.log.logged_run import SHOWN, Mismatch
+from adacd_hil.log.reader import LoggedEvent, Series
+from adacd_hil.records import JOINTS, ContactReport, Event, Layout, Request, SchemeState, Vector
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
+from adacd_hil.scheme.supervisor.supervisor import KeptRequest
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.run_settings import OperatorSettings
+
+TOLERANCE: Final = 1e-9
+"""Least squares over a minute amplify a rounding error of 1e-16 by the condition number, up to 1e6."""
+_HEAD: Final = ("cycle", "state", "previous_state", "fault", "contact_joints", "is_model_valid")
+
+
+def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
+    """Say what a log's numbers were computed with that is another here; empty where they have to be equal bit for bit.
+
+    What a log doesn't say counts as the same. Of the machine its architecture counts.
+    """
+    different = []
+    for key, here in arithmetic().items():
+        there = metadata.get(key, "")
+        if there and there.split()[-1:] != here.split()[-1:]:
+            different.append(f"{key} {there}, {here} here")
+    return different
+
+
+class SchemeComparison:
+    """Compares stretch after stretch. `count`: all mismatches; `fields`: how many in which field."""
+
+    def __init__(self, settings: Settings, tolerance: float = 0.0, shown: int = SHOWN) -> None:
+        self.mismatches: list[Mismatch] = []
+        self.count = 0
+        self.fields: Counter[str] = Counter()
+        self.cycles = 0
+        self.missing_fields: list[str] = []
+        """Fields that the log's format lacks."""
+        self._shown = shown
+        self._tolerance = tolerance
+        self._layout: Layout = layout_of(settings)
+        self._names = _place_names(settings, self._layout)
+        self._scales: dict[str, Vector] = {}
+
+    def compare(self, scheme: Series, ticks: Ticks, batch: SchemeBatch) -> None:
+        """Compare the decisions of n cycles with the records of /scheme (n,)."""
+        records = scheme.records
+        self.cycles += len(records)
+        self._compare_whole("stamp_ns", scheme.t_ns, ticks.t_ns, ticks)
+        for name in _HEAD:
+            self._compare_whole(name, records[name], getattr(batch, name), ticks)
+        known = scheme.fields
+        self.missing_fields = [name for name in self._layout.slices if name not in known]
+        if not self.missing_fields and _same_bits(scheme.block, batch.block):
+            return
+        for name, place in self._layout.slices.items():
+            if name in known:
+                logged = np.ascontiguousarray(records[name], np.float64).reshape(len(records), -1)
+                self._compare_reals(name, logged, np.ascontiguousarray(batch.block[:, place]), ticks)
+
+    def _compare_whole(self, name: str, logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks) -> None:
+        is_other = np.asarray(logged != replayed)
+        if is_other.any():
+            self._note(name, is_other[:, np.newaxis], logged[:, np.newaxis], replayed[:, np.newaxis], ticks)
+
+    def _compare_reals(self, name: str, logged: Vector, replayed: Vector, ticks: Ticks) -> None:
+        """Compare a field of the block (n, k)."""
+        if logged.shape != replayed.shape:
+            raise LogError(f"/scheme.{name} has {logged.shape[1]} values in the log, {replayed.shape[1]} here")
+        is_other = np.asarray(logged.view(np.uint64) != replayed.view(np.uint64))
+        if self._tolerance:
+            is_other &= ~self._is_near(name, logged, replayed)
+        if is_other.any():
+            self._note(name, is_other, logged, replayed, ticks)
+
+    def _is_near(self, name: str, logged: Vector, replayed: Vector) -> NDArray[np.bool_]:
+        finite = np.where(np.isfinite(logged), np.abs(logged), 0.0)
+        scale = np.maximum(self._scales.get(name, np.ones(logged.shape[1])), finite.max(axis=0, initial=0.0))
+        self._scales[name] = scale
+        with np.errstate(invalid="ignore"):
+            is_near = np.abs(logged - replayed) <= self._tolerance * scale
+        return np.asarray(is_near | (logged == replayed) | (np.isnan(logged) & np.isnan(replayed)))
+
+    def _note(
+        self, name: str, is_other: NDArray[np.bool_], logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks
+    ) -> None:
+        """Count what differs (n, k), and keep the first of it."""
+        rows, columns = np.nonzero(is_other)
+        self.count += len(rows)
+        self.fields[f"/scheme.{name}"] += len(rows)
+        for row, column in zip(rows[: self._shown].tolist(), columns[: self._shown].tolist(), strict=True):
+            place = self._names[name][column] if name in self._names else ""
+            values = (_text(side[row, column].item()) for side in (logged, replayed))
+            self._keep(Mismatch("/scheme", name, place, int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
+
+    def add(self, mismatch: Mismatch) -> None:
+        """Count a mismatch that was found elsewhere."""
+        self.count += 1
+        self.fields[f"{mismatch.topic}.{mismatch.field}"] += 1
+        self._keep(mismatch)
+
+    def _keep(self, mismatch: Mismatch) -> None:
+        """Keep the earliest ones, in order of time."""
+        self.mismatches.append(mismatch)
+        if len(self.mismatches) > 2 * self._shown:
+            self.first()
+
+    def first(self) -> tuple[Mismatch, ...]:
+        """Return the earliest mismatches."""
+        self.mismatches = sorted(self.mismatches, key=lambda mismatch: mismatch.cycle)[: self._shown]
+        return tuple(self.mismatches)
+
+    def compare_contacts(
+        self, logged: Mapping[int, Mapping[str, Any]], replayed: Mapping[int, ContactReport], cycles: Mapping[int, int]
+    ) -> None:
+        """Compare contact reports by the time at which they were made, ns; cycles: of these times."""
+        for t_ns in sorted({*logged, *replayed}):
+            where = (cycles.get(t_ns, -1), t_ns)
+            theirs, ours = logged.get(t_ns), replayed.get(t_ns)
+            if theirs is None or ours is None:
+                said = [("no report" if side is None else "a report") for side in (theirs, ours)]
+                self.add(Mismatch("/contact", "report", "", *where, *said))
+                continue
+            for field, place, there, here in _contact_values(theirs, ours):
+                if not self._is_same(there, here):
+                    self.add(Mismatch("/contact", field, place, *where, _text(there), _text(here)))
+
+    def _is_same(self, logged: float, replayed: float) -> bool:
+        if struct.pack("<d", logged) == struct.pack("<d", replayed):
+            return True
+        is_real = isinstance(logged, float) and math.isfinite(logged) and math.isfinite(replayed)
+        return is_real and abs(logged - replayed) <= self._tolerance * max(1.0, abs(logged))
+
+    def compare_events(self, logged: Sequence[LoggedEvent], replayed: Sequence[Event], cycle: int) -> None:
+        """Compare the scheme's own events of the stretch that begins with a cycle, in order."""
+        for theirs, ours in itertools.zip_longest(logged, replayed):
+            if theirs is not None and theirs.event == ours:
+                continue
+            name = ours.name if theirs is None else theirs.event.name
+            t_ns = 0 if theirs is None else theirs.t_ns
+            logged_text, replayed_text = _event_text(theirs and theirs.event), _event_text(ours)
+            self.add(Mismatch("/events", name, "", cycle, t_ns, logged_text, replayed_text))
+
+
+def _event_text(event: Event | None) -> str:
+    return repr("no event" if event is None else f"{event.level}: {event.message}")
+
+
+def _same_bits(first: Vector, second: Vector) -> bool:
+    return first.shape == second.shape and bool(np.array_equal(first.view(np.uint64), second.view(np.uint64)))
+
+
+def _text(value: float) -> str:
+    """Write a value so that it reads back to the same bits."""
+    return repr(value)
+
+
+def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Iterator[tuple[str, str, float, float]]:
+    for field, theirs in logged.items():
+        ours = getattr(replayed, field)
+        if isinstance(theirs, list):
+            for joint, (there, here) in enumerate(zip(theirs, ours, strict=True)):
+                yield field, f"joint {joint + 1}", there, type(there)(here)
+        else:
+            yield field, "", theirs, type(theirs)(ours)
+
+
+def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...]]:
+    """Name the values of every field of the block."""
+    joints = tuple(f"joint {joint + 1}" for joint in range(JOINTS))
+    parameters, further = settings.estimator.parameter_names, settings.further_names
+    named = {
+        "theta_hat": parameters,
+        "paper_theta_hat": parameters,
+        "theta_further": further,
+        "theta_std": (*parameters, *further),
+    }
+    return {field.name: _names_of(field.name, field.size, named, joints) for field in layout.fields}
+
+
+def _names_of(name: str, size: int, named: Mapping[str, Sequence[str]], joints: Iterable[str]) -> tuple[str, ...]:
+    if name in named:
+        return tuple(named[name])
+    if size == 1:
+        return ("",)
+    if size == JOINTS:
+        return tuple(joints)
+    return tuple(f"channel {index // JOINTS + 1}, joint {index % JOINTS + 1}" for index in range(size))
+
+
+class Script(Protocol):
+    """The user that the configuration plays."""
+
+    def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
+        """Return what it asks in a cycle. `elapsed_s`: since the drives were enabled, None before."""
+
+
+_OWN_CHECKS = (
+    Request.FAULT_TORQUE,
+    Request.FAULT_FOLLOWING,
+    Request.FAULT_TAMPERED,
+    Request.FAULT_MISCONFIGURED,
+)
+"""What the host asked for in place of the user; no script has them."""
+
+ScriptOf = Callable[[OperatorSettings], Script]
+
+
+class Asking:
+    """Plays the script along a replay: cycle by cycle, or where it could ask for something."""
+
+    def __init__(self, settings: Settings, script_of: ScriptOf) -> None:
+        operator = settings.operator
+        self._script = script_of(operator)
+        self._times_s = sorted(entry.at_s for entry in operator.script)
+        self._acknowledges = operator.acknowledge_after_s > 0.0
+        self._period_s = settings.bus.period_s
+        self._enabled: int | None = None
+        self._was_stopped = False
+        self._kept = KeptRequest()
+
+    def begin(self) -> None:
+        """Begin another attempt."""
+        self._enabled = None
+        self._was_stopped = False
+        self._kept = KeptRequest(self._kept.request)
+
+    def ask(self, cycle: int, state: SchemeState) -> Request:
+        """Return what is asked in a cycle; state: that of the cycle before."""
+        elapsed_s = None if self._enabled is None else (cycle - self._enabled) * self._period_s
+        carried = Request.NONE if elapsed_s is None else self._kept.take()
+        return carried or self._script.request(elapsed_s, state)
+
+    def note(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
+        """Take note of a request, of the state that it met and of the one that the cycle has led to."""
+        self._kept.ask(request, previous)
+        self._kept.serve((state,))
+        if state is SchemeState.ADAPT and self._enabled is None:
+            self._enabled = cycle
+
+    def requests(self, ticks: Ticks, batch: SchemeBatch) -> NDArray[np.uint8]:
+        """Return what the script asks in a stretch (n,), given what came of it."""
+        asked = np.zeros(len(ticks.cycle), np.uint8)
+        if self._enabled is None:
+            enabled = np.flatnonzero(batch.state == SchemeState.ADAPT)
+            if enabled.size == 0:
+                return asked
+            self._enabled = int(ticks.cycle[enabled[0]])
+            first = int(enabled[0]) + 1
+        else:
+            first = 0
+        served = 0
+        for row in self._rows(ticks, batch, first):
+            self._kept.serve(batch.state[served:row])
+            served = row
+            previous = SchemeState(batch.previous_state[row])
+            asked[row] = request = self.ask(int(ticks.cycle[row]), previous)
+            self._kept.ask(request, previous)
+        self._kept.serve(batch.state[served:])
+        return asked
+
+    def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
+        """List the rows from the first one on in which something could be asked, or the wait for it begins anew."""
+        assert self._enabled is not None
+        is_due = np.zeros(len(ticks.cycle), np.bool_)
+        is_due[first : first + 1] = True  # what the attempt before has left, in the first cycle of an enabled arm
+        if self._acknowledges:
+            is_stopped = batch.previous_state == SchemeState.STOPPED
+            is_due |= is_stopped | np.concatenate(([self._was_stopped], is_stopped[:-1]))
+            self._was_stopped = bool(is_stopped[-1])
+        elapsed_s = (ticks.cycle - self._enabled) * self._period_s
+        is_alive = batch.previous_state != SchemeState.FAULT
+        for at_s in self._times_s:  # as many cycles as others may be due before it, one each
+            is_due[np.flatnonzero((elapsed_s >= at_s) & is_alive)[: len(self._times_s) + 1]] = True
+        return [row for row in np.flatnonzero(is_due).tolist() if row >= first]
+
+
+class RequestCheck:
+    """Compares the logged requests with the script's. One request to finish that isn't in it may be an interrupt.
+
+    The script's own may follow it, while the arm parks; where it doesn't, it was the same one at another time.
+    """
+
+    def __init__(self) -> None:
+        self.interrupts: list[tuple[int, int]] = []  # cycle and time
+        self.unexplained: list[tuple[int, int, int, int]] = []  # cycle, time, logged, of the script
+
+    def compare(self, ticks: Ticks, logged: NDArray[np.uint8], asked: NDArray[np.uint8]) -> None:
+        """Compare a stretch."""
+        for row in np.flatnonzero(logged != asked).tolist():
+            cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])
+            if logged[row] in _OWN_CHECKS:
+                continue
+            if logged[row] == Request.FINISH and not self.interrupts:
+                self.interrupts.append((cycle, t_ns))
+            else:
+                self.unexplained.append((cycle, t_ns, int(logged[row]), int(asked[row])))
+        if self.interrupts and ((asked == Request.FINISH) & (logged != Request.FINISH)).any():
+            self.unexplained.append((*self.interrupts.pop(), int(Request.FINISH), int(Request.NONE)))

@@ -1,0 +1,439 @@
+"""The judge: which alarm is about which true contact, what was found, how late, what was missed, what was false.
+
+A scheme raises an *alarm* with a transition to REACT by a contact, in whatever state: the certified scheme detects
+while it adapts and while it parks, too. While it is in REACT or STOPPED it is still about the contact before. REACT
+without a joint over its threshold and without a report is an arm that is held for another reason, and no alarm.
+
+A true contact explains alarms from its onset until it is forgotten: until one time constant after its true torque,
+filtered, is back within the threshold (`forgotten_after_s`). An alarm is about the last contact that began
+before it, as long as that contact, or one before it, is not forgotten; so an alarm is about one contact at most. The
+first alarm about a contact finds it. An alarm about none is *false*, in whatever state it was raised, unless the
+emulator did not record what was true then: nobody knows about such an alarm. Where gravity acts, an alarm in PAYLOAD
+about a payload that is not that of the last MONITOR is about its weight, and not false.
+
+A contact is *armed* if detection was armed in the logged cycle before its onset. It is *missed* if it is armed and
+nothing found it. A contact that began before the log did is not armed.
+
+Of a run: its true contacts, the detections of its scheme, and what an ideal detector with its filters would see.
+
+Bounds of shares and rates are exact. Sources: Clopper and Pearson, "The use of confidence or fiducial limits
+illustrated in the case of the binomial", Biometrika 26 (1934); Garwood, "Fiducial limits for the Poisson
+distribution", Biometrika 28 (1936).
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betaincinv, gammaincinv
+
+from adacd_hil.log.logged_run import Cycles, Mask, Run, enters_react
+from adacd_hil.records import JOINTS, ContactReport, SchemeState, Vector
+from adacd_hil.scheme.model.filter_bank import channels_of, step_response
+
+
+class Alarm(NamedTuple):
+    """An alarm. is_armed: raised by armed detection, which is in MONITOR; is_known: the truth covers that time."""
+
+    t_ns: int
+    is_armed: bool
+    is_known: bool = True
+
+
+def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> NDArray[np.bool_]:
+    """Mark of samples over a threshold, at ascending times (n,), those that begin an alarm: after more than a pause.
+
+    last: the sample before them, of which they may go on; None: there was none.
+    """
+    begins = np.diff(at, prepend=at[:1] if last is None else [last]) > pause
+    if last is None:
+        begins[:1] = True
+    return np.asarray(begins)
+
+
+CONFIDENCE: Final = 0.95
+
+
+def share_bounds(found: int, count: int) -> tuple[float, float]:
+    """Give the 95 % interval of a share of which `found` of `count` were seen; (0, 1) of none."""
+    rest = 0.5 * (1.0 - CONFIDENCE)
+    low = float(betaincinv(found, count - found + 1, rest)) if found > 0 else 0.0
+    high = float(betaincinv(found + 1, count - found, 1.0 - rest)) if found < count else 1.0
+    return low, high
+
+
+Times = NDArray[np.int64]
+
+
+class TouchWindow(NamedTuple):
+    """A true contact as it is judged; is_reacting: the scheme still reacted to something else at its onset."""
+
+    number: int
+    link: int
+    onset_ns: int
+    forgotten_ns: int
+    is_armed: bool
+    is_reacting: bool = False
+
+
+class JudgedContact(NamedTuple):
+    """What became of a true contact; detected_ns: None if nothing found it."""
+
+    number: int
+    link: int
+    onset_ns: int
+    is_armed: bool
+    detected_ns: int | None
+
+    @property
+    def delay_ms(self) -> float | None:
+        """Time from onset to detection."""
+        return None if self.detected_ns is None else (self.detected_ns - self.onset_ns) * 1e-6
+
+    @property
+    def is_missed(self) -> bool:
+        """Whether detection was armed and did not find it."""
+        return self.is_armed and self.detected_ns is None
+
+
+@dataclass(frozen=True)
+class Score:
+    """What became of true contacts, in order, and which alarms were false; unjudged: those the truth does not cover."""
+
+    contacts: tuple[JudgedContact, ...]
+    false_alarms: tuple[Alarm, ...]
+    unjudged: tuple[Alarm, ...] = ()
+
+    @property
+    def armed(self) -> int:
+        """How many contacts began while detection was armed."""
+        return sum(contact.is_armed for contact in self.contacts)
+
+    @property
+    def missed(self) -> int:
+        """How many of those were not found."""
+        return sum(contact.is_missed for contact in self.contacts)
+
+    @property
+    def armed_false_alarms(self) -> int:
+        """How many false alarms armed detection raised: those that the time it was armed for can be set against."""
+        return sum(alarm.is_armed for alarm in self.false_alarms)
+
+    @property
+    def delays_ms(self) -> tuple[float, ...]:
+        """Delays of all contacts that were found, armed or not."""
+        return tuple(contact.delay_ms for contact in self.contacts if contact.delay_ms is not None)
+
+    def since(self, first_ns: int) -> "Score":
+        """Leave out what began before a time."""
+        return Score(
+            tuple(contact for contact in self.contacts if contact.onset_ns >= first_ns),
+            tuple(alarm for alarm in self.false_alarms if alarm.t_ns >= first_ns),
+            tuple(alarm for alarm in self.unjudged if alarm.t_ns >= first_ns),
+        )
+
+
+def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
+    """Give the last instant at which each of k contacts, in order, explains an alarm; integers in any one unit (k,)."""
+    until: Times = np.maximum.accumulate(np.asarray(forgotten, np.int64))
+    until[:-1] = np.minimum(until[:-1], np.asarray(onsets, np.int64)[1:] - 1)
+    return until
+
+
+def owners(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times:
+    """Give the place of the contact that each of n alarms is about (n,), -1 for none; until: of `explained_until`."""
+    places = np.searchsorted(onsets, at, side="right") - 1
+    if not len(onsets):
+        return np.asarray(places)
+    return np.asarray(np.where(at <= until[places], places, -1))
+
+
+def judge(touches: Sequence[TouchWindow], alarms: Sequence[Alarm], crossings_ns: Sequence[int] = ()) -> Score:
+    """Judge alarms by true contacts, both in order.
+
+    crossings_ns: when some threshold is first exceeded, of a scheme replayed on a motion that is not its own: while it
+    still reacts, it can raise no alarm, and a crossing finds the contacts that begin meanwhile.
+    """
+    onsets, until = _bounds(touches)
+    about = owners(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
+    found = _first(about, [alarm.t_ns for alarm in alarms])
+    crossed = _first(owners(np.array(crossings_ns, np.int64), onsets, until).tolist(), crossings_ns)
+    for place, touch in enumerate(touches):
+        if touch.is_reacting and place in crossed:
+            found.setdefault(place, crossed[place])
+    unexplained = [alarm for alarm, place in zip(alarms, about, strict=True) if place < 0]
+    return Score(
+        _judged(touches, found),
+        tuple(alarm for alarm in unexplained if alarm.is_known),
+        tuple(alarm for alarm in alarms if not alarm.is_known),
+    )
+
+
+class StreamJudge:
+    """Judges a statistic that is compared with a threshold sample by sample and decides nothing, piece by piece.
+
+    The first sample over the threshold that is about a contact finds it. Samples about none are a false alarm; those
+    that follow the one before by no more than `pause_ns` belong to the same one.
+    """
+
+    def __init__(self, touches: Sequence[TouchWindow], pause_ns: int) -> None:
+        self._touches = touches
+        self._onsets, self._until = _bounds(touches)
+        self._pause_ns = pause_ns
+        self._found: dict[int, int] = {}
+        self._false: list[Alarm] = []
+        self._last_ns: int | None = None  # of what no contact explains
+
+    def add(self, t_ns: Times, is_over: NDArray[np.bool_], is_judged: NDArray[np.bool_]) -> None:
+        """Take in the next samples (n,). is_judged: where an alarm that no contact explains counts as false."""
+        rows = np.flatnonzero(is_over)
+        about = owners(t_ns[rows], self._onsets, self._until)
+        self._found = _first(about.tolist(), t_ns[rows].tolist()) | self._found
+        false_ns = t_ns[rows[(about < 0) & is_judged[rows]]]
+        self._false += [Alarm(at, True) for at in false_ns[begins_of(false_ns, self._pause_ns, self._last_ns)].tolist()]
+        if len(false_ns):
+            self._last_ns = int(false_ns[-1])
+
+    def score(self) -> Score:
+        """Judge what has been taken in."""
+        return Score(_judged(self._touches, self._found), tuple(self._false))
+
+
+def _bounds(touches: Sequence[TouchWindow]) -> tuple[Times, Times]:
+    onsets = np.array([touch.onset_ns for touch in touches], np.int64)
+    return onsets, explained_until(onsets, np.array([touch.forgotten_ns for touch in touches], np.int64))
+
+
+def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
+    """Give the first time about each contact, by its place."""
+    first = dict(zip(reversed(about), reversed(times_ns), strict=True))
+    first.pop(-1, None)
+    return first
+
+
+def _judged(touches: Sequence[TouchWindow], found: dict[int, int]) -> tuple[JudgedContact, ...]:
+    return tuple(
+        JudgedContact(touch.number, touch.link, touch.onset_ns, touch.is_armed, found.get(place))
+        for place, touch in enumerate(touches)
+    )
+
+
+def rate_bound_per_h(alarms: int, hours: float) -> float:
+    """Give the upper 95 % bound of a rate, one-sided: 3 / T after T hours without an alarm; infinite without time."""
+    return float(gammaincinv(alarms + 1, CONFIDENCE)) / hours if hours > 0.0 else math.inf
+
+
+def least_rate_per_h(alarms: int, hours: float) -> float:
+    """Give the lower 95 % bound of a rate, one-sided; 0 after no alarm."""
+    return float(gammaincinv(alarms, 1.0 - CONFIDENCE)) / hours if alarms > 0 and hours > 0.0 else 0.0
+
+
+def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int, int]]:
+    """Give from which row to before which each contact of a truth lasts; index, attempt (m,): of its rows.
+
+    Another index is another contact, though nobody lets go in between. What goes on as an attempt begins is another
+    one, too: the scheme begins anew.
+    """
+    is_edge = index[1:] != index[:-1]
+    if attempt is not None:
+        is_edge |= attempt[1:] != attempt[:-1]
+    bounds = [0, *(np.flatnonzero(is_edge) + 1).tolist(), len(index)]
+    return [(start, end) for start, end in pairwise(bounds) if end > start and index[start] >= 0]
+
+
+def filtered(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float) -> Vector:
+    """Filter a true torque (n, 2) as an ideal detector would see it: first order, at rest at the first sample.
+
+    Each sample is held until the next one; cycle (n,): when they were taken, in periods.
+    """
+    response = np.zeros_like(tau_ext)
+    decays = np.exp(-a_rad_s * period_s * np.diff(cycle).astype(np.float64)).tolist()
+    for joint in range(tau_ext.shape[1]):
+        value = 0.0
+        for row, (sample, decay) in enumerate(zip(tau_ext[:-1, joint].tolist(), decays, strict=True), start=1):
+            value = sample + (value - sample) * decay
+            response[row, joint] = value
+    return response
+
+
+def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float, threshold: Vector) -> float:
+    """Give how long after its end an alarm may still stem from a contact, s.
+
+    One time constant after its true torque (k, 2), filtered with `a_rad_s`, is back within the threshold (2,).
+    """
+    response = filtered(tau_ext, cycle, period_s, a_rad_s)[-1]
+    excess = float(np.max(np.abs(response) / threshold))
+    return (1.0 + math.log(max(1.0, excess))) / a_rad_s
+
+
+class LoggedDetection(NamedTuple):
+    """An alarm of a run: its row, its time, and the report at the alarm and at the end of the window."""
+
+    row: int
+    detected_s: float
+    raised: Alarm
+    alarm: ContactReport | None
+    final: ContactReport | None
+
+
+def find_detections(run: Run) -> tuple[LoggedDetection, ...]:
+    """Find the alarms of a run and the reports that belong to them by their cycle."""
+    rows = np.flatnonzero(enters_react(run.state[:-1], run.state[1:])) + 1
+    alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
+    finals = {report.cycle: report for report in run.reports if report.is_final}
+    time_s = run.time_s()
+    detections = []
+    for row in rows.tolist():
+        cycle = int(run.cycle[row])
+        final = finals.get(cycle)
+        alarm = alarms.get(cycle, final)
+        if alarm is None and run.contact_joints is not None and not run.contact_joints[row]:
+            continue
+        raised = Alarm(
+            int(run.t_ns[row]),
+            bool(run.state[row - 1] == SchemeState.MONITOR),
+            run.truth is None or run.truth.covers(cycle),
+        )
+        detections.append(LoggedDetection(row, float(time_s[row]), raised, alarm, final))
+    return tuple(detections)
+
+
+class TruthTouch(NamedTuple):
+    """A true contact: its number, its rows [first, last] of the truth, and times since motion start."""
+
+    number: int
+    first: int
+    last: int
+    link: int
+    onset_s: float
+    end_s: float
+
+
+def true_contacts(run: Run) -> tuple[TruthTouch, ...]:
+    """Find the true contacts in the truth record; without one there are none to be known."""
+    truth = run.truth
+    if truth is None or truth.cycle.size == 0 or run.cycle.size == 0:
+        return ()
+    time_s, last = run.truth_time_s(), truth.cycle.size - 1
+    return tuple(
+        TruthTouch(
+            number, start, end - 1, int(truth.contact_link[start]), float(time_s[start]), float(time_s[min(end, last)])
+        )
+        for number, (start, end) in enumerate(contact_bounds(truth.contact_index, truth.attempt), run.first_contact)
+    )
+
+
+def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
+    """Give the closed-form delay of a torque step, t = -ln(1 - h / |tau|) / a; None if it never crosses."""
+    if not abs(tau_ext_Nm) > threshold_Nm:
+        return None
+    return -math.log1p(-threshold_Nm / abs(tau_ext_Nm)) / a_rad_s
+
+
+def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
+    """Give the delay of a torque step behind two first-order low-passes; None if it never crosses.
+
+    The response rises steadily, so that bisection finds the crossing.
+    """
+    if not abs(tau_ext_Nm) > threshold_Nm:
+        return None
+    wanted = threshold_Nm / abs(tau_ext_Nm)
+    low_s, high_s = 0.0, 40.0 / min(a_rad_s, b_rad_s)
+    for _ in range(60):
+        middle_s = 0.5 * (low_s + high_s)
+        is_below = step_response(middle_s, a_rad_s, b_rad_s) < wanted
+        low_s, high_s = (middle_s, high_s) if is_below else (low_s, middle_s)
+    return high_s
+
+
+@dataclass(frozen=True)
+class FilterChannel:
+    """A filter with its threshold, Nm (2,): first order, and with `smoothing_rad_s` a second one behind it."""
+
+    cutoff_rad_s: float
+    smoothing_rad_s: float | None
+    threshold: Vector
+
+    def step_delay_s(self, tau_ext: Vector) -> float | None:
+        """Give how long steps of each joint's torque (2,) take over the threshold, the faster joint; None: never."""
+        delays_s = []
+        for joint in range(JOINTS):
+            tau, h = float(tau_ext[joint]), float(self.threshold[joint])
+            if self.smoothing_rad_s is None:
+                delays_s.append(detection_delay_s(tau, h, self.cutoff_rad_s))
+            else:
+                delays_s.append(two_pole_delay_s(tau, h, self.cutoff_rad_s, self.smoothing_rad_s))
+        return min((delay_s for delay_s in delays_s if delay_s is not None), default=None)
+
+    def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
+        """Filter a true torque (n, 2), at rest at the first sample; see `filtered`."""
+        response = filtered(tau_ext, cycle, period_s, self.cutoff_rad_s)
+        if self.smoothing_rad_s is None:
+            return response
+        return filtered(response, cycle, period_s, self.smoothing_rad_s)
+
+
+def threshold_at(run: Run, time_s: float) -> Vector:
+    """Give the threshold of `tau_ext_hat` in force at a time, Nm (2,); the configured one where detection is off."""
+    row = row_at(run, time_s)
+    configured = np.array(run.settings.detector.threshold_Nm)
+    return np.where(np.isfinite(run.threshold[row]), run.threshold[row], configured)
+
+
+def row_at(run: Run, time_s: float) -> int:
+    """Give the first cycle's row that is not before a time; the last one after the end."""
+    t_ns, zero_ns = run.t_ns, run.zero_ns
+    row = bisect_left(range(len(t_ns)), time_s, key=lambda row: float((t_ns[row] - zero_ns) * 1e-9))
+    return min(row, len(t_ns) - 1)
+
+
+def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
+    """Give what detects at a time: the paper's one filter, or the bank with its thresholds."""
+    if run.certified is None:
+        return (FilterChannel(run.a_rad_s, None, threshold_at(run, time_s)),)
+    thresholds = run.certified.threshold[row_at(run, time_s)]
+    return tuple(
+        FilterChannel(cutoff, smoothing, threshold)
+        for (cutoff, smoothing), threshold in zip(channels_of(run.settings), thresholds, strict=True)
+    )
+
+
+def ideal_response(run: Run, touch: TruthTouch, channel: FilterChannel) -> Vector:
+    """Filter a contact's true torque by a channel, from its first row to the one after its last (k, 2)."""
+    truth = run.truth
+    assert truth is not None
+    rows = slice(touch.first, touch.last + 2)
+    return channel.respond(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s)
+
+
+def touch_window(run: Run, touch: TruthTouch, a_rad_s: float, threshold: Vector, armed: Mask) -> TouchWindow:
+    """Give a contact as it is judged; armed (n,): the cycles of the run in which detection is armed."""
+    truth = run.truth
+    assert truth is not None
+    rows = slice(touch.first, touch.last + 2)
+    after_s = forgotten_after_s(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s, a_rad_s, threshold)
+    row = row_at(run, touch.onset_s)
+    onset_ns, forgotten_ns = (run.zero_ns + round(at_s * 1e9) for at_s in (touch.onset_s, touch.end_s + after_s))
+    is_armed = bool(row > 0 and armed[row - 1])
+    return TouchWindow(touch.number, touch.link, onset_ns, forgotten_ns, is_armed)
+
+
+def judge_run(run: Run, touches: Sequence[TruthTouch], detections: Sequence[LoggedDetection]) -> Score:
+    """Judge the alarms of a run's own scheme."""
+    armed = run.state == SchemeState.MONITOR
+    windows = [touch_window(run, touch, run.a_rad_s, threshold_at(run, touch.onset_s), armed) for touch in touches]
+    return judge(windows, [detection.raised for detection in detections if not is_of_weight(run, detection.row)])
+
+
+def is_of_weight(run: Run, row: int) -> bool:
+    """Tell whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet."""
+    truth, armed = run.truth, np.flatnonzero(run.state[:row] == SchemeState.MONITOR)
+    if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:
+        return False
+    known, now = (truth.model_row(int(run.cycle[place])) for place in (armed[-1] if len(armed) else row, row))
+    return known is not None and now is not None and bool(truth.payload_kg[known] != truth.payload_kg[now])

@@ -1,0 +1,428 @@
+"""What a run's cycles come to where nobody touches the arm: residuals, margins, and the paper's scheme beside.
+
+Cycles are taken piece by piece, in order; a run in memory is one piece. A cycle is *free* unless it lies in
+[onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
+5 Nm. Without the truth, [detection - 10/a, detection + 10/a] stands for the contact; of what a truth doesn't cover
+nobody knows whether it is free, so it isn't. After the request to finish the
+arm parks and stands, where friction may hold any torque up to F_c: those cycles are not free.
+
+The smallest push that is found in time (`scheme.detect.margin`) is an estimate, since threshold and residual change
+meanwhile:
+of 300 pushes 2 % larger than at their moment 247 were found in 100 ms, the others as the threshold rose. Of 300 as
+large as at the worst moment all were, after 59 ms at most.
+
+*Margin* of a channel of the certified scheme: the smallest threshold / |residual| of any free cycle; below 1 it would
+have been a false alarm. Per section, adaptations included, since detection is on there too.
+
+**The paper's scheme beside** the certified one adapts when that one does, ends by eq. (15) and compares with its own
+thresholds, but decides nothing: a contact that is reacted to has been found by the other. So its residual is judged as
+a stream (`judge.StreamJudge`), with a pause of 10 time constants; a false alarm counts until the user asks to finish.
+While the payload is changed it does not detect.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.log.logged_run import CertifiedStream, Mask, Run, Section, rows_of, split_sections
+from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.scheme.detect import margin as detect_margin
+from adacd_hil.scheme.model.filter_bank import channels_of
+from adacd_hil.score.distribution import Distribution
+from adacd_hil.score.judge import (
+    LoggedDetection,
+    StreamJudge,
+    TruthTouch,
+    find_detections,
+    touch_window,
+    true_contacts,
+)
+from adacd_hil.score.metrics import (
+    Beside,
+    BesideContact,
+    CertifiedEvidence,
+    ChannelMargin,
+    ParameterEstimate,
+    Residual,
+    SmallestPush,
+    Untouched,
+    certificates_in,
+)
+from adacd_hil.settings.configuration import Settings
+
+SETTLING_TIME_CONSTANTS = 10.0
+"""Time constants of a filter after which a contact counts as forgotten; e^-10 of 5 Nm is 0.2 mNm."""
+
+
+def larger(largest: Vector | None, values: Vector) -> Vector | None:
+    """Give the larger of the sizes of `values` (k, …) and of what was the largest of each so far (…).
+
+    None so far: none. NaN stays.
+    """
+    if values.shape[0] == 0:
+        return largest
+    found = np.abs(values).max(axis=0)
+    return np.asarray(found if largest is None else np.maximum(largest, found))
+
+
+class BesideGatherer:
+    """Gathers what the paper's scheme reached, piece by piece."""
+
+    def __init__(self, run: Run, sections: Sequence[Section], touches: Sequence[TruthTouch]) -> None:
+        assert run.beside is not None
+        a = run.settings.filter.a_rad_s
+        threshold = np.array(run.settings.detector.threshold_Nm)
+        time_s = run.time_s()
+        armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
+        windows = [touch_window(run, touch, a, threshold, armed) for touch in touches]
+        self._judge = StreamJudge(windows, round(SETTLING_TIME_CONSTANTS / a * 1e9))
+        self._zero_ns, self._has_truth = run.zero_ns, run.truth is not None
+        self._sections = sections
+        self._finish_cycle = run.finish_cycle
+        self._span = None if run.truth is None else run.truth.span
+        self._end_s = float(run.time_s()[-1]) if run.cycle.size else 0.0
+        self._adaptations = [
+            (section.label, section.start_s, _left_s(section, sections))
+            for section in sections
+            if section.kind == "adaptation"
+        ]
+        self._adaptation_s: dict[str, float | None] = dict.fromkeys(label for label, _, _ in self._adaptations)
+        self._largest: dict[str, Vector | None] = dict.fromkeys(
+            section.label for section in sections if section.kind == "detection"
+        )
+
+    def add(self, piece: Run, time_s: Vector, free: Mask) -> None:
+        """Take in the next cycles, at such times (n,); free: those in which nothing touches the arm (n,)."""
+        stream = piece.beside
+        assert stream is not None
+        armed = stream.is_armed & ~_parked(time_s, self._sections, self._end_s)
+        over = armed & (np.abs(stream.tau_ext_hat) > stream.threshold).any(axis=1)
+        is_judged = np.ones(over.size, np.bool_) if self._span is None else self._span.covers(piece.cycle)
+        if self._finish_cycle is not None:
+            is_judged &= piece.cycle < self._finish_cycle
+        self._judge.add(piece.t_ns, over, is_judged)
+        for label, start_s, left_s in self._adaptations:
+            if self._adaptation_s[label] is None and start_s <= time_s[-1] and left_s >= time_s[0]:
+                # In the first cycle of ADAPT it is still what it was before.
+                rows = slice(np.searchsorted(time_s, start_s, "right"), np.searchsorted(time_s, left_s, "right"))
+                first = np.flatnonzero(stream.is_armed[rows])
+                if first.size:
+                    self._adaptation_s[label] = float(time_s[rows][first[0]]) - start_s
+        for section in self._sections:
+            if section.label in self._largest and section.start_s <= time_s[-1] and section.end_s >= time_s[0]:
+                rows = rows_of(time_s, section, self._end_s)
+                values = stream.tau_ext_hat[rows][free[rows] & armed[rows]]
+                self._largest[section.label] = larger(self._largest[section.label], values)
+
+    def beside(self) -> Beside:
+        """Sum up what has been taken in."""
+        score = self._judge.score()
+        zero_ns = self._zero_ns
+        false_s = tuple((alarm.t_ns - zero_ns) * 1e-9 for alarm in score.false_alarms)
+        return Beside(
+            adaptation_s=self._adaptation_s,
+            frozen_residual_max_Nm={
+                label: None if values is None else (float(values[0]), float(values[1]))
+                for label, values in self._largest.items()
+            },
+            contacts=tuple(
+                BesideContact(
+                    contact.number,
+                    contact.is_armed,
+                    None if contact.detected_ns is None else (contact.detected_ns - zero_ns) * 1e-9,
+                    contact.delay_ms,
+                )
+                for contact in score.contacts
+            ),
+            false_alarms=len(false_s) if self._has_truth else None,
+            false_alarms_s=false_s if self._has_truth else None,
+            missed=score.missed if self._has_truth else None,
+        )
+
+
+def _left_s(adaptation: Section, sections: Sequence[Section]) -> float:
+    """Give when an adaptation and the detection after it are left, s; infinite at the end of the run."""
+    later = (section for section in sections if section.start_s > adaptation.start_s and section.kind != "detection")
+    return next((section.start_s for section in later), np.inf)
+
+
+def _parked(time_s: Vector, sections: Sequence[Section], end_s: float) -> Mask:
+    """Mark the cycles at such times (n,) in which the payload is changed. end_s: when the run ends."""
+    parked = np.zeros(time_s.size, dtype=np.bool_)
+    for section in sections:
+        if section.kind == "payload":
+            parked[rows_of(time_s, section, end_s)] = True
+    return parked
+
+
+def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouched) -> CertifiedEvidence | None:
+    """Judge a run of the certified scheme; None of the paper's. untouched: of all its cycles."""
+    stream = run.certified
+    if stream is None:
+        return None
+    adaptations = [section for section in sections if section.kind == "adaptation"]
+    stays = {section.label: _tests(run, section) for section in adaptations}
+    return CertifiedEvidence(
+        tests={label: len(lengths_s) for label, lengths_s in stays.items()},
+        test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
+        estimates={section.label: _estimates(run, stream, section) for section in adaptations},
+        margins=untouched.margins,
+        promotions=untouched.promotions,
+        paper_beside=untouched.beside,
+        is_anchored=all(event.level == "info" for _, event in run.events if event.name == "certificate"),
+        revoked=tuple(event.message for _, event in run.events if event.name == "revoked"),
+        smallest_push=untouched.smallest_push,
+        certificates=tuple(certificates_in((event.name, event.message) for _, event in run.events)),
+    )
+
+
+def last_row(run: Run, section: Section) -> int:
+    """Give the row with an adaptation's result: the next section's first cycle, which still learns."""
+    time_s = run.time_s()
+    end = int(rows_of(time_s, section, float(time_s[-1])).stop)
+    return end - 1 + int(section.is_complete)
+
+
+def _tests(run: Run, section: Section) -> list[float]:
+    """Give the lengths of the stays in CERTIFY of a section, s."""
+    time_s = run.time_s()
+    rows = rows_of(time_s, section, float(time_s[-1]))
+    inside = np.concatenate(([False], run.state[rows] == SchemeState.CERTIFY, [False]))
+    edges = np.flatnonzero(inside[1:] != inside[:-1]) + rows.start
+    time_s = np.append(time_s, section.end_s)
+    return [float(time_s[end] - time_s[start]) for start, end in edges.reshape(-1, 2)]
+
+
+def _estimates(run: Run, stream: CertifiedStream, section: Section) -> dict[str, ParameterEstimate]:
+    row = last_row(run, section)
+    values = np.concatenate((run.theta_hat[row], stream.theta_further[row]))
+    names = run.parameter_names + run.settings.further_names
+    return {
+        name: ParameterEstimate(float(value), float(std))
+        for name, value, std in zip(names, values, stream.theta_std[row], strict=True)
+    }
+
+
+class MarginGatherer:
+    """Gathers the margins of one section, cycles at a time."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._channels = channels_of(settings)
+        self._residual: Vector | None = None  # largest (channels, 2)
+        self._share: Vector | None = None  # largest residual / threshold (channels, 2)
+        self._thresholds = [[Distribution() for _ in range(JOINTS)] for _ in self._channels]
+
+    def add(self, tau_ext: Vector, threshold: Vector) -> None:
+        """Take in cycles in which nothing touches the arm: residuals and thresholds (k, channels, 2), k > 0."""
+        self._residual = larger(self._residual, tau_ext)
+        self._share = larger(self._share, np.abs(tau_ext) / threshold)
+        for place, distributions in enumerate(self._thresholds):
+            for joint, distribution in enumerate(distributions):
+                distribution.add(threshold[:, place, joint])
+
+    def margins(self) -> tuple[ChannelMargin, ...]:
+        """Sum up each channel; nothing has to have been gathered for none."""
+        if self._residual is None or self._share is None:
+            return ()
+        found = []
+        for place, (cutoff, smoothing) in enumerate(self._channels):
+            residual, share = self._residual[place].tolist(), self._share[place].tolist()
+            middle = [distribution.median() for distribution in self._thresholds[place]]
+            found.append(
+                ChannelMargin(
+                    cutoff_rad_s=cutoff,
+                    smoothing_rad_s=smoothing,
+                    residual_max_Nm=(residual[0], residual[1]),
+                    threshold_Nm=(middle[0], middle[1]),
+                    margin=(_inverse(share[0]), _inverse(share[JOINTS - 1])),
+                )
+            )
+        return tuple(found)
+
+
+def _inverse(share: float) -> float:
+    return 1.0 / share if share > 0.0 else float("inf")
+
+
+def gather_untouched(run: Run, pieces: Iterable[Run]) -> Untouched:
+    """Gather what the cycles of a run come to.
+
+    run: has the cycles in which something begins or ends; pieces: together all of its cycles, in order.
+    """
+    gatherer = UntouchedGatherer(run)
+    for piece in pieces:
+        gatherer.add(piece)
+    return gatherer.gathered()
+
+
+class UntouchedGatherer:
+    """Gathers pieces of a run, whose contacts, detections and sections are known."""
+
+    def __init__(self, run: Run) -> None:
+        """Take from `run` when something begins or ends."""
+        self._sections = split_sections(run)
+        touches = true_contacts(run)
+        self._free = _Free(run, touches, find_detections(run))
+        self._end_s = float(run.time_s()[-1]) if run.cycle.size else 0.0
+        self._residuals: dict[str, _Largest] = {}
+        self._margins: dict[str, MarginGatherer] = {}
+        self._done: dict[str, tuple[ChannelMargin, ...]] = {}
+        self._push = PushGatherer(run.settings)
+        self._promotions = 0
+        self._promoted = 0.0  # the count so far
+        self._beside = None if run.beside is None else BesideGatherer(run, self._sections, touches)
+
+    def add(self, piece: Run) -> None:
+        """Take in the next cycles."""
+        if piece.cycle.size == 0:
+            return
+        time_s = piece.time_s()
+        free = self._free.mask(piece, time_s)
+        for section in self._sections:
+            if section.start_s > time_s[-1]:
+                break
+            if section.end_s < time_s[0] or section.kind not in ("adaptation", "detection"):
+                continue
+            rows = rows_of(time_s, section, self._end_s)
+            self._add_residual(piece, section, rows, free[rows])
+            if piece.certified is not None:
+                self._add_margin(piece, section, rows, free[rows])
+            if section.end_s <= time_s[-1]:
+                self._close(section.label)
+        if piece.certified is not None:
+            self._count_promotions(piece.certified.promotions)
+        if self._beside is not None:
+            self._beside.add(piece, time_s, free)
+
+    def _add_residual(self, piece: Run, section: Section, rows: slice, free: Mask) -> None:
+        is_frozen = section.kind == "detection"
+        if is_frozen:
+            free = free & (piece.state[rows] == SchemeState.MONITOR)
+        largest = self._residuals.setdefault(section.label, _Largest())
+        largest.cycles += int(free.sum())
+        if is_frozen:
+            largest.identified = larger(largest.identified, piece.tau_ext_hat[rows][free])
+        if piece.has_cad:
+            largest.cad = larger(largest.cad, piece.tau_ext_hat_cad[rows][free])
+
+    def _add_margin(self, piece: Run, section: Section, rows: slice, free: Mask) -> None:
+        assert piece.certified is not None
+        threshold = piece.certified.threshold[rows]
+        chosen = free & np.isfinite(threshold).all(axis=(1, 2))
+        if chosen.any():
+            margin = self._margins.setdefault(section.label, MarginGatherer(piece.settings))
+            margin.add(piece.certified.tau_ext[rows][chosen], threshold[chosen])
+        armed = chosen & (piece.state[rows] == SchemeState.MONITOR)
+        if armed.any():
+            self._push.add(piece.certified.tau_ext[rows][armed], threshold[armed])
+
+    def _close(self, label: str) -> None:
+        """Sum up a section that nothing will be added to: its values need not be kept."""
+        if label in self._margins:
+            self._done[label] = self._margins.pop(label).margins()
+
+    def _count_promotions(self, promotions: Vector) -> None:
+        steps = np.diff(promotions, prepend=self._promoted)
+        self._promotions += int(np.maximum(steps, 0.0).sum())
+        self._promoted = float(promotions[-1])
+
+    def gathered(self) -> Untouched:
+        """Sum up what has been taken in."""
+        for label in list(self._margins):
+            self._close(label)
+        labels = [section.label for section in self._sections]
+        residuals = {label: self._residuals[label].residual() for label in labels if label in self._residuals}
+        margins = {label: self._done[label] for label in labels if label in self._done}
+        beside = None if self._beside is None else self._beside.beside()
+        return Untouched(residuals, margins, self._promotions, beside, self._push.smallest_push())
+
+
+class _Largest:
+    """Of a section: the largest residuals so far, over how many cycles."""
+
+    def __init__(self) -> None:
+        self.identified: Vector | None = None
+        self.cad: Vector | None = None
+        self.cycles = 0
+
+    def residual(self) -> Residual:
+        return Residual(_pair(self.identified), _pair(self.cad), self.cycles)
+
+
+def _pair(values: Vector | None) -> tuple[float, float] | None:
+    return None if values is None else (float(values[0]), float(values[1]))
+
+
+class _Free:
+    """Tells which cycles are free of contact, piece by piece."""
+
+    def __init__(self, run: Run, touches: Sequence[TruthTouch], detections: Sequence[LoggedDetection]) -> None:
+        self._settling_s = SETTLING_TIME_CONSTANTS / run.a_rad_s
+        if run.truth is None:
+            around = [(d.detected_s - self._settling_s, d.detected_s + self._settling_s) for d in detections]
+        else:
+            around = [(touch.onset_s, touch.end_s + self._settling_s) for touch in touches]
+        self._windows = np.array(around).reshape(-1, 2)
+        self._span = None if run.truth is None else run.truth.span
+        self._finish_cycle = run.finish_cycle
+        self._last_react_s = -np.inf
+
+    def mask(self, piece: Run, time_s: Vector) -> Mask:
+        """Mark the cycles (n,) of a piece, at such times (n,)."""
+        finish = self._finish_cycle
+        free = np.ones(time_s.size, dtype=np.bool_) if finish is None else piece.cycle < finish
+        if self._span is not None:
+            free &= self._span.covers(piece.cycle)
+        is_here = (self._windows[:, 0] <= time_s[-1]) & (self._windows[:, 1] >= time_s[0])
+        for start_s, end_s in self._windows[is_here].tolist():
+            free[np.searchsorted(time_s, start_s) : np.searchsorted(time_s, end_s, side="right")] = False
+        reacted_s = np.where(piece.state == SchemeState.REACT, time_s, -np.inf)
+        reacted_s[0] = max(reacted_s[0], self._last_react_s)
+        last_react_s = np.maximum.accumulate(reacted_s)
+        self._last_react_s = float(last_react_s[-1])
+        return np.asarray(free & (time_s - last_react_s > self._settling_s))
+
+
+class PushGatherer:
+    """Gathers the cycles of MONITOR in which nothing touches the arm."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._shown = detect_margin.constants_of(settings)["shown"]
+        self._period_s = settings.bus.period_s
+        self._excursions_Hz = detect_margin.constants_of(settings)["excursions_Hz"]
+        self._share = np.zeros((self._shown.size, JOINTS))  # largest of residual over threshold
+        self._push, self._threshold = ([Distribution() for _ in range(JOINTS)] for _ in range(2))
+
+    def add(self, tau_ext: Vector, threshold: Vector) -> None:
+        """Take in residuals and thresholds (k, channels, 2), k > 0."""
+        push = np.zeros((len(tau_ext), JOINTS))
+        _fill(tau_ext, threshold, self._shown, push)
+        in_force = threshold.min(axis=1)
+        self._share = np.maximum(self._share, (np.abs(tau_ext) / threshold).max(axis=0))
+        for joint in range(JOINTS):
+            self._push[joint].add(push[:, joint])
+            self._threshold[joint].add(in_force[:, joint])
+
+    def smallest_push(self) -> SmallestPush | None:
+        """Sum up; None where nothing has been taken in."""
+        if not self._push[0].count:
+            return None
+        seen_s = self._push[0].count * self._period_s
+        return SmallestPush(
+            push_Nm=tuple(each.percentiles() for each in self._push),
+            threshold_Nm=tuple(each.percentiles() for each in self._threshold),
+            hours=seen_s / 3600.0,
+            tail_rate_per_h=sum(
+                detect_margin.rate_per_h(float(nu), seen_s, float(share))
+                for nu, shares in zip(self._excursions_Hz, self._share, strict=True)
+                for share in shares
+            ),
+        )
+
+
+@compiled
+def _fill(tau_ext: Vector, threshold: Vector, shown: Vector, push: Vector) -> None:
+    for k in range(push.shape[0]):
+        for i in range(push.shape[1]):
+            push[k, i] = detect_margin.smallest_push(tau_ext[k], threshold[k], shown, i)

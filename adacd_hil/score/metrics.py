@@ -1,0 +1,392 @@
+"""What a run achieved, in numbers: adaptation times, residuals, contacts, false alarms, margins, times of the cycle.
+
+`evaluation` makes these results of a run's arrays. Times in s count from *motion start*: the first cycle in ADAPT.
+Torques in Nm, joint arrays (2,), histories time-first (n, 2); `tau_ext_hat` has the filter's DC gain taken out, so
+that a torque step tau crosses the threshold h after t = -ln(1 - h / |tau|) / a.
+
+**Sections** are lettered A, B, C, … in order, see `adacd_hil.log.logged_run`. An adaptation's time is that of its
+section: up to MONITOR, the test of the frozen model and what a contact on the way costs included.
+
+**Frozen residual**: largest |tau_ext_hat| of each joint where nobody touches the arm. A cycle counts unless it lies in
+[onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
+5 Nm. In a detection section only armed cycles (MONITOR) count; in an adaptation section all do, and only the CAD
+model's residual is given, because theta_hat still moves. Without the truth, [detection - 10/a, detection + 10/a]
+stands for the contact. After the request to finish the arm parks and stands, where friction may hold any torque up
+to F_c: those cycles don't count.
+
+**A detection** is an alarm of `adacd_hil.score.judge`. Which contacts were found or missed, and which
+detections are false alarms: `adacd_hil.score.judge`; detection is armed in MONITOR.
+
+**Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
+those of the fastest channel of its bank. What else it has: `adacd_hil.score.margins`; the paper's
+scheme that ran beside it on the same stream: `adacd_hil.score.margins`.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from adacd_hil.log.logged_run import Section
+from adacd_hil.log.types.topics import CERTIFIED_MODEL
+from adacd_hil.score.distribution import LogHistogram
+from adacd_hil.score.judge import rate_bound_per_h
+
+if TYPE_CHECKING:
+    from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
+
+
+@dataclass(frozen=True)
+class TimeStatistics:
+    """Percentiles by name, µs, and the histogram of a time; both empty without a value."""
+
+    percentiles: Mapping[str, float]
+    histogram: LogHistogram
+
+
+class Count(NamedTuple):
+    """How often something happened, in all and per 100 000 cycles; None without a cycle."""
+
+    total: int
+    per_100000: float | None
+
+
+@dataclass(frozen=True)
+class ReactionLatency:
+    """Latency from the decision to the first command that reacts, over `count` reactions; percentiles in µs."""
+
+    count: int
+    percentiles: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class TimingEvidence:
+    """What the times of a run come to; None is what the log does not have, or what lockstep has no meaning for.
+
+    is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. data_age: cycles by
+    the age of the oldest value used; the last entry counts all from OLDEST_CYCLES on.
+    """
+
+    period_us: float
+    is_modelled: bool
+    cycles: int
+    times: Mapping[str, TimeStatistics | None]
+    reaction: ReactionLatency | None
+    data_age: tuple[int, ...] | None
+    queues_bytes: Mapping[str, Mapping[str, float] | None]
+    counts: Mapping[str, Count | None]
+
+    def as_json(self) -> dict[str, Any]:
+        """Give the evidence in plain values."""
+        times = {name: found for name, found in self.times.items() if found is not None}
+        absent = dict.fromkeys(self.times)
+        reaction = self.reaction
+        return {
+            "is_modelled": self.is_modelled,
+            "period_us": self.period_us,
+            "cycles": self.cycles,
+            "times_us": {**absent, **{name: dict(found.percentiles) for name, found in times.items()}},
+            "reaction_us": None if reaction is None else {"count": reaction.count, **reaction.percentiles},
+            "data_age_cycles": None if self.data_age is None else list(self.data_age),
+            "queues_bytes": {name: None if depth is None else dict(depth) for name, depth in self.queues_bytes.items()},
+            "counts": {name: None if count is None else count._asdict() for name, count in self.counts.items()},
+            "histograms_us": {**absent, **{name: found.histogram.as_json() for name, found in times.items()}},
+        }
+
+
+class Fault(NamedTuple):
+    """A stay in FAULT. cause: the log's words for it, "" without any; is_last: the run ended in it."""
+
+    reason: str
+    at_s: float
+    cause: str
+    is_last: bool
+
+
+@dataclass(frozen=True)
+class DeviceShares:
+    """Shares of the cycles of a device, 0…1: without a new frame, with a repeated one, and the worst second of each."""
+
+    cycles: int
+    no_new_data: float
+    repeated: float
+    worst_no_new_data: float
+    worst_repeated: float
+
+
+@dataclass(frozen=True)
+class CyclicData:
+    """Shares of `cycles` cycles with powered drives, 0…1; excesses: over their limit in some second, a line each.
+
+    incomplete, worst_incomplete, aged: None where the log does not say. devices: empty where it does not.
+    """
+
+    cycles: int
+    incomplete: float | None
+    worst_incomplete: float | None
+    aged: float | None
+    devices: dict[str, DeviceShares]
+    excesses: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        devices = {name: vars(shares) for name, shares in self.devices.items()}
+        return {**vars(self), "devices": devices, "excesses": list(self.excesses)}
+
+
+@dataclass(frozen=True)
+class SmallestPush:
+    """Of each joint the percentiles p50, p99, p99.9 and max, Nm, over so many hours of MONITOR without a touch.
+
+    tail_rate_per_h: false alarms to be expected if all channels' residuals have the tail of a Gaussian.
+    """
+
+    push_Nm: tuple[dict[str, float], ...]
+    threshold_Nm: tuple[dict[str, float], ...]
+    hours: float
+    tail_rate_per_h: float
+
+
+@dataclass(frozen=True)
+class BesideContact:
+    """A true contact as the paper's scheme would have seen it; number as in the list of contacts."""
+
+    number: int
+    is_armed: bool
+    detected_s: float | None
+    delay_ms: float | None
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What the paper's scheme would have come to, by the definitions of the module's first lines.
+
+    Without the truth there are no contacts, and false alarms and misses are None.
+    """
+
+    adaptation_s: dict[str, float | None]
+    frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
+    contacts: tuple[BesideContact, ...]
+    false_alarms: int | None
+    false_alarms_s: tuple[float, ...] | None
+    missed: int | None
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """A parameter at the end of an adaptation and the standard deviation that the scheme gives it, in its unit."""
+
+    value: float
+    std: float
+
+
+@dataclass(frozen=True)
+class ChannelMargin:
+    """A channel of the bank over a section: cut-off and smoothing, rad/s; then per joint, where nothing touches.
+
+    residual_max_Nm: largest. threshold_Nm: median of the threshold. margin: see the module's first lines.
+    """
+
+    cutoff_rad_s: float
+    smoothing_rad_s: float | None
+    residual_max_Nm: tuple[float, float]
+    threshold_Nm: tuple[float, float]
+    margin: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class CertifiedEvidence:
+    """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
+
+    margins: by section. promotions: refined models that took over in the run. is_anchored: whether each certificate
+    says what anchors all its offsets; logs from before there were anchors say nothing. revoked: why certificates were
+    taken back, in order. smallest_push: None where nothing was armed. certificates: those that were not taken back, as
+    the log has them at its end; none in a log that lacks its end, or of an earlier version.
+    """
+
+    tests: dict[str, int]
+    test_s: dict[str, float | None]
+    estimates: dict[str, dict[str, ParameterEstimate]]
+    margins: dict[str, tuple[ChannelMargin, ...]]
+    promotions: int
+    paper_beside: Beside | None
+    is_anchored: bool
+    revoked: tuple[str, ...]
+    smallest_push: SmallestPush | None
+    certificates: "tuple[Certificate, ...]" = ()
+
+    @property
+    def smallest_margin(self) -> float | None:
+        """The smallest of all margins where the certified model was in force or was learnt."""
+        values = [min(row.margin) for rows in self.margins.values() for row in rows]
+        return min(values, default=None)
+
+
+def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
+    """Give the certificates that events, by name and message, have as numbers; what is none is left out."""
+    from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
+
+    for name, message in told:
+        if name == CERTIFIED_MODEL:
+            with suppress(ValueError, TypeError, RecursionError, AttributeError):  # of another version
+                values: dict[str, Any] = {
+                    key: tuple(value) if isinstance(value, list) else value
+                    for key, value in json.loads(message).items()
+                }
+                yield Certificate(**values)
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Largest |tau_ext_hat| of a section, Nm per joint, over `cycles` cycles free of contact; None if none."""
+
+    identified: tuple[float, float] | None
+    cad: tuple[float, float] | None
+    cycles: int
+
+
+@dataclass(frozen=True)
+class Untouched:
+    """What was gathered, by section. promotions: refined models that took over; beside: None where none ran.
+
+    smallest_push: None of the paper's scheme, and where nothing was armed.
+    """
+
+    residuals: dict[str, Residual]
+    margins: dict[str, tuple[ChannelMargin, ...]]
+    promotions: int
+    beside: Beside | None
+    smallest_push: SmallestPush | None
+
+
+class PaperRow(NamedTuple):
+    """One line of *paper against measured*.
+
+    paper: None where the run is not of the paper's experiment; beside: the paper's scheme on the same stream, None
+    where none ran.
+    """
+
+    quantity: str
+    paper: str | None
+    beside: str | None
+    measured: str
+
+
+class ReportSource(NamedTuple):
+    """The log that a run was read from; `is_complete`: it is whole and nothing was dropped on the way to it."""
+
+    log_name: str
+    problem: str = ""  # what is missing, one line
+    is_complete: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportedContact:
+    """A true contact and its detection, or on a real arm a detection alone.
+
+    state: of the scheme at the onset, on a real arm at the detection.
+    law_ms: closed-form delay of a step of the largest torque up to the detection, the faster joint; None if never.
+    ideal_ms: delay that the filter alone gives to the true torque as it was; None if never.
+    link_at_alarm, link_detected: isolated at detection and at the end of the isolation window.
+    torque_error_ratio: peak with the filter undone over the true peak, at the joint with the larger true torque.
+    true_force_N: size of the true force, at whatever angle.
+    level to blind_deg: what the last report says, in the names of `records`; None where it doesn't say. A sigma is a
+    standard deviation.
+    """
+
+    number: int
+    section: str | None = None
+    state: str
+    link: int | None = None
+    onset_s: float | None = None
+    end_s: float | None = None
+    is_armed: bool
+    detected_s: float | None = None
+    delay_ms: float | None = None
+    law_ms: float | None = None
+    ideal_ms: float | None = None
+    link_at_alarm: int | None = None
+    link_detected: int | None = None
+    direction: tuple[int, int] | None = None
+    direction_ok: bool | None = None
+    tau_ext_Nm: tuple[float, float] | None = None
+    tau_ext_peak_hat_Nm: tuple[float, float] | None = None
+    torque_error_ratio: float | None = None
+    true_force_N: float | None = None
+    level: str | None = None
+    kind: str | None = None
+    reaction: str | None = None
+    location: str | None = None
+    is_two_sided: bool | None = None
+    tau_ext_peak_sigma_Nm: tuple[float | None, float | None] | None = None
+    impulse_Nm_s: tuple[float, float] | None = None
+    impulse_sigma_Nm_s: tuple[float | None, float | None] | None = None
+    force_N: float | None = None
+    force_sigma_N: float | None = None
+    lever_m: float | None = None
+    lever_sigma_m: float | None = None
+    blind_deg: float | None = None
+
+    @property
+    def at_s(self) -> float:
+        """Its onset, or its detection where the onset is not known."""
+        at_s = self.onset_s if self.onset_s is not None else self.detected_s
+        assert at_s is not None
+        return at_s
+
+
+@dataclass(frozen=True)
+class CycleStatistics:
+    """How many cycles, for how long, and what drove them."""
+
+    count: int
+    duration_s: float
+    clock: str | None
+    scheduler: str | None
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Everything that the report says, see the module's first lines for the definitions.
+
+    fault, fault_s: the first one of the run.
+    """
+
+    sections: tuple[Section, ...]
+    adaptation_s: dict[str, float | None]
+    frozen_residual_max_Nm: dict[str, Residual]
+    contacts: tuple[ReportedContact, ...]
+    false_alarms: int | None
+    false_alarms_s: tuple[float, ...] | None
+    missed: int | None
+    parameters: dict[str, dict[str, tuple[float | None, float]]]
+    payload_kg: dict[str, float | None]
+    fault: str | None
+    fault_s: float | None
+    cycle: CycleStatistics
+    timing: TimingEvidence
+    data: CyclicData
+    frames: int | None
+    dropped: int | None
+    evidence: CertifiedEvidence | None
+    paper: tuple[PaperRow, ...]
+    verdict: str
+    is_clean: bool
+    armed_false_alarms: int | None  # of them those in MONITOR
+
+    @property
+    def false_alarm_bound_per_h(self) -> float | None:
+        """Upper 95 % bound of the certified scheme's rate of false alarms in MONITOR, by counting; None: not known."""
+        push = None if self.evidence is None else self.evidence.smallest_push
+        if push is None or self.armed_false_alarms is None:
+            return None
+        return rate_bound_per_h(self.armed_false_alarms, push.hours)
+
+
+class Gathered(NamedTuple):
+    """What takes all cycles of a run to say."""
+
+    untouched: Untouched
+    timing: TimingEvidence
+    data: CyclicData
