@@ -1,32 +1,30 @@
 """Two arms on one bus in virtual time: the first host sends SYNC, the second follows it."""
 
 import dataclasses
-from collections import deque
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from two_arms_rig import FIRST, SECOND, TwoArms, first_beside
 
 from adacd_hil.cli.connection import received_ids
 from adacd_hil.cli.main import cli
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle import Cycle, RunResult
-from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.pacing import GridPacer, Tick, make_pacer
+from adacd_hil.control.pacing import make_pacer
 from adacd_hil.control.session import Session
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.records import ArmCommand, FaultReason, SchemeState
+from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import ConfigError, parse
-from adacd_hil.wire.bus import Bus, BusError, EmbeddedBus, Frame, Tap
+from adacd_hil.wire.bus import BusError, EmbeddedBus, Tap
 from adacd_hil.wire.lockstep_bus import make_lockstep_bus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import load_scenario
@@ -34,133 +32,30 @@ from firmware_sim.scenario.scenario import load_scenario
 pytestmark = pytest.mark.slow
 
 PERIOD_NS = 2_000_000
-HOST_NODES = (127, 126)
-FIRST, SECOND = 0, 1
-PUSH_NM = np.array([0.2, 0.05])
 
 
 def settings_of(arm: int, finish_s: float = 0.4) -> Settings:
     """Configure one of two arms that share a bus at 2 ms."""
     base = load_settings("paper")
-    return dataclasses.replace(
+    second = dataclasses.replace(
         base,
-        bus=dataclasses.replace(
-            base.bus,
-            period_us=PERIOD_NS // 1000,
-            arms=2,
-            host_node=HOST_NODES[arm],
-            sync="follow" if arm == SECOND else "produce",
-        ),
-        devices=dataclasses.replace(
-            base.devices, drive_node=(1 + 4 * arm, 2 + 4 * arm), sensor_node=(3 + 4 * arm, 4 + 4 * arm)
-        ),
+        bus=dataclasses.replace(base.bus, period_us=PERIOD_NS // 1000, arms=2, host_node=126, sync="follow"),
+        devices=dataclasses.replace(base.devices, drive_node=(5, 6), sensor_node=(7, 8)),
         operator=OperatorSettings(script=(RequestSettings(at_s=finish_s, request="finish"),)),
     )
-
-
-class End(Bus):
-    """One host's end of the bus. `on_wait`: lets time pass until something may have come, False at the limit."""
-
-    waiting_frames = ()
-
-    def __init__(self, wire: "Wire") -> None:
-        self.channel = "shared"
-        self.sent: list[tuple[int, bytes]] = []
-        self.received: deque[Frame] = deque()
-        self.on_wait: Callable[[int], bool] = lambda limit_ns: False
-        self._wire = wire
-
-    def send(self, can_id: int, data: bytes) -> None:
-        self.sent.append((can_id, bytes(data)))
-        self._wire.carry(Frame(can_id, bytes(data), self._wire.clock.now_ns()), self)
-
-    def receive(self, timeout_s: float) -> Frame | None:
-        limit_ns = self._wire.clock.now_ns() + round(max(timeout_s, 0.0) * 1e9)
-        while not self.received:
-            if timeout_s <= 0.0 or not self.on_wait(limit_ns):
-                return None
-        return self.received.popleft()
-
-    def recover(self) -> None:
-        self.received.clear()
-
-    def close(self) -> None:
-        pass
-
-
-class Wire:
-    """Everybody hears every frame, in the order in which they are sent."""
-
-    def __init__(self) -> None:
-        self.clock = VirtualClock()
-        self.ends = (End(self), End(self))
-        self.benches: list[Bench] = []
-
-    def carry(self, frame: Frame, sender: object) -> None:
-        for end in self.ends:
-            if end is not sender:
-                end.received.append(frame)
-        for bench in self.benches:
-            if bench is not sender:
-                bench.on_frame(frame)
-
-    def add_arm(self, settings: Settings) -> None:
-        bench = Bench(load_scenario("idle", "P"), load_contract(settings), lambda *frame: self._answer(bench, *frame))
-        self.benches.append(bench)
-        bench.boot()
-
-    def _answer(self, bench: Bench, can_id: int, data: bytes) -> None:
-        self.carry(Frame(can_id, bytes(data), self.clock.now_ns()), bench)
-
-
-class FirstHost:
-    """Pushes its arm a little, once per period; sends SYNC."""
-
-    def __init__(self, wire: Wire) -> None:
-        settings = settings_of(FIRST)
-        codec = load_contract(settings)
-        self.tap = Tap(wire.ends[FIRST], wire.clock)
-        self.arm = Arm(settings, codec, self.tap)
-        self.master = Master(settings, codec, self.tap)
-        pacer = GridPacer(wire.clock, PERIOD_NS)
-        self._exchange = Exchange(settings, self.tap, self.arm, self.master, pacer, wire.clock)
-        self.cycle = -1
-        self._clock = wire.clock
-        self.states = []
-
-    def boot(self) -> None:
-        self.master.reset()
-        self.master.identify()
-        self.master.configure()
-        self.master.start()
-
-    def step(self) -> None:
-        self.cycle += 1
-        state = self._exchange.read(Tick(self.cycle, self._clock.now_ns(), 1, 0))
-        self.states.append(state)
-        self.arm.write(ArmCommand(PUSH_NM if state.is_enabled else np.zeros(2), True, False))
-        if self.cycle % 50 == 0:
-            self.master.send_heartbeat()
+    return second if arm == SECOND else first_beside(second)
 
 
 class Rig:
-    """`dies_ns`: when the first host falls silent."""
+    """The two arms, and the second one's host with its log. `dies_ns`: when the first host falls silent."""
 
     def __init__(self, folder: Path, dies_ns: int = 1 << 62, finish_s: float = 0.4) -> None:
-        self.wire = Wire()
-        for arm in (FIRST, SECOND):
-            self.wire.add_arm(settings_of(arm))
-        self.first = FirstHost(self.wire)
-        self.first.boot()
-        self._dies_ns = dies_ns
         settings = settings_of(SECOND, finish_s)
-        codec = load_contract(settings)
-        self.end = self.wire.ends[SECOND]
-        self.end.on_wait = self._let_pass
-        clock = self.wire.clock
+        arms = TwoArms(settings, dies_ns=dies_ns)
+        self.wire, self.first, self.end, clock = arms.wire, arms.first, arms.end, arms.clock
         self.tap = Tap(self.end, clock)
-        self.arm = Arm(settings, codec, self.tap)
-        self.master = Master(settings, codec, self.tap)
+        self.arm = Arm(settings, load_contract(settings), self.tap)
+        self.master = Master(settings, load_contract(settings), self.tap)
         self.pacer = make_pacer(settings, clock, self.tap, self.arm.sync_id)
         operator = ScriptedOperator(settings.operator)
         self.cycle = Cycle(settings, self.tap, self.arm, self.master, self.pacer, operator, lambda _: None, clock)
@@ -168,20 +63,7 @@ class Rig:
         self.path = folder / "run.mcap"
         self.recorder = Recorder(self.path, blocking=True)
 
-    def _let_pass(self, limit_ns: int) -> bool:
-        """Let time pass to the first host's next period, or to the limit."""
-        clock = self.wire.clock
-        due_ns = (clock.now_ns() // PERIOD_NS + 1) * PERIOD_NS
-        if due_ns > limit_ns or due_ns >= self._dies_ns:
-            clock.sleep_until_ns(limit_ns)
-            return False
-        clock.sleep_until_ns(due_ns)
-        self.first.step()
-        return True
-
     def run(self) -> RunResult:
-        for _ in range(5):  # SYNC is there before the second arm is
-            self.first.step()
         self.master.reset()
         self.master.identify()
         self.master.configure()

@@ -1,4 +1,4 @@
-"""Twelve short runs whose decisions and bits are stored: a change that alters live and replay together is seen.
+"""Short runs whose decisions and bits are stored: a change that alters live and replay together is seen.
 
 Each run is two files in `runs/`: NAME.config.toml and NAME.scenario.toml. What it came to is stored in NAME.json:
 
@@ -25,14 +25,17 @@ import llvmlite.binding
 import numpy as np
 from numpy.typing import NDArray
 from rig import SessionRig
+from two_arms_rig import TwoArms
 
-from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.session import Session
 from adacd_hil.device.contract import load_contract
-from adacd_hil.log.reader import RunLog, Series
+from adacd_hil.device.profile import place_devices
+from adacd_hil.log.reader import RunLog, Series, read_log
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.settings.configuration import load_settings
-from firmware_sim.scenario.scenario import load_scenario
+from adacd_hil.settings.configuration import Settings, load_settings
+from firmware_sim.cli.own_devices import describe_devices
+from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 RUNS = Path(__file__).parent / "runs"
 BLOCK_CYCLES = 250
@@ -77,11 +80,22 @@ def play(name: str, folder: Path, cycles: int = 0) -> RunLog:
     """Play a reference run in lockstep and read its log. `cycles`: end after so many; 0: at its end."""
     settings = load_settings(str(RUNS / f"{name}.config.toml"))
     scenario = load_scenario(str(RUNS / f"{name}.scenario.toml"), settings.arm.profile)
+    operator = _StoppingOperator(settings.operator)
+    session = _session(settings, scenario, operator, folder)
+    operator.session, operator.cycles_left = session, cycles
+    return read_log(session.run().log.path)
+
+
+def _session(settings: Settings, scenario: Scenario, operator: Operator, folder: Path) -> Session:
+    """Prepare a host and its arm: alone on the bus, or behind another arm whose host sends SYNC."""
     codec = load_contract(settings)
-    rig = SessionRig(folder, settings, scenario, codec=codec, is_modelled=True)
-    rig.session.operator = operator = _StoppingOperator(settings.operator)
-    operator.session, operator.cycles_left = rig.session, cycles
-    return rig.run()[1]
+    if settings.bus.follows:
+        arms = TwoArms(settings, scenario)
+        return Session(settings, codec, arms.end, arms.clock, operator, folder, "embedded")
+    own = None if settings.devices.contract else describe_devices(codec, place_devices(settings), settings)
+    rig = SessionRig(folder, settings, scenario, codec=codec, contract=own, is_modelled=True)
+    rig.session.operator = operator
+    return rig.session
 
 
 @dataclass(frozen=True)

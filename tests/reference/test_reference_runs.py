@@ -20,6 +20,7 @@ from reference_runs import (
     play,
 )
 
+from adacd_hil.device.profile import place_devices
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import load_settings
 
@@ -78,15 +79,28 @@ def test_uncompiled_code_comes_to_the_same_bits(name: str, tmp_path: Path) -> No
 
 def test_the_runs_cover_both_schemes_and_every_contract() -> None:
     settings = [load_settings(str(RUNS / f"{name}.config.toml")) for name in names()]
-    assert len(settings) >= 12
+    assert len(settings) >= 16
     assert {(one.scheme, one.devices.contract) for one in settings} == {
         ("paper", "arm"),
         ("paper", "arm_fd_500us"),
         ("paper", "arm_stock"),
         ("certified", "arm"),
         ("certified", "arm_fd"),
+        ("certified", "arm_fd_500us"),
         ("certified", "arm_stock"),
+        ("certified", ""),
     }
+
+
+def test_the_runs_cover_a_host_that_follows_a_pipelined_one_gears_and_gravity() -> None:
+    settings = [load_settings(str(RUNS / f"{name}.config.toml")) for name in names()]
+    assert any(one.bus.follows for one in settings)
+    assert any(one.bus.is_pipelined for one in settings)
+    assert any(one.estimator.gravity for one in settings)
+    ratios = {
+        device.settings.scale.gear_ratio for one in settings for device in place_devices(one) if device.joint == 0
+    }
+    assert ratios >= {1.0, 50.0}
 
 
 def test_the_runs_come_through_every_state() -> None:

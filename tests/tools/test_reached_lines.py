@@ -1,0 +1,32 @@
+"""tools/reached_lines.py: what it counts is what runs on an arm and replays its logs."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import reached_lines
+
+
+@pytest.mark.parametrize(
+    ("path", "is_counted"),
+    [
+        ("adacd_hil/control/session.py", True),
+        ("adacd_hil/log/recording/writer.py", True),
+        ("adacd_hil/analysis/replay/replay.py", True),
+        ("adacd_hil/cli/commands/run_command.py", True),
+        ("adacd_hil/cli/commands/report_command.py", False),
+        ("adacd_hil/analysis/report/page.py", False),
+        ("adacd_hil/commission/tare.py", False),
+        ("adacd_hil/lab/score/judge.py", False),
+    ],
+)
+def test_what_runs_on_an_arm_counts_and_the_laboratory_does_not(path: str, is_counted: bool) -> None:
+    assert reached_lines.is_counted(path) == is_counted
+
+
+def test_the_scenarios_that_are_played_are_those_with_faults() -> None:
+    for name in reached_lines.FAULTS:
+        scenario = reached_lines.resolve("certified", name, None, None).scenario
+        assert scenario.faults, name
