@@ -281,7 +281,10 @@ PLAYED = {
     r"pip install docs/examples/detector": ("test_packaging.py", "docs/examples/detector"),
     r"python tests/reference/renew.py": ("reference/test_reference_runs.py", "reference"),
     r"python tools/notebook.py .*": ("test_certified_experiment.py", "run_notebook"),
-    r".*tools/(attack|doubt|error|property|timing|touch)_campaign.py .*": ("tools/test_tool_commands.py", "PROGRAMS"),
+    r".*tools/(attack|cause|doubt|error|property|timing|touch)_campaign.py .*": (
+        "tools/test_tool_commands.py",
+        "PROGRAMS",
+    ),
     r"python tools/(blind_grid|damage_campaign|mutation_campaign).py .*": ("tools/test_tool_commands.py", "PROGRAMS"),
 }
 """Commands that a test plays in its own way, in short or on a bus: the test's file, and what it must hold."""

@@ -14,12 +14,12 @@ import reached_lines
     [
         ("adacd_hil/control/session.py", True),
         ("adacd_hil/log/recording/writer.py", True),
-        ("adacd_hil/analysis/replay/replay.py", True),
+        ("adacd_hil/replay/replay.py", True),
         ("adacd_hil/cli/commands/run_command.py", True),
-        ("adacd_hil/cli/commands/report_command.py", False),
-        ("adacd_hil/analysis/report/page.py", False),
-        ("adacd_hil/commission/tare.py", False),
-        ("adacd_hil/lab/score/judge.py", False),
+        ("adacd_hil/lab/cli/report_command.py", False),
+        ("adacd_hil/lab/report/page.py", False),
+        ("adacd_hil/lab/commission/tare.py", False),
+        ("adacd_hil/lab/score/verdict.py", False),
     ],
 )
 def test_what_runs_on_an_arm_counts_and_the_laboratory_does_not(path: str, is_counted: bool) -> None:
