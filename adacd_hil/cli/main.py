@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
@@ -91,12 +91,22 @@ def run(
 
 
 COMMAND_ENTRY_POINTS: Final = "adacd_hil.commands"
-"""The group of further commands; each has click's commands, as a sequence."""
-for command in (
-    config,
-    replay,
-    *(command for entry in entry_points(group=COMMAND_ENTRY_POINTS) for command in entry.load()),
-):
+"""The group of further commands: each entry is a sequence of click's."""
+
+
+def further_commands() -> Iterator[click.Command]:
+    """Give the commands that packages add. Commands that can't be imported are named, and no others are lost."""
+    for entry in entry_points(group=COMMAND_ENTRY_POINTS):
+        try:
+            yield from entry.load()
+        except (ImportError, AttributeError) as error:
+            if is_interrupted(error):
+                raise
+            line = f"adacd-hil: the commands of {entry.value} can't be imported: {error}"
+            print(one_line(line), file=sys.stderr)
+
+
+for command in (config, replay, *further_commands()):
     cli.add_command(command)
 
 
