@@ -281,6 +281,7 @@ PLAYED = {
     r"pip install docs/examples/detector": ("test_packaging.py", "docs/examples/detector"),
     r"python tests/reference/renew.py": ("reference/test_reference_runs.py", "reference"),
     r"python tools/notebook.py .*": ("test_certified_experiment.py", "run_notebook"),
+    r"python tools/reached_lines.py.*": ("tools/test_reached_lines.py", "FAULTS"),
     r".*tools/(attack|cause|doubt|error|property|timing|touch)_campaign.py .*": (
         "tools/test_tool_commands.py",
         "PROGRAMS",

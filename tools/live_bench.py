@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from side_by_side import patient_config
 
 from adacd_hil.cli.embedded_run import Cast, resolve, run_embedded
-from adacd_hil.control.session import LiveAddress
+from adacd_hil.lab.live.live_view import LiveAddress
 from adacd_hil.log.reader import Series, read_log
 from adacd_hil.settings.run_settings import RequestSettings
 

@@ -16,10 +16,11 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.terminal import hurry, in_line
-from adacd_hil.wire.bus import Bus, BusError, BusMissingError, open_bus
+from adacd_hil.wire.bus import Bus, BusError, BusMissingError
 from adacd_hil.wire.can_interface import can_interfaces, is_virtual
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.dbc_decoder import DbcDecoder, load_decoder
+from adacd_hil.wire.open_bus import open_bus
 
 MOST_BLIND_CYCLES = 5
 """Cycles without data that a real arm may go through: at 100 deg/s and 1 ms half a degree."""

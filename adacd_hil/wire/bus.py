@@ -5,7 +5,7 @@ returns. A tap around a bus remembers every frame that passes, both ways, for th
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from adacd_hil.clock import Clock
@@ -163,32 +163,6 @@ def take_first(received: deque[Frame], most: int) -> list[Frame]:
             return frames or [received.popleft()]
         frames.append(received.popleft())
     return frames
-
-
-def open_bus(
-    interface: str,
-    channel: str,
-    clock: Clock,
-    can_ids: Iterable[int] | None = None,
-    bitrate: int | None = None,
-    is_fd: bool = False,
-    is_shared: bool = False,
-) -> Bus:
-    """Open one end of a real or virtual bus. Raises BusMissingError.
-
-    `can_ids` are filtered in the kernel on SocketCAN; elsewhere everything is received. `bitrate` in bit/s is for the
-    interfaces that python-can configures; a SocketCAN interface has its own from `ip link`. Frames of more than 8 bytes
-    need `is_fd`. `is_shared`: other programs use the interface too; it isn't taken down while frames are on the bus.
-    Identifiers beyond 0x7FF are 29-bit ones. Remote frames, and 29-bit identifiers that would read as 11-bit ones, are
-    never received.
-    """
-    # Both build on this module; and who only knows frames, such as the log's writer, does without python-can (0.1 s).
-    from adacd_hil.wire.python_can import PythonCanBus
-    from adacd_hil.wire.socketcan import SocketCanBus
-
-    if interface == "socketcan":
-        return SocketCanBus(channel, clock, can_ids, is_fd, is_shared)
-    return PythonCanBus(interface, channel, clock, bitrate, is_fd)
 
 
 class Tap(Bus):

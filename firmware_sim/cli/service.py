@@ -7,8 +7,9 @@ from typing import Any
 
 from adacd_hil.clock import Clock
 from adacd_hil.terminal import hurry
-from adacd_hil.wire.bus import Bus, BusError, Frame, InterfaceDownError, open_bus
+from adacd_hil.wire.bus import Bus, BusError, Frame, InterfaceDownError
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.open_bus import open_bus
 from adacd_hil.wire.time_marks import HOST_MARK, NEVER_NS
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import LONGEST_ORPHANAGE_NS

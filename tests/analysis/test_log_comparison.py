@@ -9,8 +9,8 @@ from log.recorded_run import make_run, record
 from adacd_hil.lab.cli.compare_command import _contact as in_words
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.runs.log_comparison import MATCH_S, ComparedContact, compare_logs, match_contacts
+from adacd_hil.log import logged_run
 from adacd_hil.log.log_files import LogError
-from adacd_hil.replay import logged_run
 from adacd_hil.settings.configuration import apply_settings, load_settings
 from adacd_hil.settings.toml_files import to_toml
 

@@ -33,7 +33,7 @@ from adacd_hil.score.metrics import ReportSource
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
-TEMPLATES = sorted((ROOT / "adacd_hil" / "analysis" / "report" / "templates").iterdir())
+TEMPLATES = sorted((ROOT / "adacd_hil" / "lab" / "report" / "templates").iterdir())
 EVIL = """'"><evil>&</script></style></title></svg><script>alert(1)</script>"""
 
 

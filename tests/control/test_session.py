@@ -19,7 +19,7 @@ from rig import (
 )
 
 from adacd_hil.control.gate import GateFlag
-from adacd_hil.control.session import LiveAddress
+from adacd_hil.lab.live.live_view import LiveAddress
 from adacd_hil.log.robot_description import ROBOT_NAME
 from adacd_hil.log.viewer_layout import LAYOUT_NAME
 from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState

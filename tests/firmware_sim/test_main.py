@@ -317,7 +317,7 @@ def test_a_signal_before_a_host_ends_it_with_exit_code_0_and_leaves_nothing(tmp_
 @pytest.mark.vcan
 def test_on_socketcan_it_answers_a_host_and_ends_with_it(tmp_path, vcan_channel):
     from adacd_hil.clock import MonotonicClock
-    from adacd_hil.wire.bus import open_bus
+    from adacd_hil.wire.open_bus import open_bus
 
     clock = MonotonicClock()
     process = spawn(tmp_path / "out", "-i", "socketcan", "-c", vcan_channel, "--once")

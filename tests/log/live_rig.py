@@ -11,10 +11,11 @@ from reference_writer import MemorySink
 
 from adacd_hil.lab.live.client import LiveClient, LiveMessage
 from adacd_hil.lab.live.feed import LiveFeed
+from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.log.recording.log_file import McapFile
 from adacd_hil.log.recording.packet import ROOM, pack_cycle, pack_event
 from adacd_hil.log.recording.packet_writer import PacketWriter
-from adacd_hil.log.recording.processes import LiveSetup, WriterSetup
+from adacd_hil.log.recording.processes import WriterSetup
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import Event
 from adacd_hil.wire.codec_columns import plain_tables
@@ -22,11 +23,11 @@ from adacd_hil.wire.codec_columns import plain_tables
 EPOCH_NS = 1_700_000_000_000_000_000
 URDF = '<robot name="a"/>'
 LINK_LENGTH_M = (0.35, 0.30)
-SETUP = LiveSetup("127.0.0.1", 0, URDF, LINK_LENGTH_M)
+SETUP = LiveView("127.0.0.1", 0, URDF, LINK_LENGTH_M)
 LAST = Event("info", "test", "last")
 
 
-def setup_of(live: LiveSetup | None, path: Path = Path("run.mcap"), parameter_count: int = 7) -> WriterSetup:
+def setup_of(live: LiveView | None, path: Path = Path("run.mcap"), parameter_count: int = 7) -> WriterSetup:
     """What a writer is told of a log in real time."""
     return WriterSetup(
         path=path,
@@ -45,13 +46,13 @@ def setup_of(live: LiveSetup | None, path: Path = Path("run.mcap"), parameter_co
 class Feed:
     """A file and its live view."""
 
-    def __init__(self, setup: LiveSetup | None = SETUP, parameter_count: int = 7) -> None:
+    def __init__(self, setup: LiveView | None = SETUP, parameter_count: int = 7) -> None:
         messages = tuple(CODEC.messages.values())
         channels = run_channels(parameter_count, messages)
         self.sink = MemorySink()
         self._file = McapFile(self.sink, channels, {}, {})
         told = setup_of(setup, parameter_count=parameter_count)
-        self.live = None if setup is None else LiveFeed(told, self._file.ids, EPOCH_NS)
+        self.live = None if setup is None else LiveFeed(setup, told, self._file.ids, EPOCH_NS)
         show = self.live.show if self.live else None
         self._writer = PacketWriter(self._file, messages, EPOCH_NS, show)
         self._packets: list[bytes] = []

@@ -33,11 +33,11 @@ from websockets.sync.client import connect
 from adacd_hil.clock import VirtualClock
 from adacd_hil.lab.live.client import LiveClient, live_client
 from adacd_hil.lab.live.feed import Decimator, rate_of
+from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.log_file import Sink
 from adacd_hil.log.recording.packet import pack_cycle, pack_event
-from adacd_hil.log.recording.processes import LiveSetup
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.ring import Ring, RingReader
 from adacd_hil.log.recording.writer import SHOW_PERIOD_NS, WriterProcess
@@ -234,7 +234,7 @@ def test_a_port_that_is_taken_is_named_and_leaves_no_log(tmp_path):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        live = LiveSetup("127.0.0.1", port, URDF, LINK_LENGTH_M)
+        live = LiveView("127.0.0.1", port, URDF, LINK_LENGTH_M)
         with pytest.raises(LogError, match=rf"can't listen on 127\.0\.0\.1:{port}: .*in use"):
             Recorder(tmp_path / "run.mcap", messages=CODEC.messages.values(), live=live)
     assert list(tmp_path.iterdir()) == []

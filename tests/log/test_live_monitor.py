@@ -15,9 +15,9 @@ from recorded_run import make_run
 
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.options import live_options
-from adacd_hil.control.session import LiveAddress
 from adacd_hil.lab.cli.live_monitor import TOPICS, LiveMonitor, as_text
 from adacd_hil.lab.live.client import LiveMessage, live_client
+from adacd_hil.lab.live.live_view import LiveAddress
 from adacd_hil.log.types.message_types import payload_dtype
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import (

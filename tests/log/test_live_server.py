@@ -25,9 +25,9 @@ from adacd_hil.lab.live import server as server_module
 from adacd_hil.lab.live.admission import FULL, NOTICES, Admission
 from adacd_hil.lab.live.client import live_client
 from adacd_hil.lab.live.feed import ServerSetup
+from adacd_hil.lab.live.live_setup import LiveSetup
 from adacd_hil.lab.live.server import listen, make_server, url_of
 from adacd_hil.log.recording import processes
-from adacd_hil.log.recording.processes import LiveSetup
 from adacd_hil.log.recording.ring import Ring, RingReader
 from adacd_hil.log.types.topics import run_channels
 
@@ -527,7 +527,7 @@ def unstarted():
     ring = Ring(2**16)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     reader = RingReader(ring.descriptor)
-    server = make_server(ServerSetup(setup_of(SETUP), CHANNEL_IDS, EPOCH_NS), reader, theirs)
+    server = make_server(ServerSetup(SETUP, setup_of(None), CHANNEL_IDS, EPOCH_NS), reader, theirs)
     listening = listen(SETUP)
     yield Unstarted(server, listening, listening.getsockname(), ours)
     for end in (ours, theirs, reader, ring):

@@ -4,7 +4,8 @@ import can
 import pytest
 
 from adacd_hil.clock import MonotonicClock, VirtualClock
-from adacd_hil.wire.bus import BusError, BusMissingError, BusOffError, EmbeddedBus, Frame, Tap, open_bus
+from adacd_hil.wire.bus import BusError, BusMissingError, BusOffError, EmbeddedBus, Frame, Tap
+from adacd_hil.wire.open_bus import open_bus
 
 
 def test_the_embedded_device_has_answered_when_send_returns() -> None:

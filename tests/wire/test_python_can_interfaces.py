@@ -7,7 +7,8 @@ from click.testing import CliRunner
 
 from adacd_hil.cli.main import cli
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.wire.bus import BusError, BusMissingError, open_bus
+from adacd_hil.wire.bus import BusError, BusMissingError
+from adacd_hil.wire.open_bus import open_bus
 from adacd_hil.wire.python_can import interface_names
 
 REAL = ("socketcan", "virtual")  # those that this test does not need hardware for have tests of their own

@@ -47,8 +47,8 @@ from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
 from adacd_hil.settings.configuration import known_keys
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.terminal import in_line
-from adacd_hil.wire.bus import open_bus
 from adacd_hil.wire.can_interface import can_interfaces, read_link
+from adacd_hil.wire.open_bus import open_bus
 
 Pair = tuple[float, float]
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)

@@ -12,9 +12,9 @@ from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import request_realtime
 from adacd_hil.terminal import in_line
-from adacd_hil.wire.bus import open_bus
 from adacd_hil.wire.can_interface import InterfaceState, read_link
 from adacd_hil.wire.contract_frames import read_bitrates
+from adacd_hil.wire.open_bus import open_bus
 
 _MARKS = {Status.OK: "ok", Status.WARNING: "WARNING", Status.FAILED: "FAILED", Status.SKIPPED: "skipped"}
 

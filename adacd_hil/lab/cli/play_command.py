@@ -19,8 +19,9 @@ from adacd_hil.lab.cli.log_command import dbc_option, find_dbc, id_option, only_
 from adacd_hil.log.log_files import LogError
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.terminal import in_line
-from adacd_hil.wire.bus import Bus, BusError, open_bus
+from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.can_interface import is_virtual
+from adacd_hil.wire.open_bus import open_bus
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

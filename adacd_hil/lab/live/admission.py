@@ -13,11 +13,9 @@ import socket
 import struct
 from collections.abc import Sequence
 from http import HTTPStatus
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from adacd_hil.lab.live.live_setup import LiveSetup
-
+from adacd_hil.lab.live.live_setup import LiveSetup
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Two names of what is the same on the wire: of the viewers since 2025, and of the ones before."""
@@ -73,7 +71,7 @@ def normal_origin(origin: str) -> str:
 class Admission:
     """The rules of one run."""
 
-    def __init__(self, setup: "LiveSetup") -> None:
+    def __init__(self, setup: LiveSetup) -> None:
         """Take in what `setup` allows beside the viewers' own pages and this machine's own names."""
         self._origins = {*VIEWER_ORIGINS, *map(normal_origin, setup.origins)}
         own = socket.gethostname().lower()

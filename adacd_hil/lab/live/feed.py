@@ -68,8 +68,9 @@ class Batch(NamedTuple):
 
 
 class ServerSetup(NamedTuple):
-    """ids: the file's number of each channel, by ours; start_ns: log time before the first record."""
+    """live: where; setup: of the log; ids: the file's number of each channel; start_ns: before the first record."""
 
+    live: LiveSetup
     setup: WriterSetup
     ids: dict[int, int]
     start_ns: int
@@ -100,16 +101,15 @@ RING_BYTES = 8 * 1024 * 1024
 class LiveFeed:
     """Records for the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
 
-    def __init__(self, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> None:
-        """Start the process, and wait until it listens where `setup.live` says. Raises LogError.
+    def __init__(self, live: LiveSetup, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> None:
+        """Start the process, and wait until it listens where `live` says. Raises LogError.
 
         ids: the file's number of each channel, by ours. start_ns: log time before the first record.
         """
         self.hidden = 0
         self._is_watched = False
-        assert isinstance(setup.live, LiveSetup)
-        place = f"{setup.live.host}:{setup.live.port}"
-        told = ServerSetup(replace(setup, attachments={}, metadata={}), ids, start_ns)
+        place = f"{live.host}:{live.port}"
+        told = ServerSetup(live, replace(setup, attachments={}, metadata={}, live=None), ids, start_ns)
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             self._ring = Ring(RING_BYTES)

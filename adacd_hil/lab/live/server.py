@@ -392,9 +392,8 @@ def url_of(setup: LiveSetup, listening: socket.socket) -> str:
 
 def make_server(told: ServerSetup, ring: RingReader, writer: socket.socket) -> LiveServer:
     """Make the server of a log."""
-    setup = told.setup
-    assert isinstance(setup.live, LiveSetup)
-    return LiveServer(setup.live, LiveTopics(setup.live, setup.channels, told.ids, told.start_ns), ring, writer)
+    topics = LiveTopics(told.live, told.setup.channels, told.ids, told.start_ns)
+    return LiveServer(told.live, topics, ring, writer)
 
 
 async def _serve(
@@ -407,15 +406,14 @@ def main(socket_descriptor: int, ring_descriptor: int, notices: int) -> None:
     """Serve: say where, show what comes, end with the writer."""
     writer = socket.socket(fileno=socket_descriptor)
     told: ServerSetup = read_setup()
-    assert isinstance(told.setup.live, LiveSetup)
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
     try:
-        listening = listen(told.setup.live)
+        listening = listen(told.live)
     except (OSError, OverflowError, UnicodeError) as error:
         writer.send(json.dumps({"error": " ".join(str(error).split())}).encode())
         return
-    writer.send(json.dumps({"error": "", "url": url_of(told.setup.live, listening)}).encode())
+    writer.send(json.dumps({"error": "", "url": url_of(told.live, listening)}).encode())
     asyncio.run(_serve(told, RingReader(ring_descriptor), writer, listening, notices))
 
 
