@@ -27,15 +27,26 @@ $(BIN)/python:
 		|| { echo "$(PYTHON) has no venv module; on Debian: apt-get install python3-venv"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 
+# uv takes a fifteenth of pip's time for the same locked packages; what it can't do, pip does. Of pip's configuration, uv
+# is told the index.
+$(BIN)/.uv: requirements-uv.lock | $(BIN)/python
+	@$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-uv.lock || true
+	@touch $@
+
+locked = index="$${PIP_INDEX_URL:-`$(BIN)/pip config get global.index-url 2>/dev/null`}"; \
+	{ test -x $(BIN)/uv && $(BIN)/uv pip install --quiet --python $(BIN)/python $${index:+--default-index "$$index"} \
+		--require-hashes -r $(1); } \
+	|| $(BIN)/pip install --disable-pip-version-check --require-hashes -r $(1)
+
 # The package is installed as the source tree itself, with the locked build back end and nothing fetched besides.
-$(VENV)/.run: requirements.lock pyproject.toml | $(BIN)/python
+$(VENV)/.run: requirements.lock pyproject.toml | $(BIN)/.uv
 	@echo "installing `grep -c '==' requirements.lock` packages, some 0.6 GB, into $(VENV)"
-	$(BIN)/pip install --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(call locked,requirements.lock)
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
 $(VENV)/.dev: requirements-dev.lock $(VENV)/.run
-	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.lock
+	@$(call locked,requirements-dev.lock)
 	@touch $@
 
 install: $(VENV)/.run
