@@ -1,6 +1,6 @@
 """The report's files: a self-contained HTML page, its numbers as JSON and CSV, figures as PNG, the index of a folder.
 
-Where it is asked for, it is printed, too: report.pdf and report.png have the words and all figures.
+Where it is asked for, report.png has the verdict and all figures, too. A browser prints the page.
 
 The same log gives the same bytes. Tables in CSV have times in s since motion start, and units in the names.
 """
@@ -10,14 +10,13 @@ import dataclasses
 import io
 import json
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from numpy.typing import NDArray
@@ -135,9 +134,7 @@ def write_run_report(
         report.html_path.name: report_page(metrics, shown_run, source, drawings, timing),
     }
     if is_printed:
-        shown, verdict = [*drawings, *timing], (metrics.verdict, metrics.is_clean)
-        files["report.pdf"] = report_pdf(*verdict, _tables(metrics, source), shown)
-        files["report.png"] = report_png(*verdict, shown)
+        files["report.png"] = report_png(metrics.verdict, metrics.is_clean, [*drawings, *timing])
     with failing_as(f"report in {out_dir} can't be written"):
         replace_files(out_dir, files)
     return report
@@ -197,25 +194,10 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 _WIDTH_IN: Final = 10.0
 """That of all figures."""
-_LINES_A_PAGE: Final = 62
-_LINE_IN: Final = 0.105
-_FONT_SIZE: Final = 5.6
 _VERDICT_LETTERS: Final = 96
 _PNG_DOTS_PER_INCH: Final = 110
 _ROOM_IN: Final = 0.32
 """Above each figure, for its title."""
-
-
-def report_pdf(verdict: str, is_good: bool, lines: Sequence[str], drawings: Sequence[Drawing]) -> bytes:
-    """Write verdict and tables, as many pages as they need, then a page per figure."""
-    out = io.BytesIO()
-    metadata: Any = {"CreationDate": None, "Creator": "adacd-hil"}  # None: without it
-    with style(), PdfPages(out, metadata=metadata) as pages:
-        for figure in _word_pages(verdict, is_good, lines):
-            pages.savefig(figure)
-        for drawing in drawings:
-            pages.savefig(drawing.figure)
-    return out.getvalue()
 
 
 def report_png(verdict: str, is_good: bool, drawings: Sequence[Drawing]) -> bytes:
@@ -241,21 +223,6 @@ def _pixels(figure: Figure) -> NDArray[np.uint8]:
     figure.dpi = _PNG_DOTS_PER_INCH
     canvas.draw()
     return np.array(canvas.buffer_rgba())
-
-
-def _word_pages(verdict: str, is_good: bool, lines: Sequence[str]) -> Iterator[Figure]:
-    for first in range(0, max(len(lines), 1), _LINES_A_PAGE):
-        chosen = lines[first : first + _LINES_A_PAGE]
-        head = _head(verdict, is_good) if first == 0 else Figure(figsize=(_WIDTH_IN, 0.4))
-        top_in = head.get_figheight()
-        height_in = top_in + _LINE_IN * (len(chosen) + 4)
-        head.set_figheight(height_in)
-        for text in head.texts:
-            text.set_y(1.0 - 0.35 / height_in)
-        for number, line in enumerate(chosen):
-            y = 1.0 - (top_in + _LINE_IN * number) / height_in
-            head.text(0.04, y, line, fontsize=_FONT_SIZE, family="DejaVu Sans Mono", va="top", parse_math=False)
-        yield head
 
 
 def _head(verdict: str, is_good: bool) -> Figure:
