@@ -79,7 +79,7 @@ def test_uncompiled_code_comes_to_the_same_bits(name: str, tmp_path: Path) -> No
 
 def test_the_runs_cover_both_schemes_and_every_contract() -> None:
     settings = [load_settings(str(RUNS / f"{name}.config.toml")) for name in names()]
-    assert len(settings) >= 16
+    assert len(settings) >= 18
     assert {(one.scheme, one.devices.contract) for one in settings} == {
         ("paper", "arm"),
         ("paper", "arm_fd_500us"),
