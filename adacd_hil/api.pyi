@@ -1,15 +1,35 @@
-from adacd_hil.lab.library.array_detection import ArrayContact as ArrayContact
-from adacd_hil.lab.library.array_detection import ArrayError as ArrayError
-from adacd_hil.lab.library.array_detection import detect as detect
-from adacd_hil.lab.library.array_detection import fit as fit
-from adacd_hil.lab.library.loaded_run import LoadedRun as LoadedRun
-from adacd_hil.lab.library.loaded_run import RunContact as RunContact
-from adacd_hil.lab.library.loaded_run import RunEvent as RunEvent
-from adacd_hil.lab.library.loaded_run import load as load
-from adacd_hil.lab.offline.recording_verdict import Verdict as Verdict
-from adacd_hil.log.log_files import LogError as LogError
-from adacd_hil.records import ContactReport as ContactReport
-from adacd_hil.records import SchemeState as SchemeState
-from adacd_hil.scheme.identify.certificate import Certificate as Certificate
-from adacd_hil.wire.bus import Bus as Bus
-from adacd_hil.wire.bus import Frame as Frame
+from adacd_hil.lab.library.array_detection import ArrayContact, ArrayError, detect, fit
+from adacd_hil.lab.library.array_detection import ArrayDetection as Detection
+from adacd_hil.lab.library.array_detection import FittedModel as Model
+from adacd_hil.lab.library.array_detection import OfflineArm as Arm
+from adacd_hil.lab.library.loaded_run import LoadedRun, RunContact, RunEvent, load
+from adacd_hil.lab.offline.recording_verdict import Verdict
+from adacd_hil.log.log_files import LogError
+from adacd_hil.records import ContactReport, SchemeState
+from adacd_hil.scheme.detect.detector_registry import StreamDetector as Detector
+from adacd_hil.scheme.detect.detectors import register as register_detector
+from adacd_hil.scheme.identify.certificate import Certificate
+from adacd_hil.wire.bus import Bus, Frame
+
+__all__ = [
+    "Arm",
+    "ArrayContact",
+    "ArrayError",
+    "Bus",
+    "Certificate",
+    "ContactReport",
+    "Detection",
+    "Detector",
+    "Frame",
+    "LoadedRun",
+    "LogError",
+    "Model",
+    "RunContact",
+    "RunEvent",
+    "SchemeState",
+    "Verdict",
+    "detect",
+    "fit",
+    "load",
+    "register_detector",
+]

@@ -21,7 +21,6 @@ from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.can_interface import is_virtual
-from adacd_hil.wire.open_bus import open_bus
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -102,6 +101,8 @@ def play(
     playback = Playback(log, choice, is_harmless=may_move_an_arm(interface, channel) and not commands)
     open_frames(log)  # what is wrong with the recording comes before what is wrong with the bus
     clock = MonotonicClock()
+    from adacd_hil.wire.open_bus import open_bus
+
     bus = open_bus(interface, channel, clock, (), bitrate, is_fd or codec.is_fd)
     described, code = _run(playback, bus, clock, speed, times, longest_pause_s)
     answer(as_json, described, _as_text(described))
