@@ -539,6 +539,18 @@ def test_the_weight_of_a_payload_holds_an_upright_arm_until_somebody_says_that_i
     assert run.step(observation=CONTACT | Observation.AT_REST, request=Request.PAYLOAD_CHANGED) is SchemeState.ADAPT
 
 
+@pytest.mark.parametrize("observation", [CONTACT, COLLISION])
+def test_a_word_of_before_a_touch_does_not_let_an_upright_arm_go_on_beneath_it(observation):
+    run = Run(UPRIGHT).to(SchemeState.PAYLOAD)
+    run.step(request=Request.PAYLOAD_CHANGED)
+    assert run.step(observation=observation) is SchemeState.REACT
+    states = {run.step(observation=observation | Observation.AT_REST) for _ in range(2 * REST_CYCLES)}
+    assert SchemeState.ADAPT not in states
+    said = [run.step(observation=observation | Observation.AT_REST, request=Request.PAYLOAD_CHANGED)]
+    said += [run.step(observation=observation | Observation.AT_REST) for _ in range(2 * REST_CYCLES)]
+    assert SchemeState.ADAPT in said
+
+
 def test_a_touch_outside_of_a_payload_change_still_wants_to_be_acknowledged_of_an_upright_arm():
     run = Run(UPRIGHT).to(SchemeState.MONITOR)
     run.step(observation=COLLISION | Observation.AT_REST, cycles=REST_CYCLES)

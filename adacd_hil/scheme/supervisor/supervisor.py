@@ -189,6 +189,7 @@ class Supervisor:
         self._cause = SchemeEvent.NONE
         self._fault = FaultReason.NONE
         self._pending: set[Request] = set()
+        self._is_weight_told = False
         self._is_told_here = False
         self._phase_cycles = 0
         self._learning_cycles = 0
@@ -322,6 +323,7 @@ class Supervisor:
         if self._keeps(request, self._state):
             self._pending.add(request)
             self._is_told_here |= request is Request.PAYLOAD
+            self._is_weight_told |= request is Request.PAYLOAD_CHANGED and self._state in REACTING
 
     @property
     def _is_announced(self) -> bool:
@@ -330,14 +332,16 @@ class Supervisor:
 
     @property
     def _is_told_of_payload(self) -> bool:
-        """Whether the user has said that what looks like a contact is the payload: its weight, where gravity acts."""
-        is_weight = self._has_gravity and self._origin is SchemeState.PAYLOAD
+        """Whether the user has said that what looks like a contact is the payload: its weight, where gravity acts.
+
+        A weight is meant only by a word since the contact began: one of before knows nothing of who touches the arm.
+        """
+        is_weight = self._has_gravity and self._origin is SchemeState.PAYLOAD and self._is_weight_told
         return (self._is_doubted or is_weight) and Request.PAYLOAD_CHANGED in self._pending
 
     def _keeps(self, request: Request, state: SchemeState) -> bool:
         """Tell whether a request waits in a state; hands that change a payload may touch the arm."""
-        is_interrupted = state in (SchemeState.REACT, SchemeState.STOPPED)
-        if request is Request.PAYLOAD_CHANGED and is_interrupted:
+        if request is Request.PAYLOAD_CHANGED and state in REACTING:
             return self._is_doubted or self._origin is SchemeState.PAYLOAD
         return state in KEPT_IN[request]
 
@@ -348,6 +352,7 @@ class Supervisor:
         if state is SchemeState.REACT:
             self._origin = SchemeState.ADAPT if self._state is SchemeState.CERTIFY else self._state
             self._is_latched = event is not SchemeEvent.CONTACT
+            self._is_weight_told = False
         elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED, SchemeEvent.REVOKED):
             self._learning_cycles = 0
         self._cause = event
