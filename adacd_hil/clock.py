@@ -58,7 +58,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """A clock that moves only when told; starts at 0."""
+    """A clock for lockstep: starts at 0 and moves only by `sleep_until_ns`."""
 
     def __init__(self) -> None:
         self._t_ns = 0
@@ -78,7 +78,7 @@ def wall_ns() -> int:
 
 
 def wall_offset_ns() -> int:
-    """Return the wall clock minus CLOCK_MONOTONIC, ns; of three readings the one that was interrupted least."""
+    """Return the wall clock minus CLOCK_MONOTONIC, ns; the reading with the shortest interruption out of three."""
     offsets = []
     for _ in range(3):
         before_ns = time.monotonic_ns()
@@ -94,5 +94,5 @@ def format_date(t_ns: int) -> str:
 
 
 def date_ns(date_utc: str) -> int:
-    """Read what `format_date` writes, ns since 1970. Raises ValueError."""
+    """Parse a date as `format_date` writes it; return ns since 1970. Raises ValueError."""
     return int(datetime.strptime(date_utc, _DATE).replace(tzinfo=UTC).timestamp()) * _NS_PER_S
