@@ -1,4 +1,4 @@
-"""Settings of a run: who asks for what, time, log, motion and reaction, and what is known before it begins."""
+"""Settings of a run: operator, real time, log, motion, reactions, safety, tare, history."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class RequestSettings:
 
 @dataclass(frozen=True)
 class OperatorSettings:
-    """The user, where a script plays the user."""
+    """The user's role: requests by script, automatic acknowledgement."""
 
     script: tuple[RequestSettings, ...] = setting((), meaning="the user's requests, by time")
     acknowledge_after_s: float = setting(
@@ -28,18 +28,18 @@ class OperatorSettings:
         1.0, unit="s", low=0.0, high=3600.0, meaning="time after which such a fault is acknowledged"
     )
     acknowledge_on_hardware: bool = setting(
-        False, meaning="allow acknowledgement without the user where a real arm may be on the bus"
+        False, meaning="allow automatic acknowledgement where a real arm may be on the bus"
     )
 
     @property
     def acknowledges(self) -> bool:
-        """Whether stops or faults are acknowledged by themselves."""
+        """Whether stops or faults are acknowledged automatically."""
         return self.acknowledge_after_s > 0.0 or self.acknowledge_faults > 0
 
 
 @dataclass(frozen=True)
 class RealtimeSettings:
-    """How the process that runs the cycle gets on time, and what is done when it doesn't."""
+    """Real-time scheduling of the control process, and its behaviour when cycles are late."""
 
     scheduler: str = setting(
         "fifo", choices=("fifo", "deadline", "other"), meaning="SCHED_FIFO, SCHED_DEADLINE, or none of real time"
@@ -80,7 +80,7 @@ class RealtimeSettings:
 
 @dataclass(frozen=True)
 class LogSettings:
-    """The log: what may wait for its writer, and when a part of it ends and the next one begins."""
+    """The log: memory for its writer, and the length of its parts."""
 
     buffer_MiB: int = setting(
         4, unit="MiB", low=1, high=256, meaning="memory between control process and writer; 6 s of cycles at 1 kHz"
@@ -92,7 +92,7 @@ class LogSettings:
 
 
 REACTIONS = tuple(reaction.name.lower() for reaction in Reaction)
-"""What can be done about a contact, as a configuration says it."""
+"""Names of the reactions to a contact, as in a configuration."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class ControllerSettings:
 
 @dataclass(frozen=True)
 class ReactionSettings:
-    """What is done about a contact, by its level and link. Link 1's joint is joint 1; pairs of numbers are joints."""
+    """Reaction to a contact, by its level and link. Pairs of numbers are by joint."""
 
     distance_deg: tuple[float, float] = setting((8.0, 8.0), unit="deg", low=0.0, high=90.0, meaning="how far back")
     velocity_limit_deg_s: tuple[float, float] = setting(
@@ -246,10 +246,10 @@ class SafetySettings:
 
 @dataclass(frozen=True)
 class TareSettings:
-    """Tare of the joint torque sensors: how long, how still, how far apart, and how old.
+    """Tare of the joint torque sensors: poses, durations, limits of spread and drift, age.
 
-    The bounds on spread and drift are a small part of the detection threshold (0.15 Nm); an offset that is off by the
-    threshold is a contact that nobody made.
+    The bounds on spread and drift are a small part of the detection threshold (0.15 Nm): an offset that is wrong by the
+    threshold reads as a contact.
     """
 
     poses: int = setting(1, low=1, high=50, meaning="poses to measure in")
@@ -300,13 +300,13 @@ class TareSettings:
     )
 
     def drift_variance(self, age_s: float) -> float:
-        """Return by how much a sensor's zero may have moved in so long, as a variance in Nm²."""
+        """Return the variance of a sensor's zero, Nm², after a drift of so many seconds."""
         return (self.drift_Nm_K * self.temperature_K) ** 2 + self.drift_Nm_sqrt_s**2 * age_s
 
 
 @dataclass(frozen=True)
 class HistorySettings:
-    """What the arm's last certificate, of another run, says of it; `run --history` fills it in from the arm's file."""
+    """The arm's last certificate, of an earlier run; `run --history` reads it from the arm's file."""
 
     date_utc: str = setting("", meaning="time of the last certificate, ISO 8601, UTC; empty: none")
     friction_Nm: tuple[float, ...] = setting(
@@ -343,5 +343,5 @@ class HistorySettings:
 
     @property
     def is_known(self) -> bool:
-        """Whether there is a last certificate."""
+        """Whether a last certificate is known."""
         return bool(self.date_utc)

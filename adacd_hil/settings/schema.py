@@ -18,7 +18,7 @@ class ConfigError(ValueError):
 
 
 class DetectorError(ConfigError):
-    """A live detector that can't run here: it isn't registered, doesn't keep the contract, or is too slow."""
+    """A live detector that can't run here: it isn't registered, breaks the detectors' contract, or is too slow."""
 
 
 SUCCESSORS = {
@@ -27,7 +27,7 @@ SUCCESSORS = {
     "certified.sigmas": "`certified.noise_sigmas` and `certified.model_sigmas`",
     "safety.commission_cycles": "`safety.commission_s`",
 }
-"""Keys that are gone, and by what they are replaced, as an error says it."""
+"""Removed keys, and the keys that replace them, as an error prints them."""
 
 
 def setting(
@@ -77,9 +77,9 @@ def parse(section: type[Section], table: dict[str, Any], where: str = "") -> Sec
 
 
 def find_problems(section: type[Any], table: dict[str, Any], where: str = "") -> list[str]:
-    """List everything for which `parse` would refuse a table, a line each.
+    """List every reason for which `parse` would refuse a table, a line each.
 
-    What concerns several keys of a section is looked at only where each of them is right, and then the first of it.
+    Conditions on several keys are checked only if each key is valid by itself; the first violation is reported.
     """
     fields = {field.name: field for field in dataclasses.fields(section)}
     hints = typing.get_type_hints(section)
@@ -189,11 +189,11 @@ _OTHER_UNITS = {
     "rad": (("deg", math.radians(1.0)),),
     "rad/s": (("Hz", math.tau), ("deg/s", math.radians(1.0))),
 }
-"""Units that a value may have been meant in, with their worth in the setting's own."""
+"""Other units in which a value may have been given by mistake, as factors to the setting's unit."""
 
 
 def _other_unit(value: float, metadata: Any) -> str:
-    """Say what a value out of bounds would be in another unit, if it is within them then."""
+    """Return a hint if a value out of bounds would be within them in another unit."""
     for unit, worth in _OTHER_UNITS.get(metadata["unit"], ()):
         if value and metadata["low"] <= value * worth <= metadata["high"]:
             return f"; {value:g} {unit} are {value * worth:g} {metadata['unit']}"

@@ -17,7 +17,7 @@ class FilterSettings:
 
 
 _GRAVITY_P0 = (50.0, 50.0)
-"""Gravity's torques are some ten times those of Coulomb friction, whose gain is 0.5; a gain goes by their square."""
+"""Gravity torques are about ten times Coulomb friction, whose gain is 0.5; a gain goes with the square."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class TerminationSettings:
 
 @dataclass(frozen=True)
 class LiveDetectorSettings:
-    """One detector that watches beside the scheme's own thresholds."""
+    """One detector that runs live beside the scheme's own thresholds."""
 
     name: str = setting(meaning="a channel of `thresholds`, or a registered detector")
     threshold: tuple[float, float] = setting(
@@ -116,17 +116,17 @@ class DetectorSettings:
 FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")
 """Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.model.regressor`."""
 CROSS_TALK = "cross_talk"
-"""What each torque sensor shows of the other joint's torque, Nm/Nm."""
+"""Share of the other joint's torque in a torque sensor's value, Nm/Nm."""
 
 _KINDS = "inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm, torque offset Nm, lag s, further friction Nm"
 
 
 @dataclass(frozen=True)
 class CertifiedSettings:
-    """The scheme that goes beyond the paper: what is believed, when it is enough, and what stands out from it.
+    """The certified scheme: prior and process noise of the parameters, evidence for a certificate, thresholds.
 
-    Seven numbers are by kind of parameter: inertia, viscous friction, Coulomb friction, gravity, torque offset, lag,
-    further friction.
+    Lists of seven numbers are by kind of parameter: inertia, viscous friction, Coulomb friction, gravity, torque
+    offset, lag, further friction.
     """
 
     cutoffs_rad_s: tuple[float, ...] = setting(
