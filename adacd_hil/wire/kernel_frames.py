@@ -1,12 +1,12 @@
-"""Frames as the kernel gives and takes them: many per system call, and those in which a controller reports errors.
+"""SocketCAN at the level of system calls: batches of frames, and decoding of error frames.
 
-**Batches** of SocketCAN: recvmmsg and sendmmsg in memory that is laid out once.
-A received frame comes with the kernel's stamp of its reception and with how many frames the socket has dropped so far
-(SO_RXQ_OVFL). The kernel stamps by the wall clock; frames carry CLOCK_MONOTONIC.
+**Batches**: recvmmsg and sendmmsg in memory that is laid out once.
+A received frame comes with the kernel's stamp of its reception and the number of frames that the socket has dropped so
+far (SO_RXQ_OVFL). The kernel stamps by the wall clock; frames carry CLOCK_MONOTONIC.
 Sources: recvmmsg(2), sendmmsg(2), cmsg(3), socket(7); linux/can.h, asm-generic/socket.h.
 
-**Error frames**: what a CAN controller's driver reports. Source: linux/can/error.h. One frame may report several
-things: the kind is the gravest of them, the text names all.
+**Error frames**: reports of a CAN controller's driver. Source: linux/can/error.h. One frame may report several errors:
+the kind is the gravest of them, the text names all.
 """
 
 import ctypes
@@ -24,7 +24,7 @@ from adacd_hil.wire.can_interface import CANFD_MTU
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 ERROR_CLASS_MASK = 0x1FFFFFFF
-"""Subscribes to every class."""
+"""Mask that subscribes to every error class."""
 
 _TX_TIMEOUT, _ARBITRATION, _CONTROLLER, _PROTOCOL, _TRANSCEIVER = 0x001, 0x002, 0x004, 0x008, 0x010
 _ACKNOWLEDGE, _BUS_OFF, _BUS_ERROR, _RESTARTED, _COUNTERS = 0x020, 0x040, 0x080, 0x100, 0x200
@@ -105,7 +105,7 @@ _WIRES = {
 
 
 class BusTrouble(NamedTuple):
-    """What an error frame says. The controller's error counters are None where the frame has none."""
+    """Content of an error frame. The controller's error counters are None if the frame has none."""
 
     kind: TroubleKind
     text: str
@@ -114,12 +114,12 @@ class BusTrouble(NamedTuple):
 
 
 def is_bus_off(frame: Frame) -> bool:
-    """Tell whether an error frame says that the controller has left the bus."""
+    """Tell whether an error frame reports bus-off."""
     return bool(frame.can_id & _BUS_OFF)
 
 
 def decode_error(frame: Frame) -> BusTrouble:
-    """Read an error frame; missing data bytes count as zero. Raises ValueError for a frame that isn't one."""
+    """Decode an error frame; missing data bytes count as zero. Raises ValueError for other frames."""
     if not frame.is_error:
         raise ValueError(f"frame 0x{frame.can_id:X} is not an error frame")
     data = frame.data.ljust(_DATA_BYTES, b"\0")
@@ -135,7 +135,7 @@ def decode_error(frame: Frame) -> BusTrouble:
 
 
 def _of_controller(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
-    """List what concerns the controller and its driver."""
+    """Return the errors of the controller and its driver in an error frame."""
     found = [
         (kind, kind.value)
         for bit, kind in (
@@ -155,7 +155,7 @@ def _of_controller(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
 
 
 def _of_bus(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
-    """List what concerns frames on the bus."""
+    """Return the bus errors in an error frame: acknowledgement, protocol, arbitration."""
     found = []
     is_slot_empty = bool(classes & _PROTOCOL) and data[3] == _ACKNOWLEDGE_SLOT
     if classes & _ACKNOWLEDGE or is_slot_empty:
@@ -177,7 +177,7 @@ CAN_ERR_FLAG = 0x20000000
 CAN_ID_MASK = 0x1FFFFFFF
 
 _FRAMES: Final = 64
-"""Frames of one system call: three cycles of a full bus at 1 Mbit/s."""
+"""Frames per system call: three cycles of a full bus at 1 Mbit/s."""
 _IS_64_BIT = ctypes.sizeof(ctypes.c_void_p) == 8
 _SO_RXQ_OVFL = 40
 _SO_TIMESTAMPNS = 35 if _IS_64_BIT else 64  # the second is the one with 64 bits of seconds everywhere
@@ -185,12 +185,12 @@ _MSG_DONTWAIT = 0x40
 _POLLIN = 1
 _HEAD = "QII" if _IS_64_BIT else "III"  # struct cmsghdr: length, level, type
 _RECEIVED = struct.Struct(f"=IB3x64s {_HEAD}qq {_HEAD}I")
-"""A frame, its stamp's control message, and that of the drops, which comes once there has been one."""
+"""A frame, the control message of its stamp, and that of the drop count, which comes after the first drop."""
 _SLOT_BYTES = CANFD_MTU + 64
 _STEP_NS = 20_000_000
-"""After a longer silence, or a larger step of the wall clock, the clocks are compared anew."""
+"""After a longer silence, or a larger step of the wall clock, the two clocks are compared again."""
 _TRUST_NS = 1_000_000_000
-"""How long a comparison of the clocks holds at most. Slewing moves both alike; only a step sets them apart."""
+"""Longest use of one comparison of the clocks. Slewing moves both alike; only a step sets them apart."""
 
 
 class _Vector(ctypes.Structure):
@@ -239,17 +239,18 @@ _poll.argtypes = (ctypes.c_void_p, ctypes.c_ulong, ctypes.c_void_p, ctypes.c_voi
 
 
 class FrameReceiver:
-    """Takes what waits in a CAN socket.
+    """Receives the frames in a CAN socket, in batches.
 
-    `frames_lost`: dropped by the kernel for want of room before the frames of the last `take`; one ends before a loss.
+    `frames_lost`: frames that the kernel dropped for want of room before those of the last `take`; a batch ends at a
+    drop.
     """
 
     def __init__(self, opened: socket.socket, clock: Clock) -> None:
-        """Ask the socket for stamps and drops. Frames of a clock other than the monotonic one carry its time."""
+        """Enable stamps and drop counts of the socket. Unless the clock is monotonic, frames carry the clock's time."""
         opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         opened.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         self.frames_lost = 0
-        self._held: list[tuple[int, Frame]] = []  # after a loss, each with how many had been dropped before it
+        self._held: list[tuple[int, Frame]] = []  # frames behind a drop, each with the drop count before it
         self._descriptor = opened.fileno()
         self._clock = None if isinstance(clock, MonotonicClock) else clock
         self._memory = ctypes.create_string_buffer(_FRAMES * _SLOT_BYTES)
@@ -258,7 +259,7 @@ class FrameReceiver:
             message.head.control = ctypes.addressof(self._memory) + index * _SLOT_BYTES + CANFD_MTU
             message.head.control_length = _SLOT_BYTES - CANFD_MTU
         self._place = ctypes.addressof(self._messages)
-        self._fresh = bytes(self._messages)  # the kernel changes what it fills in
+        self._fresh = bytes(self._messages)  # the kernel overwrites lengths and flags
         self._polled = _Poll(self._descriptor, _POLLIN, 0)
         self._poll_place = ctypes.addressof(self._polled)
         self._duration = _Duration(0, 0)
@@ -268,7 +269,7 @@ class FrameReceiver:
         self._last_ns = 0
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until there is something to take; False after `timeout_s`, anew after a signal. Raises OSError."""
+        """Wait until a frame can be received; False after `timeout_s`; a signal restarts the wait. Raises OSError."""
         if self._held:
             return True
         whole_s = int(timeout_s)
@@ -281,7 +282,7 @@ class FrameReceiver:
         return bool(found)
 
     def take(self) -> list[Frame]:
-        """Return what waits, at most 64 frames; the rest is for the next time. Raises OSError."""
+        """Receive up to 64 frames without waiting. Raises OSError, BlockingIOError if there is no frame."""
         if self._held:
             return self._take_held()
         count = _receive(self._descriptor, self._place, _FRAMES, _MSG_DONTWAIT, None)
@@ -303,19 +304,19 @@ class FrameReceiver:
         return Frame(can_id & CAN_ID_MASK, data[:length], t_ns, bool(can_id & CAN_ERR_FLAG))
 
     def _lost_before(self, index: int) -> int:
-        """Return how many frames the kernel had dropped before one of the batch came; those of the past, where none."""
+        """Return the drop count before a frame of the batch; the last known one if the frame carries none."""
         *_, kind, lost = _RECEIVED.unpack_from(self._memory, index * _SLOT_BYTES)
         return lost if kind == _SO_RXQ_OVFL else self.frames_lost
 
     def _take_held(self) -> list[Frame]:
-        """Return the held frames up to the next loss."""
+        """Return the held frames up to the next drop."""
         self.frames_lost = max(self.frames_lost, self._held[0][0])
         frames = [frame for lost, frame in self._held if lost <= self.frames_lost]
         self._held = self._held[len(frames) :]
         return frames
 
     def _to_clock(self, wall_ns: int) -> int:
-        """Take a stamp of the kernel to the clock that frames carry."""
+        """Convert a kernel stamp to the clock of the frames."""
         if self._clock is not None:
             return self._clock.now_ns()
         if not (wall_ns < self._trusted_ns and 0 <= wall_ns - self._last_ns < _STEP_NS):
@@ -326,7 +327,7 @@ class FrameReceiver:
 
 
 class FrameSender:
-    """Sends some packed frames at once."""
+    """Sends several packed frames in one system call."""
 
     def __init__(self, opened: socket.socket) -> None:
         self._descriptor = opened.fileno()
@@ -337,7 +338,7 @@ class FrameSender:
         self._lengths = [0] * _FRAMES
 
     def send(self, frames: Sequence[bytes]) -> int:
-        """Hand over packed frames in one system call; return how many were taken, 0 on an error of any kind."""
+        """Send packed frames in one system call; return how many the kernel accepted, 0 on any error."""
         count = 0
         for count, packed in enumerate(frames[:_FRAMES], 1):
             slot, length = count - 1, len(packed)
@@ -349,7 +350,7 @@ class FrameSender:
 
 
 def _lay_out(memory: int, slot_bytes: int, length: int) -> tuple[Any, Any]:
-    """Make the messages of a batch, each with a vector of `length` bytes at the beginning of its slot."""
+    """Lay out the messages of a batch, each with a vector of `length` bytes at the beginning of its slot."""
     vectors = (_Vector * _FRAMES)()
     messages = (_MessageHead * _FRAMES)()
     for index in range(_FRAMES):
