@@ -1,14 +1,13 @@
-"""What is known of an arm from one run to the next: its tare and its history, as TOML, and the checks before their use.
+"""Tare and history of an arm: the files that outlive a run, as TOML, and the checks before their use.
 
-Both belong to devices, by their serial numbers of 0x1018:4: a tare to the sensors that it was measured with, a history
-to all devices of one arm.
+Both belong to devices, by the serial numbers of 0x1018:4: a tare to the sensors that were tared, a history to all
+devices of one arm.
 
-**A tare** has offsets with their provenance. They are in joint direction and are what `arm.torque_offset_Nm` subtracts
-after the sign.
+**A tare** has offsets with their provenance, in joint direction: `arm.torque_offset_Nm` subtracts them after the sign.
 
-**A history** has what each run has certified. The first certificate carries a digest of the devices and of itself, each
-further one that of the one before and of itself, so that a file that was damaged or edited by hand is refused. That the
-newest were cut off isn't seen. It is no signature: who can write the file can compute digests, too.
+**A history** lists the certificates of all runs. The first certificate carries a digest of the devices and of itself,
+each further one a digest of its predecessor's and of itself, so that a damaged or edited file is refused. Missing
+newest certificates are not noticed. The digest is no signature: anybody who can write the file can compute it.
 """
 
 import dataclasses
@@ -34,16 +33,16 @@ from adacd_hil.settings.toml_files import parse_toml, read_toml, to_toml
 TARE_NAME = "tare.toml"
 TARE_FORMAT = 1
 SMALLEST_STD_NM = 0.001
-"""No zero is known better than this, however long it was measured."""
+"""Smallest standard deviation of a sensor's zero that is used, however long it was measured."""
 _NS_PER_H = 3_600_000_000_000
 TARED = ("arm.torque_offset_Nm", "arm.torque_offset_std_Nm")
-"""Settings that a tare measures."""
+"""Settings that a tare overrides."""
 _CLOCK_TOLERANCE_H = 0.1
 
 
 @dataclass(frozen=True)
 class DeviceRecord:
-    """A device of the arm in a file that outlives the run: what it was by object 0x1018."""
+    """A device of the arm in a tare or history: name, node id and object 0x1018."""
 
     name: str = setting(meaning="name in the DBC")
     node_id: int = setting(low=1, high=127, meaning="CANopen node id")
@@ -53,7 +52,7 @@ class DeviceRecord:
     serial: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:4")
 
     def difference(self, found: Identity) -> str:
-        """Say why a device is not this one; "" where it is. Firmware, and with it the revision, may have changed."""
+        """Return the first difference to the device found, "" if it is the same. The revision may differ (firmware)."""
         for what, known, present in (
             ("vendor", self.vendor, found.vendor),
             ("product code", self.product, found.product),
@@ -86,7 +85,7 @@ class PoseRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class Tare:
-    """Offsets of both joint torque sensors and where they come from."""
+    """Offsets of both joint torque sensors, and how they were measured."""
 
     format: int = setting(low=TARE_FORMAT, high=TARE_FORMAT, meaning="version of this file's layout")
     offset_Nm: tuple[float, float] = setting(unit="Nm", low=-50.0, high=50.0, meaning="subtracted after the sign")
@@ -119,7 +118,7 @@ class Tare:
     git: str = setting(meaning="commit of adacd-hil, empty when installed without one")
     sensor1: SensorRecord = setting(meaning="sensor of joint 1")
     sensor2: SensorRecord = setting(meaning="sensor of joint 2")
-    poses: tuple[PoseRecord, ...] = setting(meaning="what was measured")
+    poses: tuple[PoseRecord, ...] = setting(meaning="measured poses")
 
     def __post_init__(self) -> None:
         if not self.poses:
@@ -135,7 +134,7 @@ class Tare:
         return self.sensor1, self.sensor2
 
     def measured_ns(self) -> int:
-        """Return when it was measured, ns since 1970."""
+        """Return the time of the measurement, ns since 1970."""
         return date_ns(self.date_utc)
 
 
@@ -151,9 +150,9 @@ def read_tare(path: Path) -> Tare:
 
 
 def write_tare(tare: Tare, path: Path) -> Path | None:
-    """Write a tare file in one step; what is there is kept with `.1` appended, whose path is returned. Raises OSError.
+    """Write a tare file in one step; keep the old one as `.1` and return its path, None without one. Raises OSError.
 
-    At no moment is there half a file, or none where there was one.
+    At each moment the path holds a whole file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     backup = path.with_name(f"{path.name}.1") if path.exists() else None
@@ -166,14 +165,14 @@ def write_tare(tare: Tare, path: Path) -> Path | None:
 
 
 def sensor_identities(identities: Sequence[Identity]) -> tuple[Identity, ...]:
-    """Pick the torque sensors out of the devices found at boot, in joint order."""
+    """Return the torque sensors among the devices found at boot, in joint order."""
     found = {identity.name: identity for identity in identities}
     return tuple(found[f"Sensor{joint}"] for joint in range(1, JOINTS + 1))
 
 
 @dataclass(frozen=True)
 class UsedTare:
-    """A tare file that a run uses. `text`: the file as it is. `warnings`: what there is to say of it."""
+    """A tare file that a run uses. `text`: its contents. `warnings`: remarks for the log, such as its age."""
 
     path: Path
     text: bytes
@@ -182,14 +181,14 @@ class UsedTare:
     warnings: tuple[str, ...]
 
     def apply(self, settings: Settings) -> Settings:
-        """Return settings whose `arm.torque_offset_Nm` is the tare's, and say how well it is known."""
+        """Return the settings with the tare's `arm.torque_offset_Nm` and its standard deviation."""
         arm = dataclasses.replace(
             settings.arm, torque_offset_Nm=self.tare.offset_Nm, torque_offset_std_Nm=self.offset_std_Nm(settings.tare)
         )
         return dataclasses.replace(settings, arm=arm)
 
     def offset_std_Nm(self, drift: TareSettings) -> tuple[float, float]:
-        """Return the standard deviation of the offsets now: as measured, and what has drifted since."""
+        """Return the standard deviation of the offsets now, Nm: measured, plus drift since the tare."""
         drifted = drift.drift_variance(self.age_s)
         first, second = (
             math.sqrt(error**2 + (spread / 2.0) ** 2 + drifted)
@@ -198,7 +197,7 @@ class UsedTare:
         return max(first, SMALLEST_STD_NM), max(second, SMALLEST_STD_NM)
 
     def check_sensors(self, identities: Sequence[Identity]) -> list[Event]:
-        """Return what goes to the log's events. Raises DeviceError unless the sensors are those that were tared."""
+        """Return events for the log. Raises DeviceError unless the sensors are those of the tare."""
         for sensor, identity in zip(self.tare.sensors, sensor_identities(identities), strict=True):
             if difference := sensor.difference(identity):
                 raise DeviceError(f"{difference} of tare {self.path}; tare again")
@@ -215,12 +214,12 @@ class UsedTare:
         }
 
     def describe_offset(self) -> str:
-        """Write the offsets of both joints, Nm."""
+        """Format the offsets of both joints, Nm."""
         return ", ".join(repr(offset) for offset in self.tare.offset_Nm)
 
 
 def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
-    """Read a tare for a run with these settings. now_ns: wall clock. Raises ConfigError when it can't be used."""
+    """Read a tare for a run with these settings. now_ns: wall clock. Raises ConfigError if it can't be used."""
     tare = read_tare(path)
     if tare.sign != settings.arm.sign:
         raise ConfigError(
@@ -256,12 +255,12 @@ HISTORY_NAME = "history.toml"
 HISTORY_FORMAT = 1
 _LARGEST = 1000.0
 _FUTURE_NS = 360_000_000_000
-"""How far ahead of this machine's clock a certificate may be dated."""
+"""Most by which a certificate's date may be ahead of this machine's clock."""
 
 
 @dataclass(frozen=True)
 class CertificateRecord:
-    """What one run has certified, see `Certificate`."""
+    """One certificate of a run, see `Certificate`."""
 
     date_utc: str = setting(meaning="when the run ended, ISO 8601, UTC")
     log: str = setting(meaning="the run's log")
@@ -279,14 +278,14 @@ class CertificateRecord:
     )
     offset_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, high=_LARGEST, meaning="their deviations")
     is_payload: bool = setting(meaning="with a payload that was announced in the run")
-    text: str = setting(meaning="what anchors it, and what friction and inertia are known by")
+    text: str = setting(meaning="the anchor of its offsets, and the sources of friction and inertia")
     digest: str = setting("", meaning="SHA-256 of the digest before (of the devices at first) and of all above")
 
     def __post_init__(self) -> None:
         self.known(HistorySettings())
 
     def known(self, settings: HistorySettings) -> HistorySettings:
-        """Return settings whose last certificate is this one. Raises ValueError where values are missing."""
+        """Return settings with this as the last certificate. Raises ValueError if values are missing."""
         return dataclasses.replace(
             settings,
             date_utc=self.date_utc,
@@ -299,7 +298,7 @@ class CertificateRecord:
         )
 
     def digest_after(self, before: str) -> str:
-        """Return the digest that this record must have after another's."""
+        """Return this record's digest after a predecessor's."""
         return _digest(before + to_toml(dataclasses.replace(self, digest="")))
 
 
@@ -309,7 +308,7 @@ class History:
 
     format: int = setting(low=HISTORY_FORMAT, high=HISTORY_FORMAT, meaning="version of this file's layout")
     devices: tuple[DeviceRecord, ...] = setting(meaning="drives and sensors of the arm")
-    certificates: tuple[CertificateRecord, ...] = setting(meaning="what runs have certified")
+    certificates: tuple[CertificateRecord, ...] = setting(meaning="certificates of all runs")
 
     def __post_init__(self) -> None:
         if not self.certificates:
@@ -331,7 +330,7 @@ class History:
 
 
 def devices_digest(devices: Sequence[DeviceRecord]) -> str:
-    """Return the digest that stands before that of the first certificate."""
+    """Return the digest of the devices, the predecessor of the first certificate's."""
     return _digest("\n".join(map(to_toml, devices)))
 
 
@@ -340,7 +339,7 @@ def _digest(text: str) -> str:
 
 
 def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity], path: Path) -> str:
-    """Say why devices are not those of a history; "" where they are."""
+    """Return the first difference between devices and a history's, "" if they are the same."""
     known = {record.name: record for record in devices}
     for identity in identities:
         record = known.get(identity.name)
@@ -367,9 +366,9 @@ def _parse(path: Path, text: bytes) -> History:
 
 @dataclass(frozen=True)
 class UsedHistory:
-    """The history that a run uses and adds to.
+    """The history that a run reads and extends.
 
-    `text`: the file as it was; `history` None: there was none yet. `age_s`: of its last certificate.
+    `text`: the file's contents; `history` None: the file doesn't exist yet. `age_s`: age of its last certificate.
     """
 
     path: Path
@@ -379,16 +378,16 @@ class UsedHistory:
 
     @property
     def is_first_run(self) -> bool:
-        """Whether nothing is known of the arm."""
+        """Whether the arm has no certificate yet."""
         return self.history is None
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What there is to say of it."""
+        """Remarks for the log."""
         return (f"{self.path}: the arm's first run, nothing is known of its friction",) if self.is_first_run else ()
 
     def apply(self, settings: Settings) -> Settings:
-        """Return settings whose `history` is the last certificate, with how far the sensors may have drifted since."""
+        """Return the settings with the last certificate in section `history`, its age as drift of the sensors."""
         if self.history is None:
             return settings
         known = self.history.last.known(settings.history)
@@ -397,7 +396,7 @@ class UsedHistory:
         return dataclasses.replace(settings, history=dataclasses.replace(known, offset_std_Nm=std_Nm))
 
     def check_devices(self, identities: Sequence[Identity]) -> Event:
-        """Return what goes to the log's events. Raises DeviceError unless the devices are those of the history."""
+        """Return an event for the log. Raises DeviceError unless the devices are those of the history."""
         if self.history is None:
             return Event("warning", "history", self.warnings[0])
         if difference := _difference(self.history.devices, identities, self.path):
@@ -413,9 +412,9 @@ class UsedHistory:
         return {"history": str(self.path), "history_certificates": self._count()}
 
     def add(self, certificates: Sequence[Certificate], identities: Sequence[Identity], origin: "Origin") -> str:
-        """Write the history with more certificates, in one step; say so. Raises OSError, ConfigError.
+        """Append certificates and write the history in one step; return a summary. Raises OSError, ConfigError.
 
-        Those of another run that came in between are kept.
+        Certificates that another run has appended meanwhile are kept.
         """
         devices, records = tuple(DeviceRecord(*identity) for identity in identities), []
         if self.path.exists():
@@ -435,7 +434,7 @@ class UsedHistory:
 
 
 class Origin(NamedTuple):
-    """Where certificates come from: see `CertificateRecord`."""
+    """Origin of certificates: run, log, profile, version; see `CertificateRecord`."""
 
     date_utc: str
     log: str
@@ -444,8 +443,8 @@ class Origin(NamedTuple):
 
 
 def use_history(path: Path, now_ns: int) -> UsedHistory:
-    """Read the arm's history for a run; none yet is a first run. Raises ConfigError when it can't be used."""
-    if (link := dangling_link(path)) is not None:  # a history that has moved: nothing says that nothing is known
+    """Read the arm's history for a run; a missing file is a first run. Raises ConfigError if it can't be used."""
+    if (link := dangling_link(path)) is not None:  # the history was moved: the arm is known, not on its first run
         raise ConfigError(f"history {path}: link {link} leads to {link.readlink()}, which is not there")
     if not path.exists():
         return UsedHistory(path, b"", None)

@@ -1,15 +1,14 @@
-"""What a first certificate says of the lengths that the host was told, and what nothing says.
+"""Compares a first certificate with the configured link lengths; names lengths that can't be checked.
 
-Torques at the joints depend on a length through the inertia alone, whatever the length is called:
+Torques at the joints depend on a length through the inertia alone:
+    a2 = m2 c2 l1,   a1 - a3 = I1 + m1 c1² + m2 l1²,   a3 = I2 + m2 c2²        c: centre of mass, from the link's joint
 
-    a2 = m2 c2 l1,   a1 − a3 = I1 + m1 c1² + m2 l1²,   a3 = I2 + m2 c2²        c: centre of mass, from the link's joint
+so a link that is s times as long as configured, its masses in their places, has
 
-so a link that is s times as long as told, its masses in their places, has
+    link 1:  a2 → s a2,  a1 - a3 → s² (a1 - a3),  a3 unchanged     link 2:  a2 → s a2,  a3 → s² a3,  a1 - a3 unchanged
 
-    link 1:  a2 → s a2,  a1 − a3 → s² (a1 − a3),  a3 as told        link 2:  a2 → s a2,  a3 → s² a3,  a1 − a3 as told
-
-of `arm.cad_theta`. Where gravity acts, a5 = m2 c2 g', and l1 = g' a2 / a5; g' = g sin(tilt) acts in the plane of
-motion, and a tilt that is smaller than told makes l1 longer. An a5 below 0 is gravity in the other direction.
+relative to `arm.cad_theta`. With gravity a5 = m2 c2 g', and l1 = g' a2 / a5; g' = g sin(tilt) acts in the plane of the
+of motion, and a tilt smaller than configured makes l1 longer. An a5 below 0 is gravity in the other direction.
 """
 
 from typing import Final
@@ -23,16 +22,16 @@ from adacd_hil.settings.configuration import Settings
 
 EVENT: Final = "geometry"
 _ALIKE: Final = 0.08
-"""Share by which two figures may differ that agree; a CAD model is off by as much."""
+"""Largest relative difference of two equal figures; the error of a CAD model."""
 _LONGER: Final = 0.12
-"""Share by which a length has to be off to be told."""
+"""Smallest relative error of a length that is reported."""
 
 _SEEN: Final = 0.1
-"""Share of the expected a5 from which on its sign is no error of an arm that gravity hardly turns."""
+"""Share of the expected a5 from which its sign counts: gravity hardly acts on an arm with less."""
 
 
 def geometry_event(settings: Settings, certificate: Certificate) -> Event | None:
-    """Compare the lengths with a certificate of the arm without a payload; None where they agree."""
+    """Compare the configured lengths with a certificate of the arm without payload; None if they agree."""
     theta, lengths = certificate.parameters, settings.arm.link_length_m
     cad, is_upright = settings.arm.cad_theta, len(theta) > A5
     has_masses = any(cad[: A3 + 1])
@@ -70,7 +69,7 @@ def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
     if 1.0 / (1.0 + _LONGER) <= found_m / told_m <= 1.0 + _LONGER:
         return None
     told = f"arm.link_length_m[0] = {told_m:g} m"
-    if found_m > told_m:  # a smaller tilt looks like it
+    if found_m > told_m:  # a smaller tilt has the same effect
         tilt_deg = np.degrees(np.arcsin(np.sin(settings.tilt_rad) * told_m / found_m))
         text = (
             f"{told} is right if the arm moves at {tilt_deg:.0f} deg to the level (arm.mounting_deg[0]); at "
