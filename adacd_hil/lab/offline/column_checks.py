@@ -1,8 +1,8 @@
-"""What the columns of a recording show before anything is fitted: constant, stuck, clipped, in another unit.
+"""Checks of a recording's columns before any fit: constant, stuck, clipped, noise, wrong unit or sign.
 
-A sensor that is dead, or a column that was never filled in, reads always the same. One that is stuck reads the same for
-a while in which its joint moves. One that is clipped stays at its largest reading far longer than just below it.
-Velocities are compared with the slope of the positions, positions and torques with the limits of the URDF.
+A dead sensor, or a column that was never filled in, always has the same value. A stuck one has the same value for a
+while in which its joint moves. A clipped one stays at its largest value far longer than just below it. Velocities are
+compared with the slope of the positions, positions and torques with the limits of the URDF.
 """
 
 import math
@@ -20,44 +20,44 @@ from adacd_hil.score.wording import number_of
 
 _STUCK_S: Final = 0.5
 _STUCK_TRAVEL: Final = 0.2
-"""Of its whole travel, that a joint makes while a torque that is stuck reads the same."""
+"""Share of its whole travel that a joint makes during equal readings of a stuck torque."""
 _STUCK_TIMES: Final = 5.0
-"""Longer than 99 % of the other runs of equal readings: coarse sensors have long ones."""
+"""Factor on the 99 % quantile of the other runs of equal readings: coarse sensors have long ones."""
 _CLIPPED_SHARE, _CLIPPED_ROWS, _CLIPPED_RUN = 0.005, 10, 5
 _CLIPPED_BAND: Final = 0.05
-"""Of the span below the largest reading, which a clipped sensor passes in less time than it stays at the bound."""
+"""Share of the span below the largest reading that a clipped sensor crosses faster than the time it is clipped."""
 _PLATEAU_SIGMAS: Final = 3.5
 _PLATEAU_WIDTH: Final = 0.1
 _PLATEAU_SHARE, _PLATEAU_TIMES = 0.02, 4.0
 """A sine stays at its crest for 2.4 times as long as just below it."""
 _FEWEST_LEVELS, _FINE_LEVELS = 50, 200
-"""Of a sensor whose largest reading says anything, and of one that a sine leaves sooner, to half the time."""
+"""Fewest distinct readings of a sensor for the check, and readings from which half the time at a bound suffices."""
 STILL_RAD: Final = 0.01
-"""A joint that travels less is at rest."""
+"""Travel below which a joint is at rest."""
 _SPIKE_WINDOW, _SPIKE_SIGMAS, _SPIKE_SPAN, _SPIKES_SHARE = 5, 30.0, 1.0, 0.005
-"""Samples around one, its distance to their median by noise and by the usual span, and the most of all samples."""
+"""Samples around one; its least distance to their median, by noise and by the usual span; largest share of spikes."""
 _NOISE_STEP: Final = 0.5
-"""Mean square of the steps from sample to sample over twice the variance: 1 of white noise, 0.01 of a motion of 1 Hz at
-50 Hz."""
+"""Mean square of the steps from sample to sample over twice the variance: 1 for white noise, 0.01 for a motion of 1 Hz
+at 50 Hz."""
 _NOISE_PERIOD_S: Final = 0.02
-"""At longer periods a fast motion has such steps, too."""
+"""Longest period for that check: at longer ones a fast motion has such steps, too."""
 _TURNS_THOUGH_STILL_RAD: Final = 0.3
-"""Travel by the velocities, of a joint at rest, that neither their noise nor their offset makes."""
+"""Travel by the velocities, for a joint at rest by its positions, that velocity noise and offset can't explain."""
 _WELL_CORRELATED: Final = 0.8
 _SAME_SLOPE: Final = (0.8, 1.25)
 _BEYOND_LIMITS: Final = 3.0
-"""Times the limits of a joint: no arm goes there, but degrees taken for radians are 57 times."""
+"""Factor on the limits of a joint: no arm goes there, but degrees read as radians are 57 times too large."""
 _BEYOND_EFFORT: Final = 30.0
-"""Times the effort of the URDF: mNm taken for Nm are 1000 times."""
+"""Factor on the effort of the URDF: mNm read as Nm are 1000 times too large."""
 
 CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 
 
 class ColumnFinding(NamedTuple):
-    """What is wrong with columns, and the next thing to do.
+    """A defect of columns, and the user's next step.
 
-    is_dead: no model can be made of it. is_wrong: no model of it is worth anything, if no other reading is found. What
-    is neither may be why nothing fits.
+    is_dead: no model can be fitted. is_wrong: a fitted model is worthless, unless another interpretation of the map is
+    found. With neither, the defect is a possible reason of a bad fit.
     """
 
     text: str
@@ -79,7 +79,7 @@ class _Columns(NamedTuple):
 def find_faults(
     described: RecordingMap, fitted: Sequence[ForeignRecording], tested: ForeignRecording
 ) -> tuple[ColumnFinding, ...]:
-    """List what the columns of what is fitted and tested show."""
+    """Return the defects of the columns of the fitted and the tested recordings."""
     recordings = [*fitted, tested]
     stretches = [stretch for recording in recordings for stretch in recording.stretches]
     period_s = recordings[0].period_s
@@ -98,14 +98,14 @@ def find_faults(
 
 
 def joined_names(names: list[str], count: int) -> str:
-    """Join the names of some of so many joints."""
+    """Join the names of some joints; "all joints" if these are all of `count`."""
     if len(names) == count > 2:
         return "all joints"
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def column_name(described: RecordingMap, key: str, joint: int) -> str:
-    """Name a joint with its column."""
+    """Return a joint's name with its column."""
     name, columns = described.urdf.joint_names[joint], getattr(described.columns, key)
     return f"{name} ({columns[joint]})" if columns and columns[joint] != name else name
 
@@ -140,7 +140,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFi
 
 
 def largest_torques(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
-    """Return the largest torque (n,) of each joint, but for outliers, and its effort (n,): inf where unknown."""
+    """Return the largest torque (n,) of each joint, without outliers, and its effort (n,), inf where unknown."""
     effort = np.where(np.isfinite(arm.torque_limit) & (arm.torque_limit > 0.0), arm.torque_limit, np.inf)
     return np.nanquantile(np.abs(tau_J), 0.99, axis=0), effort
 
@@ -160,7 +160,7 @@ def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[Colu
 
 
 def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, is_meant: NDArray[np.bool_]) -> str:
-    """Name the key that gives all joints another unit, or some of them."""
+    """Return the map's key that changes the unit of all joints, or the scale of some."""
     if is_meant.all():
         return f'`units.{key}` = "{unit}", which the map has as "{getattr(described.units, key)}"'
     scale = np.array(getattr(described.scale, key) or (1.0,) * described.joints)
@@ -224,7 +224,7 @@ def _stays(column: Vector) -> str:
 
 
 def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
-    """Name single samples that are far from their neighbours, as of a frame that was read wrong."""
+    """Report single samples far from their neighbours, as of a corrupted frame."""
     for key, what, unit in (("tau_J", "torque", "Nm"), ("q", "position", "rad")):
         for joint, column in enumerate(getattr(columns, key).T):
             rows = _spikes(column)
@@ -238,7 +238,7 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFin
 
 
 def _spikes(column: Vector) -> NDArray[np.int64]:
-    """List the samples that are spikes, if they are few."""
+    """Return the rows of spikes, empty if there are too many to be spikes."""
     if len(column) < _SPIKE_WINDOW:
         return np.zeros(0, np.int64)
     windows = np.lib.stride_tricks.sliding_window_view(column, _SPIKE_WINDOW)
@@ -258,7 +258,7 @@ def _is_noise(column: Vector, period_s: float) -> bool:
 def _of_rest(
     described: RecordingMap, part: str, recordings: Sequence[ForeignRecording], still: NDArray[np.bool_]
 ) -> Iterator[ColumnFinding]:
-    """Say which joints rest in the part that is fitted, or tested, though they move in the other one. still (n,)."""
+    """Report joints that rest in the fitted, or the tested, part although they move in the other one. still (n,)."""
     q = np.concatenate([stretch.record.q for recording in recordings for stretch in recording.stretches])
     rests = np.ptp(q, axis=0) < STILL_RAD
     joints = np.flatnonzero(rests & ~still).tolist()
@@ -312,17 +312,17 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
 
 
 def _runs(column: Vector) -> NDArray[np.int64]:
-    """List the runs of equal readings: first row, and the one after the last (r, 2)."""
+    """Return the runs of equal readings: first row, and the row after the last (r, 2)."""
     edges = np.flatnonzero(np.diff(column) != 0.0) + 1
     bounds = np.concatenate(([0], edges, [len(column)]))
     return np.column_stack([bounds[:-1], bounds[1:]])
 
 
 def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | None:
-    """Find the longest run of equal torques in which a joint moves, if it is too long for a coarse sensor. q (k, n)."""
+    """Return the longest run of equal torques in which a joint moves, if a coarse sensor can't explain it. q (k, n)."""
     runs = _runs(torque)
     lengths = runs[:, 1] - runs[:, 0]
-    lengths[np.isin(torque[runs[:, 0]], (torque.min(), torque.max()))] = 1  # of a sensor that is clipped
+    lengths[np.isin(torque[runs[:, 0]], (torque.min(), torque.max()))] = 1  # a clipped sensor, reported elsewhere
     place = int(np.argmax(lengths))
     first, last = runs[place].tolist()
     usual = float(np.quantile(np.delete(lengths, place), 0.99)) if len(lengths) > 1 else 0.0
@@ -332,10 +332,10 @@ def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | 
 
 
 def plateau(torque: Vector) -> tuple[float, float] | None:
-    """Find a bound at which a torque stays within its noise: the bound, and the share of the time; None: there is none.
+    """Return the bound at which a torque stays within its noise, and the share of time there; None without one.
 
-    The last stretch before its extreme reading, as wide as the noise, holds far more readings than the one before it.
-    A joint that overcomes nothing but friction is like that, too.
+    The last band below the extreme reading, as wide as the noise, holds far more readings than the band before it. A
+    joint that overcomes nothing but friction looks like this, too.
     """
     noise = float(MEDIAN_TO_SIGMA) * float(np.median(np.abs(np.diff(torque, 2))))
     width, span = 2.0 * _PLATEAU_SIGMAS * noise, float(np.ptp(torque))
@@ -352,7 +352,7 @@ def plateau(torque: Vector) -> tuple[float, float] | None:
 
 
 def _clipped_at(torque: Vector) -> Iterator[float]:
-    """List the bounds at which readings are cut off."""
+    """Yield the bounds at which readings are cut off."""
     levels = np.unique(torque)
     if len(levels) < _FEWEST_LEVELS:
         return

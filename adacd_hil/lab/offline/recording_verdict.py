@@ -1,18 +1,18 @@
-"""The verdict on a recording: whether its torque is explained, why not, and what to do next.
+"""The verdict on a recording: whether the model explains its torque, the reasons if not, the user's next step.
 
 **Share.** Of each joint's torque, the part that the frozen model explains in the test:
 
     share = 1 - sum (tau_f - W_f theta)² / sum (tau_f - c u_f)²
 
-with the filter of the fit on both, u_f what it leaves of a constant and c the best one: what the filter takes away is
-no one's merit, nor is an offset. A torque that is noise has a share of 0.
+with the filter of the fit on both; u_f is the filtered constant and c its best factor, so that neither the filter's
+effect nor an offset counts as explained. A torque that is noise has a share of 0.
 
-**Margin.** The smallest threshold over the residual in the test, of thresholds that noise and the parameters' P make.
+**Margin.** The smallest ratio of threshold to residual in the test, with thresholds from noise and the parameters' P.
 
 A joint is explained if its share is at least `WHOLE`, or if the residual stays below its threshold and the share is at
-least `HALF`: of a torque that is mostly noise no model explains more. The test is explained if all joints are, no
-column is dead, both parts are long enough and an arm can have the parameters. Beyond a margin of 1 the model lacks more
-than noise, which the verdict says with the smallest contact that shows beside it.
+least `HALF`: no model explains more of a torque that is mostly noise. The test is explained if all joints are, no
+column is dead, both parts are long enough and an arm can have the parameters. With a margin below 1 the model lacks
+more than noise; the verdict then names the smallest contact that still shows.
 """
 
 import math
@@ -33,28 +33,28 @@ from adacd_hil.scheme.identify.offline import ArmModel, ModelEstimate, OfflineCe
 WHOLE: Final = 0.99
 HALF: Final = 0.5
 NOTHING: Final = 0.1
-"""Largest share of a torque in which nothing of the motion is."""
+"""Largest share of a torque that is unrelated to the motion."""
 _NOISE_TIMES: Final = 1.5
-"""Times the filtered noise, up to which a torque is called noise."""
+"""Factor on the filtered noise, up to which a torque is called noise."""
 _SHORTEST_FIT_S, _SHORTEST_TEST_S = 2.0, 1.0
 _SIGMAS: Final = 3.0
 _UNKNOWN: Final = 0.3
-"""Of the deviation before any motion: a parameter of which more is left was not excited."""
+"""Share of its initial deviation: a parameter that keeps more of it was not excited."""
 _MILLI: Final = (300.0, 3000.0)
-"""Times the masses of the URDF that torques ask for if they are mNm."""
+"""Range of the factor on the URDF's masses that the torques need if they are mNm."""
 _ODD_SCALE: Final = 2.0
 _ODD_MASSES: Final = 0.3
-"""Share by which the parameters of a URDF may be off."""
+"""Relative error that the parameters of a URDF may have."""
 _HEAVIEST_KG, _LIGHTEST_KG = 300.0, 0.01
-"""Inertia over the square of the reach: what no arm of a lab has."""
+"""Inertia over the square of the reach; beyond this no arm of a lab has it."""
 _HEAVY_KG, _LIGHT_KG = 30.0, 0.1
-"""What few have."""
+"""The same; beyond this few arms have it."""
 _MOSTLY: Final = 0.8
-"""Share of the torque that is explained where the scale of the parameters says anything."""
+"""Share of the torque that must be explained before the scale of the parameters is judged."""
 
 
 class JointShare(NamedTuple):
-    """What the test says of a joint. share: nan where there is no torque."""
+    """Result of the test for a joint. share: nan without torque."""
 
     name: str
     share: float
@@ -65,20 +65,20 @@ class JointShare(NamedTuple):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the torque is explained. reasons: why not, and remarks: what else is to be known, a sentence each."""
+    """Whether the torque is explained. reasons: why not, remarks: further facts, a sentence each."""
 
     is_explained: bool
     headline: str
     joints: tuple[JointShare, ...]
     reasons: tuple[str, ...]
     remarks: tuple[str, ...]
-    remedy: str  # the next thing to do; "" where nothing has to be mended
+    remedy: str  # the user's next step; "" if none is needed
 
     def __repr__(self) -> str:
         return f"<Verdict: {self.headline}>"
 
     def as_json(self) -> dict[str, Any]:
-        """Describe it for machines."""
+        """Return the verdict as a dictionary for JSON."""
         return {
             "is_explained": self.is_explained,
             "headline": self.headline,
@@ -89,7 +89,7 @@ class Verdict:
 
 
 class Fitted(NamedTuple):
-    """What is judged. before: the estimate that the fit began with."""
+    """A fit to be judged. before: the estimate that the fit began with."""
 
     described: RecordingMap
     model: ArmModel
@@ -134,9 +134,9 @@ def _against(found: ColumnFinding) -> _Finding:
 
 
 def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[ColumnFinding]) -> list[_Finding]:
-    """Say why the torque is not explained, or not by an arm that there can be: the likeliest cause alone.
+    """Return the likeliest cause of an unexplained torque, or of parameters that no arm has.
 
-    columns: what may be a cause; remarks where the torque is explained.
+    columns: defects of columns as possible causes; remarks if the torque is explained.
     """
     remarks = [_Finding(found.text, found.remedy, is_against=False) for found in columns]
     scale = list(_of_scale(fit, joints))
@@ -159,13 +159,13 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Colum
 
 
 def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
-    """Tell of each torque whether it is no more than the sensor's noise behind the filter of the fit."""
+    """Tell for each torque whether it is no more than the sensor's noise behind the filter of the fit."""
     noise = offline.filtered_noise_Nm(fit.settings)
     return [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
 
 
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
-    """Measure each joint's share and margin."""
+    """Compute each joint's share and margin."""
     parts = [
         offline.filtered(fit.model, stretch.record, fit.estimate, fit.settings) for stretch in fit.tested.stretches
     ]
@@ -190,7 +190,7 @@ def _shares(fit: Fitted) -> tuple[JointShare, ...]:
 
 
 def percent(share: float) -> str:
-    """Write a share; what is explained less than not at all is nothing."""
+    """Format a share as a percentage; a negative one is 0."""
     if math.isnan(share):
         return "-"
     digits = 1 if share < 0.9995 else 2
@@ -212,7 +212,7 @@ def _headline(fit: Fitted, joints: Sequence[JointShare], is_explained: bool) -> 
 
 
 def _of_length(fit: Fitted) -> Iterator[_Finding]:
-    """Say what is too short."""
+    """Report parts that are too short."""
     fit_s, test_s = sum(recording.duration_s for recording in fit.fitted), fit.tested.duration_s
     if fit_s < _SHORTEST_FIT_S or test_s < _SHORTEST_TEST_S:
         yield _Finding(
@@ -224,7 +224,7 @@ def _of_length(fit: Fitted) -> Iterator[_Finding]:
 
 
 def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[_Finding]:
-    """Name the mistake of the map that explains at least such a share of the torque."""
+    """Report the mistake of the map that explains at least this share of the torque."""
     fitted = [stretch.record for recording in fit.fitted for stretch in recording.stretches]
     tested = [stretch.record for stretch in fit.tested.stretches]
     readings = find_readings(fit.described, fit.model, fit.settings, fitted, tested)
@@ -240,7 +240,7 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
 
 
 def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
-    """Name torques in which nothing of the motion is, or little."""
+    """Report torques that are unrelated to the motion, or nearly so."""
     related, is_noise = _related_to_motion(fit), _is_noise(fit, joints)
     empty = [
         i for i, joint in enumerate(joints) if not joint.share >= NOTHING and (is_noise[i] or related[i] < NOTHING)
@@ -286,10 +286,10 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
 
 
 def _related_to_motion(fit: Fitted) -> Vector:
-    """Return the share (n,) of each torque that plain terms of the joint's own motion explain, whatever the model is.
+    """Return the share (n,) of each torque that simple terms of the joint's own motion explain, whatever the model.
 
-    By least squares on fit or test, told by the other one, whichever does better: filtered position, its sine and
-    cosine, velocity, its sign, and acceleration.
+    By least squares on fit or test, evaluated on the other, the better of the two; terms: filtered position, its sine
+    and cosine, velocity, its sign, and acceleration.
     """
     n = fit.model.joints
     period_s, cutoff = fit.settings.period_s, fit.settings.fit_cutoff_rad_s
@@ -315,7 +315,7 @@ def _related_to_motion(fit: Fitted) -> Vector:
 
 
 def _told_share(told: Vector, tested: Vector) -> float:
-    """Return the share of the last column of a table that a fit of the others to another table explains."""
+    """Return the share of a table's last column that a fit of the others to another table explains."""
     coefficients = np.linalg.lstsq(told[:, :-1], told[:, -1], rcond=1e-6)[0]
     unit, torque = tested[:, 0], tested[:, -1]
     spread = torque - unit * (unit @ torque) / max(float(unit @ unit), 1e-18)
@@ -361,7 +361,7 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
 def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
     """Return the unit that torques are meant in if they are off by 1000; "" if they aren't.
 
-    Some URDFs have masses of a thousandth to please a simulator: an inertia that an arm can have is none of mNm.
+    Some URDFs have masses of a thousandth for the sake of a simulator: with a plausible inertia, torques are not mNm.
     """
     low, high = _MILLI
     if low <= scale <= high and unit in ("Nm", "A") and (mass_kg is None or mass_kg > _HEAVY_KG):
@@ -372,7 +372,7 @@ def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
 
 
 def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
-    """Return by what the URDF's masses have to be multiplied, with its deviation; None where it has none."""
+    """Return the factor that the URDF's masses need, with its deviation; None if the URDF has no masses."""
     theta_full = fit.described.urdf.theta_full
     base = fit.model.place_of("base")
     told = fit.model.base.map @ theta_full
@@ -386,7 +386,7 @@ def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
 
 
 def _mass_at_reach(fit: Fitted) -> float | None:
-    """Return the mass that the inertia about the first joint is of, at the distance of the outermost joint."""
+    """Return the mass at the distance of the outermost joint that has the inertia about the first joint."""
     arm = fit.described.urdf.chain
     reach_m = float(np.sum(np.linalg.norm(arm.translation[1:], axis=1)))
     if reach_m <= 0.0 or np.any(arm.is_prismatic):
@@ -399,7 +399,7 @@ def _mass_at_reach(fit: Fitted) -> float | None:
 
 
 def _of_inertia(fit: Fitted) -> Iterator[_Finding]:
-    """Say where no masses make the inertia that was found: kinetic energy would be negative."""
+    """Report an inertia that no masses have: kinetic energy would be negative."""
     names = fit.described.urdf.joint_names
     n = fit.model.joints
     record = fit.tested.stretches[0].record
@@ -421,7 +421,7 @@ def _of_inertia(fit: Fitted) -> Iterator[_Finding]:
 
 
 def _of_friction(fit: Fitted) -> Iterator[_Finding]:
-    """Say where friction drives a joint on, or one of its two terms is negative."""
+    """Report friction that drives a joint on, or whose viscous or Coulomb term is negative."""
     record = np.concatenate([stretch.record.dq for stretch in fit.tested.stretches])
     speed = np.abs(record)
     theta, deviation = fit.estimate.theta, fit.deviation
@@ -447,7 +447,7 @@ def _of_friction(fit: Fitted) -> Iterator[_Finding]:
 
 
 def _of_excitation(fit: Fitted) -> Iterator[_Finding]:
-    """Name parameters that the motion tells little of, as noisy as the residual is."""
+    """Report parameters that the motion hardly determines, given the noise of the residual."""
     before, after = (np.sqrt(np.diag(estimate.P)) for estimate in (fit.before, fit.estimate))
     noise = np.maximum(fit.certificate.threshold_Nm / fit.settings.deviations, 1e-12)
     worse = max(1.0, float(np.max(fit.certificate.residual_rms_Nm / noise)))
@@ -462,7 +462,7 @@ def _of_excitation(fit: Fitted) -> Iterator[_Finding]:
 
 
 def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
-    """Say which joints are not explained where nothing says why."""
+    """Report unexplained joints if no cause was found."""
     for i, joint in enumerate(joints):
         if joint.is_explained or math.isnan(joint.share):
             continue
@@ -500,7 +500,7 @@ def _times_threshold(margin: float) -> str:
 
 
 def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
-    """Say what contacts show where the model lacks more than noise, or noise is more than the torque."""
+    """Report the smallest contacts that show, if the model lacks more than noise, or noise exceeds the torque."""
     certificate = fit.certificate
     contact_Nm = np.hypot(certificate.threshold_Nm, fit.settings.deviations * certificate.lack_Nm)
     over = [i for i, joint in enumerate(joints) if joint.margin < 1.0]
@@ -523,7 +523,7 @@ def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding
 
 
 def _column(described: RecordingMap, key: str, joints: Sequence[int]) -> str:
-    """Name a key of the map with the columns of some joints."""
+    """Return a key of the map with the columns of some joints."""
     columns = getattr(described.columns, key)
     named = f" ({', '.join(columns[i] for i in joints)})" if columns else ""
     return f"`columns.{key}`{named}"
