@@ -1,4 +1,4 @@
-"""`adacd-hil log`: logs at a glance, checked, recovered, cut, merged and exported, with the text printed of them."""
+"""`adacd-hil log`: info, check, recover, cut, merge and export of logs, and their output for people."""
 
 import json
 import sys
@@ -39,7 +39,7 @@ def log() -> None:
 @json_option
 @explained
 def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
-    """Show what logs hold: topics, rates, attachments, the run, its contacts and faults.
+    """Show the contents of logs: topics, rates, attachments, the run, its contacts and faults.
 
     A folder stands for the logs in it.
     """
@@ -59,7 +59,7 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 @json_option
 @explained
 def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
-    """Check logs: the rules of `mcap doctor`, all CRCs, indexes against records, and what our own logs promise.
+    """Check logs: the rules of `mcap doctor`, all CRCs, indexes against records, and the rules of our own logs.
 
     A folder stands for the logs in it.
     """
@@ -85,8 +85,8 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     """Save everything intact of a cut or damaged log, before and after the damage, to one whole file.
 
-    --out: default NAME.recovered.mcap. The log itself stays as it is. Of a log with CRCs no message is saved for which
-    none vouches; of one without all that can be read is, and counted.
+    --out: default NAME.recovered.mcap. The log itself stays as it is. A message of a log with CRCs is saved only if a
+    CRC covers it; of a log without, all readable messages are saved, and counted.
     """
     from adacd_hil.lab.logs.recover import recover as recover_log
 
@@ -154,13 +154,13 @@ def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) ->
 
 
 def info_as_json(info: "LogInfo") -> dict[str, Any]:
-    """Make a table of all that is known."""
+    """Return the information as a dictionary for JSON."""
     topics = [topic._asdict() for topic in info.topics]
     return {**vars(info), "path": str(info.path), "duration_s": info.duration_s, "topics": topics}
 
 
 def info_as_text(info: "LogInfo") -> str:
-    """Tell what a log holds, the gist first."""
+    """Format the contents of a log for people, the main facts first."""
     ending = f", {info.ending}" if info.ending else ", without an end" if info.problems else ""
     parts = f"{info.files} parts, " if info.files > 1 else ""
     lines = [
@@ -198,13 +198,13 @@ def _bytes(count: int | None) -> str:
 
 
 def check_as_json(check: "LogCheck") -> dict[str, Any]:
-    """Make a table of what was found."""
+    """Return the findings as a dictionary for JSON."""
     findings = [finding._asdict() for finding in check.findings]
     return {**check._asdict(), "path": str(check.path), "findings": findings}
 
 
 def check_as_text(check: "LogCheck") -> str:
-    """Tell what was found, and the sum of it."""
+    """Format the findings for people, and their number."""
     lines = []
     for finding in check.findings:
         where = f"{finding.file}, byte {finding.offset}" if finding.offset >= 0 else finding.file
@@ -218,7 +218,7 @@ def check_as_text(check: "LogCheck") -> str:
 
 
 def recovery_as_json(recovery: "LogRecovery") -> dict[str, Any]:
-    """Make a table of what was saved and lost."""
+    """Return saved and lost data as a dictionary for JSON."""
     losses = recovery.losses
     return {
         "path": str(recovery.path),
@@ -240,7 +240,7 @@ def recovery_as_json(recovery: "LogRecovery") -> dict[str, Any]:
 
 
 def recovery_as_text(recovery: "LogRecovery") -> str:
-    """Tell what was saved and lost."""
+    """Format saved and lost data for people."""
     saved = f"{recovery.messages} messages, {recovery.attachments} attachments"
     lost = recovery.describe_loss()
     lines = [f"{recovery.out}: {saved}", *(f"  {note}" for note in recovery.losses.notes)]
@@ -254,7 +254,7 @@ TABLES = ("parquet", "csv")
 FRAMES = ("blf", "asc", "candump")
 _SUFFIXES = {"candump": ".log"}
 _TOLD_EACH = 1_000_000
-"""Rows or frames between two lines of progress."""
+"""Rows or frames between two progress lines."""
 
 
 class HexId(click.ParamType[int]):
@@ -263,7 +263,7 @@ class HexId(click.ParamType[int]):
     name = "hex"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Read it."""
+        """Parse the identifier."""
         try:
             number = int(str(value), 16)
         except ValueError:
@@ -279,7 +279,7 @@ only_option = click.option(
     type=click.Choice(["host", "devices", "both"]),
     default="both",
     show_default=True,
-    help="Whose frames: by the contract, else by their direction.",
+    help="Sender of the frames: by the contract, else by their direction.",
 )
 dbc_option = click.option(
     "--dbc", type=GivenPath(dir_okay=False), help="A DBC; default: the log's contract, else the arm's."
@@ -292,7 +292,7 @@ dbc_option = click.option(
     "usage or contract; 3 the recording is damaged, or a disk is full; 130 interrupted.",
 )
 @click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
-@click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Of the output.")
+@click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Format of the output.")
 @click.option("--out", type=WrittenPath(), help="Folder of the tables, or file of the frames; default: beside LOG.")
 @click.option(
     "--topic", "topics", multiple=True, metavar="TOPIC", help="For tables: a topic, or a pattern such as 'decoded/*'."
@@ -319,10 +319,10 @@ def export(
     dbc: Path | None,
     as_json: bool,
 ) -> ExitCode:
-    """Write what a recording holds as tables (Parquet, CSV) or its frames as BLF, ASC or candump log.
+    """Write a recording as tables (Parquet, CSV), or its frames as BLF, ASC or candump log.
 
-    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. What the target can't hold is counted on stderr. Tables
-    replace tables; a file of frames replaces none but the same.
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. Frames that the target format can't hold are counted on
+    stderr. Tables replace tables; a file of frames replaces only an identical one.
     """
     from adacd_hil.wire.dbc_decoder import DbcDecoder
 
@@ -346,7 +346,7 @@ def export(
 
 
 def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
-    """Read the DBC of a recording: the given one, else the one that is attached to the log, else the arm's."""
+    """Return the DBC of a recording: the given one, else the one attached to the log, else the arm's."""
     from adacd_hil.log.log_info import attachment
     from adacd_hil.wire.codec import read_dbc
 
@@ -394,14 +394,14 @@ def _export_frames(
 
 
 class _Teller:
-    """Prints how far the work is."""
+    """Prints progress lines."""
 
     def __init__(self, what: str) -> None:
         self._what = what
         self._told = 0
 
     def __call__(self, count: int) -> None:
-        """Print a line for every so many."""
+        """Print a line for every `_TOLD_EACH` rows or frames."""
         if count - self._told >= _TOLD_EACH:
             self._told = count
             print(f"{count} {self._what}", file=sys.stderr, flush=True)

@@ -79,7 +79,7 @@ def tune(
 
 
 def _next(log_path: Path, found: "Tuning", out: Path | None) -> tuple[str, ...]:
-    """Name what may be typed after it: to write the configuration, then to try it on the log."""
+    """Return the commands to suggest: first write the configuration, then try it on the log."""
     if found.best is None:
         return ()
     if out is None:
@@ -92,7 +92,7 @@ def _as_text(found: "Tuning") -> str:
     from adacd_hil.lab.tune.tune_roc import LIMITS, free_hours
 
     hours = sum(map(free_hours, found.logs))
-    lines = [f"{found.rate_per_h:g} false alarms per hour wanted; {hours:.4f} h of motion that nobody touched", ""]
+    lines = [f"{found.rate_per_h:g} false alarms per hour wanted; {hours:.4f} h of contact-free motion", ""]
     if found.detectors:
         head = ("detector", "found", "95 %", "median ms", "p90 ms", "max ms", "alarms", "95 % bound, 1/h", "thresholds")
         rows = [
@@ -122,7 +122,7 @@ def _as_text(found: "Tuning") -> str:
 
 
 def _cells(checked: "Found") -> tuple[str, ...]:
-    """Say what thresholds come to in one half, a cell for each figure."""
+    """Format the result of thresholds in one half, a cell for each figure."""
     from adacd_hil.score.wording import delay_figures
 
     low, high = checked.share_bounds
