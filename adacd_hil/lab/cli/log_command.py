@@ -14,6 +14,8 @@ from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from adacd_hil.lab.logs.check.log_check import LogCheck
     from adacd_hil.lab.logs.recover import LogRecovery
     from adacd_hil.log.log_files import TimeWindow
@@ -359,7 +361,7 @@ def _export_tables(
 ) -> tuple[dict[str, Any], str]:
     from adacd_hil.lab.logs.signal_tables import export_tables
 
-    summary = export_tables(log, out, kind, topics, decoder, _Teller("rows"))
+    summary = export_tables(log, out, kind, topics, decoder, _progress_of("rows"))
     for note in summary.notes:
         _tell(f"{kind}: {note}")
     lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
@@ -381,7 +383,7 @@ def _export_frames(
     host_ids, device_ids = sides(decoder)
     choice = FrameChoice(only, host_ids, device_ids, frozenset(can_ids))
     source = open_frames(log)
-    summary = export_frames(source, choice.pieces(source), out, kind, _Teller("frames"), has_direction)
+    summary = export_frames(source, choice.pieces(source), out, kind, _progress_of("frames"), has_direction)
     for loss in summary.losses:
         print(in_line(f"{kind}: {loss}"), file=sys.stderr)
     described = {
@@ -393,15 +395,8 @@ def _export_frames(
     return described, source.problem
 
 
-class _Teller:
-    """Prints progress lines."""
+def _progress_of(noun: str) -> "Callable[[int], None]":
+    """Return a function that prints a count of rows or frames every `_TOLD_EACH` of them."""
+    from adacd_hil.log.logged_run import Milestones
 
-    def __init__(self, what: str) -> None:
-        self._what = what
-        self._told = 0
-
-    def __call__(self, count: int) -> None:
-        """Print a line for every `_TOLD_EACH` rows or frames."""
-        if count - self._told >= _TOLD_EACH:
-            self._told = count
-            print(f"{count} {self._what}", file=sys.stderr, flush=True)
+    return Milestones(lambda count: _tell(f"{count} {noun}"), _TOLD_EACH).reach

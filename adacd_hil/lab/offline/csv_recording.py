@@ -155,7 +155,7 @@ def _columns(path: Path, head: CsvHead, described: RecordingMap) -> list[_Column
 def _time_column(path: Path, head: CsvHead, described: RecordingMap) -> _Column:
     """Find the time column; without one, if the map gives a period, a nameless column. Raises ConfigError."""
     name, units = described.columns.time, described.units
-    read = _Times(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
+    read = _time_reader(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
     has_period = described.sampling.period_s > 0.0
     if name and not (has_period and name not in head.heads and nearest_name(name, head.heads) is None):
         try:
@@ -252,21 +252,21 @@ def read_number(text: str, decimal: str) -> float:
     return float(text.replace(",", ".") if decimal == "," else text)
 
 
-class _Times:
-    """Reads times relative to the first one: ns since 1970 have more digits than a float."""
+def _time_reader(read: Callable[[str], Decimal], decimal: str) -> Callable[[str], float]:
+    """Return a reader of times relative to the first one: ns since 1970 have more digits than a float."""
+    first: Decimal | None = None
 
-    def __init__(self, read: Callable[[str], Decimal], decimal: str) -> None:
-        self._read, self._decimal = read, decimal
-        self._first: Decimal | None = None
-
-    def __call__(self, text: str) -> float:
+    def read_time(text: str) -> float:
+        nonlocal first
         try:
-            moment = self._read(text.strip().replace(self._decimal, "."))
+            moment = read(text.strip().replace(decimal, "."))
         except InvalidOperation:
             raise ValueError(text) from None
-        if self._first is None and moment.is_finite():
-            self._first = moment
-        return float(moment - (self._first or 0))
+        if first is None and moment.is_finite():
+            first = moment
+        return float(moment - (first or 0))
+
+    return read_time
 
 
 def _iso_seconds(text: str) -> Decimal:

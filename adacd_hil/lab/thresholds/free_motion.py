@@ -6,7 +6,7 @@ least as long before a contact. A touch that no detector found counts as free mo
 Per sample one byte is kept: whether it is free. All other data are read from the log again when needed.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -224,21 +224,20 @@ def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
     return replace(part, **{name: getattr(part, name)[rows] for name in (*_COLUMNS, "is_free")})
 
 
-class TorqueStream:
-    """Computes the stream of `scheme.detect.detectors` for motion that comes piece by piece."""
+def torque_streams(
+    pieces: Iterable[Motion], lag_s: float, standstill_rad_s: float
+) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:
+    """Yield each piece of a motion with its stream of `scheme.detect.detectors`.
 
-    def __init__(self, lag_s: float, standstill_rad_s: float) -> None:
-        self._lag_s = lag_s
-        self._standstill_rad_s = standstill_rad_s
-        self._last: list[Vector] | None = None  # last sample of the previous piece
-
-    def add(self, motion: Motion) -> tuple[Vector, Vector]:
-        """Return the next piece's z and the friction that may hold, (n, 2) each, Nm."""
+    The stream: z, and the torque that friction may hold, (n, 2) each, Nm.
+    """
+    last: list[Vector] | None = None  # last sample of the previous piece
+    for motion in pieces:
         columns = [getattr(motion, name) for name in _COLUMNS]
-        last, self._last = self._last, [column[-1:].copy() for column in columns]
-        if last is not None:
-            columns = [np.concatenate(pair) for pair in zip(last, columns, strict=True)]
+        before, last = last, [column[-1:].copy() for column in columns]
+        if before is not None:
+            columns = [np.concatenate(pair) for pair in zip(before, columns, strict=True)]
         q, dq, tau_J, theta, interval_s = columns
-        z, held_Nm = detectors.make_stream(q, dq, tau_J, theta, interval_s, self._lag_s, self._standstill_rad_s)
-        skipped = int(last is not None)
-        return z[skipped:], held_Nm[skipped:]
+        z, held_Nm = detectors.make_stream(q, dq, tau_J, theta, interval_s, lag_s, standstill_rad_s)
+        skipped = int(before is not None)
+        yield motion, (z[skipped:], held_Nm[skipped:])

@@ -28,7 +28,7 @@ from adacd_hil.lab.thresholds.false_alarms import (
     resolution,
     white_noise,
 )
-from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, TorqueStream, read_motion, sample_of
+from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, read_motion, sample_of, torque_streams
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import Milestones, Progress
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
@@ -94,7 +94,7 @@ def run_detectors(
     """Run every detector over the motion of logs. Raises LogError, TooLittleMotionError."""
     motion = sample_of(logs)
     lag_s, lag_of_joint_s = find_lag(motion)
-    z, held_Nm = TorqueStream(lag_s, settings.standstill_rad_s).add(motion)
+    _, (z, held_Nm) = next(torque_streams([motion], lag_s, settings.standstill_rad_s))
     free = motion.is_free
     z[~free] = 0.0
     held_Nm[~free] = 0.0
@@ -122,9 +122,7 @@ def _peaks(
     place = 0
     milestones = Milestones(lambda count: progress(f"{log.path}: running the detectors, {count} of {len(free)} cycles"))
     for log in logs:
-        stream = TorqueStream(lag_s, settings.standstill_rad_s)
-        for motion in log.pieces():
-            new = stream.add(motion)
+        for motion, new in torque_streams(log.pieces(), lag_s, settings.standstill_rad_s):
             for column in new:
                 column[~motion.is_free] = 0.0
             z, held_Nm = (np.concatenate(pair) for pair in zip(rest, new, strict=True))
