@@ -97,16 +97,16 @@ class DraftFiles:
     is_forced: bool
     contents: dict[Path, bytes] = field(default_factory=dict)
 
-    def check(self, path: Path) -> None:
+    def require_free(self, path: Path) -> None:
         """Raise CommandError if a file of that name exists and may not be replaced."""
         if is_there(path) and not self.is_forced:
             raise CommandError(f"{path} exists; give another name, or --force to replace it", ExitCode.USAGE)
 
-    def add(self, path: Path, content: str | bytes) -> None:
+    def add_file(self, path: Path, content: str | bytes) -> None:
         """Add a file. Raises CommandError if a file of that name exists and may not be replaced."""
         data = content.encode() if isinstance(content, str) else content
         if not (path.is_file() and path.read_bytes() == data):
-            self.check(path)
+            self.require_free(path)
         self.contents[path] = data
 
     def examine(self, text: str) -> ConfigurationFindings:
@@ -120,7 +120,7 @@ class DraftFiles:
             raise CommandError(f"{self.out} is not written, as it could not be used: {line}", ExitCode.USAGE)
         return found
 
-    def finish(self, text: str) -> None:
+    def write_files(self, text: str) -> None:
         """Write the configuration and the other files. Raises CommandError."""
         self.contents[self.out] = text.encode()
         try:
@@ -167,7 +167,7 @@ class Drafting:
         return text, summary
 
     def _gather(self) -> ArmFacts:
-
+        """Find devices, profiles, geometry and limits, asking the user for unknown ones."""
         options = self.options
         drives, sensors = self._find_devices()
         drive, sensor = self._profiles(drives, sensors)
@@ -177,9 +177,13 @@ class Drafting:
         ratings = [device.ratings for device in drives]
         rated = self._rated(ratings, profiles, geometry)
         torque = self._limit("torque_limit_Nm", "--torque-limit-nm", _torque_proposals(rated, ratings, geometry))
-        proposal = _position_proposals(ratings, scales, geometry)
+        scaled = list(zip(ratings, scales, strict=False))
+        by_drives = [rating.position_limit_deg(scale) for rating, scale in scaled]
+        proposal = _limit_proposal(geometry.position_limit_deg, by_drives, "0x607D of the drives", (75.0, 120.0))
         position = self._limit("position_limit_deg", "--position-limit-deg", proposal)
-        proposal = _speed_proposals(ratings, scales, geometry)
+        by_drives = [rating.velocity_limit_deg_s(scale) for rating, scale in scaled]
+        source = "0x6080 of the drives, by their gears"
+        proposal = _limit_proposal(geometry.velocity_limit_deg_s, by_drives, source, (250.0, 300.0))
         velocity = self._limit("velocity_limit_deg_s", "--velocity-limit-deg-s", proposal)
         nodes = [
             Fact(tuple(device.node.node_id for device in found), "found on the bus")
@@ -263,7 +267,7 @@ class Drafting:
         return chosen[0], chosen[1]
 
     def _ask_channel(self) -> str | None:
-
+        """Return the channel of the arm's bus; None for an arm without hardware. Raises CommandError."""
         options = self.options
         if options.is_busless and (options.channel or options.interface):
             raise CommandError("--no-bus and --interface or --channel exclude each other", ExitCode.USAGE)
@@ -322,7 +326,7 @@ class Drafting:
         return answer
 
     def _profiles(self, drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]) -> tuple[Fact, Fact]:
-
+        """Return the device profiles of the drives and of the sensors, drafted from an EDS if needed."""
         options = self.options
         drafted = self._draft_profiles([*drives, *sensors])
         found = choose_family(drives, sensors) if drives else (("",) * 2, ("",) * 2)
@@ -423,7 +427,7 @@ class Drafting:
         """Draft the profile of an EDS for some joints, asking for missing values; return the names of the files."""
         drafts = self._draft(eds, kind, ratings)
         folder, stem = self.writing.out.parent, f"{self.writing.out.stem}-{eds.stem}"
-        self.writing.add(folder / eds.name, eds.read_bytes())
+        self.writing.add_file(folder / eds.name, eds.read_bytes())
         names: dict[tuple[str, int], str] = {}
         texts: dict[str, str] = {}
         for joint, draft in drafts.items():
@@ -431,7 +435,7 @@ class Drafting:
             names[kind, joint] = name
             self._note(kind, joint, name, draft)
         for text, name in texts.items():
-            self.writing.add(folder / name, text)
+            self.writing.add_file(folder / name, text)
         return names
 
     def _note(self, kind: str, joint: int, name: str, draft: ProfileDraft) -> None:
@@ -497,7 +501,7 @@ class Drafting:
             else:
                 self.guessed.add(name)
         for text, file in texts.items():
-            self.writing.add(self.writing.out.parent / file, text)
+            self.writing.add_file(self.writing.out.parent / file, text)
         return tuple(completed)
 
     # -- the arm
@@ -620,7 +624,7 @@ class Drafting:
         return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
 
     def _limit(self, key: str, option: str, proposal: Proposal) -> Fact:
-
+        """Ask for a pair of `arm.KEY`, within its bounds."""
         given = getattr(self.options, option[2:].replace("-", "_"))
         meaning = known_keys()[f"arm.{key}"].meaning
         value, source = self.interview.ask(
@@ -713,26 +717,13 @@ def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: P
     return Proposal(limit, source if rated.source else "")
 
 
-def _position_proposals(
-    ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm
-) -> Proposal:
-    told = [rating.position_limit_deg(scale) for rating, scale in zip(ratings, scales, strict=False)]
-    if geometry.position_limit_deg is not None:
-        return Proposal(geometry.position_limit_deg, "the URDF's")
-    if told and None not in told:
-        return Proposal(tuple(told), "0x607D of the drives")
-    return Proposal((75.0, 120.0))
-
-
-def _speed_proposals(
-    ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm
-) -> Proposal:
-    told = [rating.velocity_limit_deg_s(scale) for rating, scale in zip(ratings, scales, strict=False)]
-    if geometry.velocity_limit_deg_s is not None:
-        return Proposal(geometry.velocity_limit_deg_s, "the URDF's")
-    if told and None not in told:
-        return Proposal(tuple(told), "0x6080 of the drives, by their gears")
-    return Proposal((250.0, 300.0))
+def _limit_proposal(by_urdf: Pair | None, by_drives: list[float | None], source: str, default: Pair) -> Proposal:
+    """Propose the URDF's limits, else those read from both drives, from this source, else a guess."""
+    if by_urdf is not None:
+        return Proposal(by_urdf, "the URDF's")
+    if by_drives and None not in by_drives:
+        return Proposal(tuple(by_drives), source)
+    return Proposal(default)
 
 
 _ESSENTIAL = {"scale.increments_per_joint_rev", "scale.torque_Nm", "scale.rated_torque_count_Nm"}

@@ -78,13 +78,13 @@ def init(
 
     interview = Interview(takes_proposals)
     writing = DraftFiles(out, is_forced)
-    writing.check(out)
+    writing.require_free(out)
     options = InitOptions(**given)
     if log is None:
         text, summary = Drafting(options, interview, writing).draft()
     else:
         text, summary = draft_from_log(log, options, interview, writing)
-    writing.finish(text)
+    writing.write_files(text)
     summary |= {"file": str(out), "written": [str(path) for path in writing.contents]}
     bus, code = summary.pop("bus", None), ExitCode.OK
     if not as_json:
