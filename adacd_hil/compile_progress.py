@@ -72,14 +72,14 @@ class CompileCount:
         """Whether there is a total."""
         return bool(self._expected)
 
-    def add(self, function: Any) -> None:
+    def count_function(self, function: Any) -> None:
         """Count a function that has been compiled, and all that it calls."""
         self._done |= {
             name for name in functions_below([function], is_all=True) if not self._expected or name in self._expected
         }
-        self.tell()
+        self.call_listeners()
 
-    def tell(self) -> None:
+    def call_listeners(self) -> None:
         """Call the listeners."""
         for listener in _listeners:
             listener(self._line)

@@ -147,16 +147,16 @@ class _Claims:
         with contextlib.suppress(OSError):
             self._descriptor = os.open(_FOLDER / "claims", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
-    def take(self, what: str) -> bool:
+    def claim(self, what: str) -> bool:
         """Claim a function; return whether another process had it until now. Without file locks nothing is claimed."""
         for polls in range(_MOST_POLLS):
             if self._lock(what, fcntl.LOCK_EX | fcntl.LOCK_NB):
                 return polls > 0
             threading.Event().wait(_POLL_S)
-            _compilation.tell()
+            _compilation.call_listeners()
         return True
 
-    def give_back(self, what: str) -> None:
+    def release(self, what: str) -> None:
         """Release the claim on a function."""
         self._lock(what, fcntl.LOCK_UN)
 
@@ -199,10 +199,10 @@ class _SharedCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the code compiled for these types; None: this process has to compile it, then save it."""
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        if found is None and _claims.take(self._claim(sig)):
+        if found is None and _claims.claim(self._claim(sig)):
             found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
             if found is not None:
-                _claims.give_back(self._claim(sig))
+                _claims.release(self._claim(sig))
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -212,7 +212,7 @@ class _SharedCache(FunctionCache):
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         finally:
-            _claims.give_back(self._claim(sig))
+            _claims.release(self._claim(sig))
 
     def version(self) -> int | None:
         """Return a number that changes whenever any process saves code of this function; None: none is saved."""
@@ -267,7 +267,7 @@ class _Compilation(event.Listener):
         begin, self._on_first = self._on_first, None
         if begin is not None:
             begin()
-        self._count.tell()
+        self._count.call_listeners()
 
     def on_end(self, event: Any) -> None:
         """Count a function that is compiled."""
@@ -275,11 +275,11 @@ class _Compilation(event.Listener):
         if self._depth == 0 and self._was_collecting:
             gc.enable()
         if isinstance(event.data["dispatcher"]._cache, _SharedCache):  # not one of numba's own
-            self._count.add(event.data["dispatcher"])
+            self._count.count_function(event.data["dispatcher"])
 
-    def tell(self) -> None:
+    def call_listeners(self) -> None:
         """Call the listeners."""
-        self._count.tell()
+        self._count.call_listeners()
 
     @contextmanager
     def of(self, functions: Sequence[Any], on_first: Callable[[], None]) -> Iterator[None]:

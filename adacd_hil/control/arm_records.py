@@ -411,7 +411,9 @@ class UsedHistory:
         """Describe the history for the log's metadata."""
         return {"history": str(self.path), "history_certificates": self._count()}
 
-    def add(self, certificates: Sequence[Certificate], identities: Sequence[Identity], origin: "Origin") -> str:
+    def add_certificates(
+        self, certificates: Sequence[Certificate], identities: Sequence[Identity], origin: "Origin"
+    ) -> str:
         """Append certificates and write the history in one step; return a summary. Raises OSError, ConfigError.
 
         Certificates that another run has appended meanwhile are kept.

@@ -252,18 +252,18 @@ class DeviceReadings:
         self._refuted = 0  # rounds in a row in which the configuration was refuted
 
     def compile(self) -> None:
-        """Compile the functions that `add` calls."""
+        """Compile the functions that `add_means` calls."""
         zero = np.zeros(JOINTS)
         add_block(self._rows, zero, zero, zero, zero, zero, self._level_rad, self._count, self._normals.copy())
         solve_readings(self._normals, self._count, 1, self._shares.copy(), self._solutions.copy())
         is_positive_definite(self._solutions[0])
 
-    def add(self, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector) -> None:
+    def add_means(self, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector) -> None:
         """Add the means of a block, (2,) each."""
         add_block(self._rows, q, dq, ddq, tau_J, dtau_J, self._level_rad, self._count, self._normals)
         self._blocks += 1
 
-    def step(self, is_torque_known: bool) -> bool:
+    def judge_blocks(self, is_torque_known: bool) -> bool:
         """Judge every few blocks; return whether the configuration is refuted.
 
         is_torque_known: torque scales are judged only if the commanded torques have confirmed them.

@@ -163,7 +163,7 @@ class FaultReport:
 
     def note(self, state: SchemeState, arm: ArmState) -> None:
         """Take in a cycle; `state`: of the scheme after the previous one."""
-        self._commission.note(state, arm)
+        self._commission.count_cycle(state, arm)
 
     def describe(self, fault: FaultReason) -> list[str]:
         """Describe the causes of a fault, one line each: first those of its reason."""
@@ -213,7 +213,7 @@ class CommissionReport:
         self._causes: Counter[str | _Unrest] = Counter()
         self._worst: dict[_Unrest, float] = {}
 
-    def note(self, state: SchemeState, arm: ArmState) -> None:
+    def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
         """Take in a cycle; `state`: of the scheme after the previous one."""
         if state not in _STATES:
             return

@@ -136,10 +136,10 @@ class FirstMotion:
             self._short.break_off()
             return
         acting = commands[-1]
-        block = self._long.take(arm, acting)
+        block = self._long.add_cycle(arm, acting)
         if block is not None:
             self._take_block(block)
-        self._read(self._short.take(arm, acting), state)
+        self._read(self._short.add_cycle(arm, acting), state)
 
     def _read(self, block: "_Block | None", state: SchemeState) -> None:
         """Fit the arm's equation, until the first certificate."""
@@ -149,11 +149,11 @@ class FirstMotion:
         if state is SchemeState.MONITOR:
             self._readings = None
         elif block is not None:
-            readings.add(block.q, block.dq, block.ddq, block.tau_J, block.dtau_J)
+            readings.add_means(block.q, block.dq, block.ddq, block.tau_J, block.dtau_J)
             ddq, tau_c, tau_J = block.ddq, block.tau_c, block.tau_J
             squares = ddq * ddq, tau_c * tau_c, tau_J * tau_J
             self._pushed += *squares, tau_c * ddq, tau_J * ddq, tau_c * block.dq, tau_c * tau_J
-            if readings.step(is_torque_known=not self._open):
+            if readings.judge_blocks(is_torque_known=not self._open):
                 self.line = readings.describe(self._left()) or _NO_CAUSE
 
     def certify(self, certificates: tuple[Certificate, ...]) -> None:
@@ -343,7 +343,7 @@ class _Blocks:
         """Begin a new block, since cycles are missing."""
         self._seen = 0
 
-    def take(self, arm: ArmState, acting: Vector) -> _Block | None:
+    def add_cycle(self, arm: ArmState, acting: Vector) -> _Block | None:
         """Take in a cycle; return the block that it completes, if any. The cycle also begins the next block."""
         last = np.array((arm.q, arm.dq, arm.tau_J, acting))
         if self._seen == 0:

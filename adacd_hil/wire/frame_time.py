@@ -206,7 +206,7 @@ class Load:
 
 
 class LoadMeter:
-    """Counts frames; `take` returns the load since the last call. For `monitor`, not the cycle.
+    """Counts frames; `take_load` returns the load since the last call. For `monitor`, not the cycle.
 
     Error frames don't count: their duration is unknown. Identifiers above 0x7FF are extended ones.
     """
@@ -221,7 +221,7 @@ class LoadMeter:
         self._start_ns = start_ns
         self._frames = self._nominal = self._data = self._payload = 0
 
-    def add(self, frame: Frame) -> None:
+    def count_frame(self, frame: Frame) -> None:
         """Count a frame. Raises ValueError for an impossible length, or CAN FD without a data bit rate."""
         if frame.is_error:
             return
@@ -237,7 +237,7 @@ class LoadMeter:
         self._data += bits.data
         self._payload += 8 * len(frame.data)
 
-    def take(self, t_ns: int) -> Load:
+    def take_load(self, t_ns: int) -> Load:
         """Return the load since the last call, and start again from zero."""
         interval_ns = 0 if self._start_ns is None else t_ns - self._start_ns
         bits = FrameBits(self._nominal, self._data)

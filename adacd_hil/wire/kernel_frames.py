@@ -241,8 +241,8 @@ _poll.argtypes = (ctypes.c_void_p, ctypes.c_ulong, ctypes.c_void_p, ctypes.c_voi
 class FrameReceiver:
     """Receives the frames in a CAN socket, in batches.
 
-    `frames_lost`: frames that the kernel dropped for want of room before those of the last `take`; a batch ends at a
-    drop.
+    `frames_lost`: frames that the kernel dropped for want of room before those of the last `take_frames`; a batch ends
+    at a drop.
     """
 
     def __init__(self, opened: socket.socket, clock: Clock) -> None:
@@ -281,7 +281,7 @@ class FrameReceiver:
                 raise OSError(error, os.strerror(error))
         return bool(found)
 
-    def take(self) -> list[Frame]:
+    def take_frames(self) -> list[Frame]:
         """Receive up to 64 frames without waiting. Raises OSError, BlockingIOError if there is no frame."""
         if self._held:
             return self._take_held()

@@ -41,7 +41,7 @@ class Lateness:
         self.worst_ns = 0
         self._counts: Counter[int] = Counter()
 
-    def add(self, lateness_ns: int) -> None:
+    def add_lateness(self, lateness_ns: int) -> None:
         """Count a frame."""
         self.frames += 1
         self.late_frames += lateness_ns > LATE_NS
@@ -81,7 +81,7 @@ def play(
         late_ns = max(0, clock.now_ns() - due_ns)
         bus.send_all([(frame.can_id, frame.data) for frame in group])
         for _ in group:
-            lateness.add(late_ns)
+            lateness.add_lateness(late_ns)
     return lateness
 
 

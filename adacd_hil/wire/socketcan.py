@@ -188,7 +188,7 @@ class SocketCanBus(Bus):
         """Fetch received frames; wait for the first up to `timeout_s`."""
         try:
             if timeout_s <= 0.0 or self._receiver.wait(timeout_s):
-                self._received.extend(self._receiver.take())
+                self._received.extend(self._receiver.take_frames())
         except BlockingIOError:
             return
         except OSError as error:

@@ -40,7 +40,7 @@ class Traffic:
         self.talks: dict[int, Talk] = {}
         self.error_frames = 0
 
-    def accept(self, frame: Frame) -> None:
+    def count_frame(self, frame: Frame) -> None:
         """Count one frame."""
         if frame.is_error:
             self.error_frames += 1
@@ -79,4 +79,4 @@ def listen(bus: Bus, clock: Clock, duration_s: float, traffic: Traffic) -> None:
     """Count the frames on the bus for a duration, sending none. Raises BusError."""
     end_ns = clock.now_ns() + round(duration_s * 1e9)
     while (frame := receive_until(bus, clock, end_ns)) is not None:
-        traffic.accept(frame)
+        traffic.count_frame(frame)

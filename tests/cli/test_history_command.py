@@ -124,7 +124,7 @@ def test_a_certificate_is_not_added_to_what_another_arm_has_made_meanwhile(lab: 
     devices = read_history(path).devices
     mine = [Identity(**asdict(replace(device, serial=device.serial + 100))) for device in devices]
     with pytest.raises(ConfigError, match=r"serial number 101 is not the 1 of history .*: it is another arm's"):
-        used.add((), mine, Origin("2026-11-22T10:00:00Z", "run.mcap", "P", "1"))
+        used.add_certificates((), mine, Origin("2026-11-22T10:00:00Z", "run.mcap", "P", "1"))
     assert path.read_text() == first_history
 
 

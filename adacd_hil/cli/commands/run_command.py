@@ -143,7 +143,7 @@ def run_on_bus(
     if history is not None and summary.certificates:
         origin = Origin(format_date(wall_ns()), str(summary.log.path), settings.arm.profile, __version__)
         try:
-            described["history"] = history.add(summary.certificates, summary.identities, origin)
+            described["history"] = history.add_certificates(summary.certificates, summary.identities, origin)
         except (OSError, ConfigError) as error:
             described["history_error"] = str(error)
             print(in_line(f"adacd-hil: the certificate is not in the history: {error}"), file=sys.stderr)

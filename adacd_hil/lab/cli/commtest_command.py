@@ -107,7 +107,7 @@ def _run(
     freeze_garbage()
 
     def observe(cycle: ZeroTorqueCycle) -> None:
-        record = test.observe(cycle, 0 if recorder is None else recorder.waiting_bytes)
+        record = test.observe_cycle(cycle, 0 if recorder is None else recorder.waiting_bytes)
         if recorder is not None:
             recorder.cycle(cycle.state.t_ns, [(ChannelId.CYCLE, pack_cycle(record))], cycle.frames)
 

@@ -49,7 +49,7 @@ class LiveMonitor:
         self._contacts: deque[dict[str, Any]] = deque(maxlen=_CONTACTS)
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
 
-    def accept(self, message: LiveMessage) -> None:
+    def accept_message(self, message: LiveMessage) -> None:
         """Take in a message."""
         if message.topic not in TOPICS:
             return
@@ -151,13 +151,13 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
             wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
             if (message := client.receive(max(0.0, (wake_ns - now_ns) * 1e-9))) is not None:
                 with _understood():
-                    monitor.accept(message)
+                    monitor.accept_message(message)
             now_ns = clock.now_ns()
             if now_ns >= due_ns:
                 drawn_ns = now_ns
                 if is_live and not as_json:
                     with _understood():
-                        screen.draw(as_text(monitor.describe(), is_cut=screen.is_redrawn))
+                        screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
         with _understood():
             described = {"url": url} | monitor.describe()
     screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))

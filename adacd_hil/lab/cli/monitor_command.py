@@ -44,7 +44,7 @@ class Screen:
         """Time between two tables."""
         return REDRAW_S if self._is_terminal else PLAIN_S
 
-    def draw(self, text: str) -> None:
+    def draw_table(self, text: str) -> None:
         """Show a table, cut to the terminal; `end` shows the whole one."""
         text = plain(text)
         if not self._is_terminal:
@@ -137,7 +137,7 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
                     if monitor.is_stopped or (end_ns is not None and clock.now_ns() >= end_ns):
                         break
                     if is_live and not as_json:
-                        screen.draw(as_text(monitor.describe(), is_cut=screen.is_redrawn))
+                        screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
             finally:  # the last table is printed even if the bus fails
                 described = monitor.describe()
                 screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))

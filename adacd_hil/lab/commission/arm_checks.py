@@ -111,7 +111,7 @@ class ArmExamination:
         """Return the communication test's report on the cycles so far."""
         test = CommunicationTest(self.settings, self.arm, self.bitrate, self.data_bitrate)
         for cycle in self.cycles:
-            test.observe(cycle)
+            test.observe_cycle(cycle)
         return test.report()
 
     def joint_values(self, name: str) -> NDArray[np.float64]:
@@ -233,7 +233,7 @@ def check_cycle(patient: ArmExamination) -> CheckOutcome:
     for cycle in patient.cycles:
         for is_sent, frame in cycle.frames:
             if not is_sent:
-                patient.traffic.accept(frame)
+                patient.traffic.count_frame(frame)
     return ok(f"{len(patient.cycles)} cycles, torque zero, drives not enabled")
 
 
@@ -377,7 +377,7 @@ def _check_joint(joint: int) -> Callable[[ArmExamination], CheckOutcome]:
             f"move joint {joint + 1} by hand toward +q, at least {motion.WANTED_DEG:g} degrees, "
             f"within {patient.move_s:g} s"
         )
-        patient.loop.run(patient.move_s, motion.observe, lambda: motion.is_done)
+        patient.loop.run(patient.move_s, motion.observe_cycle, lambda: motion.is_done)
         return motion.judge()
 
     return check
@@ -412,7 +412,7 @@ class HandMotion:
         """Whether any joint has moved far enough."""
         return bool(np.abs(self._way).max() >= math.radians(self.WANTED_DEG))
 
-    def observe(self, cycle: ZeroTorqueCycle) -> None:
+    def observe_cycle(self, cycle: ZeroTorqueCycle) -> None:
         """Take in one cycle."""
         state = cycle.state
         if not state.is_complete:

@@ -161,7 +161,7 @@ class CommunicationReport:
 
 @dataclass
 class CommunicationTest:
-    """Collects the cycles of a test: the loop calls `observe`; `report` returns the results."""
+    """Collects the cycles of a test: the loop calls `observe_cycle`; `report` returns the results."""
 
     settings: Settings
     arm: Arm
@@ -174,7 +174,7 @@ class CommunicationTest:
     _overruns: int = 0
     _complete: int = 0
 
-    def observe(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
+    def observe_cycle(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
         """Take in one cycle; return its record for the log."""
         state = cycle.state
         ages = (*state.age_q, *state.age_tau_J)
@@ -224,6 +224,6 @@ class CommunicationTest:
         for cycle in self._recent:
             for _, frame in cycle.frames:
                 with suppress(ValueError):  # a foreign frame whose length the contract's bus can't have
-                    meter.add(frame)
+                    meter.count_frame(frame)
         periods = sum(cycle.state.periods for cycle in self._recent)
-        return meter.take(periods * self.settings.bus.period_ns).percent
+        return meter.take_load(periods * self.settings.bus.period_ns).percent

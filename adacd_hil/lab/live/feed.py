@@ -169,7 +169,7 @@ class LiveFeed:
         """Hand over message records that follow each other, of which the other side shows some; see Batch."""
         if not len(ends) or not self.is_watched:
             return
-        if not self._ring.put(pack_batch(Batch(records, channels, log_ns, ends))):
+        if not self._ring.put_packet(pack_batch(Batch(records, channels, log_ns, ends))):
             self.hidden += 1
             return
         self._say(processes.WAKE)

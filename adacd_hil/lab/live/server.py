@@ -182,7 +182,7 @@ class LiveServer:
 
     def _show_some(self) -> None:
         """Show a part of what waits in the ring; the rest after the viewers had their turn."""
-        data = self._ring.take(_AT_ONCE_BYTES)
+        data = self._ring.take_packets(_AT_ONCE_BYTES)
         for start, size in zip(*(numbers.tolist() for numbers in split(data)), strict=True):
             self._show(data[start : start + size])
         if self._ring.waiting:

@@ -86,7 +86,7 @@ class Sink:
                 self._changed.notify_all()
         return len(data)
 
-    def begin(self, path: Path) -> None:
+    def begin_file(self, path: Path) -> None:
         """Switch to a new file, or restart the present one, once all earlier data are written or have failed."""
         self._position = 0
         with self._changed:

@@ -106,7 +106,7 @@ class PacketWriter:
         self._joint_slices = {name: slice(start, start + 8 * JOINTS) for name, start in starts.items()}
         self._least_scheme = max((place.stop for place in self._joint_slices.values()), default=_BODY) - _BODY
 
-    def begin(self, file: McapFile) -> None:
+    def begin_file(self, file: McapFile) -> None:
         """Continue with another file of the same topics."""
         self._file = file
 
@@ -114,7 +114,7 @@ class PacketWriter:
         """Count packets that can't be written; an event before the next packet reports them."""
         self._lost += count
 
-    def write(self, data: Rows, starts: Numbers, sizes: Numbers) -> int:
+    def write_packets(self, data: Rows, starts: Numbers, sizes: Numbers) -> int:
         """Write the contents of the packets in `data`; return the number of invalid packets, which are skipped.
 
         data: bytes (b,), with packet.ROOM behind the last packet; starts, sizes: of the packets (n,).

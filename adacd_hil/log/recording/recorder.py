@@ -169,7 +169,7 @@ class Recorder:
             self._socket.send(processes.WAKE, socket.MSG_DONTWAIT)
 
     def _put(self, data: bytes) -> None:
-        if not self._ring.put(data) and not (self._is_blocking and self._put_patiently(data)):
+        if not self._ring.put_packet(data) and not (self._is_blocking and self._put_patiently(data)):
             self.dropped += 1
             self._ring.count_dropped(self.dropped)
         elif self._is_blocking:
@@ -185,7 +185,7 @@ class Recorder:
                 self._socket.send(processes.ROOM)
                 if self._socket.recv(processes.MOST_BYTES) == processes.NOTHING:
                     break
-                is_put = self._ring.put(data)
+                is_put = self._ring.put_packet(data)
         return is_put
 
     def close(self) -> LogSummary:

@@ -80,7 +80,7 @@ class Ring(_SharedRing):
         self._head = 0
         self._room_until = self.capacity  # limit of HEAD by the last TAIL that was read
 
-    def put(self, packet: bytes) -> bool:
+    def put_packet(self, packet: bytes) -> bool:
         """Add a packet; False if there is no room for it."""
         size = len(packet)
         head = self._head
@@ -131,7 +131,7 @@ class RingReader(_SharedRing):
         """Add to the number of packets on the disk."""
         self._counts[_WRITTEN] += packets
 
-    def take(self, most: int) -> bytes:
+    def take_packets(self, most: int) -> bytes:
         """Take whole packets of up to `most` bytes in all, or a longer one alone; b"" if the ring is empty."""
         tail = self._counts[_TAIL]
         waiting = self._counts[_HEAD] - tail

@@ -123,7 +123,7 @@ class WriterProcess:
                 return
 
     def _take_some(self) -> None:
-        if data := self._ring.take(BATCH_BYTES):
+        if data := self._ring.take_packets(BATCH_BYTES):
             self._gathered.append(data)
             self._gathered_bytes += len(data)
 
@@ -182,9 +182,9 @@ class WriterProcess:
         self._messages += self._file.messages
         self._packets.frames = 0
         self._part_ns = None
-        self._sink.begin(path)
+        self._sink.begin_file(path)
         self._file = self._begin_file()
-        self._packets.begin(self._file)
+        self._packets.begin_file(self._file)
 
     def _begin_file(self) -> McapFile:
         setup = self._setup
@@ -247,7 +247,7 @@ class WriterProcess:
             return
         first_ns = int(times_ns[0]) if self._part_ns is None else self._part_ns[0]
         self._part_ns = first_ns, int(times_ns[-1])
-        self._lost += self._packets.write(block, starts, sizes)
+        self._lost += self._packets.write_packets(block, starts, sizes)
 
     def _note_lost(self) -> None:
         """Count the packets that the sink has dropped."""
