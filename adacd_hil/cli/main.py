@@ -114,7 +114,7 @@ def _misused(error: click.ClickException) -> str:
     """Describe a wrong command line in one line, with the command that shows its help."""
     text = " ".join(error.format_message().split())
     context = error.ctx if isinstance(error, click.UsageError) else None
-    return text if context is None else f"{text} `{context.command_path} --help` lists what there is"
+    return text if context is None else f"{text} see `{context.command_path} --help`"
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:

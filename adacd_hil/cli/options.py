@@ -164,10 +164,10 @@ _OPTIONS = (  # last first: click lists them the other way round
         "--live-origin",
         multiple=True,
         metavar="ORIGIN",
-        help="A web page that may watch beside Foxglove's and this machine's own, such as https://view.lab.example.",
+        help="A web page that may watch, in addition to Foxglove's and this machine's, such as https://view.lab.example.",
     ),
     click.option(
-        "--live-host", default=HOST, show_default=True, help="Address to listen on; 0.0.0.0: all, for anybody."
+        "--live-host", default=HOST, show_default=True, help="Address to listen on; 0.0.0.0: all, for any viewer."
     ),
     click.option(
         "--live-port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="0: any that is free."

@@ -320,7 +320,7 @@ class History:
             except ValueError:
                 raise ValueError(f"certificate {number}: date_utc is not like 2026-01-31T12:00:00Z") from None
             if certificate.digest != certificate.digest_after(before):
-                raise ValueError(f"certificate {number} is not as it was written: its digest is another")
+                raise ValueError(f"certificate {number} was changed or damaged: its digest differs")
             before = certificate.digest
 
     @property
@@ -384,7 +384,7 @@ class UsedHistory:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Remarks for the log."""
-        return (f"{self.path}: the arm's first run, nothing is known of its friction",) if self.is_first_run else ()
+        return (f"{self.path}: the arm's first run, its friction is unknown",) if self.is_first_run else ()
 
     def apply(self, settings: Settings) -> Settings:
         """Return the settings with the last certificate in section `history`, its age as drift of the sensors."""

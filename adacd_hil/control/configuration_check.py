@@ -194,7 +194,7 @@ def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
     if not own:
         return
     if not any("scheme" in layer.table for layer in layers if layer.origin != "paper"):
-        yield 'the scheme is the paper\'s, which certifies nothing; `extends = "certified"` gives the certified one'
+        yield 'the scheme is the paper\'s, without certificates; `extends = "certified"` gives the certified one'
     if not any("arm" in layer.table or "devices" in layer.table for layer in own):
         return
     origins = origins_of(layers)

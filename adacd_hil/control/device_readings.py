@@ -328,7 +328,7 @@ class DeviceReadings:
             for reading in wrong
         ]
         texts = " or ".join(f"{name}: {so:.1f} %" for name, so in zip(names, shares[1:], strict=True))
-        return f"either {texts}; the motion doesn't say which ({told})"
+        return f"either {texts}; the motion can't distinguish them ({told})"
 
     def _text(self, reading: Reading) -> str:
         """Return the text of one cause: the mistake and its remedy."""

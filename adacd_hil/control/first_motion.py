@@ -67,7 +67,7 @@ _NO_CAUSE: Final = (
 )
 _TOO_SHORT: Final = (
     "perhaps a node, sign or scale of the devices is wrong, or something pushed the arm; the motion was too short to "
-    "say which"
+    "distinguish them"
 )
 _OWN, _OTHER = 0, 1
 _COLUMNS: Final = 7
@@ -229,7 +229,7 @@ class FirstMotion:
         for joint in sorted(self._open):
             text = (
                 f"joint {joint + 1} is not known after {_LONGEST_S:g} s, since it moves too little, a drive is at a "
-                "limit, or cycles are missing: nothing has checked its signs, scales of position and velocity, "
+                "limit, or cycles are missing: unchecked are its signs, scales of position and velocity, "
                 f"{self._scales(joint)}"
             )
             self._events.append(Event("warning", "first motion", text))
@@ -259,7 +259,7 @@ class FirstMotion:
         found = self._ratios()
         first, second = found
         if first is not None and second is not None and is_of_other(first) and is_of_other(second):
-            head = "joints 1 and 2: each torque sensor measures what the drive of the other joint is commanded: "
+            head = "joints 1 and 2: each torque sensor measures the commanded torque of the other joint: "
             causes = "" if self._readings is None else self._readings.describe(self._left())
             return head + (causes or "the drives or the sensors are exchanged")
         for joint, ratio in enumerate(found):
@@ -299,8 +299,8 @@ class FirstMotion:
         head = f"joint {joint + 1}: its torque sensor measures {ratio.own:+.2f} times the commanded torque"
         if abs(ratio.own) <= _NOTHING:
             return (
-                f"{head}, +1 expected, so nothing of it: check that the sensor of devices.sensor_node[{joint}] is at "
-                f"this joint and measures, and {self._scales(joint)}"
+                f"{head}, +1 expected, so not its joint's torque: check that the sensor of "
+                f"devices.sensor_node[{joint}] is at this joint and measures, and {self._scales(joint)}"
             )
         if ratio.own < 0.0:
             causes = "" if self._readings is None else self._readings.describe(self._left())

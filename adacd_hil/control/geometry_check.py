@@ -44,8 +44,8 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
         return event
     unchecked = f"arm.link_length_m[1] = {lengths[1]:g} m" if is_upright else f"arm.link_length_m = {list(lengths)} m"
     text = (
-        f"assumed: {unchecked}, which nothing checks, since torques don't tell a length; "
-        "places and forces of contacts are wrong by as much as it is"
+        f"assumed: {unchecked}, unchecked, since torques alone don't determine a length; "
+        "an error of it is one of contact places and forces, too"
     )
     return Event("info", EVENT, text)
 

@@ -107,7 +107,7 @@ def _run(check: Check[Examination], examination: Examination) -> CheckOutcome:
     try:
         return check.run(examination)
     except DeviceError as error:
-        return failed(str(error), error.remedy or "see the device's manual; `adacd-hil scan` lists who is there")
+        return failed(str(error), error.remedy or "see the device's manual; `adacd-hil scan` lists the nodes")
     except BusError as error:
         return failed(str(error), "check wiring, termination and bit rate")
 

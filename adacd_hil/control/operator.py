@@ -30,7 +30,7 @@ class FaultAnswer(Enum):
 
     WAIT = "nothing yet"
     RECOVER = "the cause is gone, begin again"
-    END = "end the run, or nobody is there to ask"
+    END = "end the run, or no user is there"
 
 
 class Operator(Protocol):
@@ -131,7 +131,7 @@ _STATES = {
     SchemeState.ADAPT: "learns the arm's model on the move: keep off",
     SchemeState.CERTIFY: "tests the model on motion it has not seen",
     SchemeState.MONITOR: "watches for touches",
-    SchemeState.STOPPED: "stands still, until somebody acknowledges",
+    SchemeState.STOPPED: "stopped, until you acknowledge",
     SchemeState.PAYLOAD: "parks, so that the payload can be changed",
     SchemeState.FAULT: "fault: the drives are disabled",
 }

@@ -145,7 +145,7 @@ class ControllerSettings:
     Kp: tuple[float, float] = setting((250.0, 20.0), unit="Nm/rad", low=0.0, high=1e5, meaning="position gain")
     Kd: tuple[float, float] = setting((12.5, 0.75), unit="Nm s/rad", low=0.0, high=1e4, meaning="velocity gain")
     following_window_deg: tuple[float, float] = setting(
-        (20.0, 30.0), unit="deg", low=0.1, high=360.0, meaning="largest |q - q_d| of an arm that nobody touches"
+        (20.0, 30.0), unit="deg", low=0.1, high=360.0, meaning="largest |q - q_d| of an arm without contact"
     )
     following_timeout_s: float = setting(
         0.1, unit="s", low=0.001, high=60.0, meaning="time beyond that window after which the run faults"
@@ -168,7 +168,7 @@ class ReactionSettings:
         3.0, unit="deg", low=0.0, high=90.0, meaning="how far the withdrawal stays from the position limits"
     )
     clear_s: float = setting(
-        0.5, unit="s", low=0.0, high=60.0, meaning="time without a push after which the arm goes on from a contact"
+        0.5, unit="s", low=0.0, high=60.0, meaning="time without a push after which the arm resumes after a contact"
     )
     patience_s: float = setting(
         10.0, unit="s", low=0.1, high=3600.0, meaning="a contact that lasts longer must be acknowledged"
@@ -203,7 +203,7 @@ class ReactionSettings:
         (3.0, 1.2), unit="Nm s/rad", low=1e-3, high=1000.0, meaning="admittance: virtual damping of each joint"
     )
     deadband_Nm: tuple[float, float] = setting(
-        (0.2, 0.1), unit="Nm", low=0.0, high=100.0, meaning="admittance: external torque that moves nothing"
+        (0.2, 0.1), unit="Nm", low=0.0, high=100.0, meaning="admittance: dead band of the external torque"
     )
     yield_limit_deg_s: tuple[float, float] = setting(
         (60.0, 90.0), unit="deg/s", low=1.0, high=360.0, meaning="float, admittance: speed that a push may give a joint"
@@ -233,7 +233,7 @@ class SafetySettings:
         unit="s",
         low=0.1,
         high=600.0,
-        meaning="longest ENABLE; absent: phase_timeout_s, or what the drives' profiles ask for if that is more",
+        meaning="longest ENABLE; absent: phase_timeout_s, or the drives' profiles' time if longer",
     )
     tolerated_emergencies: tuple[int, ...] = setting(
         (0x8200, 0x8210, 0x8240),

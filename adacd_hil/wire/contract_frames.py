@@ -167,7 +167,7 @@ def read_contract(text: bytes, name: str) -> ContractTiming:
     database = parse_database(text, Path(name))
     definitions = database.dbc.attribute_definitions if database.dbc else {}
     if "Trigger" not in definitions:
-        raise CodecError(f"DBC {name} doesn't say when its messages are sent: it has no Trigger attribute")
+        raise CodecError(f"DBC {name} has no attribute Trigger, which tells when messages are sent")
     frames = [_read_frame(message, name) for message in database.messages]
     return ContractTiming(
         name,

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 _EPILOG = (
     "Exit status: 0 identical, or other settings were replayed; 1 something differs, or a log can't be read; 2 wrong "
-    "usage or configuration; 3 what could be compared is identical, but not all of the log could; 6 a live detector of "
-    "the log can't run here; 130 interrupted."
+    "usage or configuration; 3 all compared cycles are identical, but part of the log can't be compared; 6 a live "
+    "detector of the log can't run here; 130 interrupted."
 )
 _MOST_COLUMNS = 6
 """Most variants that are printed as columns beside the log's own; more are printed as rows."""
@@ -160,9 +160,7 @@ def _open(
         return LogSource(path), False
     config, profile, dbc = configured
     if config is None:
-        raise CommandError(
-            f"{path} says nothing of the settings: --against the log of its run, or --config", ExitCode.USAGE
-        )
+        raise CommandError(f"{path} holds no settings: give --against the log of its run, or --config", ExitCode.USAGE)
     settings = load_settings(config, profile)
     return RecordingAlone(path, settings, load_codec(dbc) if dbc else load_contract(settings)), True
 

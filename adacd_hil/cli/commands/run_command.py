@@ -100,7 +100,7 @@ def run_on_bus(
     history = None
     if history_path is not None:
         if settings.scheme != "certified":
-            raise CommandError(f"--history: scheme {settings.scheme!r} certifies nothing", ExitCode.USAGE)
+            raise CommandError(f"--history: scheme {settings.scheme!r} has no certificates", ExitCode.USAGE)
         history = use_history(history_path, wall_ns())
         settings = history.apply(settings)
         ask_first_run(history)

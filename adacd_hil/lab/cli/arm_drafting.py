@@ -260,8 +260,8 @@ class Drafting:
         for node in found.nodes:
             if all(device.node is not node for device in devices):
                 self.interview.say(
-                    f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; --drive-node and "
-                    "--sensor-node say what such a node is"
+                    f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; give --drive-node "
+                    "or --sensor-node for such a node"
                 )
         chosen = [self._two(devices, kind, getattr(self.options, f"{kind}_node"), channel) for kind in (DRIVE, SENSOR)]
         return chosen[0], chosen[1]
@@ -512,10 +512,12 @@ class Drafting:
         urdf, arm = options.urdf, None
         if urdf is not None:
             if options.length_m is not None or options.mass_kg is not None:
-                raise CommandError("--urdf says lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE)
+                raise CommandError(
+                    "--urdf gives lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE
+                )
             if options.at_zero is not None or options.is_upright is not None:
                 raise CommandError(
-                    "--urdf says where gravity acts; --mounting floor, wall or ceiling says how its root is mounted",
+                    "--urdf gives the direction of gravity; --mounting floor, wall or ceiling gives that of its root",
                     ExitCode.USAGE,
                 )
             try:

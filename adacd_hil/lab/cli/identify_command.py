@@ -26,12 +26,10 @@ _RECORDING = GivenPath()
 
 @click.command(
     epilog="Exit status: 0 done; 1 a recording can't be read; 2 wrong usage or map; 3 the model doesn't explain the "
-    "test; the verdict says why."
+    "test; the verdict gives the reason."
 )
 @click.argument("recordings", nargs=-1, required=True, type=_RECORDING)
-@click.option(
-    "--map", "map_path", type=WrittenPath(dir_okay=False), help="TOML: what the columns are, and of which arm."
-)
+@click.option("--map", "map_path", type=WrittenPath(dir_okay=False), help="TOML: meaning of the columns, and the arm.")
 @click.option("--init", "is_init", is_flag=True, help="Write that map: --init RECORDING URDF.")
 @click.option("--test", type=_RECORDING, help="Recording to test on; default: the last part of the last one fitted.")
 @click.option("--watch", multiple=True, type=_RECORDING, help="Recording in which to look for contacts; repeatable.")
@@ -110,7 +108,7 @@ def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
     read_map(target)
     rows = [(f"{key.section}.{key.key}", toml_value(key.value), key.reason) for key in draft.keys]
     table = format_table(("key", "value", "a guess, because"), [row for row in rows if row[2]])
-    told = f"{target} written" + (f"; look at these:\n{table}" if draft.guesses else ", nothing in it is a guess")
+    told = f"{target} written" + (f"; look at these:\n{table}" if draft.guesses else ", without guesses")
     show(told, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
     return ExitCode.OK
 

@@ -134,6 +134,6 @@ def next_of_init(file: str, bus: dict[str, Any] | None) -> tuple[str, ...]:
     return (
         f"adacd-hil demo --config {quoted(Path(file))}   # rehearse",
         f"adacd-hil doctor {arm}",
-        f"adacd-hil tare {arm} --out {tare}   # the zero of the torque sensors, while nobody touches the arm",
+        f"adacd-hil tare {arm} --out {tare}   # the zero of the torque sensors; don't touch the arm",
         f"adacd-hil run {arm} --tare {tare}   # moves the arm",
     )

@@ -277,9 +277,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 @click.option(
     "--seconds", type=click.FloatRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test."
 )
-@click.option(
-    "--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: nothing holds the arm."
-)
+@click.option("--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: the arm isn't held.")
 @click.option("--out", type=WrittenPath(file_okay=False), help="Folder for a log; default: none.")
 @json_option
 def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:

@@ -78,7 +78,7 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 
 
 @log.command(
-    epilog="Exit status: 0 nothing was lost; 1 nothing to save, or the log can't be read; 2 wrong usage; 3 with loss."
+    epilog="Exit status: 0 without loss; 1 no data to save, or the log can't be read; 2 wrong usage; 3 with loss."
 )
 @_log_argument
 @_out_option
@@ -98,7 +98,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     return ExitCode.PARTIAL if recovery.is_lossy else ExitCode.OK
 
 
-@log.command(epilog="Exit status: 0 done; 1 nothing there, or the log is damaged; 2 wrong usage.")
+@log.command(epilog="Exit status: 0 done; 1 no data there, or the log is damaged; 2 wrong usage.")
 @_log_argument
 @click.option("--contact", type=click.IntRange(min=1), help="Cut around this contact, numbered from 1.")
 @click.option(
@@ -129,7 +129,7 @@ def cut(
 
     if contact is not None:
         if not stretch.is_whole:
-            raise CommandError("--contact says where to cut: without --from and --until", ExitCode.USAGE)
+            raise CommandError("--contact excludes --from and --until", ExitCode.USAGE)
         stretch = find_contact(log, contact, around_s)
     done = cut_log(log, out or default_out(log), stretch, topics, _tell)
     result = {"out": str(done.out), **stretch.as_json(), "messages": done.messages}
@@ -247,7 +247,7 @@ def recovery_as_text(recovery: "LogRecovery") -> str:
     lost = recovery.describe_loss()
     lines = [f"{recovery.out}: {saved}", *(f"  {note}" for note in recovery.losses.notes)]
     if recovery.losses.unvouched:
-        lines.append(f"nothing vouches for {recovery.losses.unvouched} messages: {recovery.path.name} has no checksums")
+        lines.append(f"{recovery.losses.unvouched} messages are unchecked: {recovery.path.name} has no checksums")
     lines.append(f"lost: {lost}" if lost else "nothing was lost")
     return "\n".join(in_line(line) for line in lines)
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _STATUSES = ("good", "not good", "not judged", "broken", "running")
 _EPILOG = (
     "Exit status: 0 done; 1 no run there, or a file can't be written; 2 wrong usage; 3 the log of a run is broken, the "
-    "others are told of; 130 interrupted."
+    "others are listed; 130 interrupted."
 )
 _DATE_FORMS = "2026-11-25, 2026-11-25T14:22 or 2026-11-25T14:22:33"
 _DRAWN = (".svg", ".png", ".html")

@@ -142,7 +142,7 @@ def _contract(described: dict[str, Any]) -> str:
     other = [f"node {node['node']}: {node['layout_digest']}" for node in told if node["node"] not in same]
     what = f"{contract['name']}: wire version {contract['wire_version']}, layout digest {contract['layout_digest']}"
     says = [f"same in node {', '.join(map(str, same))}"] * bool(same) + other
-    return f"{what}; {'; '.join(says) or 'no node tells its own'}"
+    return f"{what}; {'; '.join(says) or 'no node reports one'}"
 
 
 def _summary(described: dict[str, Any]) -> str:

@@ -59,7 +59,7 @@ def tune(
 
     paths = [log_in(given) for given in logs]
     if len(set(paths)) < len(paths):
-        raise CommandError("a log is given twice: what is chosen on it can't be checked on it", ExitCode.USAGE)
+        raise CommandError("a log is given twice: a choice can't be checked on the log it was made on", ExitCode.USAGE)
     with tried(out):
         base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
         with Progress() as progress:
@@ -84,7 +84,7 @@ def _next(log_path: Path, found: "Tuning", out: Path | None) -> tuple[str, ...]:
         return ()
     if out is None:
         return (f"adacd-hil tune {quoted(log_path)} --out tuned.toml   # writes the suggestion as a configuration",)
-    return (f"adacd-hil replay {quoted(log_path)} --config {quoted(out)}   # what it would have changed",)
+    return (f"adacd-hil replay {quoted(log_path)} --config {quoted(out)}   # with these settings",)
 
 
 def _as_text(found: "Tuning") -> str:

@@ -195,7 +195,7 @@ def check_pdo_map(patient: ArmExamination) -> CheckOutcome:
         lines += contract_differences(slave.device, read_pdos(patient.master.nodes[slave.name]))
     if lines:
         return failed(
-            "; ".join(lines), "correct [[pdo]] of the devices' profiles, or map the devices' PDOs as these say"
+            "; ".join(lines), "correct [[pdo]] of the devices' profiles, or map the devices' PDOs accordingly"
         )
     return ok("read back, equal to the contract")
 
@@ -249,7 +249,7 @@ def check_rate(patient: ArmExamination) -> CheckOutcome:
         f"{100.0 * report.share:.1f} % of the periods complete, {report.overruns} skipped"
     )
     remedy = (
-        "`adacd-hil commtest` shows what is late; see `scheduler` and `preemption`, or choose a longer bus.period_us"
+        "`adacd-hil commtest` shows the late part; see `scheduler` and `preemption`, or choose a longer bus.period_us"
     )
     if report.verdict is Verdict.NOT_SUFFICIENT:
         return failed(text, remedy)
@@ -261,7 +261,7 @@ def check_load(patient: ArmExamination) -> CheckOutcome:
     load = patient.communication().load_percent
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
     if load > HIGH_LOAD_PERCENT:
-        return warning(text, "choose a longer bus.period_us or CAN FD; `adacd-hil budget` shows what takes the time")
+        return warning(text, "choose a longer bus.period_us or CAN FD; `adacd-hil budget` shows the time of each frame")
     return ok(text)
 
 

@@ -381,12 +381,15 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
     told = "+1 where the device counts as the joint"
     if geometry.sign != (1, 1):
         told = "joint 2 of the URDF turns against joint 1, and the drives as the URDF"
-    yield Entry("arm.sign", geometry.sign, f"a guess: {told}; `doctor --move` tells", True)
+    yield Entry("arm.sign", geometry.sign, f"a guess: {told}; `doctor --move` checks it", True)
     if any(geometry.zero_deg):
         told = "a guess: drives that read the URDF's positions; at q2 = 0 the arm is stretched"
         yield Entry("arm.zero_deg", geometry.zero_deg, told, True)
     yield Entry(
-        "arm.holding_torque_Nm", None, "not known: what brakes, friction and cogging hold without power; 0: free", True
+        "arm.holding_torque_Nm",
+        None,
+        "not known: largest torque of brakes, friction and cogging without power; 0: free",
+        True,
     )
     theta = geometry.cad_theta
     if theta:
@@ -493,7 +496,7 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
             ("certified.enough_std", enough, found.enough_std, f"{reason}; lags stay"),
             ("certified.drift_std", _scaled(found.drift_std, scale), found.drift_std, f"{reason}; lags stay"),
         ]
-    reason = "what the arm may be; inertia and gravity: at least twice what the description says"
+    reason = "prior; inertia and gravity: at least twice the description's"
     entries.append(("certified.prior_std", prior, found.prior_std, reason))
     ratios = [inertia[i] / _MODEL_INERTIA[i] for i in range(JOINTS)]
     light, heavy = min(1.0, _ALIKE * min(ratios)), max(1.0, max(ratios) / _HEAVY_INERTIA)
@@ -600,8 +603,8 @@ def _round(value: float) -> float:
 
 
 _HEAD = """# {title}
-# `adacd-hil config check {name}` checks this file, `adacd-hil config docs KEY` explains a key; what is not named here
-# is as in `{base}`. `adacd-hil run` needs offsets of the torque sensors: `adacd-hil tare`.
+# `adacd-hil config check {name}` checks this file, `adacd-hil config docs KEY` explains a key; other keys
+# are as in `{base}`. `adacd-hil run` needs offsets of the torque sensors: `adacd-hil tare`.
 
 extends = "{base}"
 """

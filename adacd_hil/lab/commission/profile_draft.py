@@ -628,7 +628,7 @@ class _DriveWriter(_ProfileWriter):
             if status.transmission is None and not status.has_timer:
                 self.remarks.append(
                     f"its statusword comes on change only, as 0x{_SENT + status.number - 1:X}:5 (event timer) is not "
-                    "there: nobody notices one that is lost"
+                    "there: a lost one is not noticed"
                 )
         return [*lines, *self.pdo("Command", self._command(), ((0x6040, 0), (0x6071, 0)))]
 

@@ -160,7 +160,7 @@ def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
             remedy = "; something pushes on the arm there, or the mounting, arm.mounting_deg, is wrong"
             _bound(f"residual of pose {number}", residual, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
     else:
-        remedy = "; friction, a cable or somebody pushes on the arm in one of them"
+        remedy = "; friction, a cable or a hand pushes on the arm in one of them"
         _bound("spread between poses of tau_J", solution.spread_Nm, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
     mounting = "the mounting, arm.mounting_deg, is wrong"
     if not settings.estimator.gravity:

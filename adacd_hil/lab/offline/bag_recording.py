@@ -53,7 +53,7 @@ def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
         there = ", ".join(f"{topic} ({kind})" for topic, kind in list(topics.items())[:6]) or "no topic at all"
         raise ConfigError(f"recording {path} has no topic of {TYPE}; it has {there}")
     if len(found) > 1 and JOINT_STATES not in found:
-        raise ConfigError(f"recording {path} has joint states on {', '.join(found)}: `bag.topic` says which")
+        raise ConfigError(f"recording {path} has joint states on {', '.join(found)}: choose one by `bag.topic`")
     return JOINT_STATES if JOINT_STATES in found else found[0]
 
 
@@ -110,7 +110,7 @@ class _States:
             raise ConfigError(f"{self._where} has no joint {lacking!r}; {known} (`columns.q` names them)")
         if self._taken and self._lacks_effort:
             names = ", ".join(name for name in self._wanted if name in self._lacks_effort)
-            raise LogError(f"{self._where} has no effort of {names}: without a torque nothing can be explained")
+            raise LogError(f"{self._where} has no effort of {names}: torques are needed")
         if is_stamped and self._taken and not self._has_stamps:
             raise ConfigError(f'{self._where}: all stamps are 0; `bag.time` = "received" takes when it was recorded')
 

@@ -117,7 +117,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFi
         names = joined_names([column_name(described, "tau_J", joint) for joint in constant], n)
         always = ", ".join(dict.fromkeys(f"{columns.tau_J[0, joint] + 0.0:g}" for joint in constant))
         yield ColumnFinding(
-            f"the torque of {names} is always {always} Nm: a dead sensor, or a column that nobody filled in",
+            f"the torque of {names} is always {always} Nm: a dead sensor, or an empty column",
             "check that sensor, and `columns.tau_J`",
             is_dead=True,
         )

@@ -161,7 +161,7 @@ def _time_column(path: Path, head: CsvHead, described: RecordingMap) -> _Column:
         try:
             return _Column(name, find_column(name, head, path), read, units.time)
         except ConfigError as error:
-            raise ConfigError(f"{error}; if it has no times, `sampling.period_s` says how far rows are apart") from None
+            raise ConfigError(f"{error}; without times, give their distance by `sampling.period_s`") from None
     if not has_period:
         raise ConfigError("missing key `columns.time`; where there are no times `sampling.period_s` is the period")
     return _Column("", 0, read, "")

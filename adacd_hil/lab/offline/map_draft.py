@@ -53,7 +53,7 @@ class MapDraft:
 
     def text(self) -> str:
         """Write the map as TOML."""
-        lines = [f"# Drafted from {self.recording.name}: look at what is a guess."]
+        lines = [f"# Drafted from {self.recording.name}: check the guesses."]
         for section in dict.fromkeys(key.section for key in self.keys):
             lines += ["", f"[{section}]"]
             for key in (key for key in self.keys if key.section == section):

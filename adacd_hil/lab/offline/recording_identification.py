@@ -137,14 +137,14 @@ def identify(
     if tested is None:
         last = recordings[-1]
         if not last.stretches:
-            raise LogError(f"{last.path}: nothing is free of touches")
+            raise LogError(f"{last.path}: no part is free of touches")
         first, final = last.stretches[0], last.stretches[-1]
         end_s = final.start_s + len(final.record.q) * last.period_s
         split_s = first.start_s + FIT_SHARE * (end_s - first.start_s)
         recordings[-1], tested = last.between(-np.inf, split_s), last.between(split_s, np.inf)
     tested = tested.free
     if not tested.stretches or not any(recording.stretches for recording in recordings):
-        raise LogError("too little free motion: nothing is left to fit or to test")
+        raise LogError("too little free motion to fit or to test")
     source = recordings[-1]
     settings = described.settings(source.noise_Nm, source.period_s, source.velocity_noise_rad_s)
     model = offline.model_of(described.urdf.chain, described.arm.has_rotors)

@@ -254,18 +254,18 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
     for chosen, text in (
         (
             passive,
-            "the torque of {names} is noise, and by the model of the others there is hardly any: a passive joint, or "
-            "what drives it is less than the noise",
+            "the torque of {names} is noise, and by the model of the others it is tiny: a passive joint, or "
+            "its torque is less than the noise",
         ),
         (
             [i for i in empty if is_noise[i] and i not in passive],
-            "the torque of {names} is noise: nothing of the motion is in it. The sensor is dead, the column is another "
-            "one's, or nothing drives the joint",
+            "the torque of {names} is noise, unrelated to the motion: the sensor is dead, the column is another "
+            "joint's, or the joint isn't driven",
         ),
         (
             [i for i in empty if not is_noise[i] and i not in passive],
-            "nothing of the torque of {names} is explained: the sensor is dead, the column is another one's, nothing "
-            "drives the joint, or it moves in the test as it never did in the fit",
+            "the torque of {names} is unexplained: the sensor is dead, the column is another joint's, the joint isn't "
+            "driven, or it moves in the test unlike in the fit",
         ),
     ):
         if chosen:
@@ -279,7 +279,7 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
     ]
     if weak:
         yield _Finding(
-            f"the torque of {joined_names(weak, len(joints))} is mostly noise: what the motion makes of it is smaller",
+            f"the torque of {joined_names(weak, len(joints))} is mostly noise: the part due to motion is smaller",
             "move faster and farther",
             is_against=True,
         )
@@ -455,7 +455,7 @@ def _of_excitation(fit: Fitted) -> Iterator[_Finding]:
     if unknown:
         some = ", ".join(unknown[:6]) + (f" and {len(unknown) - 6} more" if len(unknown) > 6 else "")
         yield _Finding(
-            f"too little excitation: the motion tells next to nothing of {some}",
+            f"too little excitation: the motion hardly determines {some}",
             "record motion of every joint, fast and slow, both ways",
             is_against=False,
         )
@@ -488,7 +488,7 @@ def _lack_remedy(fit: Fitted) -> str:
     if fit.described.units.tau_J in ("A", "mA") and not fit.described.arm.has_rotors:
         return "torques of motors turn the rotors, too: `arm.has_rotors` = true"
     return (
-        "look at the picture of --out where the residual is large: reversals say friction, fast motion says lengths, "
+        "look at the picture of --out where the residual is large: at reversals: friction; in fast motion: lengths, "
         "elasticity or late velocities"
     )
 
@@ -507,9 +507,7 @@ def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding
     loud = [i for i, joint in enumerate(joints) if i not in over and certificate.threshold_Nm[i] > joint.torque_Nm]
     if over:
         each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in over)
-        yield _Finding(
-            f"what the model lacks is more than noise: contacts show from about {each} on", "", is_against=False
-        )
+        yield _Finding(f"the model error exceeds the noise: contacts show from about {each} on", "", is_against=False)
     if loud:
         each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in loud)
         noise = fit.settings.velocity_noise_rad_s

@@ -130,7 +130,7 @@ def fit_tail(peaks: Vector, block_s: float) -> Tail:
         if found.size < deeper.size <= wanted:
             level, found = float(levels[place]), deeper
     if found.size < least // 2:
-        raise TooLittleMotionError(f"only {found.size} peaks stand apart in {hours:.2f} h: the tail can't be told")
+        raise TooLittleMotionError(f"only {found.size} peaks stand apart in {hours:.2f} h: the tail can't be fitted")
     scale, shape = _moments_fit(np.sort(found - level))
     return Tail(level, float(scale), float(shape), found.size / hours, hours, found.size, float(found.max()))
 
