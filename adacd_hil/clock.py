@@ -23,13 +23,13 @@ class _Timespec(ctypes.Structure):
 
 
 class Clock(Protocol):
-    """A source of `t_ns`."""
+    """A clock that gives `t_ns`."""
 
     def now_ns(self) -> int:
         """Return the present time in ns."""
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Return at `t_ns`, at once if that has passed."""
+        """Wait until `t_ns`; return at once if it has passed."""
 
 
 class MonotonicClock:
@@ -68,7 +68,7 @@ class VirtualClock:
         return self._t_ns
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Move to `t_ns`; never backwards."""
+        """Set the clock to `t_ns`, never backwards; doesn't wait."""
         self._t_ns = max(self._t_ns, t_ns)
 
 

@@ -69,7 +69,7 @@ class CompileCount:
 
     @property
     def is_expecting(self) -> bool:
-        """Whether there is a total."""
+        """Whether the count has a total."""
         return bool(self._expected)
 
     def count_function(self, function: Any) -> None:
@@ -80,7 +80,7 @@ class CompileCount:
         self.call_listeners()
 
     def call_listeners(self) -> None:
-        """Call the listeners."""
+        """Call the listeners with the present count."""
         for listener in _listeners:
             listener(self._line)
 

@@ -278,7 +278,7 @@ class _Compilation(event.Listener):
             self._count.count_function(event.data["dispatcher"])
 
     def call_listeners(self) -> None:
-        """Call the listeners."""
+        """Call the listeners with the present count."""
         self._count.call_listeners()
 
     @contextmanager

@@ -19,7 +19,7 @@ class GivenPath(click.Path):
         super().__init__(path_type=Path, file_okay=file_okay, dir_okay=dir_okay)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Refuse an empty name."""
+        """Convert a path; refuse an empty name."""
         if value == "":
             self.fail("the name is empty", param, ctx)
         return super().convert(value, param, ctx)
@@ -32,7 +32,7 @@ class WrittenPath(GivenPath):
     """A path to write to: refused if a folder of it would have to be made at a link without a target."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Refuse a dangling link."""
+        """Convert a path; refuse a dangling link."""
         path = Path(super().convert(value, param, ctx))
         link = dangling_link(path if self.dir_okay else path.parent)  # a file would replace the link
         if link is not None:
@@ -44,7 +44,7 @@ class CommandGroup(click.Group):
     """A group of commands that lists whole summaries, folded; click cuts them to one line."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list."""
+        """Write the list of commands with their summaries."""
         commands = [(name, self.commands[name]) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
             formatter.write_dl([(name, command.get_short_help_str(_LONGEST)) for name, command in commands])

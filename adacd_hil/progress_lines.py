@@ -37,7 +37,7 @@ class Progress:
         self._told.enter_context(telling(self.count))
 
     def __call__(self, line: str) -> None:
-        """Queue a line."""
+        """Queue a line to be printed."""
         self._is_counting = False
         self._lines.put((line, False))
 

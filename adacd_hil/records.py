@@ -63,7 +63,7 @@ PARAMETER_UNITS = {
 
 
 class Field(NamedTuple):
-    """One field of a block."""
+    """One field of a block: name, number of values, unit, meaning."""
 
     name: str
     size: int
@@ -89,7 +89,7 @@ class Layout:
 
     @cached_property
     def size(self) -> int:
-        """Count the float64 values of a block."""
+        """Number of float64 values in a block."""
         return sum(field.size for field in self.fields)
 
 
@@ -218,7 +218,7 @@ class Reaction(IntEnum):
 
 
 class FaultReason(IntEnum):
-    """Why the scheme went to FAULT."""
+    """Reason of a FAULT."""
 
     NONE = 0
     DATA_AGE = 1  # a signal older than its budget
@@ -416,7 +416,7 @@ class Event(NamedTuple):
     message: str
 
     @property
-    def told(self) -> str:
+    def operator_text(self) -> str:
         """Text shown to the operator."""
         return self.message
 
@@ -434,7 +434,7 @@ class BriefedEvent(Event):
         return briefed
 
     @property
-    def told(self) -> str:
+    def operator_text(self) -> str:
         """Text shown to the operator."""
         return self.brief
 

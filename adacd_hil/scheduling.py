@@ -241,7 +241,7 @@ def isolated_cpus(folder: Path = _SYSTEM_CPUS) -> tuple[int, ...]:
 
 
 def freeze_garbage() -> None:
-    """Collect once and never again: the cycle makes no cycles of references."""
+    """Collect garbage once, then disable the collection: the cycle makes no cycles of references."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -249,7 +249,7 @@ def freeze_garbage() -> None:
 
 @contextmanager
 def frozen_garbage() -> Iterator[None]:
-    """Collect once, and not again while the block lasts."""
+    """Collect garbage once; the collection is disabled while the block lasts."""
     freeze_garbage()
     try:
         yield

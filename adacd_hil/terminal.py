@@ -261,7 +261,7 @@ def write_screen(text: str, stream: TextIO | None = None) -> None:
         stream.flush()
 
 
-def write_told(text: str) -> None:
+def write_result(text: str) -> None:
     """Write a result and a line end to standard output, laid out by `for_people`."""
     write_screen(for_people(f"{text}\n", sys.stdout))
 

@@ -24,7 +24,7 @@ from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import fold, in_line, one_line, painted, terminal_columns, write_screen, write_told
+from adacd_hil.terminal import fold, in_line, one_line, painted, terminal_columns, write_result, write_screen
 
 PROGRAM = "adacd-hil"
 
@@ -145,7 +145,7 @@ def format_table(
 
 def show(text: str, *next_commands: str) -> None:
     """Print a result for people, folded to their terminal, and suggest the next commands on standard error."""
-    write_told(text)
+    write_result(text)
     suggest(*next_commands)
 
 
@@ -222,7 +222,7 @@ def tell(said: str, out: Path | None, content: str, has_all: bool) -> None:
             replace_file(out, content)
         except OSError as error:
             failure = error
-    print(said) if has_all else write_told(said)
+    print(said) if has_all else write_result(said)
     if failure is None:
         return
     if not has_all:

@@ -205,7 +205,7 @@ class UsedTare:
         return events + [Event("warning", "tare", line) for line in self.warnings]
 
     def metadata(self) -> dict[str, str]:
-        """Describe the tare for the log's metadata."""
+        """Return file, date, offsets and sensors of the tare for the log's metadata."""
         return {
             "tare": str(self.path),
             "tare_date_utc": self.tare.date_utc,

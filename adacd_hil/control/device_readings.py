@@ -135,7 +135,7 @@ class Reading(NamedTuple):
 
 
 READINGS: Final = (
-    Reading("told"),
+    Reading("configured"),
     Reading("reversed", position=(1.0, -1.0), torque=(1.0, -1.0), motor=(1.0, -1.0)),
     Reading("joints", True, True),
     Reading("joints", True, True, (1.0, -1.0), (1.0, -1.0), (1.0, -1.0)),
@@ -310,7 +310,7 @@ class DeviceReadings:
 
         If even the best reading explains little, the cause is not among the readings, or there are several.
         """
-        wrong = [reading for reading in left if reading.kind != "told"]
+        wrong = [reading for reading in left if reading.kind != "configured"]
         places = [self._readings.index(reading) for reading in wrong]
         if not wrong or len(wrong) > _MOST_NAMED or min(self._shares[places]) > _EXPLAINED:
             return ""

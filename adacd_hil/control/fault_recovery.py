@@ -132,7 +132,7 @@ class SelfChecks:
 
 
 class FaultReport:
-    """Collects the causes of a fault from the parts that can know them."""
+    """Lists the causes of a fault, from the arm, its devices, the scheme and the host's own checks."""
 
     def __init__(
         self,

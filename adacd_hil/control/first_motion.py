@@ -73,7 +73,7 @@ _OWN, _OTHER = 0, 1
 _COLUMNS: Final = 7
 
 
-def is_told(event: Event) -> bool:
+def is_shown(event: Event) -> bool:
     """Tell whether the operator sees an event as it happens."""
     return event.name == GEOMETRY or (event.name == "first motion" and event.level == "warning")
 

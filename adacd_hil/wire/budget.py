@@ -166,17 +166,17 @@ class Budget:
 
     @property
     def cyclic(self) -> tuple[FrameBudget, ...]:
-        """The frames of every cycle."""
+        """Frames that are sent in every cycle."""
         return tuple(entry for entry in self.frames if entry.frame.is_cyclic)
 
     @property
     def unstuffed_bits(self) -> int:
-        """Bits of a cycle without stuffing, of both rates."""
+        """Bits of a cycle's frames without stuff bits, at both rates."""
         return sum(entry.unstuffed.total for entry in self.cyclic)
 
     @property
     def worst_bits(self) -> int:
-        """Bits of a cycle at worst, of both rates."""
+        """Bits of a cycle's frames with the most stuff bits, at both rates."""
         return sum(entry.worst.total for entry in self.cyclic)
 
     @property

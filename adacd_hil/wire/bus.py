@@ -126,7 +126,7 @@ class EmbeddedBus(Bus):
         self._device: Callable[[Frame], None] | None = None
 
     def attach(self, device: Callable[[Frame], None]) -> None:
-        """Register the device's receiver."""
+        """Register the function that receives the host's frames."""
         self._device = device
 
     def deliver(self, can_id: int, data: bytes, is_error: bool = False) -> None:
@@ -151,7 +151,7 @@ class EmbeddedBus(Bus):
         self._received.clear()
 
     def close(self) -> None:
-        """Disconnect the device."""
+        """Disconnect the device; later frames are dropped."""
         self._device = None
 
 

@@ -50,7 +50,7 @@ class MessageDecoder:
         return {name: float(value) for name, value in values.items()}  # type: ignore[arg-type]
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
-        """Decode a frame to (signal, value, unit)."""
+        """Decode a frame to its signals' (name, value, unit)."""
         return tuple((name, value, self.units[name]) for name, value in self.decode(data).items())
 
 

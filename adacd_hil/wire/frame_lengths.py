@@ -35,7 +35,7 @@ class FrameBits(NamedTuple):
 
     @property
     def total(self) -> int:
-        """All bits."""
+        """Sum of the bits at both rates."""
         return self.nominal + self.data
 
     def duration_ns(self, bitrate: int, data_bitrate: int = 0) -> int:

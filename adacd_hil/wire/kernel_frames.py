@@ -33,7 +33,7 @@ _ACKNOWLEDGE_SLOT = 0x19
 
 
 class TroubleKind(Enum):
-    """Kinds of trouble, gravest first."""
+    """Kinds of CAN errors, gravest first."""
 
     BUS_OFF = "bus-off"  # ends by a restart: restart-ms, or the interface down and up
     RESTARTED = "controller restarted"

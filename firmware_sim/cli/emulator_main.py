@@ -23,7 +23,7 @@ from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import in_line, one_line, open_terminals, terminal_columns, write_told
+from adacd_hil.terminal import in_line, one_line, open_terminals, terminal_columns, write_result
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from adacd_hil.wire.contract_frames import HOST_NODE, move_contract
@@ -258,7 +258,7 @@ def list_scenarios(as_json: bool) -> int:
     else:
         columns = ("name", "group", "about")
         table = fit_table([columns, *([row[name] for name in columns] for row in described)], width=terminal_columns())
-        write_told("\n".join(table))
+        write_result("\n".join(table))
     return EmulatorExit.OK
 
 
@@ -270,7 +270,7 @@ def list_truths(as_json: bool) -> int:
     if as_json:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
     else:
-        write_told("\n".join(fit_table([(row["name"], row["about"]) for row in rows], width=terminal_columns())))
+        write_result("\n".join(fit_table([(row["name"], row["about"]) for row in rows], width=terminal_columns())))
     return EmulatorExit.OK
 
 
@@ -303,7 +303,7 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
     if as_json:
         print(json.dumps([vars(finding) for finding in findings], indent=2, ensure_ascii=False))
     else:
-        write_told("\n".join(in_line(line) for finding in findings for line in finding.lines))
+        write_result("\n".join(in_line(line) for finding in findings for line in finding.lines))
     return EmulatorExit.USAGE if any(finding.problems for finding in findings) else EmulatorExit.OK
 
 

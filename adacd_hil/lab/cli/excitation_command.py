@@ -57,7 +57,7 @@ def as_toml(outcome: ExcitationOutcome) -> str:
 
 
 def as_json(outcome: ExcitationOutcome) -> str:
-    """Return the result as JSON."""
+    """Return the search's result as JSON."""
     named = {
         "present": None if outcome.present is None else dataclasses.asdict(outcome.present),
         "found": dataclasses.asdict(outcome.found),

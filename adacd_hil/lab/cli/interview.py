@@ -61,7 +61,7 @@ class Interview:
             raise CommandError(f"stdin is not a terminal: give {option} ({question})", ExitCode.USAGE)
         if not self.takes_proposals:
             raise CommandError(
-                f"stdin is not a terminal: give {option} ({question}), or --yes for {told(proposal)}",
+                f"stdin is not a terminal: give {option} ({question}), or --yes for {as_typed(proposal)}",
                 ExitCode.USAGE,
             )
         return read(proposal.value), proposal.source
@@ -70,7 +70,7 @@ class Interview:
         self, question: str, read: Callable[[Any], Answer], proposal: Proposal, help_text: str
     ) -> tuple[Answer, str]:
         while True:
-            default = None if proposal.value is None else told(proposal)
+            default = None if proposal.value is None else as_typed(proposal)
             text = click.prompt(in_line(question), default=default, err=True, show_default=default != "")
             if text.strip() == "?":
                 self.say(help_text)
@@ -92,10 +92,10 @@ class Interview:
 def _origin(proposal: Proposal) -> str:
     if proposal.value is None:
         return ""
-    return f"Enter takes {told(proposal)}: {proposal.source or 'a guess'}"
+    return f"Enter takes {as_typed(proposal)}: {proposal.source or 'a guess'}"
 
 
-def told(proposal: Proposal) -> str:
+def as_typed(proposal: Proposal) -> str:
     """Format a proposed value in the form in which the user types it."""
     value = proposal.value
     if isinstance(value, tuple | list):

@@ -62,7 +62,7 @@ class Screen:
 
 
 class Monitor:
-    """Feeds a view from a bus and describes it."""
+    """Keeps a view of the traffic on a bus, and describes it."""
 
     def __init__(
         self, connection: Connection, codec: Codec | DbcDecoder, bus: Bus, clock: Clock, node_id: int | None
@@ -81,7 +81,7 @@ class Monitor:
         self.is_stopped = True
 
     def listen(self, duration_s: float) -> None:
-        """Take in the frames of a while. Raises BusError."""
+        """Read frames from the bus for a duration. Raises BusError."""
         end_ns = self._clock.now_ns() + round(duration_s * 1e9)
         while (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
             self._accept(frame)

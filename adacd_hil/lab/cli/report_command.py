@@ -30,7 +30,7 @@ class Index(NamedTuple):
     entries: tuple[IndexEntry, ...]
 
     def as_text(self) -> str:
-        """Return a line for each run."""
+        """Return the index as text: a line for each run, with its verdict."""
         lines = [count_text([entry.listed.run for entry in self.entries]), ""]
         for listed, _ in self.entries:
             run = listed.run

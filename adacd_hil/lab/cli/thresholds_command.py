@@ -22,7 +22,7 @@ def find(
 
 
 def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:
-    """Return both as JSON."""
+    """Return thresholds and comparison as JSON."""
     content = dataclasses.asdict(thresholds)
     if comparison is not None:
         content["comparison"] = comparison.as_json()
@@ -30,7 +30,7 @@ def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:
 
 
 def as_text(thresholds: Thresholds, comparison: Comparison | None) -> str:
-    """Format both as tables."""
+    """Format thresholds and comparison as tables."""
     lines = [
         f"{thresholds.rate_per_h:g} false alarms per hour, from {thresholds.hours:.2f} h of contact-free motion"
         + (", extrapolated" if thresholds.is_extrapolated else "")

@@ -51,19 +51,19 @@ class Reading(NamedTuple):
 class _Motion(NamedTuple):
     """A reading of the motion. T (n, n), R (n, n) of the torques: see above; R None: unchanged."""
 
-    kind: str  # "told": as the map says
+    kind: str  # "map": unchanged
     T: Vector
     R: Vector | None = None
     joints: tuple[int, ...] = ()
     unit: str = ""
-    has_rotors: bool | None = None  # None: as the map says
-    gravity_m_s2: tuple[float, ...] | None = None  # None: as the map says
+    has_rotors: bool | None = None  # None: as in the map
+    gravity_m_s2: tuple[float, ...] | None = None  # None: as in the map
     is_of_velocities: bool = True
 
     @property
     def weight(self) -> int:
         """Number of differences from the map."""
-        return int(self.kind != "told")
+        return int(self.kind != "map")
 
 
 class _Torques(NamedTuple):
@@ -203,8 +203,8 @@ def _judge(
         for i in joints
     ]
     unexplained = float(np.max(np.maximum(left, 0.0) / test.spread[places]))
-    is_told = motion.weight + torques.weight == 0
-    if unexplained > 1.0 - EXPLAINED and not is_told:
+    is_of_map = motion.weight + torques.weight == 0
+    if unexplained > 1.0 - EXPLAINED and not is_of_map:
         return _Judged(motion, torques, unexplained, is_possible=False)
     q, dq = (np.concatenate([getattr(record, name) for record in fitted]) @ motion.T.T for name in ("q", "dq"))
     return _Judged(motion, torques, unexplained, is_possible(model, theta, q, dq))
@@ -226,7 +226,7 @@ def _torques(n: int, most_turned: int) -> Iterator[_Torques]:
 def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
     """Yield readings of the motion, the map's first."""
     n, straight = model.joints, np.eye(model.joints)
-    yield _Motion("told", straight)
+    yield _Motion("map", straight)
     for unit, factor in (("deg", math.pi / 180.0), ("rad", 180.0 / math.pi)):
         if unit != described.units.q:
             yield _Motion("unit", factor * straight, unit=unit)

@@ -89,7 +89,7 @@ class Verdict:
 
 
 class Fitted(NamedTuple):
-    """A fit to be judged. before: the estimate that the fit began with."""
+    """A fit with its recordings and its test, to be judged. before: the estimate that the fit began with."""
 
     described: RecordingMap
     model: ArmModel

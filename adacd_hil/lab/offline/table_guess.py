@@ -82,7 +82,7 @@ class TableGuess:
 
 
 class _Head(NamedTuple):
-    """A head, split."""
+    """A column's head, split into words, joint number or index, and unit."""
 
     place: int
     words: tuple[str, ...]

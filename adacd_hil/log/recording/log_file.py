@@ -76,7 +76,7 @@ class Sink:
         self._thread.start()
 
     def write(self, data: bytes, packets: int = 0) -> int:
-        """Queue `data`, which completes so many packets."""
+        """Queue `data` for the disk; packets: number of packets that end with it. Return the length of the data."""
         self._position += len(data)
         if data:
             with self._changed:

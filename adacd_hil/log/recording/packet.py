@@ -52,14 +52,14 @@ ROOM = MAX_DATA
 
 @functools.cache
 def _table(frame_count: int, message_count: int) -> struct.Struct:
-    """Return the packer of everything but the bodies: one call per cycle."""
+    """Return the struct of a packet without its bodies, which packs them in one call per cycle."""
     return struct.Struct("<" + _HEAD_FORMAT + _FRAME_FORMAT * frame_count + _MESSAGE_FORMAT * message_count)
 
 
 def pack_cycle(
     t_ns: int, dropped: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]]
 ) -> bytes:
-    """Pack a cycle."""
+    """Return the packet of a cycle: its messages (channel, body) and its frames, True for sent ones."""
     values: list[int | bytes] = [CYCLE, len(messages), len(frames), dropped, t_ns]
     rests = []
     for is_tx, (can_id, data, frame_t_ns, is_error) in frames:
@@ -76,7 +76,7 @@ def pack_cycle(
 
 
 def pack_event(t_ns: int, dropped: int, event: Event) -> bytes:
-    """Pack an event; longer texts are cut at 4 KiB."""
+    """Return the packet of an event; longer texts are cut at 4 KiB."""
     texts = [text.encode("utf-8", "replace")[:_MAX_TEXT] for text in event]
     return _EVENT.pack(EVENT, dropped, t_ns, *map(len, texts)) + b"".join(texts)
 
@@ -155,7 +155,7 @@ def _unpack(
 
 
 def unpack_event(columns: Columns, index: int) -> Event:
-    """Unpack the event of packet `index`, which is one."""
+    """Return the event in packet `index`, which must be an event's."""
     start = int(columns.starts[index])
     packet = columns.data[start : start + int(columns.sizes[index])].tobytes()
     _, _, _, *sizes = _EVENT.unpack_from(packet)

@@ -31,7 +31,7 @@ def room_of(size: int) -> int:
 
 
 class _SharedRing:
-    """Common part of both sides."""
+    """Common part of the ring's writing and reading side: the shared memory and its counts."""
 
     def __init__(self, descriptor: int) -> None:
         self._memory = mmap.mmap(descriptor, os.fstat(descriptor).st_size)
@@ -54,13 +54,13 @@ class _SharedRing:
         return data if len(data) == size else data + self._memory[_COUNTS_BYTES : _COUNTS_BYTES + size - len(data)]
 
     def close(self) -> None:
-        """Release the memory."""
+        """Unmap the shared memory."""
         self._counts.release()
         self._memory.close()
 
 
 class Ring(_SharedRing):
-    """The side that puts."""
+    """The ring's writing side: puts packets."""
 
     def __init__(self, capacity: int) -> None:
         """Make a ring of `capacity` bytes, at least LEAST_BYTES. Raises OSError, as when that much can't be locked."""
@@ -120,7 +120,7 @@ class Ring(_SharedRing):
 
 
 class RingReader(_SharedRing):
-    """The side that takes."""
+    """The ring's reading side: takes packets."""
 
     @property
     def dropped(self) -> int:

@@ -45,7 +45,7 @@ BATCH_BYTES = 256 * 1024
 
 
 class WriterProcess:
-    """The loop around a PacketWriter."""
+    """The writer process's loop: takes packets, writes them, ends chunks and parts, reports the end."""
 
     def __init__(
         self, connection: socket.socket, ring: RingReader, sink: Sink, setup: WriterSetup, clock: Clock | None = None
