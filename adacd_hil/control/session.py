@@ -9,12 +9,13 @@ from typing import NamedTuple, Protocol
 
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
-from adacd_hil.control.arm_records import HISTORY_NAME, TARE_NAME, UsedHistory, UsedTare
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.fault_recovery import Recovery
+from adacd_hil.control.history_file import HISTORY_NAME, UsedHistory
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.pacing import Pacer, make_pacer, prepare_spin
+from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError

@@ -52,7 +52,7 @@ NOTHING_QUEUED = QueueBytes(0, 0)
 class Frame(NamedTuple):
     """One CAN frame. t_ns: host time of its reception or transmission.
 
-    The identifier of an error frame holds its error class; `adacd_hil.wire.kernel_frames` decodes it.
+    The identifier of an error frame holds its error class; `adacd_hil.wire.error_frames` decodes it.
     """
 
     can_id: int

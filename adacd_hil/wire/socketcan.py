@@ -30,8 +30,9 @@ from adacd_hil.wire.bus import (
     take_first,
 )
 from adacd_hil.wire.can_interface import CanInterface
+from adacd_hil.wire.error_frames import ERROR_CLASS_MASK, is_bus_off
+from adacd_hil.wire.frame_batches import CAN_ID_MASK, FrameReceiver, FrameSender
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS, MAX_STANDARD_ID
-from adacd_hil.wire.kernel_frames import CAN_ID_MASK, ERROR_CLASS_MASK, FrameReceiver, FrameSender, is_bus_off
 
 CAN_RTR_FLAG = 0x40000000
 CAN_EFF_FLAG = 0x80000000

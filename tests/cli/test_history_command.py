@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from adacd_hil.cli.commands.run_command import ask_first_run
 from adacd_hil.cli.main import cli
 from adacd_hil.clock import date_ns, wall_ns
-from adacd_hil.control.arm_records import (
+from adacd_hil.control.history_file import (
     HISTORY_FORMAT,
     CertificateRecord,
     History,

@@ -9,7 +9,7 @@ from hang import HANG_S
 
 from adacd_hil.clock import MonotonicClock, VirtualClock, wall_offset_ns
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.kernel_frames import FrameReceiver, FrameSender
+from adacd_hil.wire.frame_batches import FrameReceiver, FrameSender
 
 CLASSIC = struct.Struct("=IB3x8s")
 FD = struct.Struct("=IBB2x64s")
@@ -85,11 +85,11 @@ def test_a_wall_clock_that_was_set_is_compared_anew(
     near, far = pair
     # The offset of a wall clock that is about to be set by `step_ns`: the kernel's is the clock after it.
     offset_ns = wall_offset_ns() - step_ns
-    monkeypatch.setattr("adacd_hil.wire.kernel_frames.wall_offset_ns", lambda: offset_ns)
+    monkeypatch.setattr("adacd_hil.wire.frame_batches.wall_offset_ns", lambda: offset_ns)
     receiver = FrameReceiver(far, MonotonicClock())
     receiver._last_ns = MonotonicClock().now_ns() + offset_ns
     receiver._trusted_ns = receiver._last_ns + 1_000_000_000
-    monkeypatch.setattr("adacd_hil.wire.kernel_frames.wall_offset_ns", wall_offset_ns)
+    monkeypatch.setattr("adacd_hil.wire.frame_batches.wall_offset_ns", wall_offset_ns)
     before_ns = MonotonicClock().now_ns()
     near.send(CLASSIC.pack(0x181, 0, b""))
     (frame,) = receiver.take_frames()

@@ -13,7 +13,7 @@ from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.control.arm_records import History
+    from adacd_hil.control.history_file import History
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _MIDDLE = slice(1, None, 3)
@@ -30,7 +30,7 @@ def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
 
     `adacd-hil run --history FILE` makes the file. A file that was damaged or edited is refused.
     """
-    from adacd_hil.control.arm_records import read_history
+    from adacd_hil.control.history_file import read_history
 
     found = read_history(file)
     if plot is not None:

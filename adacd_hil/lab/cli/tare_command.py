@@ -10,7 +10,7 @@ from typing import Any
 from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import VirtualClock
-from adacd_hil.control.arm_records import Tare, read_tare, write_tare
+from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import refuse_company
