@@ -53,15 +53,17 @@ _BEYOND_EFFORT: Final = 30.0
 CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 
 
-class ColumnFinding(NamedTuple):
-    """A defect of columns, and the user's next step.
+class RecordingFinding(NamedTuple):
+    """A finding on a recording, and the user's next step; "" if none is needed.
 
-    is_dead: no model can be fitted. is_wrong: a fitted model is worthless, unless another interpretation of the map is
-    found. With neither, the defect is a possible reason of a bad fit.
+    is_against: a reason why the torque isn't explained; else a remark. Of columns: is_dead: no model can be fitted.
+    is_wrong: a fitted model is worthless, unless another interpretation of the map is found. With neither, the defect
+    is a possible reason of a bad fit.
     """
 
     text: str
-    remedy: str
+    remedy: str = ""
+    is_against: bool = True
     is_dead: bool = False
     is_wrong: bool = False
 
@@ -78,7 +80,7 @@ class _Columns(NamedTuple):
 
 def find_faults(
     described: RecordingMap, fitted: Sequence[ForeignRecording], tested: ForeignRecording
-) -> tuple[ColumnFinding, ...]:
+) -> tuple[RecordingFinding, ...]:
     """Return the defects of the columns of the fitted and the tested recordings."""
     recordings = [*fitted, tested]
     stretches = [stretch for recording in recordings for stretch in recording.stretches]
@@ -110,13 +112,13 @@ def column_name(described: RecordingMap, key: str, joint: int) -> str:
     return f"{name} ({columns[joint]})" if columns and columns[joint] != name else name
 
 
-def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     n = described.joints
     constant = [joint for joint in range(n) if np.ptp(columns.tau_J[:, joint]) == 0.0]
     if constant:
         names = joined_names([column_name(described, "tau_J", joint) for joint in constant], n)
         always = ", ".join(dict.fromkeys(f"{columns.tau_J[0, joint] + 0.0:g}" for joint in constant))
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"the torque of {names} is always {always} Nm: a dead sensor, or an empty column",
             "check that sensor, and `columns.tau_J`",
             is_dead=True,
@@ -126,13 +128,13 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFi
         run = _stuck_run(torque, columns.q, columns.period_s)
         if run is not None:
             seconds, start_s = (run[1] - run[0]) * columns.period_s, columns.time_s[run[0]]
-            yield ColumnFinding(
+            yield RecordingFinding(
                 f"the torque of {name} is stuck at {torque[run[0]]:g} Nm for {seconds:.2g} s, from {start_s:.4g} s on, "
                 "while the arm moves",
                 "leave that time out with --from and --until, and check the sensor",
             )
         if bounds := list(_clipped_at(torque)):
-            yield ColumnFinding(
+            yield RecordingFinding(
                 f"the torque of {name} is clipped at {' and '.join(f'{bound:g}' for bound in bounds)} Nm",
                 CLIPPED_REMEDY,
             )
@@ -145,13 +147,13 @@ def largest_torques(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
     return np.nanquantile(np.abs(tau_J), 0.99, axis=0), effort
 
 
-def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     largest, effort = largest_torques(columns.tau_J, described.urdf)
     is_over = largest > _BEYOND_EFFORT * effort
     if "A" in described.units.tau_J or not is_over.any():
         return
     joint = int(np.argmax(largest / effort))
-    yield ColumnFinding(
+    yield RecordingFinding(
         f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest[joint]:.3g} Nm, the URDF allows "
         f"{effort[joint]:g} Nm",
         f"if the torques are mNm: {_unit_or_scale(described, 'tau_J', 'mNm', 1e-3, is_over | np.isinf(effort))}",
@@ -168,17 +170,17 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
     return f"`scale.{key}` = [{', '.join(f'{value:.6g}' for value in values)}]"
 
 
-def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     n, urdf = described.joints, described.urdf
     travel = np.ptp(columns.q, axis=0)
     still = [joint for joint in range(n) if travel[joint] < STILL_RAD]
     if len(still) == n:
-        yield ColumnFinding("the arm does not move", "record motion of every joint, fast and slow", is_dead=True)
+        yield RecordingFinding("the arm does not move", "record motion of every joint, fast and slow", is_dead=True)
     at_rest: list[int] = []
     for joint in still if len(still) < n else ():
         turned = float(np.ptp(np.cumsum(columns.dq[:, joint]))) * columns.period_s
         if turned > _TURNS_THOUGH_STILL_RAD:
-            yield ColumnFinding(
+            yield RecordingFinding(
                 f"the position of {column_name(described, 'q', joint)} {_stays(columns.q[:, joint])}, though by its "
                 "velocity it turns: a dead encoder",
                 "check that encoder, and `columns.q`",
@@ -191,14 +193,14 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
         said = f"the position of {names} {_stays(columns.q[:, at_rest[0]])}: a dead encoder, or a joint"
         if len(at_rest) > 1:
             said = f"the positions of {names} change by less than {STILL_RAD:g} rad: dead encoders, or joints"
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"{said} at rest, of which neither friction nor inertia can be learnt",
             "move every joint, name one that never moves in `arm.locked`, and check `columns.q`",
         )
     noise = [joint for joint in range(n) if joint not in still and _is_noise(columns.q[:, joint], columns.period_s)]
     if noise:
         names = joined_names([column_name(described, "q", joint) for joint in noise], n)
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"the position of {names} is noise: from sample to sample it jumps as far as it goes at all",
             "check that encoder, and `columns.q`",
             is_dead=True,
@@ -213,7 +215,7 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
     for joint in np.flatnonzero(is_beyond)[:1].tolist():
         much = f"goes to {reach[joint]:.3g} rad" if goes_far[joint] else f"turns at {speed[joint]:.3g} rad/s"
         most = f"{bound[joint]:.3g} rad" if goes_far[joint] else f"{limit[joint]:g} rad/s"
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
             f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
         )
@@ -223,13 +225,13 @@ def _stays(column: Vector) -> str:
     return f"changes by less than {STILL_RAD:g} rad" if np.ptp(column) else f"is always {column[0]:g} rad"
 
 
-def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     """Report single samples far from their neighbours, as of a corrupted frame."""
     for key, what, unit in (("tau_J", "torque", "Nm"), ("q", "position", "rad")):
         for joint, column in enumerate(getattr(columns, key).T):
             rows = _spikes(column)
             if len(rows):
-                yield ColumnFinding(
+                yield RecordingFinding(
                     f"the {what} of {column_name(described, key, joint)} jumps for single samples, "
                     f"{number_of(len(rows), 'time')}, first to {column[rows[0]]:.4g} {unit} at "
                     f"{columns.time_s[rows[0]]:.4g} s",
@@ -257,21 +259,21 @@ def _is_noise(column: Vector, period_s: float) -> bool:
 
 def _of_rest(
     described: RecordingMap, part: str, recordings: Sequence[ForeignRecording], still: NDArray[np.bool_]
-) -> Iterator[ColumnFinding]:
+) -> Iterator[RecordingFinding]:
     """Report joints that rest in the fitted, or the tested, part although they move in the other one. still (n,)."""
     q = np.concatenate([stretch.record.q for recording in recordings for stretch in recording.stretches])
     rests = np.ptp(q, axis=0) < STILL_RAD
     joints = np.flatnonzero(rests & ~still).tolist()
     if joints:
         names = "the arm" if rests.all() else joined_names([described.urdf.joint_names[i] for i in joints], len(rests))
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"{names} does not move in the part that is {'fitted' if part == 'fit' else 'tested'}",
             "choose what is fitted with --from and --until, and other motion for --test",
             is_dead=bool(rests.all()),
         )
 
 
-def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) -> Iterator[ColumnFinding]:
+def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) -> Iterator[RecordingFinding]:
     """Compare measured velocities with the slope of the positions."""
     n = described.joints
     products = np.zeros((n, n))
@@ -290,7 +292,7 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
     for joint in moving:
         other = int(np.argmax(np.abs(alike[joint])))
         if abs(alike[joint, joint]) < _WELL_CORRELATED < alike[joint, other]:
-            yield ColumnFinding(
+            yield RecordingFinding(
                 f"the velocity of {column_name(described, 'dq', joint)} is in the column of "
                 f"{column_name(described, 'dq', other)}",
                 "in the map: exchange them in `columns.dq`, or leave that key out: velocities are derived then",
@@ -303,7 +305,7 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
         name, factor = column_name(described, "dq", joint), float(slopes[joint])
         how = "has the other sign than" if factor < 0.0 else f"is {factor:.3g} times"
         keys = [f'`units.{key}` = "{unit}"' for key, unit in units_by_slope(described.units, abs(factor))]
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"the velocity of {name} {how} its position's slope",
             f"in the map: {' or '.join([*keys, 'leave `columns.dq` out'])}: velocities are derived then",
             is_wrong=True,

@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.lab.offline.column_checks import CLIPPED_REMEDY, ColumnFinding, find_faults, joined_names, plateau
+from adacd_hil.lab.offline.column_checks import CLIPPED_REMEDY, RecordingFinding, find_faults, joined_names, plateau
 from adacd_hil.lab.offline.other_readings import UNITS, find_readings
 from adacd_hil.lab.offline.recording_import import ForeignRecording
 from adacd_hil.lab.offline.recording_map import RecordingMap
@@ -102,17 +102,11 @@ class Fitted(NamedTuple):
     tested: ForeignRecording
 
 
-class _Finding(NamedTuple):
-    text: str
-    remedy: str
-    is_against: bool
-
-
 def judge_fit(fit: Fitted) -> Verdict:
     """Judge a fit by its test."""
     joints = _shares(fit)
     columns = find_faults(fit.described, fit.fitted, fit.tested)
-    plain = [_against(found) for found in columns if found.is_dead] or list(_of_length(fit))
+    plain = [found for found in columns if found.is_dead] or list(_of_length(fit))
     findings = plain or _of_model(fit, joints, columns)
     findings += [] if plain else _of_friction(fit)
     is_explained = all(joint.is_explained for joint in joints) and not any(found.is_against for found in findings)
@@ -129,21 +123,17 @@ def judge_fit(fit: Fitted) -> Verdict:
     )
 
 
-def _against(found: ColumnFinding) -> _Finding:
-    return _Finding(found.text, found.remedy, is_against=True)
-
-
-def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[ColumnFinding]) -> list[_Finding]:
+def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[RecordingFinding]) -> list[RecordingFinding]:
     """Return the likeliest cause of an unexplained torque, or of parameters that no arm has.
 
     columns: defects of columns as possible causes; remarks if the torque is explained.
     """
-    remarks = [_Finding(found.text, found.remedy, is_against=False) for found in columns]
+    remarks = [found._replace(is_against=False) for found in columns]
     scale = list(_of_scale(fit, joints))
     if any(found.is_against for found in scale):
         return [*scale, *remarks]
     inertia = list(_of_inertia(fit))
-    wrong = [_against(found) for found in columns if found.is_wrong]
+    wrong = [found for found in columns if found.is_wrong]
     is_good = not inertia and not wrong and all(joint.is_explained for joint in joints)
     if is_good and fit.certificate.margin >= 1.0:
         return [*scale, *remarks]
@@ -152,7 +142,7 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Colum
     if is_good:
         return [*scale, *remarks]
     lack = list(_of_lack(fit, joints))
-    causes = wrong or [*map(_against, columns)]
+    causes = wrong or list(columns)
     if causes:
         return [*causes, *scale, *(found._replace(is_against=False) for found in lack)]
     return [*(list(_of_noise(fit, joints)) or inertia or lack), *scale]
@@ -211,19 +201,18 @@ def _headline(fit: Fitted, joints: Sequence[JointShare], is_explained: bool) -> 
     return f"NOT explained: {least}{where}; {margin}"
 
 
-def _of_length(fit: Fitted) -> Iterator[_Finding]:
+def _of_length(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report parts that are too short."""
     fit_s, test_s = sum(recording.duration_s for recording in fit.fitted), fit.tested.duration_s
     if fit_s < _SHORTEST_FIT_S or test_s < _SHORTEST_TEST_S:
-        yield _Finding(
+        yield RecordingFinding(
             f"too short: {fit_s:.2g} s fitted and {test_s:.2g} s tested, {_SHORTEST_FIT_S:g} and {_SHORTEST_TEST_S:g} "
             "s are the least, 10 s a good beginning",
             "record more, in which every joint turns fast and slow, both ways",
-            is_against=True,
         )
 
 
-def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[_Finding]:
+def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[RecordingFinding]:
     """Report the mistake of the map that explains at least this share of the torque."""
     fitted = [stretch.record for recording in fit.fitted for stretch in recording.stretches]
     tested = [stretch.record for stretch in fit.tested.stretches]
@@ -232,14 +221,13 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
         return
     text = ", or ".join(reading.text for reading in readings[:3])
     told, where = percent(min(joint.share for joint in joints)), " at the worst joint" if len(joints) > 1 else ""
-    yield _Finding(
+    yield RecordingFinding(
         f"{text}: so {percent(readings[0].share)} of the torque is explained{where}, {told} as the map has it",
         f"in the map: {', or '.join(dict.fromkeys(reading.remedy for reading in readings[:3]))}",
-        is_against=True,
     )
 
 
-def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
+def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
     """Report torques that are unrelated to the motion, or nearly so."""
     related, is_noise = _related_to_motion(fit), _is_noise(fit, joints)
     empty = [
@@ -271,17 +259,16 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
         if chosen:
             names = joined_names([joints[i].name for i in chosen], len(joints))
             remedy = f"check the sensor of {names}, and {_column(fit.described, 'tau_J', chosen)}"
-            yield _Finding(text.format(names=names), remedy, is_against=True)
+            yield RecordingFinding(text.format(names=names), remedy)
     weak = [
         joint.name
         for i, joint in enumerate(joints)
         if i not in (*empty, *passive) and not joint.is_explained and joint.margin >= 1.0
     ]
     if weak:
-        yield _Finding(
+        yield RecordingFinding(
             f"the torque of {joined_names(weak, len(joints))} is mostly noise: the part due to motion is smaller",
             "move faster and farther",
-            is_against=True,
         )
 
 
@@ -329,7 +316,7 @@ def _low_pass(values: Vector, decay: float) -> Vector:
     return np.asarray(lfilter([1.0 - decay], [1.0, -decay], values, axis=0))
 
 
-def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
+def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
     """Compare the torques with the masses of the URDF, and the inertia with that of any arm of this reach."""
     scale, sigma = _scale_of_urdf(fit)
     mass_kg = _mass_at_reach(fit)
@@ -340,21 +327,20 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
         turns = {"rad": 180.0 / math.pi, "deg": math.pi / 180.0}
         angle = [unit for unit, factor in turns.items() if unit != units.q and 0.8 < abs(scale) / factor < 1.25]
         if meant:
-            yield _Finding(f"{text}: they are {meant}", f'in the map: `units.tau_J` = "{meant}"', is_against=True)
+            yield RecordingFinding(f"{text}: they are {meant}", f'in the map: `units.tau_J` = "{meant}"')
             return
         if angle and least >= WHOLE:
             remedy = f'in the map: `units.q` = "{angle[0]}"'
-            yield _Finding(f"{text}: the positions are {UNITS[angle[0]]}", remedy, is_against=True)
+            yield RecordingFinding(f"{text}: the positions are {UNITS[angle[0]]}", remedy)
             return
         if not 1.0 / _ODD_SCALE <= abs(scale) <= _ODD_SCALE:
-            yield _Finding(
-                f"{text}: a unit, a gear or a gain is wrong, or the masses of the URDF are", "", is_against=False
+            yield RecordingFinding(
+                f"{text}: a unit, a gear or a gain is wrong, or the masses of the URDF are", is_against=False
             )
     if mass_kg is not None and least >= HALF and not _LIGHTEST_KG <= mass_kg <= _HEAVIEST_KG:
-        yield _Finding(
+        yield RecordingFinding(
             f"the inertia about {joints[0].name} is that of {mass_kg:.2g} kg at the arm's reach",
             "correct `units` and `scale` of positions and torques",
-            is_against=True,
         )
 
 
@@ -398,7 +384,7 @@ def _mass_at_reach(fit: Fitted) -> float | None:
     return inertia / reach_m**2 if inertia > 0.0 else None
 
 
-def _of_inertia(fit: Fitted) -> Iterator[_Finding]:
+def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report an inertia that no masses have: kinetic energy would be negative."""
     names = fit.described.urdf.joint_names
     n = fit.model.joints
@@ -413,14 +399,13 @@ def _of_inertia(fit: Fitted) -> Iterator[_Finding]:
     if worst is not None:
         _, joint, inertia, sigma = worst
         unit_text = "kg" if fit.described.urdf.chain.is_prismatic[joint] else "kg m²"
-        yield _Finding(
+        yield RecordingFinding(
             f"the inertia about {names[joint]} is negative, {inertia:.3g} ± {sigma:.1g} {unit_text}: no masses make it",
             "check signs and order of the columns, and the URDF",
-            is_against=True,
         )
 
 
-def _of_friction(fit: Fitted) -> Iterator[_Finding]:
+def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report friction that drives a joint on, or whose viscous or Coulomb term is negative."""
     record = np.concatenate([stretch.record.dq for stretch in fit.tested.stretches])
     speed = np.abs(record)
@@ -430,23 +415,21 @@ def _of_friction(fit: Fitted) -> Iterator[_Finding]:
         power = theta[F_c] * speed[:, joint].mean() + theta[F_v] * (speed[:, joint] ** 2).mean()
         sigma = math.hypot(deviation[F_c] * speed[:, joint].mean(), deviation[F_v] * (speed[:, joint] ** 2).mean())
         if power < -_SIGMAS * sigma:
-            yield _Finding(
+            yield RecordingFinding(
                 f"friction drives {name} on: F_v {theta[F_v]:.3g} ± {deviation[F_v]:.1g} Nm s/rad, F_c "
                 f"{theta[F_c]:.3g} ± {deviation[F_c]:.1g} Nm",
-                "",
                 is_against=False,
             )
         for place, unit in ((F_v, "Nm s/rad"), (F_c, "Nm")):
             if power >= -_SIGMAS * sigma and theta[place] < -_SIGMAS * deviation[place]:
-                yield _Finding(
+                yield RecordingFinding(
                     f"{fit.model.parameter_names[place]} of {name} is negative, {theta[place]:.3g} ± "
                     f"{deviation[place]:.1g} {unit}: the friction's curve is not a straight line",
-                    "",
                     is_against=False,
                 )
 
 
-def _of_excitation(fit: Fitted) -> Iterator[_Finding]:
+def _of_excitation(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report parameters that the motion hardly determines, given the noise of the residual."""
     before, after = (np.sqrt(np.diag(estimate.P)) for estimate in (fit.before, fit.estimate))
     noise = np.maximum(fit.certificate.threshold_Nm / fit.settings.deviations, 1e-12)
@@ -454,14 +437,14 @@ def _of_excitation(fit: Fitted) -> Iterator[_Finding]:
     unknown = np.array(fit.model.parameter_names)[worse * after > _UNKNOWN * before].tolist()
     if unknown:
         some = ", ".join(unknown[:6]) + (f" and {len(unknown) - 6} more" if len(unknown) > 6 else "")
-        yield _Finding(
+        yield RecordingFinding(
             f"too little excitation: the motion hardly determines {some}",
             "record motion of every joint, fast and slow, both ways",
             is_against=False,
         )
 
 
-def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
+def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
     """Report unexplained joints if no cause was found."""
     for i, joint in enumerate(joints):
         if joint.is_explained or math.isnan(joint.share):
@@ -471,7 +454,7 @@ def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
         )
         bound = plateau(torque)
         largest, rms = fit.certificate.residual_max_Nm[i], fit.certificate.residual_rms_Nm[i]
-        yield _Finding(
+        yield RecordingFinding(
             f"{joint.name}: {percent(joint.share)} is explained, {100.0 * WHOLE:.0f} % are needed; the residual "
             f"reaches {largest:.3g} Nm ({rms:.2g} rms), {_times_threshold(joint.margin)}"
             + (
@@ -480,7 +463,6 @@ def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
                 else ""
             ),
             CLIPPED_REMEDY if bound else _lack_remedy(fit),
-            is_against=True,
         )
 
 
@@ -499,7 +481,7 @@ def _times_threshold(margin: float) -> str:
     return f"{1.0 / margin:.2g} times its threshold" if margin > 0.0 else "far beyond its threshold"
 
 
-def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
+def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
     """Report the smallest contacts that show, if the model lacks more than noise, or noise exceeds the torque."""
     certificate = fit.certificate
     contact_Nm = np.hypot(certificate.threshold_Nm, fit.settings.deviations * certificate.lack_Nm)
@@ -507,15 +489,16 @@ def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding
     loud = [i for i, joint in enumerate(joints) if i not in over and certificate.threshold_Nm[i] > joint.torque_Nm]
     if over:
         each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in over)
-        yield _Finding(f"the model error exceeds the noise: contacts show from about {each} on", "", is_against=False)
+        yield RecordingFinding(
+            f"the model error exceeds the noise: contacts show from about {each} on", is_against=False
+        )
     if loud:
         each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in loud)
         noise = fit.settings.velocity_noise_rad_s
         source = f" of the velocities, {noise:.2g} rad/s," if noise and fit.described.columns.dq else ""
         remedy = "; without `columns.dq` they are derived from the positions" if source else ""
-        yield _Finding(
+        yield RecordingFinding(
             f"noise{source} hides contacts smaller than the torque itself: they show from about {each} on{remedy}",
-            "",
             is_against=False,
         )
 
