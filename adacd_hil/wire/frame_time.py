@@ -193,7 +193,6 @@ class Load:
     interval_ns: int
     frames: int
     bits: FrameBits
-    payload_bits: int
     bitrate: int
     data_bitrate: int
 
@@ -219,7 +218,7 @@ class LoadMeter:
         self._bitrate = bitrate
         self._data_bitrate = data_bitrate
         self._start_ns = start_ns
-        self._frames = self._nominal = self._data = self._payload = 0
+        self._frames = self._nominal = self._data = 0
 
     def count_frame(self, frame: Frame) -> None:
         """Count a frame. Raises ValueError for an impossible length, or CAN FD without a data bit rate."""
@@ -235,13 +234,12 @@ class LoadMeter:
         self._frames += 1
         self._nominal += bits.nominal
         self._data += bits.data
-        self._payload += 8 * len(frame.data)
 
     def take_load(self, t_ns: int) -> Load:
         """Return the load since the last call, and start again from zero."""
         interval_ns = 0 if self._start_ns is None else t_ns - self._start_ns
         bits = FrameBits(self._nominal, self._data)
-        load = Load(interval_ns, self._frames, bits, self._payload, self._bitrate, self._data_bitrate)
+        load = Load(interval_ns, self._frames, bits, self._bitrate, self._data_bitrate)
         self._start_ns = t_ns
-        self._frames = self._nominal = self._data = self._payload = 0
+        self._frames = self._nominal = self._data = 0
         return load
