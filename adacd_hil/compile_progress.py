@@ -88,8 +88,8 @@ class CompileCount:
         kept = self._versions().items()
         self._done |= {name for name, version in kept if version is not None and version != self._before[name]}
         done, total = len(self._done), len(self._expected)
-        said = f"compiling {done} of {total} functions" if total else f"compiling, {done} functions so far"
-        return f"{said}, once per version"
+        text = f"compiling {done} of {total} functions" if total else f"compiling, {done} functions so far"
+        return f"{text}, once per version"
 
     def _versions(self) -> dict[str, object]:
         return {name: self._version_of(function) for name, function in self._expected.items()}

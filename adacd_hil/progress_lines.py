@@ -21,20 +21,20 @@ class Progress:
 
     CLOSE_TIMEOUT_S = 2.0
     COUNT_EVERY_NS = 1_000_000_000
-    TOLD_EVERY_NS = 4_000_000_000
+    LINES_EVERY_NS = 4_000_000_000
     """Shortest time between two counts, on a terminal and elsewhere; code from the cache takes less than that."""
 
     def __init__(self) -> None:
         self._lines: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
         self._has_cursor = moves_cursor(sys.stderr)
-        self._pause_ns = self.COUNT_EVERY_NS if self._has_cursor else self.TOLD_EVERY_NS
+        self._pause_ns = self.COUNT_EVERY_NS if self._has_cursor else self.LINES_EVERY_NS
         self._clock = MonotonicClock()
         self._is_counting = False
         self._begun_ns = self._counted_ns = 0
         self._thread = threading.Thread(target=self._print, name="progress", daemon=True)
         self._thread.start()
-        self._told = ExitStack()
-        self._told.enter_context(telling(self.count))
+        self._listening = ExitStack()
+        self._listening.enter_context(telling(self.count))
 
     def __call__(self, line: str) -> None:
         """Queue a line to be printed."""
@@ -57,8 +57,8 @@ class Progress:
 
     def _print(self) -> None:
         is_overwritten = False
-        while (said := self._lines.get()) is not None:
-            line, is_passing = said
+        while (queued := self._lines.get()) is not None:
+            line, is_passing = queued
             write_line(sys.stderr, in_line(line), is_overwritten, has_end=not is_passing)
             is_overwritten = is_passing
         if is_overwritten:
@@ -69,6 +69,6 @@ class Progress:
 
     def __exit__(self, *_: object) -> None:
         """Print all queued lines, then end."""
-        self._told.close()
+        self._listening.close()
         self._lines.put(None)
         self._thread.join(self.CLOSE_TIMEOUT_S)

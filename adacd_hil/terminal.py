@@ -59,8 +59,8 @@ def terminal_columns(stream: "TextIO | Terminal | None" = None) -> int | None:
     """
     is_output = stream is None or stream is sys.stdout
     stream = stream or sys.stdout
-    told = os.environ.get("COLUMNS", "")
-    columns = int(told) if told.isdecimal() and len(told) <= _MOST_DIGITS else 0
+    given = os.environ.get("COLUMNS", "")
+    columns = int(given) if given.isdecimal() and len(given) <= _MOST_DIGITS else 0
     if not _is_terminal(stream):
         return max(columns, _LEAST_COLUMNS) if columns and is_output else None
     with contextlib.suppress(OSError):  # the terminal has hung up since

@@ -190,7 +190,7 @@ def quoted(path: Path) -> str:
 
 
 @contextmanager
-def tried(out: Path | None) -> Iterator[None]:
+def checked_place(out: Path | None) -> Iterator[None]:
     """Before the block, make the folder of a result and test that a file can be written in it; None: do nothing.
 
     A folder that was made and is empty at the end is removed. Raises CommandError.
@@ -209,8 +209,8 @@ def tried(out: Path | None) -> Iterator[None]:
         yield
 
 
-def tell(said: str, out: Path | None, content: str, has_all: bool) -> None:
-    """Print a result and write `content` to its file.
+def print_and_write(text: str, out: Path | None, content: str, has_all: bool) -> None:
+    """Print a result's text and write `content` to its file.
 
     If the file can't be written, `content` is printed, too, unless the printed result contains it (`has_all`). Raises
     CommandError.
@@ -222,7 +222,7 @@ def tell(said: str, out: Path | None, content: str, has_all: bool) -> None:
             replace_file(out, content)
         except OSError as error:
             failure = error
-    print(said) if has_all else write_result(said)
+    print(text) if has_all else write_result(text)
     if failure is None:
         return
     if not has_all:

@@ -89,9 +89,9 @@ def _check_oddities(settings: Settings) -> CheckOutcome:
 def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
     def ask(settings: Settings) -> CheckOutcome:
         value = value_of(settings, known.key)
-        told = "nothing is given" if value is None else f"{in_words(value)} is a guess"
+        text = "nothing is given" if value is None else f"{in_words(value)} is a guess"
         remedy = f"measure it or look it up, write it, and take `{known.key}` off `assumed`"
-        return warning(f"{told}: {known.meaning}", remedy)
+        return warning(f"{text}: {known.meaning}", remedy)
 
     return ask
 
@@ -165,8 +165,8 @@ def _over(settings: Settings) -> Iterator[str]:
         pairs = zip(value_of(settings, key), value_of(settings, bound_key), strict=True)
         for joint, (value, bound) in enumerate(pairs):
             if value > bound:
-                told = f"`{bound_key}[{joint}]` = {bound:g} {unit}"
-                yield f"`{key}[{joint}]` = {value:g} {unit} exceeds {told}{outcome}"
+                limit = f"`{bound_key}[{joint}]` = {bound:g} {unit}"
+                yield f"`{key}[{joint}]` = {value:g} {unit} exceeds {limit}{outcome}"
 
 
 def _radians(settings: Settings) -> Iterator[str]:

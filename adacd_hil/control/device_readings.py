@@ -315,9 +315,9 @@ class DeviceReadings:
         if not wrong or len(wrong) > _MOST_NAMED or min(self._shares[places]) > _EXPLAINED:
             return ""
         shares = 100.0 * np.sqrt(self._shares[[0, *places]])
-        told = f"unexplained of the torque: {shares[0]:.1f} % as configured"
+        unexplained = f"unexplained of the torque: {shares[0]:.1f} % as configured"
         if len(wrong) == 1:
-            return f"{self._text(wrong[0])} ({told}, {shares[1]:.1f} % so)"
+            return f"{self._text(wrong[0])} ({unexplained}, {shares[1]:.1f} % so)"
         names = [
             _SHORT[reading.kind].format(
                 joint=reading.joint + 1,
@@ -328,7 +328,7 @@ class DeviceReadings:
             for reading in wrong
         ]
         texts = " or ".join(f"{name}: {so:.1f} %" for name, so in zip(names, shares[1:], strict=True))
-        return f"either {texts}; the motion can't distinguish them ({told})"
+        return f"either {texts}; the motion can't distinguish them ({unexplained})"
 
     def _text(self, reading: Reading) -> str:
         """Return the text of one cause: the mistake and its remedy."""

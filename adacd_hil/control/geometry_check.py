@@ -61,22 +61,22 @@ def _by_direction(settings: Settings, theta: tuple[float, ...]) -> Event | None:
 
 
 def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
-    told_m, told_tilt_deg = settings.arm.link_length_m[0], settings.mounting_deg[0]
+    configured_m, configured_tilt_deg = settings.arm.link_length_m[0], settings.mounting_deg[0]
     if theta[A2] == 0.0 or theta[A5] == 0.0:
         return None
     gravity_m_s2 = GRAVITY_M_S2 * np.sin(settings.tilt_rad)
     found_m = gravity_m_s2 * abs(theta[A2] / theta[A5])
-    if 1.0 / (1.0 + _LONGER) <= found_m / told_m <= 1.0 + _LONGER:
+    if 1.0 / (1.0 + _LONGER) <= found_m / configured_m <= 1.0 + _LONGER:
         return None
-    told = f"arm.link_length_m[0] = {told_m:g} m"
-    if found_m > told_m:  # a smaller tilt has the same effect
-        tilt_deg = np.degrees(np.arcsin(np.sin(settings.tilt_rad) * told_m / found_m))
+    setting = f"arm.link_length_m[0] = {configured_m:g} m"
+    if found_m > configured_m:  # a smaller tilt has the same effect
+        tilt_deg = np.degrees(np.arcsin(np.sin(settings.tilt_rad) * configured_m / found_m))
         text = (
-            f"{told} is right if the arm moves at {tilt_deg:.0f} deg to the level (arm.mounting_deg[0]); at "
-            f"{told_tilt_deg:g} deg link 1 is"
+            f"{setting} is right if the arm moves at {tilt_deg:.0f} deg to the level (arm.mounting_deg[0]); at "
+            f"{configured_tilt_deg:g} deg link 1 is"
         )
         return Event("info", EVENT, f"{text} {found_m:.3f} m long by inertia over gravity")
-    text = f"link 1 is {found_m:.3f} m long by inertia over gravity, or shorter; {told}: measure it"
+    text = f"link 1 is {found_m:.3f} m long by inertia over gravity, or shorter; {setting}: measure it"
     return Event("warning", EVENT, f"{text}; places and forces of contacts are wrong by as much")
 
 
@@ -97,8 +97,8 @@ def _by_cad(theta: tuple[float, ...], cad: tuple[float, ...], lengths: tuple[flo
     return None
 
 
-def _ratio(found: float, told: float) -> float:
-    return found / told if told else 0.0
+def _ratio(found: float, expected: float) -> float:
+    return found / expected if expected else 0.0
 
 
 def _is_alike(found: float, expected: float) -> bool:

@@ -97,8 +97,8 @@ def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCod
 
     findings = {name: examine_configuration(name, profile) for name in names}
     if as_json:
-        told = {name: {"errors": found.errors, "warnings": found.warnings} for name, found in findings.items()}
-        print(json.dumps(told, indent=2))
+        described = {name: {"errors": found.errors, "warnings": found.warnings} for name, found in findings.items()}
+        print(json.dumps(described, indent=2))
     else:
         for name, found in findings.items():
             for kind, lines in (("error", found.errors), ("warning", found.warnings)):
@@ -119,8 +119,8 @@ def docs(keys: tuple[str, ...], as_json: bool) -> ExitCode:
         return ExitCode.OK
     rows = _chosen(keys)
     if as_json:
-        told = [{name: getattr(row, name) for name in ("key", "default", "bounds", "meaning")} for row in rows]
-        print(json.dumps(told, indent=2))
+        described = [{name: getattr(row, name) for name in ("key", "default", "bounds", "meaning")} for row in rows]
+        print(json.dumps(described, indent=2))
     elif len(rows) == 1:
         (row,) = rows
         show(f"{row.key}\n  {row.meaning}\n  default: {row.default}" + (f"\n  bounds: {row.bounds}" * bool(row.bounds)))

@@ -280,11 +280,11 @@ class Drafting:
         present = can_interfaces()
         kernel = look_for_socketcan()
         if kernel.status is not Status.OK:
-            told = f"{kernel.reason} ({kernel.remedy}); an arm without hardware can be rehearsed"
+            line = f"{kernel.reason} ({kernel.remedy}); an arm without hardware can be rehearsed"
         else:
-            told = f"CAN interfaces: {', '.join(present) or 'none is there'}"
+            line = f"CAN interfaces: {', '.join(present) or 'none is there'}"
         if self.interview.is_asking:
-            self.interview.say(told)
+            self.interview.say(line)
         proposal = Proposal(present[0] if self.interview.is_asking and present else _NO_BUS)
         question = f"CAN interface of the arm, `{_NO_BUS}` for an arm without hardware"
 

@@ -108,8 +108,8 @@ def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
     read_map(target)
     rows = [(f"{key.section}.{key.key}", toml_value(key.value), key.reason) for key in draft.keys]
     table = format_table(("key", "value", "a guess, because"), [row for row in rows if row[2]])
-    told = f"{target} written" + (f"; look at these:\n{table}" if draft.guesses else ", without guesses")
-    show(told, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
+    text = f"{target} written" + (f"; look at these:\n{table}" if draft.guesses else ", without guesses")
+    show(text, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
     return ExitCode.OK
 
 

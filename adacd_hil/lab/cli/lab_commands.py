@@ -20,7 +20,7 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, answer, explained, show, tell, tried
+from adacd_hil.cli.output import EPILOG, ExitCode, answer, checked_place, explained, print_and_write, show
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
@@ -178,10 +178,10 @@ def thresholds(
     from adacd_hil.lab.cli import thresholds_command as command
     from adacd_hil.lab.thresholds.detector_comparison import write_comparison
 
-    with tried(out):
+    with checked_place(out):
         found, comparison = command.find(logs, rate_per_h, report is not None, stretch)
-        said = command.as_json(found, comparison) if as_json else command.as_text(found, comparison)
-        tell(said, out, to_toml(found), as_json)
+        text = command.as_json(found, comparison) if as_json else command.as_text(found, comparison)
+        print_and_write(text, out, to_toml(found), as_json)
     if report is not None and comparison is not None:
         write_comparison(comparison, report)
     return ExitCode.OK
@@ -212,9 +212,11 @@ def excitation(
     """
     from adacd_hil.lab.cli import excitation_command as command
 
-    with tried(out):
+    with checked_place(out):
         outcome = command.search(config, profile, seconds, seed, out)
-        tell(command.as_json(outcome) if as_json else command.as_text(outcome), out, command.as_toml(outcome), as_json)
+        print_and_write(
+            command.as_json(outcome) if as_json else command.as_text(outcome), out, command.as_toml(outcome), as_json
+        )
     return ExitCode.OK
 
 

@@ -149,7 +149,7 @@ def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) ->
 
     done = merge_logs(logs, out, has_prefix, _tell)
     if done.shared and not has_prefix:
-        _tell(f"topics of more than one log, told apart by their channels only: {', '.join(done.shared)}")
+        _tell(f"topics of more than one log; only their channels distinguish them: {', '.join(done.shared)}")
     result = {"out": str(done.out), "logs": list(done.names), "messages": done.messages, "shared": list(done.shared)}
     answer(as_json, result, in_line(f"{done.out}: {done.messages} messages"))
     return ExitCode.OK

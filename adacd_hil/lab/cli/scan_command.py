@@ -22,8 +22,8 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
     clock = MonotonicClock()
     with connection.bus(clock, codec.is_fd) as bus:
         expected = expected_nodes(Master(settings, codec, bus).slaves, codec)
-        told = {node.node_id for node in expected if node.layout_digest is not None}
-        found = survey(bus, clock, listen_s, lambda line: print(in_line(line), file=sys.stderr, flush=True), told)
+        reporting = {node.node_id for node in expected if node.layout_digest is not None}
+        found = survey(bus, clock, listen_s, lambda line: print(in_line(line), file=sys.stderr, flush=True), reporting)
     described = describe(found, compare(found, expected), codec)
     is_right = not any(row["verdict"] not in ("", "unexpected") for row in described["nodes"])
     return described, ExitCode.OK if is_right else ExitCode.BUS_MISSING
@@ -137,9 +137,9 @@ def _talk_row(owner: str, talk: dict[str, Any]) -> tuple[str, ...]:
 def _contract(described: dict[str, Any]) -> str:
     """Describe the expected contract, and the nodes that report the same or another one."""
     contract = described["contract"]
-    told = [node for node in described["nodes"] if node.get("layout_digest") is not None]
-    same = [node["node"] for node in told if node["layout_digest"] == contract["layout_digest"]]
-    other = [f"node {node['node']}: {node['layout_digest']}" for node in told if node["node"] not in same]
+    reporting = [node for node in described["nodes"] if node.get("layout_digest") is not None]
+    same = [node["node"] for node in reporting if node["layout_digest"] == contract["layout_digest"]]
+    other = [f"node {node['node']}: {node['layout_digest']}" for node in reporting if node["node"] not in same]
     what = f"{contract['name']}: wire version {contract['wire_version']}, layout digest {contract['layout_digest']}"
     says = [f"same in node {', '.join(map(str, same))}"] * bool(same) + other
     return f"{what}; {'; '.join(says) or 'no node reports one'}"

@@ -8,7 +8,17 @@ import click
 
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show, suggest, tell, tried
+from adacd_hil.cli.output import (
+    CommandError,
+    ExitCode,
+    checked_place,
+    explained,
+    format_table,
+    print_and_write,
+    quoted,
+    show,
+    suggest,
+)
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.progress_lines import Progress
@@ -60,15 +70,15 @@ def tune(
     paths = [log_in(given) for given in logs]
     if len(set(paths)) < len(paths):
         raise CommandError("a log is given twice: a choice can't be checked on the log it was made on", ExitCode.USAGE)
-    with tried(out):
+    with checked_place(out):
         base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
         with Progress() as progress:
             found = find(paths, rate_per_h, config, progress, stretch)
-        said = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
+        text = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
         if base is None or found.best is None:
-            print(said) if as_json else show(said, *_next(paths[0], found, None))
+            print(text) if as_json else show(text, *_next(paths[0], found, None))
         else:
-            tell(said, out, suggested_toml(found, found.best, *base), as_json)
+            print_and_write(text, out, suggested_toml(found, found.best, *base), as_json)
             if not as_json:
                 suggest(*_next(paths[0], found, out))
     if report is not None:

@@ -299,11 +299,11 @@ def check_devices(patient: ArmExamination) -> CheckOutcome:
 
 def check_saturation(patient: ArmExamination) -> CheckOutcome:
     """Check that no sensor is saturated or invalid."""
-    told = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
-    text = ", ".join(f"{name} {status!r}" for name, status in told.items())
-    if any(status & SensorStatus.NOT_VALID for status in told.values()):
+    reported = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
+    text = ", ".join(f"{name} {status!r}" for name, status in reported.items())
+    if any(status & SensorStatus.NOT_VALID for status in reported.values()):
         return failed(text, "see the sensor's EMCY; check its cable to the strain gauge")
-    if told:
+    if reported:
         return failed(text, "take the load off the joint; the arm must hang free")
     return ok("within range")
 

@@ -378,13 +378,13 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
     yield Entry("arm.torque_rate_limit_Nm_s", rate, "in proportion to the rated torque")
     yield _stated("arm.position_limit_deg", facts.position_limit_deg, "largest |q|; beyond it the run faults")
     yield _stated("arm.velocity_limit_deg_s", facts.velocity_limit_deg_s, "largest |dq|; beyond it the run faults")
-    told = "+1 where the device counts as the joint"
+    comment = "+1 where the device counts as the joint"
     if geometry.sign != (1, 1):
-        told = "joint 2 of the URDF turns against joint 1, and the drives as the URDF"
-    yield Entry("arm.sign", geometry.sign, f"a guess: {told}; `doctor --move` checks it", True)
+        comment = "joint 2 of the URDF turns against joint 1, and the drives as the URDF"
+    yield Entry("arm.sign", geometry.sign, f"a guess: {comment}; `doctor --move` checks it", True)
     if any(geometry.zero_deg):
-        told = "a guess: drives that read the URDF's positions; at q2 = 0 the arm is stretched"
-        yield Entry("arm.zero_deg", geometry.zero_deg, told, True)
+        comment = "a guess: drives that read the URDF's positions; at q2 = 0 the arm is stretched"
+        yield Entry("arm.zero_deg", geometry.zero_deg, comment, True)
     yield Entry(
         "arm.holding_torque_Nm",
         None,
@@ -403,8 +403,8 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
     axes = "not vertical: gravity acts on them" if geometry.has_gravity else "vertical: gravity doesn't act on them"
     yield _stated("estimator.gravity", Fact(geometry.has_gravity, facts.gravity_source), f"joint axes {axes}")
     if geometry.has_gravity:
-        told = f"tilt of the plane of motion, and the q1 at which link 1 hangs; {draw_arm(geometry.mounting_deg)}"
-        yield _stated("arm.mounting_deg", Fact(geometry.mounting_deg, facts.gravity_source), told)
+        comment = f"tilt of the plane of motion, and the q1 at which link 1 hangs; {draw_arm(geometry.mounting_deg)}"
+        yield _stated("arm.mounting_deg", Fact(geometry.mounting_deg, facts.gravity_source), comment)
 
 
 def _devices(facts: ArmFacts) -> Iterator[Entry]:
@@ -424,9 +424,9 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
     limit, speed = facts.position_limit_deg.value, facts.velocity_limit_deg_s.value
     hangs_rad = math.radians(facts.geometry.mounting_deg[1])
     is_level = facts.geometry.has_gravity and abs(math.sin(hangs_rad)) > _LEVEL
-    wanted, told = _AMPLITUDE_DEG, f"±, within {_TRAVEL_SHARE:.0%} of the position limit"
+    wanted, comment = _AMPLITUDE_DEG, f"±, within {_TRAVEL_SHARE:.0%} of the position limit"
     if is_level:
-        wanted, told = _UPRIGHT_DEG, f"{told}; wide, to tell gravity from the sensors' offsets"
+        wanted, comment = _UPRIGHT_DEG, f"{comment}; wide, to tell gravity from the sensors' offsets"
     amplitude = tuple(_round(min(wanted[i], _TRAVEL_SHARE * limit[i])) for i in range(JOINTS))
     if is_level and amplitude[0] < _LEAST_UPRIGHT_DEG:
         warnings.append(
@@ -439,12 +439,12 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
         while slower > _MOST_SLOWER:
             amplitude = tuple(_round(_SHORTER * value) for value in amplitude)
             slower = _slowdown(facts, amplitude, [])
-        told += f"; {amplitude[0] / whole[0]:.2g} of it, for a half period of {_MOST_HALF_PERIOD_S:g} s at most"
+        comment += f"; {amplitude[0] / whole[0]:.2g} of it, for a half period of {_MOST_HALF_PERIOD_S:g} s at most"
         warnings.append(
             f"by its limits of speed and torque the arm moves by ±{amplitude[0]:g} and ±{amplitude[1]:g} deg only, in "
             f"{slower * max(_HALF_PERIOD_S):.3g} s: learning it takes minutes; are the limits and the gears right?"
         )
-    yield Entry("trajectory.amplitude_deg", amplitude, told)
+    yield Entry("trajectory.amplitude_deg", amplitude, comment)
     half_period = tuple(_round(slower * period_s) for period_s in _HALF_PERIOD_S)
     reason = "as of the emulated arm" if slower == 1.0 else f"{slower:.2f} times slower than the emulated arm"
     yield Entry("trajectory.half_period_s", half_period, reason)
@@ -456,8 +456,8 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
     has_masses = bool(facts.geometry.cad_theta)
     for name, model in (("Kp", _KP), ("Kd", _KD)):
         gain = tuple(_round(model[i] * inertia[i] / _MODEL_INERTIA[i]) for i in range(JOINTS))
-        told = "the inertia" if has_masses else "the rated torque, as the masses are not known"
-        yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {told}", not has_masses)
+        basis = "the inertia" if has_masses else "the rated torque, as the masses are not known"
+        yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {basis}", not has_masses)
     if facts.geometry.has_gravity:
         yield _rest_torque(facts)
     yield from _certified(facts)
@@ -467,11 +467,11 @@ def _rest_torque(facts: ArmFacts) -> Entry:
     """Draft the torque at rest so that gravity may load the sensors of an arm that its brakes hold."""
     free = load_settings("certified").safety.rest_torque_Nm
     gravity = _gravity(facts, facts.position_limit_deg.value)[0]
-    load, told = 1.2 * gravity, f"gravity's {gravity:.3g} Nm on joint 1 and a fifth, which the arm's brakes hold"
+    load, comment = 1.2 * gravity, f"gravity's {gravity:.3g} Nm on joint 1 and a fifth, which the arm's brakes hold"
     if not gravity:
         load = max(facts.torque_limit_Nm.value)
-        told = "a guess: as much as the drives may give, for gravity loads the sensors and the masses are not known"
-    return Entry("safety.rest_torque_Nm", _round(min(free + load, _MOST_REST_NM)), told, not gravity)
+        comment = "a guess: as much as the drives may give, for gravity loads the sensors and the masses are not known"
+    return Entry("safety.rest_torque_Nm", _round(min(free + load, _MOST_REST_NM)), comment, not gravity)
 
 
 def _certified(facts: ArmFacts) -> Iterator[Entry]:
@@ -589,9 +589,9 @@ def draw_arm(mounting_deg: Pair) -> str:
     arm = "at q = 0: [1]====[2]===>, +q counter-clockwise"
     if tilt_deg <= SLIGHT_TILT_DEG:
         return f"{arm}, seen from above; gravity does not act on the joints"
-    told = _POSES.get(round(hangs_deg), f"link 1 hangs at q1 = {hangs_deg:g} deg")
+    pose = _POSES.get(round(hangs_deg), f"link 1 hangs at q1 = {hangs_deg:g} deg")
     tilt = "" if tilt_deg > 89.9 else f" (plane tilted by {tilt_deg:g} deg)"
-    return f"{arm}, gravity {_ARROWS[round(hangs_deg / 45.0) % 8]}{tilt}: {told}"
+    return f"{arm}, gravity {_ARROWS[round(hangs_deg / 45.0) % 8]}{tilt}: {pose}"
 
 
 def _stated(key: str, fact: Fact, what: str) -> Entry:

@@ -25,7 +25,7 @@ _STUCK_TIMES: Final = 5.0
 """Factor on the 99 % quantile of the other runs of equal readings: coarse sensors have long ones."""
 _CLIPPED_SHARE, _CLIPPED_ROWS, _CLIPPED_RUN = 0.005, 10, 5
 _CLIPPED_BAND: Final = 0.05
-"""Share of the span below the largest reading that a clipped sensor crosses faster than the time it is clipped."""
+"""Band below the largest reading, share of the span: a clipped sensor spends less time in it than at the bound."""
 _PLATEAU_SIGMAS: Final = 3.5
 _PLATEAU_WIDTH: Final = 0.1
 _PLATEAU_SHARE, _PLATEAU_TIMES = 0.02, 4.0
@@ -190,11 +190,11 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Record
             at_rest.append(joint)
     if at_rest:
         names = joined_names([column_name(described, "q", joint) for joint in at_rest], n)
-        said = f"the position of {names} {_stays(columns.q[:, at_rest[0]])}: a dead encoder, or a joint"
+        text = f"the position of {names} {_stays(columns.q[:, at_rest[0]])}: a dead encoder, or a joint"
         if len(at_rest) > 1:
-            said = f"the positions of {names} change by less than {STILL_RAD:g} rad: dead encoders, or joints"
+            text = f"the positions of {names} change by less than {STILL_RAD:g} rad: dead encoders, or joints"
         yield RecordingFinding(
-            f"{said} at rest, of which neither friction nor inertia can be learnt",
+            f"{text} at rest, of which neither friction nor inertia can be learnt",
             "move every joint, name one that never moves in `arm.locked`, and check `columns.q`",
         )
     noise = [joint for joint in range(n) if joint not in still and _is_noise(columns.q[:, joint], columns.period_s)]

@@ -118,10 +118,10 @@ def find_readings(
         if fit is not None and test is not None:
             for torques in _torques(model.joints, most_turned=1 if motion.weight else model.joints):
                 judged.append(_judge(other, fit, test, motion, torques, fitted))
-    told = next((each for each in judged if each.weight == 0), None)
-    if told is None:
+    of_map = next((each for each in judged if each.weight == 0), None)
+    if of_map is None:
         return ()
-    limit = min(1.0 - EXPLAINED, _BETTER * told.unexplained if told.is_possible else 1.0)
+    limit = min(1.0 - EXPLAINED, _BETTER * of_map.unexplained if of_map.is_possible else 1.0)
     right = [each for each in judged if each.weight and each.is_possible and each.unexplained <= limit]
     if not right:
         return ()
@@ -251,10 +251,10 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
         for R in (None, np.linalg.inv(T).T.astype(np.float64)):
             yield _Motion("absolute", T, R)
     yield _Motion("rotors", straight, has_rotors=not model.has_rotors)
-    told = model.chain.gravity_m_s2
-    size = float(np.linalg.norm(told)) or float(np.linalg.norm(STANDARD_GRAVITY_M_S2))
+    gravity_of_map = model.chain.gravity_m_s2
+    size = float(np.linalg.norm(gravity_of_map)) or float(np.linalg.norm(STANDARD_GRAVITY_M_S2))
     for direction in (np.zeros(3), *np.eye(3), *-np.eye(3)):
-        if not np.allclose(size * direction, told):
+        if not np.allclose(size * direction, gravity_of_map):
             yield _Motion("gravity", straight, gravity_m_s2=tuple((size * direction + 0.0).tolist()))
 
 

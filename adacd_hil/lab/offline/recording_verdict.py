@@ -220,9 +220,9 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
     if not readings or readings[0].share < least:
         return
     text = ", or ".join(reading.text for reading in readings[:3])
-    told, where = percent(min(joint.share for joint in joints)), " at the worst joint" if len(joints) > 1 else ""
+    by_map, where = percent(min(joint.share for joint in joints)), " at the worst joint" if len(joints) > 1 else ""
     yield RecordingFinding(
-        f"{text}: so {percent(readings[0].share)} of the torque is explained{where}, {told} as the map has it",
+        f"{text}: so {percent(readings[0].share)} of the torque is explained{where}, {by_map} as the map has it",
         f"in the map: {', or '.join(dict.fromkeys(reading.remedy for reading in readings[:3]))}",
     )
 
@@ -297,13 +297,13 @@ def _related_to_motion(fit: Fitted) -> Vector:
                 rate = cutoff * (_low_pass(terms[:, 4:5], decay) - smooth[:, 4:5])
                 rows.append(np.hstack([smooth[:, :6], rate, smooth[:, 6:]]))
             tables.append(np.concatenate(rows))
-        shares[i] = max(_told_share(*tables), _told_share(*tables[::-1]))
+        shares[i] = max(_predicted_share(*tables), _predicted_share(*tables[::-1]))
     return shares
 
 
-def _told_share(told: Vector, tested: Vector) -> float:
+def _predicted_share(fitted: Vector, tested: Vector) -> float:
     """Return the share of a table's last column that a fit of the others to another table explains."""
-    coefficients = np.linalg.lstsq(told[:, :-1], told[:, -1], rcond=1e-6)[0]
+    coefficients = np.linalg.lstsq(fitted[:, :-1], fitted[:, -1], rcond=1e-6)[0]
     unit, torque = tested[:, 0], tested[:, -1]
     spread = torque - unit * (unit @ torque) / max(float(unit @ unit), 1e-18)
     left = torque - tested[:, :-1] @ coefficients
@@ -361,13 +361,13 @@ def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
     """Return the factor that the URDF's masses need, with its deviation; None if the URDF has no masses."""
     theta_full = fit.described.urdf.theta_full
     base = fit.model.place_of("base")
-    told = fit.model.base.map @ theta_full
-    if not np.any(told):
+    expected = fit.model.base.map @ theta_full
+    if not np.any(expected):
         return None, 0.0
     P = fit.estimate.P[base, base]
-    spread = _ODD_MASSES * np.maximum(np.abs(told), 0.1 * np.abs(told).max())
-    weighed = np.linalg.solve(P + np.diag(spread**2), told)
-    along = float(weighed @ told)
+    spread = _ODD_MASSES * np.maximum(np.abs(expected), 0.1 * np.abs(expected).max())
+    weighed = np.linalg.solve(P + np.diag(spread**2), expected)
+    along = float(weighed @ expected)
     return float(weighed @ fit.estimate.theta[base]) / along, math.sqrt(float(weighed @ P @ weighed)) / along
 
 
