@@ -16,6 +16,7 @@ import argparse
 import ast
 import io
 import re
+import signal
 import sys
 import tokenize
 from collections import Counter
@@ -33,9 +34,9 @@ PATTERNS = {
 _LONGEST = 110
 
 
-def prose(source: str) -> Iterator[tuple[int, str]]:
-    """Yield line number and text of every docstring and comment of a module's source. Raises SyntaxError."""
-    for node in ast.walk(ast.parse(source)):
+def prose(source: str, name: str = "") -> Iterator[tuple[int, str]]:
+    """Yield line number and text of every docstring and comment of a source; name: for errors. Raises SyntaxError."""
+    for node in ast.walk(ast.parse(source, name)):
         match node:
             case ast.Expr(value=ast.Constant(value=str(text))):
                 yield node.lineno, text
@@ -76,14 +77,15 @@ def main(arguments: list[str] | None = None) -> int:
     hits: Counter[str] = Counter()
     try:
         for path in python_files(given.paths):
-            for number, text in prose(path.read_text()):
+            for number, text in prose(path.read_text(), str(path)):
                 words += len(text.split())
                 for name, line, shown in find_hits(text):
                     hits[name] += 1
                     if not given.figures:
                         sys.stdout.write(f"{path}:{number + line}: {name}: {shown}\n")
     except (OSError, SyntaxError, UnicodeDecodeError) as error:
-        sys.stderr.write(f"{error}\n")
+        where = f"{path}: " if isinstance(error, UnicodeDecodeError) else ""
+        sys.stderr.write(f"{where}{error}\n")
         return 2
     sys.stdout.write(f"{words} words\n")
     for name in PATTERNS:
@@ -92,4 +94,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it quietly
     sys.exit(main())

@@ -58,6 +58,17 @@ def test_figures_are_per_1000_words(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert figures[2].split() == ["what", "10.00", "per", "1000", "words,", "1", "in", "all"]
 
 
-def test_a_path_that_does_not_exist_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert prose.main([str(tmp_path / "missing")]) == 2
-    assert "missing" in capsys.readouterr().err
+@pytest.mark.parametrize("content", [None, b"def f(:\n", b"# caf\xe9\n"], ids=["missing", "no Python", "Latin-1"])
+def test_a_file_that_can_not_be_read_is_named(
+    content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "module.py"
+    if content is not None:
+        path.write_bytes(content)
+    assert prose.main([str(path)]) == 2
+    assert "module.py" in capsys.readouterr().err
+
+
+def test_docstrings_of_attributes_and_nested_functions_count(tmp_path: Path) -> None:
+    source = 'LIMIT = 1\n"""What it is."""\ndef f():\n    def g():\n        """Who asks."""\n    return f"what {g}"\n'
+    assert list(prose.prose(source)) == [(2, "What it is."), (5, "Who asks.")]
