@@ -43,10 +43,7 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
     if event is not None or has_masses:
         return event
     unchecked = f"arm.link_length_m[1] = {lengths[1]:g} m" if is_upright else f"arm.link_length_m = {list(lengths)} m"
-    text = (
-        f"assumed: {unchecked}, unchecked, since torques alone don't determine a length; "
-        "an error of it is one of contact places and forces, too"
-    )
+    text = f"assumed: {unchecked}, which torques alone can't check; its error shifts places and forces of contacts"
     return Event("info", EVENT, text)
 
 
