@@ -7,7 +7,7 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> str:
-        """Look `__version__` up when it is asked for: that takes longer than all of `start.py`."""
+        """Look `__version__` up at its first use: the lookup takes longer than all of `start.py`."""
         if name != "__version__":
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from importlib.metadata import PackageNotFoundError, version

@@ -1,4 +1,4 @@
-"""What a script or a package of a lab imports: runs as arrays, arrays through the scheme, what can be extended.
+"""Public names for scripts and packages of a lab: runs as arrays, the scheme over arrays, plug-ins.
 
 Everything else may move; these names stay. docs/api.md has examples.
 
@@ -8,7 +8,7 @@ Everything else may move; these names stay. docs/api.md has examples.
 | `detect`, `fit`, `Arm`, `Detection`, `Model`, `Verdict`, `ArrayError` | the scheme over arrays of any serial arm |
 | `Detector`, `register_detector` | a detector of your own |
 | `Bus`, `Frame` | another CAN interface |
-| `SchemeState`, `ContactReport`, `Certificate`, `LogError` | what the results are made of |
+| `SchemeState`, `ContactReport`, `Certificate`, `LogError` | types of the results |
 """
 
 __all__ = [
@@ -60,7 +60,7 @@ _PLACES = {
 
 
 def __getattr__(name: str) -> object:
-    """Import a name when it is asked for: some compile, some draw."""
+    """Import a name at its first use: some modules compile functions, some import plot libraries."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; there are {', '.join(__all__)}")
     from importlib import import_module

@@ -23,13 +23,13 @@ class _Timespec(ctypes.Structure):
 
 
 class Clock(Protocol):
-    """A source of `t_ns`."""
+    """A clock that gives `t_ns`."""
 
     def now_ns(self) -> int:
         """Return the present time in ns."""
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Return at `t_ns`, at once if that has passed."""
+        """Wait until `t_ns`; return at once if it has passed."""
 
 
 class MonotonicClock:
@@ -58,7 +58,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """A clock that moves only when told; starts at 0."""
+    """A clock for lockstep: starts at 0 and moves only by `sleep_until_ns`."""
 
     def __init__(self) -> None:
         self._t_ns = 0
@@ -68,7 +68,7 @@ class VirtualClock:
         return self._t_ns
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Move to `t_ns`; never backwards."""
+        """Set the clock to `t_ns`, never backwards; doesn't wait."""
         self._t_ns = max(self._t_ns, t_ns)
 
 
@@ -78,7 +78,7 @@ def wall_ns() -> int:
 
 
 def wall_offset_ns() -> int:
-    """Return the wall clock minus CLOCK_MONOTONIC, ns; of three readings the one that was interrupted least."""
+    """Return the wall clock minus CLOCK_MONOTONIC, ns; the reading with the shortest interruption out of three."""
     offsets = []
     for _ in range(3):
         before_ns = time.monotonic_ns()
@@ -94,5 +94,5 @@ def format_date(t_ns: int) -> str:
 
 
 def date_ns(date_utc: str) -> int:
-    """Read what `format_date` writes, ns since 1970. Raises ValueError."""
+    """Parse a date as `format_date` writes it; return ns since 1970. Raises ValueError."""
     return int(datetime.strptime(date_utc, _DATE).replace(tzinfo=UTC).timestamp()) * _NS_PER_S

@@ -1,7 +1,7 @@
-"""How far compiling is: who is told, and which functions are still to be compiled.
+"""Progress of compiling: how many functions are compiled, and the listeners that show it.
 
-Compiling takes the better part of a minute, once per version of the program. It is told to whoever listens
-(`telling`): a command's progress, which knows nothing of numba and would wait for its import.
+Compiling takes the better part of a minute, once per version of the program. Listeners register with `telling`; they
+don't import numba, which takes long, too.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -10,14 +10,14 @@ from types import ModuleType
 from typing import Any
 
 Listener = Callable[[Callable[[], str]], None]
-"""Is offered a line, often; it calls for one when it wants to show it."""
+"""Called several times a second with a function that makes the line; the listener calls that function to show it."""
 
 _listeners: list[Listener] = []
 
 
 @contextmanager
 def telling(listener: Listener) -> Iterator[None]:
-    """Tell `listener` in the block how far compiling is, in the thread that compiles, several times a second."""
+    """Call `listener` with the progress of compiling while the block lasts, in the thread that compiles."""
     _listeners.append(listener)
     try:
         yield
@@ -28,8 +28,9 @@ def telling(listener: Listener) -> Iterator[None]:
 def functions_below(functions: Sequence[Any], is_all: bool = False) -> dict[str, Any]:
     """Return these compiled functions and all that they call, by full name.
 
-    Calls are found by the names in the code: of functions, and of functions in modules. Left out is what this process
-    has compiled or loaded, unless is_all, and what numba doesn't compile, as all of it where NUMBA_DISABLE_JIT is set.
+    Calls are found by the names in the code: of functions, and of functions in modules. Left out are functions that
+    numba doesn't compile (all of them if NUMBA_DISABLE_JIT is set) and, unless `is_all`, functions that this process
+    has compiled or loaded already.
     """
     found: dict[str, Any] = {}
     waiting = list(functions)
@@ -50,15 +51,15 @@ def functions_below(functions: Sequence[Any], is_all: bool = False) -> dict[str,
 
 
 def full_name(function: Any) -> str:
-    """Name a function by its module."""
+    """Return a function's name with its module."""
     return f"{function.__module__}.{function.__qualname__}"
 
 
 class CompileCount:
-    """Counts functions that are compiled, and tells the listeners.
+    """Counts functions that are compiled, and calls the listeners.
 
-    expected: by full name, of all that will be needed; without them the count has no total. version_of: of what the
-    cache on the disk has of a function, which another process may have changed; None: nothing.
+    expected: the functions that will be needed, by full name; without them the count has no total. version_of: returns
+    the version of a function in the cache on the disk, which another process may have written; None: not cached.
     """
 
     def __init__(self, expected: dict[str, Any], version_of: Callable[[Any], object]) -> None:
@@ -68,18 +69,18 @@ class CompileCount:
 
     @property
     def is_expecting(self) -> bool:
-        """Whether there is a total."""
+        """Whether the count has a total."""
         return bool(self._expected)
 
-    def add(self, function: Any) -> None:
+    def count_function(self, function: Any) -> None:
         """Count a function that has been compiled, and all that it calls."""
         self._done |= {
             name for name in functions_below([function], is_all=True) if not self._expected or name in self._expected
         }
-        self.tell()
+        self.call_listeners()
 
-    def tell(self) -> None:
-        """Offer the listeners a line."""
+    def call_listeners(self) -> None:
+        """Call the listeners with the present count."""
         for listener in _listeners:
             listener(self._line)
 
@@ -87,8 +88,8 @@ class CompileCount:
         kept = self._versions().items()
         self._done |= {name for name, version in kept if version is not None and version != self._before[name]}
         done, total = len(self._done), len(self._expected)
-        said = f"compiling {done} of {total} functions" if total else f"compiling, {done} functions so far"
-        return f"{said}, once per version"
+        text = f"compiling {done} of {total} functions" if total else f"compiling, {done} functions so far"
+        return f"{text}, once per version"
 
     def _versions(self) -> dict[str, object]:
         return {name: self._version_of(function) for name, function in self._expected.items()}

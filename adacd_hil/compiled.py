@@ -1,10 +1,10 @@
-"""The one door to numba: `compiled` turns a numeric function into machine code, float64, no fast-math.
+"""The only import of numba: `compiled` turns a numeric function into machine code, float64, no fast-math.
 
-The on-disk cache is keyed by the text of every module with compiled functions and of all that these import. numba alone
-looks only at the file of the function itself, and would go on using the old code of an edited callee and the old value
+The on-disk cache is keyed by the text of every module with compiled functions and of all modules that these import.
+numba alone looks only at the file of the function itself; it would use old code of an edited callee, and the old value
 of an edited constant.
 
-Processes share the work: none compiles what another one is just compiling (`_SharedCache`).
+A function that one process is compiling is not compiled by another at the same time (`_SharedCache`).
 """
 
 import contextlib
@@ -41,7 +41,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def _imports(text: str) -> Iterator[str]:
-    """Name what a module imports of the packages: modules and, as they may be modules, names in them."""
+    """Yield the modules of the two packages that a source imports, and the imported names, which may be modules."""
     for module, names in _IMPORT.findall(text):
         yield module
         yield from (f"{module}.{name}" for name in _NAME.findall(names))
@@ -71,12 +71,12 @@ def compiled_sources(root: Path) -> dict[str, bytes]:
 
 
 def source_digest() -> str:
-    """Digest the sources that compiled code may depend on."""
+    """Return a digest of all sources that compiled code may depend on."""
     return _digest(compiled_sources(_ROOT))
 
 
 def program_digest() -> str:
-    """Digest all sources: what a result may depend on."""
+    """Return a digest of all sources, for results that may depend on any of them."""
     return _digest(all_sources(_ROOT))
 
 
@@ -90,8 +90,8 @@ def _digest(sources: dict[str, bytes]) -> str:
 def cache_folder(digest: str) -> Path:
     """Make the folder for compiled code of a source state: in NUMBA_CACHE_DIR, the user's cache or the temporary one.
 
-    What is read from it is executed. So it and the folder above it belong to this user alone, or the next place is
-    tried, at last a new folder. Raises OSError when there is none at all.
+    Code in the folder is executed. So the folder and its parent must belong to this user alone; else the next place is
+    tried, at last a new temporary folder. Raises OSError if all fail.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
@@ -115,14 +115,14 @@ def cache_folder(digest: str) -> Path:
 
 
 def _make(folder: Path) -> os.stat_result:
-    """Make a folder where there is nothing; say what is there. Raises OSError."""
+    """Make a folder unless its name is taken; return the status of that name. Raises OSError."""
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
     return folder.lstat()
 
 
 def _is_own(status: os.stat_result) -> bool:
-    """Tell whether it is a folder in which nobody but this user can write."""
+    """Tell whether it is a folder in which only this user can write."""
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
 
@@ -132,12 +132,12 @@ numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
 _POLL_S = 0.02
 _MOST_POLLS = 6000
-"""For another process that compiles a function, 120 s: one that was stopped in the midst of it holds up nobody longer.
+"""Waits of 20 ms for another process that compiles a function, 120 s in all: a stopped process blocks others no longer.
 """
 
 
 class _Claims:
-    """Which process compiles which function at present: locks of single bytes of one file, freed when a process ends.
+    """Marks the functions that a process is compiling, by locks on single bytes of one file; they end with the process.
 
     Calls have no circle, so neither has waiting; the kernel would refuse one.
     """
@@ -147,21 +147,21 @@ class _Claims:
         with contextlib.suppress(OSError):
             self._descriptor = os.open(_FOLDER / "claims", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
-    def take(self, what: str) -> bool:
-        """Claim a function; return whether another process had it until now. Without locks there is no claim."""
+    def claim(self, what: str) -> bool:
+        """Claim a function; return whether another process had it until now. Without file locks nothing is claimed."""
         for polls in range(_MOST_POLLS):
             if self._lock(what, fcntl.LOCK_EX | fcntl.LOCK_NB):
                 return polls > 0
             threading.Event().wait(_POLL_S)
-            _compilation.tell()
+            _compilation.call_listeners()
         return True
 
-    def give_back(self, what: str) -> None:
-        """Let others have it."""
+    def release(self, what: str) -> None:
+        """Release the claim on a function."""
         self._lock(what, fcntl.LOCK_UN)
 
     def _lock(self, what: str, operation: int) -> bool:
-        """Tell whether the operation is done, or can't be done at all; not where another process has the byte."""
+        """Lock or unlock a function's byte; False: another process has it. True also where locks don't work."""
         if self._descriptor is None:
             return True
         byte = int.from_bytes(hashlib.sha256(what.encode()).digest()[:7], "big")
@@ -197,25 +197,25 @@ class _SharedCache(FunctionCache):
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load what was compiled for these types; None where this process is to compile it, and then to save it."""
+        """Load the code compiled for these types; None: this process has to compile it, then save it."""
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        if found is None and _claims.take(self._claim(sig)):
+        if found is None and _claims.claim(self._claim(sig)):
             found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
             if found is not None:
-                _claims.give_back(self._claim(sig))
+                _claims.release(self._claim(sig))
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save what was compiled, one process after the other. A disk that takes nothing costs compiling anew."""
+        """Save compiled code, one process after the other. On a full disk it isn't saved; the next process compiles."""
         try:
             with contextlib.suppress(OSError), (_FOLDER / "lock").open("wb") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         finally:
-            _claims.give_back(self._claim(sig))
+            _claims.release(self._claim(sig))
 
     def version(self) -> int | None:
-        """Return what differs once something more was saved, by whichever process; None: nothing was."""
+        """Return a number that changes whenever any process saves code of this function; None: none is saved."""
         try:
             return Path(self._cache_file._index_path).stat().st_mtime_ns
         except OSError:
@@ -231,12 +231,12 @@ def compiled(function: Function) -> Function:
 
 
 def released(function: Function) -> Function:
-    """Compile `function` as `compiled` does; while it runs, other threads of Python go on. For what takes long."""
+    """Compile `function` as `compiled` does, without the GIL while it runs; for functions that take long."""
     return _compiled(function, nogil=True)
 
 
 def _compiled(function: Function, **options: bool) -> Function:
-    # No wrapper for callers in C, of which there are none: a twentieth of the time that compiling takes.
+    # No wrapper for callers in C: there are none, and it takes a twentieth of the compile time.
     made = numba.njit(fastmath=False, error_model="numpy", no_cfunc_wrapper=True, **options)  # type: ignore[call-overload]
     dispatcher: Any = made(function)
     if dispatcher is not function:  # as it is where NUMBA_DISABLE_JIT is set
@@ -245,7 +245,7 @@ def _compiled(function: Function, **options: bool) -> Function:
 
 
 class _Compilation(event.Listener):
-    """What is compiled at present, and who is told. No garbage is collected meanwhile: a tenth of the time."""
+    """Counts compilations and calls the listeners. Garbage collection pauses meanwhile; it took a tenth of the time."""
 
     def __init__(self) -> None:
         self._depth = 0
@@ -254,12 +254,12 @@ class _Compilation(event.Listener):
         self._on_first: Callable[[], None] | None = None
 
     def new_count(self, functions: Sequence[Any]) -> CompileCount:
-        """Count from now on, towards these functions and all that they call."""
+        """Start a count of these functions and all that they call."""
         self._count = CompileCount(functions_below(functions), lambda function: function._cache.version())
         return self._count
 
     def on_start(self, event: Any) -> None:  # noqa: ARG002
-        """Begin to compile a function."""
+        """Note that a function begins to compile."""
         if self._depth == 0:
             self._was_collecting = gc.isenabled()
             gc.disable()
@@ -267,23 +267,23 @@ class _Compilation(event.Listener):
         begin, self._on_first = self._on_first, None
         if begin is not None:
             begin()
-        self._count.tell()
+        self._count.call_listeners()
 
     def on_end(self, event: Any) -> None:
-        """Count it."""
+        """Count a function that is compiled."""
         self._depth -= 1
         if self._depth == 0 and self._was_collecting:
             gc.enable()
         if isinstance(event.data["dispatcher"]._cache, _SharedCache):  # not one of numba's own
-            self._count.add(event.data["dispatcher"])
+            self._count.count_function(event.data["dispatcher"])
 
-    def tell(self) -> None:
-        """Tell the listeners how far it is."""
-        self._count.tell()
+    def call_listeners(self) -> None:
+        """Call the listeners with the present count."""
+        self._count.call_listeners()
 
     @contextmanager
     def of(self, functions: Sequence[Any], on_first: Callable[[], None]) -> Iterator[None]:
-        """Count towards these functions in the block, unless a block around this one does."""
+        """Count these functions in the block, unless a block around it counts already."""
         if self._on_first is not None or self._count.is_expecting:
             yield
             return
@@ -301,9 +301,9 @@ event.register("numba:compile", _compilation)  # type: ignore[no-untyped-call]
 
 
 def compiling(functions: Sequence[Any], on_first: Callable[[], None] = lambda: None) -> Any:
-    """Return a block that compiles these functions and all that they call: who listens is told how many there are.
+    """Return a context manager; functions that compile in it count toward these functions and all that they call.
 
-    on_first: called before the first is compiled, and not at all where all are in the cache.
+    on_first: called before the first function is compiled, not at all if all come from the cache.
     """
     return _compilation.of(functions, on_first)
 

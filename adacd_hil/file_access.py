@@ -1,8 +1,8 @@
-"""Files that are read, and files that are written: new ones that replace nothing, and replacements in one step.
+"""Reading and writing of files: new files replace none, and replacements happen in one step.
 
-Only regular files are read, and whole ones up to a size: a device never ends, a FIFO without a writer never begins.
-Writing neither follows a link nor goes into a FIFO or a device, so that nothing is changed but what was named. A
-replacement is written beside and renamed: at no moment is there half a file, or none where there was one.
+Only regular files are read, and only up to a size: a device has no end, and opening a FIFO waits for its writer. Files
+are not written through a link, into a FIFO or a device, so that only the named path changes. A replacement is written
+beside the file and renamed: at each moment the path holds the whole old file or the whole new one.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from io import BufferedReader
 from pathlib import Path
 
 MOST_TEXT_BYTES = 4 << 20
-"""Of a configuration, a scenario, a contract, an EDS, a URDF; the largest that comes with the package has 0.1 MB."""
+"""Limit for a configuration, scenario, contract, EDS or URDF; the largest in the package has 0.1 MB."""
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _LOG_MAGIC = b"\x89MCAP0\r\n"
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -56,7 +56,7 @@ def read_input(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
 
 
 def exists(path: Path) -> bool:
-    """Tell whether there is a file or folder of that name; one that no file can have is not there."""
+    """Tell whether a file or folder of that name exists; False for a name that no file can have."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -73,13 +73,13 @@ def create_file(path: Path) -> int:
     Raises FileExistsError for whatever is there, a dangling link included; OSError.
     """
     descriptor = os.open(path, _NEW, 0o666)
-    with contextlib.suppress(OSError):  # a file system without locks: then nobody is told who writes
+    with contextlib.suppress(OSError):  # a file system without locks: `check_unused` can't see the writer then
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return descriptor
 
 
 def check_unused(path: Path) -> None:
-    """Raise InUseError when a process is writing a file that `create_file` made, with the process id where it's known.
+    """Raise InUseError if a process is writing a file that `create_file` made, with its process id where it is known.
 
     A file that can't be opened passes.
     """
@@ -110,7 +110,7 @@ def _owner(descriptor: int) -> str:
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Tell whether an error, or one that it was made of, says that there is no room for what is written."""
+    """Tell whether an error, or an error that caused it, means that the disk or the quota is full."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in _NO_ROOM:
             return True
@@ -119,7 +119,7 @@ def is_disk_full(error: BaseException | None) -> bool:
 
 
 def in_words(error: BaseException) -> str:
-    """Describe an error: of the system's by the file and its reason, without its number."""
+    """Describe an error in one line; an OSError by file and reason, without its number."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error)
@@ -129,9 +129,9 @@ class Replacement:
     """A new file, `beside`, that takes the place of `path` when it is committed."""
 
     def __init__(self, path: Path, is_log: bool = False) -> None:
-        """Create the file beside. A link is replaced, and its target left as it is.
+        """Create the new file. `commit` replaces a link itself, not the link's target.
 
-        is_log: a log may be replaced. Raises OSError, also when a FIFO, a device, a folder or, otherwise, a log is
+        is_log: a log may be replaced. Raises OSError, also if a FIFO, a device, a folder or (unless is_log) a log is
         there.
         """
         _check_replaceable(path, is_log)
@@ -139,7 +139,7 @@ class Replacement:
         self.beside = _create_beside(path)
 
     def commit(self, is_durable: bool = False) -> None:
-        """Take the place of `path`; `is_durable`: not before the contents are on the disk. Raises OSError."""
+        """Rename the new file to `path`; is_durable: after its contents are on the disk. Raises OSError."""
         try:
             if is_durable:
                 with self.beside.open("rb") as file:
@@ -150,7 +150,7 @@ class Replacement:
             raise
 
     def discard(self) -> None:
-        """Remove the file beside."""
+        """Remove the new file."""
         with contextlib.suppress(OSError):
             self.beside.unlink()
 
@@ -172,11 +172,11 @@ def replacing(path: Path, is_durable: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def placing(path: Path, dated_lines: int = 0) -> Iterator[Path]:
-    """Yield the path of a new file that takes the place of none but an empty one, or of the same already.
+    """Yield the path of a new file that takes its place only if that is free, empty, or holds the same contents.
 
-    For what leaves no mark of who made it: another one may be a user's own. dated_lines: so many at the beginning may
-    differ, as with the date of writing. See `Replacement`. Raises FileExistsError when the block has ended and another
-    one is there, OSError.
+    For files that could be a user's own, since they don't show which program made them. dated_lines: lines at the
+    beginning that may differ, as with the date of writing. See `Replacement`. Raises FileExistsError when the block
+    ends and another file is there, OSError.
     """
     with replacing(path) as beside:
         yield beside
@@ -185,7 +185,7 @@ def placing(path: Path, dated_lines: int = 0) -> Iterator[Path]:
 
 
 def _is_same(one: Path, other: Path, dated_lines: int) -> bool:
-    """Compare two files from behind their first lines on."""
+    """Compare two files without their first `dated_lines` lines."""
     with one.open("rb") as left, other.open("rb") as right:
         for _ in range(dated_lines):
             left.readline(_PIECE)
@@ -203,7 +203,7 @@ def replace_file(path: Path, content: bytes | str) -> None:
 
 
 def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Path, ...]:
-    """Write whole files, by their names, into a folder that is made if need be; return their paths. Raises OSError."""
+    """Write whole files, by name, into a folder, which is made if missing; return their paths. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
         replace_file(folder / name, content)
@@ -211,7 +211,7 @@ def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Pa
 
 
 def is_anothers(path: Path, head: bytes) -> bool:
-    """Tell whether a file is there that has something, and doesn't begin as those do that may be replaced.
+    """Tell whether the file exists, isn't empty, and doesn't begin with `head`: then it may not be replaced.
 
     Raises OSError.
     """
@@ -222,7 +222,7 @@ def is_anothers(path: Path, head: bytes) -> bool:
 
 
 def _check_replaceable(path: Path, is_log: bool) -> None:
-    """Raise OSError when what is there can't be replaced or shouldn't be."""
+    """Raise OSError if the path is a folder, a FIFO, a socket, a device or (unless is_log) a log."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
@@ -247,7 +247,7 @@ def _create_beside(path: Path) -> Path:
 
 
 def dangling_link(path: Path) -> Path | None:
-    """Find the link on the way to a path, or the path itself, that leads to nothing; None where there is none."""
+    """Return the first link on a path, or the path itself, whose target doesn't exist; None if there is none."""
     for place in (path, *path.parents):
         with contextlib.suppress(OSError):
             if place.is_symlink() and not place.exists():
@@ -256,7 +256,7 @@ def dangling_link(path: Path) -> Path | None:
 
 
 def place_file(path: Path, content: bytes) -> None:
-    """Write a file that is new, or the same already. Raises FileExistsError for another one, OSError."""
+    """Write a file unless it exists with the same content. Raises FileExistsError for other content, OSError."""
     try:
         descriptor = os.open(path, _NEW, 0o666)
     except FileExistsError:
@@ -273,7 +273,7 @@ def place_file(path: Path, content: bytes) -> None:
 
 @contextmanager
 def tidied(path: Path) -> Iterator[None]:
-    """When the block ends, remove a folder and those above it, as far as they are empty and were not there before."""
+    """When the block ends, remove a folder and its parents as far as they are empty and didn't exist before."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield

@@ -13,41 +13,41 @@ from adacd_hil.terminal import in_line, moves_cursor, write_line
 
 
 class Progress:
-    """Lines on stderr about work in progress; their end waits for the last one, but not for ever.
+    """Prints lines on stderr about work in progress; its end waits for the last one, but not forever.
 
-    A thread of their own prints them: a stuck terminal must not stop the arm. How far compiling is takes one line of a
-    terminal, which the next line overwrites; elsewhere it is said every few seconds.
+    A thread of its own prints: a stuck terminal must not stop the arm. Progress of compiling takes one line of a
+    terminal, which the next line overwrites; into a file or pipe it is printed every few seconds.
     """
 
     CLOSE_TIMEOUT_S = 2.0
     COUNT_EVERY_NS = 1_000_000_000
-    TOLD_EVERY_NS = 4_000_000_000
-    """Before a count and the next, in one line of a terminal, and as lines elsewhere: what is loaded counts nothing."""
+    LINES_EVERY_NS = 4_000_000_000
+    """Shortest time between two counts, on a terminal and elsewhere; code from the cache takes less than that."""
 
     def __init__(self) -> None:
         self._lines: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
         self._has_cursor = moves_cursor(sys.stderr)
-        self._pause_ns = self.COUNT_EVERY_NS if self._has_cursor else self.TOLD_EVERY_NS
+        self._pause_ns = self.COUNT_EVERY_NS if self._has_cursor else self.LINES_EVERY_NS
         self._clock = MonotonicClock()
         self._is_counting = False
         self._begun_ns = self._counted_ns = 0
         self._thread = threading.Thread(target=self._print, name="progress", daemon=True)
         self._thread.start()
-        self._told = ExitStack()
-        self._told.enter_context(telling(self.count))
+        self._listening = ExitStack()
+        self._listening.enter_context(telling(self.count))
 
     def __call__(self, line: str) -> None:
-        """Queue a line."""
+        """Queue a line to be printed."""
         self._is_counting = False
         self._lines.put((line, False))
 
     def passing(self, line: str) -> None:
-        """Queue a line in whose place a terminal shows the next one."""
+        """Queue a line that a terminal overwrites with the next one."""
         self._is_counting = False
         self._lines.put((line, self._has_cursor))
 
     def count(self, line: Callable[[], str]) -> None:
-        """Queue a line that the next one may overwrite, if it is time for one, with the seconds that it has taken."""
+        """Queue a count with the seconds so far, which the next line overwrites, unless the last count is recent."""
         now_ns = self._clock.now_ns()
         if not self._is_counting:
             self._is_counting, self._begun_ns, self._counted_ns = True, now_ns, now_ns
@@ -57,8 +57,8 @@ class Progress:
 
     def _print(self) -> None:
         is_overwritten = False
-        while (said := self._lines.get()) is not None:
-            line, is_passing = said
+        while (queued := self._lines.get()) is not None:
+            line, is_passing = queued
             write_line(sys.stderr, in_line(line), is_overwritten, has_end=not is_passing)
             is_overwritten = is_passing
         if is_overwritten:
@@ -68,7 +68,7 @@ class Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Print what is queued and end."""
-        self._told.close()
+        """Print all queued lines, then end."""
+        self._listening.close()
         self._lines.put(None)
         self._thread.join(self.CLOSE_TIMEOUT_S)

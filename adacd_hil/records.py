@@ -1,4 +1,4 @@
-"""Values that cross a layer: what was measured, decided, commanded and how the cycle went.
+"""Values that cross a layer: measurements, decisions, commands, and how each cycle went.
 
 Wide per-cycle values live in float64 *blocks*: one contiguous array whose fields a `Layout` names. The compiled
 step fills a block, the log stores its bytes as they are, replay compares them bit for bit.
@@ -29,7 +29,7 @@ PARAMETER_NAMES = ("a1", "a2", "a3", "F_v1", "F_v2", "F_c1", "F_c2")
 GRAVITY_PARAMETER_NAMES = ("a4", "a5")
 """Appended where the joint axes are not vertical; Nm."""
 POSITION_TERMS = ("sin_q", "cos_q", "sin_2q", "cos_2q", "sin_sum", "cos_sum")
-"""Torque that depends on where the arm is, one parameter per joint each, of `arm.position_torque_Nm`."""
+"""Torque that depends on the joint position, one parameter per joint each, of `arm.position_torque_Nm`."""
 PARAMETER_UNITS = {
     "a1": "kg m²",
     "a2": "kg m²",
@@ -63,7 +63,7 @@ PARAMETER_UNITS = {
 
 
 class Field(NamedTuple):
-    """One field of a block."""
+    """One field of a block: name, number of values, unit, meaning."""
 
     name: str
     size: int
@@ -89,7 +89,7 @@ class Layout:
 
     @cached_property
     def size(self) -> int:
-        """Count the float64 values of a block."""
+        """Number of float64 values in a block."""
         return sum(field.size for field in self.fields)
 
 
@@ -116,11 +116,11 @@ def scheme_layout(parameter_count: int) -> Layout:
 
 
 def certified_layout(parameter_count: int, further_count: int, channel_count: int) -> Layout:
-    """Lay out the block of the certified scheme: the scheme's, then what only it has.
+    """Lay out the block of the certified scheme: the fields of `scheme_layout`, then its own.
 
-    parameter_count: dynamic parameters. further_count: offsets, lags and friction terms. channel_count: of the bank.
-    The scheme's tau_f, tau_ext_hat and threshold are those of the slowest filter. The bank is channel by channel: each
-    filter smoothed, then all but the slowest bare.
+    parameter_count: dynamic parameters. further_count: offsets, lags and friction terms. channel_count: channels of the
+    detector bank. tau_f, tau_ext_hat and threshold are those of the slowest filter. The bank holds first the smoothed
+    channel of each filter, then the unsmoothed channels of all filters but the slowest.
     """
     bank = JOINTS * channel_count
     return Layout(
@@ -171,11 +171,11 @@ TRUTH_LAYOUT = Layout(
         Field("faults", 1, "", "bit i: row i of the scenario's faults is active"),
     )
 )
-"""What the emulator knows and the host must not."""
+"""Quantities that the emulator knows and that the host must not use."""
 
 
 class SchemeState(IntEnum):
-    """Where the scheme stands. Each value says how to get out of it."""
+    """States of the scheme. The comment beside each value says how to leave it."""
 
     INIT = 0  # the first complete cycle; or FAULT when it doesn't come
     COMMISSION = 1  # enough complete cycles at rest; or FAULT when they don't come
@@ -184,41 +184,41 @@ class SchemeState(IntEnum):
     MONITOR = 4  # a contact, or the announcement of a payload change
     REACT = 5  # after a collision: at rest; after a contact: it has cleared
     STOPPED = 6  # the user acknowledges
-    PAYLOAD = 7  # the user says that the payload has been changed; a contact
-    FAULT = 8  # latched; the user acknowledges, and everything begins again with INIT
+    PAYLOAD = 7  # the user announces that the payload has been changed; a contact
+    FAULT = 8  # latched; the user acknowledges, then INIT
     CERTIFY = 9  # theta frozen, tested on motion not used for the fit; out: certified; refuted; a contact
 
 
 class Request(IntEnum):
-    """What is asked of a running arm, by the user or by the host's own checks."""
+    """A request to a running arm, by the user or by the host's own checks."""
 
     NONE = 0
     ACKNOWLEDGE = 1  # the collision has been seen to; go on
     PAYLOAD = 2  # park the arm, the payload is about to change
     PAYLOAD_CHANGED = 3  # the payload has changed; adapt again
     FINISH = 4  # end the run: come to rest, then disable the drives
-    # What this host's own checks ask for, in place of the user: FAULT, with the reason of that name.
+    # Requests of the host's own checks: enter FAULT with the reason of the same name.
     FAULT_TORQUE = 5
     FAULT_FOLLOWING = 6
     FAULT_TAMPERED = 7
-    ACCEPT = 8  # nobody touches the arm: what was refused, a torque sensor's zero or more friction, is the arm's
-    RELEARN = 9  # nobody touches the stopped arm, what is known of it is wrong: learn it anew
-    FAULT_MISCONFIGURED = 10  # asked for by the host's own checks, as the FAULTs above
+    ACCEPT = 8  # the user confirms that the arm is free: adopt the refused sensor zero or the added friction
+    RELEARN = 9  # the user confirms that the stopped arm is free, and its model wrong: identify it again
+    FAULT_MISCONFIGURED = 10  # of the host's own checks, as the FAULTs above
 
 
 class Reaction(IntEnum):
-    """What the arm does about a contact."""
+    """Reaction of the arm to a contact."""
 
-    NONE = 0  # goes on as if nothing had happened
+    NONE = 0  # continues without any change
     STOP = 1  # brakes to rest and holds its place
     WITHDRAW = 2  # moves away along the external torque, then rests
     FLOAT = 3  # gives way: zero torque, friction and gravity compensated, damped
     ADMITTANCE = 4  # moves as a virtual mass with a damper would under the external torque
-    SLOW_DOWN = 5  # goes on along its path at a part of the speed
+    SLOW_DOWN = 5  # continues on its path at a fraction of the speed
 
 
 class FaultReason(IntEnum):
-    """Why the scheme went to FAULT."""
+    """Reason of a FAULT."""
 
     NONE = 0
     DATA_AGE = 1  # a signal older than its budget
@@ -232,22 +232,22 @@ class FaultReason(IntEnum):
     HEARTBEAT = 9  # a device has fallen silent or left Operational
     DEADLINE = 10  # the host has skipped too many periods
     BLIND = 11  # the model has had no fresh sample for too long
-    FOREIGN_FRAMES = 12  # somebody else sends what only this host, or only one device of the arm, sends
+    FOREIGN_FRAMES = 12  # another node sends frames that only this host, or only one device of the arm, sends
     TORQUE = 13  # a drive's torque is not the one that was commanded
     FOLLOWING = 14  # the arm doesn't follow the desired motion
-    TAMPERED = 15  # a parameter of a device is no longer what the host has written
+    TAMPERED = 15  # a parameter of a device differs from the value that the host wrote
     DETECTOR = 16  # a live detector has raised, or given no finite statistic per joint
     MISCONFIGURED = 17  # the first motion contradicts an order, a sign or a scale of the configuration
 
 
 class ArmState(NamedTuple):
-    """What the arm reported in one cycle.
+    """Measurements of one cycle, in joint coordinates.
 
-    Ages count cycles since the value was sampled: 0 is this cycle's SYNC. `periods` is how many periods have passed
-    since the previous ArmState, 1 unless the cycle overran. `is_complete`: q, dq and tau_J were sampled on one SYNC,
-    and no ArmState before had that sample; where devices answer late it is not this cycle's. `is_late`: the host has
-    skipped so many that the arm is to be held. `steps`: periods between this sample and the last complete one before
-    it, 0 when it isn't complete. `sampled_ns`: t_ns of the SYNC that it was sampled on; None: this cycle's.
+    Ages count cycles since the value was sampled: 0 is this cycle's SYNC. `periods` is the number of periods since the
+    previous ArmState, 1 unless the cycle overran. `is_complete`: q, dq and tau_J were sampled on one SYNC, and no
+    ArmState before had that sample; where devices answer late it is not this cycle's SYNC. `is_late`: the host has
+    skipped so many periods that the arm must stop. `steps`: periods between this sample and the last complete one, 0 if
+    it isn't complete. `sampled_ns`: t_ns of the SYNC of the sample; None: of this cycle's SYNC.
     """
 
     cycle: int
@@ -290,7 +290,7 @@ class ArmBatch(NamedTuple):
 
 
 class ArmCommand(NamedTuple):
-    """What the arm is told in one cycle."""
+    """Command of one cycle: torque (2,) Nm, Enable operation, Quick stop."""
 
     tau_c: Vector
     enable: bool
@@ -298,33 +298,33 @@ class ArmCommand(NamedTuple):
 
 
 class ContactLevel(IntEnum):
-    """How much pushes."""
+    """Severity of a contact."""
 
     CONTACT = 1  # over the lower threshold: clears itself
     COLLISION = 2  # over the upper threshold, or lasting: latched until acknowledged
 
 
 class ContactKind(IntEnum):
-    """How it pushes."""
+    """Time course of a contact."""
 
     UNKNOWN = 0  # not classified, or not yet
-    PUSH = 1  # slowly: it lasts, as a hand that guides or a person who leans
-    HIT = 2  # an impact: it was over as fast as it came
+    PUSH = 1  # slow and lasting, such as a guiding hand or a person who leans on the arm
+    HIT = 2  # an impact: rises and falls fast
 
 
 class Location(IntEnum):
-    """Whether force and lever arm are known, and why not."""
+    """Whether contact force and lever arm are known, or the reason why not."""
 
     NOT_SOUGHT = 0
     KNOWN = 1  # one contact without friction on link 2
-    LINK_1 = 2  # only the moment about joint 1 is known; force_N is the smallest force that has it
-    SINGULAR = 3  # the elbow stands so square that both joints say the same
-    UNCERTAIN = 4  # too weak against the noise
-    BEYOND_TIP = 5  # the lever arm ends past the tip: what the arm carries, or a force at an angle to the link
-    INCONSISTENT = 6  # no single contact on link 2: more than one, as in a clamp, or friction
+    LINK_1 = 2  # only the moment about joint 1 is known; force_N is the smallest force with that moment
+    SINGULAR = 3  # in this elbow position both joint torques carry the same information
+    UNCERTAIN = 4  # the force is too small against the noise
+    BEYOND_TIP = 5  # the lever arm ends past the tip: the payload is touched, or the force is not normal to the link
+    INCONSISTENT = 6  # no single normal force on link 2 fits: several contacts, as in a clamp, or friction
 
     def force_text(self, force_N: float) -> str:
-        """Write a report's force, N: its size after "≥" where it is a lower bound, a dash where none is known."""
+        """Format a force in N: "≥" before a lower bound, a dash where it is unknown."""
         if self in (Location.KNOWN, Location.UNCERTAIN):
             return f"{force_N:.1f}"
         return f"≥ {abs(force_N):.1f}" if self is Location.LINK_1 else "–"
@@ -335,10 +335,10 @@ class ContactReport(NamedTuple):
 
     link: 1 or 2. direction: sign of the external torque per joint, 0 where below the threshold. tau_ext_peak: largest
     external torque with the filter undone, Nm. impulse: integral of the external torque so far, Nm s. Each `_sigma` is
-    one standard deviation of the value before it, inf where that is not known. force_N: at right angles to the link,
-    positive on the side of +q; lever_m: its distance from joint 2. blind_rad: a force on link 2 that is nearer than
-    this to the link's own axis reads as one on link 1; pi / 2: any. The fields from `level` on stay as they are where
-    nobody looks.
+    one standard deviation of the value before it, inf where that is not known. force_N: normal to the link, positive on
+    the side of +q; lever_m: its distance from joint 2. blind_rad: a force on link 2 whose angle to the link's axis is
+    smaller than this looks like a force on link 1; pi / 2: any force does. Fields from `level` on keep their defaults
+    where force and kind are not computed.
     """
 
     cycle: int
@@ -362,7 +362,7 @@ class ContactReport(NamedTuple):
 
 
 class SchemeOutput(NamedTuple):
-    """What the scheme decided in one cycle. `block` is laid out by `scheme_layout`."""
+    """Decision of the scheme in one cycle. `block` is laid out by `scheme_layout`."""
 
     cycle: int
     state: SchemeState
@@ -390,17 +390,17 @@ class CycleRecord(NamedTuple):
     data_age: int  # cycles, of the oldest value that was used
     overruns: int  # periods skipped since the run began
     frames_missing: int  # cyclic frames of this cycle that did not arrive or failed their checks
-    commands_late: int  # commands of the cycle before that were not on the bus at this SYNC: they act at the next
+    commands_late: int  # commands of the previous cycle that missed this SYNC: they act at the next
     frames_lost: int  # received frames that the kernel dropped since the run began
-    receive_queue_bytes: int  # waits to be received when last looked, memory of the kernel
-    transmit_queue_bytes: int  # waits to be sent when last looked, memory of the kernel
-    log_queue_bytes: int  # what waits for the log's writer
+    receive_queue_bytes: int  # kernel memory of frames not yet received, when last read
+    transmit_queue_bytes: int  # kernel memory of frames not yet sent, when last read
+    log_queue_bytes: int  # bytes in the ring that the log's writer has not taken
 
 
 class FrameChecks(NamedTuple):
-    """What the checks have said of the cyclic frames of drive 1, drive 2, sensor 1, sensor 2 since the attempt began.
+    """Results of the checks on the cyclic frames of drive 1, drive 2, sensor 1, sensor 2, since the attempt began.
 
-    counts: per device, by E2eStatus. implausible: per device.
+    counts: per device, number of frames by E2eStatus. implausible: per device, frames with values out of bounds.
     """
 
     cycle: int
@@ -409,40 +409,40 @@ class FrameChecks(NamedTuple):
 
 
 class Event(NamedTuple):
-    """Something worth a line in the log."""
+    """An event in the log: level, name, message."""
 
     level: str  # "info", "warning", "error"
     name: str
     message: str
 
     @property
-    def told(self) -> str:
-        """What who stands beside the arm is told of it."""
+    def operator_text(self) -> str:
+        """Text shown to the operator."""
         return self.message
 
 
 class BriefedEvent(Event):
-    """An event whose message is more than somebody beside the arm needs. Equal to the event of the same message."""
+    """An event with a shorter text for the operator. Equal to the event of the same message."""
 
     brief: str
 
     @classmethod
     def of(cls, event: Event, brief: str) -> Self:
-        """Give an event its brief."""
+        """Return the event with a shorter text for the operator."""
         briefed = cls(*event)
         briefed.brief = brief
         return briefed
 
     @property
-    def told(self) -> str:
-        """What who stands beside the arm is told of it."""
+    def operator_text(self) -> str:
+        """Text shown to the operator."""
         return self.brief
 
 
 DETECTOR_EVENT: Final = "detector"
-"""Name of the events that say which live detector has found a contact."""
+"""Name of the events that report which live detector has found a contact."""
 CERTIFICATE_EVENTS: Final = frozenset(
     ("anchor", "touch", "position", "certificate", "revoked", "sight", DETECTOR_EVENT)
 )
-"""Names of what the scheme says of its certificates and its live detectors: the user is told as it happens, and a
-replay must say it again."""
+"""Names of the events about certificates and live detectors: shown to the operator at once; a replay must repeat
+them."""

@@ -1,4 +1,4 @@
-"""Remedies that error messages name: the known name that was meant, the command that installs an extra."""
+"""Remedies in error messages: the nearest known name, the command that installs an extra."""
 
 import sys
 from collections.abc import Iterable, Iterator
@@ -6,15 +6,15 @@ from pathlib import Path
 
 _LONGEST = 64
 _SLIPS = ((3, 0), (8, 1), (12, 2))
-"""Up to which length, exclusive, how many slips are one: a letter too many, too few, another, or two exchanged."""
+"""(length, slips): a shorter word may differ by so many slips: a letter added, lost or changed, or two swapped."""
 _MOST_SLIPS = 3
 
 
 def nearest_name(word: str, known: Iterable[str]) -> str | None:
-    """Return the name that differs from `word` by a few slips in each of its dotted parts, or by its ending.
+    """Return the known name that differs from `word` by a few slips in each of its dotted parts, or by its ending.
 
-    Upper and lower case are the same. Units may be missing: `threshold` stands for `threshold_Nm`. Of several the
-    nearest is returned, of these the first; None when nothing is near.
+    Case is ignored. Units may be missing: `threshold` stands for `threshold_Nm`. Of several names the nearest is
+    returned, of equally near ones the first; None when no name is near.
     """
     if len(word) > _LONGEST:
         return None
@@ -48,7 +48,7 @@ def _allowed(word: str, name: str) -> int:
 
 
 def _without_ending(name: str) -> Iterator[str]:
-    """Give what is left of a name, at least half of it, without its last parts between underscores."""
+    """Yield the name without its last parts between underscores, as long as at least half of it is left."""
     while "_" in name:
         shorter = name.rpartition("_")[0]
         if 2 * len(shorter) < len(name):
@@ -76,9 +76,9 @@ _SOURCE_TREE = Path(__file__).resolve().parent.parent
 
 
 def install_command(extra: str) -> str:
-    """Write the command that installs an extra: into this interpreter's environment, from the source tree if it is one.
+    """Return the command that installs an extra into this interpreter's environment, from the source tree if any.
 
-    This package is in no registry: without a source tree the command names the package, and its file has to be given.
+    This package is in no registry: without a source tree the command names the package, and the user gives its file.
     """
     is_source = (_SOURCE_TREE / "pyproject.toml").is_file()
     source = "adacd-hil" if not is_source else "." if Path.cwd() == _SOURCE_TREE else str(_SOURCE_TREE)
@@ -86,7 +86,7 @@ def install_command(extra: str) -> str:
 
 
 def pip_command() -> str:
-    """Name pip of this interpreter, as short as it can be from here."""
+    """Return the shortest command that runs this interpreter's pip."""
     executable = Path(sys.executable)
     pip = executable.with_name("pip")
     try:

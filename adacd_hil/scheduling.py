@@ -1,4 +1,4 @@
-"""What a process asks of the operating system to be on time, and what it was granted.
+"""Real-time requests of a process to the operating system, and the grants.
 
 Scheduler, a processor of its own, memory that stays where it is, processors that don't sleep deeply, no garbage
 collection. Constants are those of Linux' user-space headers (sched.h, prctl.h, mman.h) and of glibc's malloc.h.
@@ -22,7 +22,7 @@ _SCHED_FLAG_RESET_ON_FORK = 1
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
 _DEADLINE_SHARE = 0.8
 """Part of each period that SCHED_DEADLINE reserves: feedback is awaited for 0.7 of it and sleeps need no reserve. The
-kernel refuses what would leave less than 5 % of all processors to others."""
+kernel refuses a share that leaves less than 5 % of all processors to others."""
 
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT_AND_FUTURE = 3
@@ -31,9 +31,9 @@ _MOST_TRIM_BYTES = 2**31 - 1
 _MOST_MMAP_BYTES = 2**25
 """The largest M_MMAP_THRESHOLD that glibc takes on 64 bits."""
 _HEAP_BYTES = 16 << 20
-"""Heap that is touched in advance; a run's own allocations stay below 1 MiB once it is compiled."""
+"""Heap that is touched in advance; a run's own allocations stay below 1 MiB after compilation."""
 _ARENA_BYTES = 256 << 10
-"""What the interpreter takes from the system at a time for small objects, the smallest among its versions."""
+"""Memory that the interpreter takes from the system at a time for small objects; the smallest among its versions."""
 _SMALL_BYTES = 448
 _RESERVED_ARENAS = 32
 
@@ -46,7 +46,7 @@ _kept_objects: list[bytes] = []
 
 
 class Refusal(NamedTuple):
-    """Something that could not be had: what and why, and what to do about it."""
+    """A request that the system refused: name and reason, and the remedy."""
 
     reason: str
     remedy: str
@@ -57,7 +57,7 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True)
 class RealtimeRequest:
-    """What is asked for. scheduler: "fifo", "deadline" or "other". priority: of SCHED_FIFO, 1..98.
+    """The request. scheduler: "fifo", "deadline" or "other". priority: of SCHED_FIFO, 1..98.
 
     cpu: "any", "isolated" (the first isolated one) or a processor's number. period_ns: of SCHED_DEADLINE.
     """
@@ -71,9 +71,9 @@ class RealtimeRequest:
 
 @dataclass(frozen=True)
 class RealtimeGrant:
-    """What the operating system granted.
+    """The grant of the operating system.
 
-    `cpu`: the processor that the process stays on, None for any. `cpus`: those that it was allowed before.
+    `cpu`: the processor that the process stays on, None for any. `cpus`: processors that it was allowed before.
     """
 
     scheduler: str
@@ -95,7 +95,7 @@ class RealtimeGrant:
                 os.sched_setaffinity(0, {self.cpu})
 
     def describe(self) -> dict[str, str]:
-        """Say in words what was granted, for a log's metadata."""
+        """Return the grant in words, for a log's metadata."""
         return {
             "scheduler": self.scheduler,
             "cpu": ANY_CPU if self.cpu is None else str(self.cpu),
@@ -120,9 +120,9 @@ class _SchedulingAttributes(ctypes.Structure):
 
 
 def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
-    """Ask for what makes this process be on time; to be called once everything is compiled.
+    """Request real-time scheduling, a processor, locked memory and shallow idle states; call it after compiling.
 
-    What can't be had is said, not raised. Children inherit neither scheduler nor locked memory; see
+    Refusals are listed in the grant, not raised. Children inherit neither scheduler nor locked memory; see
     `RealtimeGrant.unpinned` for the processor.
     """
     request = request or RealtimeRequest()
@@ -144,7 +144,7 @@ def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
 
 
 def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
-    """Stay on one processor."""
+    """Pin the process to one processor; return it (None: any) and the refusals."""
     if wish == ANY_CPU:
         return None, []
     isolated = isolated_cpus()
@@ -162,7 +162,7 @@ def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
 
 
 def _schedule(libc: ctypes.CDLL, request: RealtimeRequest) -> tuple[str, list[Refusal]]:
-    """Get the scheduler asked for, or the best below it."""
+    """Set the requested scheduler, or the best below it; return its name and the refusals."""
     missing = []
     if request.scheduler == "other":
         return scheduler_name(), []
@@ -182,7 +182,7 @@ def _schedule(libc: ctypes.CDLL, request: RealtimeRequest) -> tuple[str, list[Re
 
 
 def _request_deadline(libc: ctypes.CDLL, period_ns: int) -> int:
-    """Ask for SCHED_DEADLINE; return the error's number, 0 for none."""
+    """Request SCHED_DEADLINE; return the error's number, 0 for none."""
     number = _SYS_SCHED_SETATTR.get(os.uname().machine)
     if number is None:
         return errno.ENOSYS
@@ -198,10 +198,10 @@ def _request_deadline(libc: ctypes.CDLL, period_ns: int) -> int:
 
 
 def _lock_memory(libc: ctypes.CDLL) -> str:
-    """Keep all memory, with a reserve, in place; return why not.
+    """Lock all memory, with a reserve; return the error's text, empty if locked.
 
-    Locking reads in all that is mapped, also the stack, which compiling has made deeper than a cycle does. Freed memory
-    is kept, and some is taken and freed in advance, so that the cycle has no page to wait for.
+    Locking reads in all mapped pages, also of the stack, which compiling has made deeper than a cycle does. Freed
+    memory is kept, and some is taken and freed in advance, so that a cycle never waits for a page.
     """
     if libc.mlockall(_MCL_CURRENT_AND_FUTURE) != 0:
         return os.strerror(ctypes.get_errno())
@@ -209,14 +209,14 @@ def _lock_memory(libc: ctypes.CDLL) -> str:
         libc.mallopt(_M_TRIM_THRESHOLD, _MOST_TRIM_BYTES)
         libc.mallopt(_M_MMAP_THRESHOLD, _MOST_MMAP_BYTES)
     bytearray(_HEAP_BYTES)
-    # An arena goes back when its last object goes: one in each stays.
+    # An arena is returned when its last object is freed: one object in each stays.
     objects = [bytes(_SMALL_BYTES) for _ in range(_RESERVED_ARENAS * _ARENA_BYTES // _SMALL_BYTES)]
     _kept_objects[:] = objects[:: _ARENA_BYTES // _SMALL_BYTES]
     return ""
 
 
 def _keep_awake() -> tuple[bool, list[Refusal]]:
-    """Forbid idle states that take time to leave, for as long as this process lives: the file must stay open."""
+    """Forbid idle states with a long wake-up, for as long as this process lives: the file must stay open."""
     try:
         os.write(os.open(_DMA_LATENCY, os.O_WRONLY), bytes(4))  # the longest latency to bear, int32 in µs
     except FileNotFoundError:
@@ -241,7 +241,7 @@ def isolated_cpus(folder: Path = _SYSTEM_CPUS) -> tuple[int, ...]:
 
 
 def freeze_garbage() -> None:
-    """Collect once and never again: the cycle makes no cycles of references."""
+    """Collect garbage once, then disable the collection: the cycle makes no cycles of references."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -249,7 +249,7 @@ def freeze_garbage() -> None:
 
 @contextmanager
 def frozen_garbage() -> Iterator[None]:
-    """Collect once, and not again while the block lasts."""
+    """Collect garbage once; the collection is disabled while the block lasts."""
     freeze_garbage()
     try:
         yield

@@ -1,7 +1,7 @@
-"""How a program starts from the console: it imports its commands so that Ctrl-C ends it no less quietly then.
+"""Start of a program from the console: Ctrl-C during the imports of its commands ends it without a traceback.
 
-The imports take a few tenths of a second. An exception would come up anywhere in others' modules, which turn it into
-errors of their own. There is nothing to put away so early, and the process ends at once.
+The imports take a few tenths of a second. A KeyboardInterrupt would be raised inside other packages' modules, which
+turn it into errors of their own. No file or device is open so early, so the process ends at once.
 """
 
 import os
@@ -14,7 +14,7 @@ from typing import NoReturn
 
 
 def start_program(load: Callable[[], Callable[[], NoReturn]], interrupted: int, line: str = "") -> NoReturn:
-    """Run what `load` imports; interrupted: status after Ctrl-C, before the command line takes care of it."""
+    """Call `load`, which imports the command line, and run its result; interrupted: exit status after Ctrl-C."""
     try:
         with _ending_at_once(interrupted, line):
             main = load()
@@ -25,9 +25,9 @@ def start_program(load: Callable[[], Callable[[], NoReturn]], interrupted: int, 
 
 @contextmanager
 def _ending_at_once(status: int, line: str) -> Iterator[None]:
-    """Let Ctrl-C in the block end the process with a status, and a line on standard error where one is given.
+    """End the process with `status` on Ctrl-C within the block, and print `line` to standard error if it isn't empty.
 
-    Where the signal is ignored, as in the background, or already handled, nothing changes.
+    If SIGINT is ignored, as in the background, or already handled, nothing changes.
     """
 
     def end(_number: int, _frame: FrameType | None) -> None:

@@ -1,8 +1,8 @@
 """Tables for people: cells in columns, laid out to the width of a terminal.
 
-A table that is wider than the terminal gets narrower columns first: cells of words go on in further lines. Where
-columns have no room beside each other even so, the table is told in parts, each of which begins with the first column.
-On a screen that is redrawn a row is one line, and cells are cut.
+In a table that is wider than the terminal, columns of words first get narrower, and their cells continue in further
+lines. If that isn't enough, the table is printed in parts, each of which begins with the first column. On a screen that
+is redrawn a row is one line, and cells are cut.
 """
 
 import re
@@ -13,9 +13,9 @@ from adacd_hil.terminal import in_line, wrap_words
 
 _GAP = "  "
 _LEAST_ROOM, _LEAST_CUT = 16, 8
-"""Letters to which a column of words may shrink while others keep theirs."""
+"""Letters to which a column of words may shrink: when cells wrap, when they are cut."""
 _JOINT = re.compile(r"(?<=[/_,=:;])|(?<=\.)(?!\d)")
-"""Where a word that has no room in a line is parted: a path, a key, but not a number."""
+"""Places where a long word, such as a path or a key, may be split; never within a number."""
 
 
 def fit_table(
@@ -25,10 +25,10 @@ def fit_table(
     is_cut: bool = False,
     names: int = 1,
 ) -> list[str]:
-    """Align lines of cells; columns in `right` to the right. A cell is text of one line, whatever is in it.
+    """Align lines of cells; columns in `right` to the right. Each cell is escaped to text of one line.
 
-    No line is wider than `width`, of at least 20; None: as wide as it gets. is_cut: each is one line, its cells cut.
-    names: how many columns it takes to tell rows apart; each part begins with them, if they leave room for others.
+    No line is wider than `width`, of at least 20; None: no limit. is_cut: each row is one line, its cells cut.
+    names: number of columns that identify a row; each part begins with them, if they leave room for others.
     """
     if not lines:
         return []
@@ -55,14 +55,14 @@ def _sum(widths: Sequence[int]) -> int:
 
 
 def _least_room(column: int, lines: Sequence[Sequence[str]]) -> int:
-    """Return to how many letters a column of words may shrink: words of the first stay whole, others have joints."""
+    """Return the letters to which a column of words may shrink: words of the first column stay whole, others split."""
     words = (word for line in lines for word in line[column].split())
     pieces = (piece for word in words for piece in (_JOINT.split(word) if column else [word]))
     return max(_LEAST_ROOM, *map(len, pieces), 0)
 
 
 def _parts(least: Sequence[int], width: int, names: int) -> list[list[int]]:
-    """Choose the columns of each part: as many as there is room for."""
+    """Choose the columns of each part: as many as fit."""
     if _sum([*least[:names], max(least[names:], default=0)]) > width:
         names = 1
     parts = [list(range(names))]
@@ -74,7 +74,7 @@ def _parts(least: Sequence[int], width: int, names: int) -> list[list[int]]:
 
 
 def _shrunk(natural: list[int], least: list[int], width: int) -> list[int]:
-    """Take from the widest columns until a part fits; below what words need where nothing else helps."""
+    """Narrow the widest columns until the part fits, if necessary below `least`."""
     widths = [min(one, width) for one in natural]
     while _sum(widths) > width:
         able = [place for place, one in enumerate(widths) if one > least[place]] or range(len(widths))
@@ -86,7 +86,7 @@ def _shrunk(natural: list[int], least: list[int], width: int) -> list[int]:
 
 
 def _rows(line: Sequence[str], widths: Sequence[int]) -> list[tuple[str, ...]]:
-    """Part the cells of a line between words; the first is indented where it goes on, or it looked like a line more."""
+    """Wrap the cells of a line; continued lines of the first cell are indented, to tell them from a new row."""
     cells = [
         _wrapped(cell, width, "" if column else "  ")
         for column, (cell, width) in enumerate(zip(line, widths, strict=True))
@@ -109,7 +109,7 @@ def _wrapped(text: str, width: int, indent: str) -> list[str]:
 
 
 def _broken(word: str, room: int) -> str:
-    """Part a word that has no room in a line where a path or a key has its joints."""
+    """Split a word that doesn't fit into a line, at the joints of a path or a key."""
     parts = [""]
     for piece in _JOINT.split(word):
         if len(parts[-1]) + len(piece) > room:

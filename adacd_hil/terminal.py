@@ -1,8 +1,8 @@
-"""Standard output and error of both programs: the one door through which text reaches a terminal, a pipe or a file.
+"""Standard output and error of both programs: all text for a terminal, a pipe or a file passes here.
 
-Nothing that a file or the bus says controls a terminal: control characters are escaped as in JSON, which reads them
-back; within a line of ours (`in_line`) so are the ends of lines, or it could say lines of its own. A reader that goes
-away, as `head` does, is no error. An output that blocks holds nobody up once the user has asked for the end.
+Text from files or the bus can't control a terminal: control characters are escaped as in JSON; within a line of ours
+(`in_line`) line ends are escaped, too. A reader that goes away, as `head` does, is no error. An output that blocks
+delays the end by half a second at most once the user has asked for it.
 """
 
 import _thread
@@ -22,48 +22,48 @@ from typing import TextIO
 
 _CONTROL = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # C0 but for tab and newline, DEL, C1
-    "\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"  # what turns the order of letters, or ends lines unseen
+    "\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"  # controls of writing direction, invisible line ends
 )
 _MOST_LETTERS = 2000
 _POLL_MS = 100
 _PATIENCE_POLLS = 5
-"""How long a blocked output is waited for after the user has asked for the end: 0.5 s."""
+"""Polls of a blocked output after the user has asked for the end: 0.5 s."""
 _NOBODY_READS = (errno.EPIPE, errno.EIO)
-"""The other end of the pipe is closed, the terminal has hung up."""
+"""The other end of the pipe is closed, or the terminal has hung up."""
 _MOMENT_S = 0.02
 _PIECE = 1024
 """Bytes that a pipe or a terminal takes without blocking when it is ready: POSIX has PIPE_BUF of at least 512."""
 
 
 def plain(text: str) -> str:
-    """Escape control characters of a text, but for tabs and newlines, by `u` and four hexadecimal digits."""
+    """Escape control characters of a text, except tabs and newlines, as JSON does, with four hexadecimal digits."""
     return _CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def in_line(text: str) -> str:
-    """Escape control characters as `plain` does, and tabs and newlines, too: a text stays within the line it is in."""
+    """Escape control characters as `plain` does, and also tabs and newlines, so that the text stays in its line."""
     return plain(text).replace("\n", "\\u000a").replace("\t", "\\u0009")
 
 
 def one_line(text: object) -> str:
-    """Put a text into one line, free of control characters and not longer than anybody reads."""
+    """Put a text into one line, without control characters, cut at 2000 letters."""
     line = plain(" ".join(str(text).split()))
     return line if len(line) <= _MOST_LETTERS else f"{line[:_MOST_LETTERS]} …"
 
 
 def terminal_columns(stream: "TextIO | Terminal | None" = None) -> int | None:
-    """Give the width to which text for a stream, else standard output, is laid out; None: a line stays a line.
+    """Return the width to which text for a stream (default: standard output) is laid out; None: lines are not folded.
 
-    It is COLUMNS where that is set, else the width of the terminal that the stream is. What isn't a terminal has none,
-    but for standard output where COLUMNS is set.
+    It is the environment variable COLUMNS, else the terminal's width. A stream that isn't a terminal has none, except
+    standard output if COLUMNS is set.
     """
     is_output = stream is None or stream is sys.stdout
     stream = stream or sys.stdout
-    told = os.environ.get("COLUMNS", "")
-    columns = int(told) if told.isdecimal() and len(told) <= _MOST_DIGITS else 0
+    given = os.environ.get("COLUMNS", "")
+    columns = int(given) if given.isdecimal() and len(given) <= _MOST_DIGITS else 0
     if not _is_terminal(stream):
         return max(columns, _LEAST_COLUMNS) if columns and is_output else None
-    with contextlib.suppress(OSError):  # it has hung up since
+    with contextlib.suppress(OSError):  # the terminal has hung up since
         columns = columns or os.get_terminal_size(stream.fileno()).columns
     return max(columns or _COLUMNS, _LEAST_COLUMNS)
 
@@ -76,15 +76,15 @@ def _is_terminal(stream: "TextIO | Terminal") -> bool:
 
 
 _COLUMNS, _LEAST_COLUMNS, _MOST_DIGITS = 80, 20, 5
-"""Of a terminal that doesn't say how wide it is; what words need; of COLUMNS."""
+"""Width of a terminal that doesn't report one; smallest width used; longest COLUMNS that is accepted, digits."""
 _FIRST_FIELD = re.compile(r"\s*(?:\S+ )*\S+\s{2,}")
 
 
 def fold(text: str, width: int | None) -> str:
-    """Part lines that are longer than `width` between words. None: nothing is parted.
+    """Fold lines that are longer than `width` between words. None: nothing is folded.
 
-    What follows stands below the text of a line that begins with a word and a gap, as a time, else it is indented two
-    letters more. A word that is longer, as a path, is left whole, so that it can be copied.
+    If a line begins with a word and a gap, such as a time, its continuation is aligned below the text after the gap,
+    else it is indented by two letters. A longer word, such as a path, is left whole, so that it can be copied.
     """
     if width is None:
         return text
@@ -97,15 +97,15 @@ def _parts(line: str, width: int) -> list[str]:
     field = _FIRST_FIELD.match(line, 0, width // 3)
     hang = field.end() if field else len(line) - len(line.lstrip()) + 2
     parts = wrap_words(line, width, " " * min(hang, width // 2))
-    if line.endswith(" ") and len(parts[-1]) < width:  # a question: what is typed stands apart from it
+    if line.endswith(" ") and len(parts[-1]) < width:  # a prompt keeps its space before the answer
         parts[-1] += " "
     return parts
 
 
 def wrap_words(text: str, width: int, indent: str, is_breaking: bool = False) -> list[str]:
-    """Part a line between words, but not a number from its unit; what follows the first part has the indent.
+    """Wrap a line between words, but not between a number and its unit; `indent` begins each part but the first.
 
-    is_breaking: a word that is longer than a part is parted, too.
+    is_breaking: words that are longer than a part are split, too.
     """
     parts = textwrap.wrap(
         keep_units(text, _KEPT_GAP, width - len(indent)),
@@ -119,14 +119,14 @@ def wrap_words(text: str, width: int, indent: str, is_breaking: bool = False) ->
 
 
 def keep_units(text: str, gap: str, most: int | None = None) -> str:
-    """Put `gap` for the space between a number and its unit, unless both have more than `most` letters."""
+    """Replace the space between a number and its unit by `gap`, unless the two have more than `most` letters."""
     return _QUANTITY.sub(
         lambda found: found[0] if most and len(found[0]) > most else f"{found[1]}{gap}{found[2]}", text
     )
 
 
 _KEPT_GAP = "\x00"
-"""Stands for a space at which no line ends; no plain text has it."""
+"""Replaces a space at which no line may end; escaped text never contains it."""
 _UNITS = "%|A|Hz|kHz|K|N|Nm|bit|bytes|cm|deg|h|kg|m|min|mm|ms|rad|s|µs"
 _QUANTITY = re.compile(rf"(?<!\S)(\S*\d) ((?:{_UNITS})(?!\w)\S*)")
 _MARKS = {
@@ -135,32 +135,32 @@ _MARKS = {
     "ok": 32,
     "next:": 1,
 }
-"""Words that are red, yellow, green or bold where a line begins with them, after its time."""
+"""Words that are red, yellow, green or bold (SGR codes) at the beginning of a line, or after its time."""
 _MARK = re.compile(rf"^(\s*\d+\.\d\d s  |)({'|'.join(map(re.escape, _MARKS))})(?!\S)", re.MULTILINE)
 
 
 def for_people(text: str, stream: "TextIO | Terminal") -> str:
-    """Lay a text out for a stream: free of control characters but its own, folded, with colours where it has them."""
+    """Lay a text out for a stream: escape control characters, fold lines, colour marks if the stream has colours."""
     return painted(fold(plain(text), terminal_columns(stream)), stream)
 
 
 def painted(text: str, stream: "TextIO | Terminal") -> str:
-    """Give marks in a plain text their colours, where the stream has them."""
+    """Colour the marks of an escaped text, if the stream has colours."""
     if not has_colour(stream):
         return text
     return _MARK.sub(lambda found: f"{found[1]}\x1b[{_MARKS[found[2]]}m{found[2]}\x1b[0m", text)
 
 
 class Terminal(io.TextIOBase):
-    """A standard stream. What is written goes out at once."""
+    """A standard stream without a buffer."""
 
     def __init__(self, descriptor: int, name: str, is_needed: bool) -> None:
-        """Write to `descriptor`. is_needed: a full disk behind it is an error; otherwise nobody is told."""
+        """Write to `descriptor`. is_needed: a full disk behind it raises an error; otherwise it is ignored."""
         self.name = name
         self._descriptor = descriptor
         self._is_needed = is_needed
-        self._is_gone = False  # nobody reads, or nobody would wait
-        self._patience = -1  # polls to wait for an output that blocks; negative: for ever
+        self._is_gone = False  # the reader has gone, or the wait for it is over
+        self._patience = -1  # polls to wait for an output that blocks; negative: forever
         self._lock = threading.Lock()
         try:
             self._is_ready = stat.S_ISREG(os.fstat(descriptor).st_mode)  # a file never blocks
@@ -174,7 +174,7 @@ class Terminal(io.TextIOBase):
 
     @property
     def errors(self) -> str:  # type: ignore[override]
-        """What isn't a character, as in names of files, is written in hexadecimal."""
+        """Characters that UTF-8 can't encode, as in file names, are written in hexadecimal."""
         return "backslashreplace"
 
     def fileno(self) -> int:
@@ -182,22 +182,22 @@ class Terminal(io.TextIOBase):
         return self._descriptor
 
     def isatty(self) -> bool:
-        """Whether a terminal is behind it."""
+        """Whether the stream is a terminal."""
         return not self._is_gone and os.isatty(self._descriptor)
 
     def writable(self) -> bool:
-        """Tell that it can be written."""
+        """Return True."""
         return True
 
     def write(self, text: str) -> int:
-        """Write a text, free of control characters. Raises OSError where the stream is needed."""
+        """Write a text with control characters escaped. Raises OSError where the stream is needed."""
         if not isinstance(text, str):
             raise TypeError(f"{self.name} takes text, not {type(text).__name__}")
         self.write_raw(plain(text) if self._is_needed else for_people(text, self))
         return len(text)
 
     def write_raw(self, text: str) -> None:
-        """Write a text as it is: of our own making, with what moves a cursor. Raises OSError."""
+        """Write a text without escaping, for our own cursor movements. Raises OSError."""
         data = text.encode(self.encoding, self.errors)
         if not data or self._is_gone or not self._acquire():
             return
@@ -211,11 +211,11 @@ class Terminal(io.TextIOBase):
             self._lock.release()
 
     def hurry(self) -> None:
-        """From now on, wait for an output that blocks for half a second only. Safe in a signal handler."""
+        """From now on, wait half a second at most for an output that blocks. Safe in a signal handler."""
         self._patience = _PATIENCE_POLLS
 
     def _acquire(self) -> bool:
-        """Wait for whoever writes at present; False when patience ends."""
+        """Wait until no other thread writes; return False when the wait is over."""
         polls = 0
         while not self._lock.acquire(timeout=_POLL_MS / 1000):
             polls += 1
@@ -232,11 +232,11 @@ class Terminal(io.TextIOBase):
                 polls += 1
                 self._is_gone = 0 <= self._patience < polls
                 continue
-            with contextlib.suppress(BlockingIOError):  # whoever shares the other end has made it so
+            with contextlib.suppress(BlockingIOError):  # another process has made the descriptor non-blocking
                 view = view[os.write(self._descriptor, view if self._is_ready else view[:_PIECE]) :]
 
     def _leave(self) -> None:
-        """Write nothing more; what others write to this descriptor goes nowhere."""
+        """Write nothing more, and discard further output of other code to this descriptor."""
         self._is_gone = True
         with contextlib.suppress(OSError):
             nowhere = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
@@ -245,14 +245,14 @@ class Terminal(io.TextIOBase):
 
 
 def hurry() -> None:
-    """Let no output hold up the end any more. Safe in a signal handler."""
+    """Shorten the wait of both standard streams, see `Terminal.hurry`. Safe in a signal handler."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, Terminal):
             stream.hurry()
 
 
 def write_screen(text: str, stream: TextIO | None = None) -> None:
-    """Write what moves a cursor or has colours to a stream, else standard output: own sequences around plain text."""
+    """Write escape sequences of ours and escaped text to a stream (default: standard output)."""
     stream = stream or sys.stdout
     if isinstance(stream, Terminal):
         stream.write_raw(text)
@@ -261,20 +261,20 @@ def write_screen(text: str, stream: TextIO | None = None) -> None:
         stream.flush()
 
 
-def write_told(text: str) -> None:
-    """Write a result for people to standard output, as it is laid out there, and the end of its line."""
+def write_result(text: str) -> None:
+    """Write a result and a line end to standard output, laid out by `for_people`."""
     write_screen(for_people(f"{text}\n", sys.stdout))
 
 
 def moves_cursor(stream: "TextIO | Terminal") -> bool:
-    """Tell whether a stream is a terminal that can overwrite a line; TERM=dumb can't."""
+    """Tell whether a stream is a terminal that can overwrite a line; not with TERM=dumb."""
     return _is_terminal(stream) and os.environ.get("TERM", "dumb") != "dumb"
 
 
 def has_colour(stream: "TextIO | Terminal") -> bool:
-    """Tell whether colours may be written: to terminals that aren't dumb.
+    """Tell whether colours may be written: to terminals except with TERM=dumb.
 
-    NO_COLOR, set to anything, refuses them; else FORCE_COLOR and CLICOLOR_FORCE, but for 0, ask for them everywhere.
+    NO_COLOR, set to any value, forbids them; otherwise FORCE_COLOR or CLICOLOR_FORCE, other than 0, force them.
     """
     if os.environ.get("NO_COLOR"):
         return False
@@ -284,7 +284,7 @@ def has_colour(stream: "TextIO | Terminal") -> bool:
 
 
 def write_line(stream: TextIO, text: str, is_over: bool, has_end: bool) -> None:
-    """Write a line, over the one that the cursor is in where `is_over`; without `has_end` the cursor stays in it."""
+    """Write a line; `is_over`: over the cursor's line. Without `has_end` the cursor stays in the line, which is cut."""
     shown = (
         f"{for_people(text, stream)}{_LINE_END}"
         if has_end
@@ -298,9 +298,9 @@ _LINE_END = "\n"
 
 
 def open_terminals() -> None:
-    """Put the door before both streams of this process, for good; Ctrl-C ends a wait for one that blocks.
+    """Replace both standard streams of this process by `Terminal`s; Ctrl-C ends a wait for a blocked one.
 
-    Where a standard descriptor is closed it is opened to nowhere, so that no file of ours takes its place.
+    A standard descriptor that is closed is opened to /dev/null, so that no file of ours gets its number.
     """
     for descriptor in (0, 1, 2):
         try:
@@ -315,7 +315,7 @@ def open_terminals() -> None:
 
 
 def is_interrupted(error: BaseException | None) -> bool:
-    """Tell whether Ctrl-C is behind an error: a compiled module that is being imported makes an ImportError of it."""
+    """Tell whether Ctrl-C caused an error: importing a compiled module turns it into an ImportError."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True
@@ -324,7 +324,7 @@ def is_interrupted(error: BaseException | None) -> bool:
 
 
 def _ask_again(lost: "sys.UnraisableHookArgs") -> None:
-    """Interrupt again, a moment later, where a Ctrl-C came in what raises nothing, as when compiled code is loaded."""
+    """Interrupt again, a moment later, if a Ctrl-C was lost where exceptions are dropped: in loading compiled code."""
     if not issubclass(lost.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(lost)
         return

@@ -22,7 +22,7 @@ import click
 from documents import ROOT
 
 from adacd_hil.cli.main import cli as host_cli
-from adacd_hil.control.arm_records import Tare, read_tare
+from adacd_hil.control.tare_file import Tare, read_tare
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.device.profile import ProfileSettings, load_profile
 from adacd_hil.given_path import WrittenPath

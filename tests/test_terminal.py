@@ -76,7 +76,7 @@ def test_a_table_that_is_redrawn_moves_the_cursor_by_its_own_sequences_only(monk
     monkeypatch.setenv("COLUMNS", "200")
     written: list[str] = []
     screen = Screen(True, written.append)
-    screen.draw("name\x1b[2J\nother\x0c")
+    screen.draw_table("name\x1b[2J\nother\x0c")
     screen.end("name\x1b[2J")
     assert "".join(written) == "\x1b[H\x1b[Kname\\u001b[2J\n\x1b[Kother\\u000c\n\x1b[J\x1b[H\x1b[Jname\\u001b[2J\n"
 
@@ -315,7 +315,7 @@ def test_a_screen_says_how_much_of_a_table_it_has_no_room_for(monkeypatch) -> No
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setenv("LINES", "5")
     written: list[str] = []
-    Screen(True, written.append).draw("\n".join(f"line {number}" for number in range(9)))
+    Screen(True, written.append).draw_table("\n".join(f"line {number}" for number in range(9)))
     shown = "".join(written).replace("\x1b[K", "").removeprefix("\x1b[H").removesuffix("\x1b[J")
     assert shown == "line 0\nline 1\nline 2\n… 6 lines more: a higher terminal shows them\n"
 

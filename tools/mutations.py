@@ -14,7 +14,8 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from adacd_hil.control.arm_records import CertificateRecord, DeviceRecord, devices_digest
+from adacd_hil.control.device_record import DeviceRecord
+from adacd_hil.control.history_file import CertificateRecord, devices_digest
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import parse_toml
 

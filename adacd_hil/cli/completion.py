@@ -1,6 +1,6 @@
-"""What a shell completes by itself: configurations, scenarios, keys and values of settings, interfaces, run folders.
+"""Completion in the shell: configurations, scenarios, keys and values of settings, interfaces, run folders.
 
-Everything is imported when it is asked for: a shell waits for each answer.
+Modules are imported at their first use: a shell waits for each answer.
 """
 
 import os
@@ -11,20 +11,20 @@ from click import Context, Parameter
 from click.shell_completion import BashComplete, CompletionItem, ZshComplete, add_completion_class
 
 _ASKED = "_ADACD_HIL_COMPLETE"
-"""The variable by which click knows that a shell asks, and what."""
+"""The environment variable by which a shell asks click for completions."""
 _FILE = "file"
 _MOST_RUNS = 30
 
 
 def complete_configuration(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Give the built-in configurations and TOML files."""
+    """Complete built-in configurations and TOML files."""
     from adacd_hil.settings.toml_files import builtin_names
 
     return [*_starting(builtin_names(), incomplete), *_toml_files(incomplete)]
 
 
 def complete_scenario(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Give the built-in scenarios and TOML files."""
+    """Complete built-in scenarios and TOML files."""
     from importlib import resources
 
     from adacd_hil.settings.toml_files import toml_names
@@ -34,7 +34,7 @@ def complete_scenario(_ctx: Context, _param: Parameter, incomplete: str) -> list
 
 
 def complete_truth(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Give the built-in truths and TOML files."""
+    """Complete built-in truths and TOML files."""
     from importlib import resources
 
     from adacd_hil.settings.toml_files import toml_names
@@ -44,7 +44,7 @@ def complete_truth(_ctx: Context, _param: Parameter, incomplete: str) -> list[Co
 
 
 def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Give groups and keys; of an option KEY=VALUE keys with `=`, and the values of a key that has choices."""
+    """Complete sections and keys; for an option KEY=VALUE keys with `=`, and the choices of a key."""
     from adacd_hil.settings.configuration import known_keys, sections
 
     known = {key: row for key, row in known_keys().items() if not row.is_in_row}
@@ -61,14 +61,14 @@ def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[C
 
 
 def complete_interface(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Give python-can's interfaces, SocketCAN first."""
+    """Complete python-can's interfaces, SocketCAN first."""
     from adacd_hil.wire.python_can import interface_names
 
     return _starting(("socketcan", *(name for name in interface_names() if name != "socketcan")), incomplete)
 
 
 def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Give the CAN interfaces of this machine, where the interface is SocketCAN or not said yet."""
+    """Complete the CAN interfaces of this machine, if the interface is SocketCAN or not given yet."""
     if ctx.params.get("interface") not in (None, "socketcan"):
         return []
     from adacd_hil.wire.can_interface import can_interfaces
@@ -77,7 +77,7 @@ def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[C
 
 
 def complete_run(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Give the folders below `runs` that have a log, the newest first, and files."""
+    """Complete files and the folders below `runs` that have a log, the newest first."""
     from adacd_hil.cli.output import RUNS
     from adacd_hil.log.log_files import LOG_NAME
 
@@ -85,7 +85,7 @@ def complete_run(_ctx: Context, _param: Parameter, incomplete: str) -> list[Comp
         found = sorted((path for path in RUNS.iterdir() if (path / LOG_NAME).is_file()), reverse=True)
     except OSError:
         found = []
-    # Bash forgets what came before a file, and looks for files where nothing else fits.
+    # Bash forgets the words before a file, and completes files if no word fits.
     return [CompletionItem(incomplete, type=_FILE), *_starting(map(str, found[:_MOST_RUNS]), incomplete)]
 
 
@@ -94,7 +94,7 @@ def _starting(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
 
 
 def _toml_files(incomplete: str) -> list[CompletionItem]:
-    """Give the TOML files and the folders that a path begins; built-in names need no slash."""
+    """Complete TOML files and folders by their paths."""
     folder, slash, _ = incomplete.rpartition("/")
     found = []
     try:
@@ -116,17 +116,17 @@ _CHANGES = ("--set", "--vary")
 
 
 class BashWithEquals(BashComplete):
-    """Bash's completion, which takes `KEY=VALUE` for three words: they are one again, and only the last is replaced."""
+    """Bash's completion for `KEY=VALUE`, which bash splits into three words; only the last of them is replaced."""
 
     source_template = BashComplete.source_template.replace(
         "    return 0",
         "    [[ ${#COMPREPLY[@]} -eq 1 && ${COMPREPLY[0]} == *[=/] ]] && compopt -o nospace\n\n    return 0",
     )
     _kept = ""
-    """What bash keeps of the word in front of what it replaces."""
+    """The part of the word before `=` that bash keeps."""
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """Give the words before the cursor, and the one it is in."""
+        """Return the words before the cursor, and the word under it."""
         args, incomplete = super().get_completion_args()
         words: list[str] = []
         for word in [*args, incomplete]:
@@ -140,7 +140,7 @@ class BashWithEquals(BashComplete):
         return words[:-1], words[-1]
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Write what takes the place of the word that bash sees."""
+        """Return the replacement for the part of the word that bash sees."""
         return super().format_completion(CompletionItem(item.value.removeprefix(self._kept), item.type))
 
 
@@ -158,11 +158,11 @@ class ZshWithEquals(ZshComplete):
 
 
 def is_completing() -> bool:
-    """Whether a shell has started this process, for its script or for an answer."""
+    """Tell whether a shell started this process, for the completion script or for an answer."""
     return _ASKED in os.environ
 
 
 def prepare_completion() -> None:
-    """Let click answer bash and zsh by the classes above."""
+    """Register the classes above with click."""
     add_completion_class(BashWithEquals)
     add_completion_class(ZshWithEquals)

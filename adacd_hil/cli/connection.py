@@ -1,4 +1,4 @@
-"""What the commands that work on a bus share: settings, contract, an open bus, and an orderly end."""
+"""Commands on a bus: settings, contract, the open bus, signals."""
 
 import dataclasses
 import shlex
@@ -23,7 +23,7 @@ from adacd_hil.wire.dbc_decoder import DbcDecoder, load_decoder
 from adacd_hil.wire.open_bus import open_bus
 
 MOST_BLIND_CYCLES = 5
-"""Cycles without data that a real arm may go through: at 100 deg/s and 1 ms half a degree."""
+"""Most cycles without data that is allowed on a real arm: half a degree at 100 deg/s and 1 ms."""
 
 
 def make_clock(name: str) -> Clock:
@@ -32,9 +32,9 @@ def make_clock(name: str) -> Clock:
 
 
 def check_clock(name: str, interface: str, channel: str) -> None:
-    """Raise CommandError for lockstep on what may be hardware, which has no time for it.
+    """Raise CommandError for lockstep on a channel that may be hardware, since hardware can't wait for the host.
 
-    An interface that is not there is nothing yet; opening it says so.
+    A missing interface passes; opening it raises the error.
     """
     if name == "lockstep" and may_be_hardware(interface, channel):
         raise CommandError(
@@ -44,7 +44,7 @@ def check_clock(name: str, interface: str, channel: str) -> None:
 
 
 def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
-    """Raise CommandError for a scripted user on what may be hardware: there a person acknowledges."""
+    """Raise CommandError for a scripted user on a channel that may be hardware, where a person has to acknowledge."""
     if may_be_hardware(interface, channel):
         raise CommandError(
             f"--scenario {in_line(scenario)} plays the user of an emulated arm; {interface} {channel} may be hardware: "
@@ -54,7 +54,7 @@ def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
 
 
 def may_be_hardware(interface: str, channel: str) -> bool:
-    """Tell whether an arm may be on a channel that is there: all but vcan, vxcan and python-can's own virtual bus."""
+    """Tell whether an arm may be on an existing channel: on all but vcan, vxcan and python-can's own virtual bus."""
     from adacd_hil.wire.python_can import is_usable
 
     is_there = channel in can_interfaces() if interface == "socketcan" else is_usable(interface)
@@ -62,9 +62,9 @@ def may_be_hardware(interface: str, channel: str) -> bool:
 
 
 def check_autonomy(settings: Settings, interface: str, channel: str) -> None:
-    """Raise CommandError where a real arm may be on the bus and the settings let it act without data or without a user.
+    """Raise CommandError if settings let a real arm move without data, or acknowledge stops without a user.
 
-    What may stand on the other side of anything but vcan, vxcan and python-can's own virtual bus is not known.
+    Any channel but vcan, vxcan and python-can's own virtual bus counts as a real arm.
     """
     if is_virtual(interface, channel):
         return
@@ -89,30 +89,30 @@ def check_autonomy(settings: Settings, interface: str, channel: str) -> None:
 
 
 def check_shared(name: str, settings: Settings) -> None:
-    """Raise CommandError for lockstep on a bus that other hosts are on: in lockstep one host says the time."""
+    """Raise CommandError for lockstep on a bus with other hosts: in lockstep one host sets the time."""
     if name == "lockstep" and settings.bus.is_shared:
         raise CommandError(
-            f"`bus.arms` = {settings.bus.arms} hosts need --clock realtime; in lockstep one says the time",
+            f"`bus.arms` = {settings.bus.arms} hosts need --clock realtime; in lockstep one host sets the time",
             ExitCode.USAGE,
         )
 
 
 def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
-    """Give a bus without time of its own the modelled one of lockstep. Raises CodecError."""
-    # The emulator's part of the host; real time does without.
+    """Wrap a bus in the modelled time of lockstep. Raises CodecError."""
+    # Imported here: it belongs to lockstep and isn't needed in real time.
     from adacd_hil.wire.lockstep_bus import make_lockstep_bus
 
     return make_lockstep_bus(bus, clock, codec, settings)
 
 
 def received_ids(codec: Codec, settings: Settings) -> list[int]:
-    """List the identifiers that the host receives: the contract's, and what nobody else may send."""
+    """Return the identifiers that the host receives: of the contract, and of frames that only the host may send."""
     return sorted({message.can_id for message in codec.messages.values()} | host_frames(settings, codec).keys())
 
 
 @dataclass(frozen=True)
 class Connection:
-    """Where the arm is and what it should be, as given on the command line."""
+    """The options of a command that reaches an arm: interface, channel, bit rate, configuration, profile, DBC."""
 
     interface: str
     channel: str
@@ -123,7 +123,7 @@ class Connection:
 
     @property
     def arguments(self) -> str:
-        """The options by which another command reaches the same arm, as typed in a shell."""
+        """The options by which another command reaches the same arm, quoted for a shell."""
         given = [
             ("-i", self.interface),
             ("-c", self.channel),
@@ -135,11 +135,11 @@ class Connection:
         return " ".join(f"{option} {shlex.quote(str(value))}" for option, value in given if value is not None)
 
     def settings(self) -> Settings:
-        """Read the configuration, of which the option --dbc outweighs the contract. Raises ConfigError."""
+        """Read the configuration, with the contract of --dbc if given. Raises ConfigError."""
         return self.with_contract(load_settings(self.config, self.profile))
 
     def with_contract(self, settings: Settings) -> Settings:
-        """Give settings the contract of --dbc, where it is given."""
+        """Return the settings with the contract of --dbc, if given."""
         if self.dbc is None:
             return settings
         return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, contract=str(self.dbc)))
@@ -150,7 +150,7 @@ class Connection:
         return settings, load_contract(settings)
 
     def load_decoder(self) -> Codec | DbcDecoder:
-        """Read what a listener decodes by: a DBC of --dbc may be any, the configuration's is a contract.
+        """Return the decoder of a listener: any DBC that --dbc names, else the contract of the configuration.
 
         Raises ConfigError, CodecError.
         """
@@ -161,7 +161,7 @@ class Connection:
         return self.load()[1]
 
     def open(self, clock: Clock, codec: Codec, settings: Settings) -> Bus:
-        """Open the bus for a run: what the host receives in real time; all of it, with modelled time, in lockstep.
+        """Open the bus for a run. Real time: with a filter on the host's identifiers; lockstep: with modelled time.
 
         Raises BusMissingError, CodecError.
         """
@@ -171,9 +171,9 @@ class Connection:
 
     @contextmanager
     def bus(self, clock: Clock, is_fd: bool) -> Iterator[Bus]:
-        """Open the bus, receiving everything, while the block lasts. Raises BusMissingError.
+        """Open the bus without a filter while the block lasts. Raises BusMissingError.
 
-        A bus that fails in the block ends the command as missing: nothing has been enabled on it.
+        A BusError in the block becomes BusMissingError: no drive has been enabled.
         """
         bus = open_bus(self.interface, self.channel, clock, None, self.bitrate, is_fd)
         try:
@@ -187,15 +187,15 @@ class Connection:
 
 
 def raise_interrupt() -> NoReturn:
-    """End a command from within a signal handler, through its `finally` blocks. Raises KeyboardInterrupt."""
+    """Raise KeyboardInterrupt; as a signal handler it ends a command through its `finally` blocks."""
     raise KeyboardInterrupt
 
 
 @contextmanager
 def never_stopped() -> Iterator[None]:
-    """Ignore SIGTTIN and SIGTTOU, by which a terminal stops who reads or writes from the background.
+    """Ignore SIGTTIN and SIGTTOU, by which a terminal stops background processes that read or write it.
 
-    A stopped process sends no commands to an arm that moves. Reading such a terminal raises OSError instead.
+    A stopped process would send no commands to a moving arm. Reading such a terminal raises OSError instead.
     """
     previous = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTTIN, signal.SIGTTOU)}
     try:
@@ -207,9 +207,9 @@ def never_stopped() -> Iterator[None]:
 
 @contextmanager
 def on_interrupt(interrupt: Callable[[], None], *further: signal.Signals) -> Iterator[None]:
-    """Let SIGINT, SIGTERM and SIGHUP call a function and not end the process; outside the main thread, nothing can.
+    """Call a function on SIGINT, SIGTERM and SIGHUP, in place of their default; only in the main thread.
 
-    SIGHUP stays ignored where it was. further: signals that call it, too.
+    SIGHUP stays ignored if it was. further: signals that call it, too.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -29,9 +29,9 @@ from firmware_sim.scenario.rehearsal import told_arm
 from firmware_sim.scenario.scenario import Scenario, load_scenario, named_profile
 
 SCENARIO = "paper"
-"""Whose requests to the host are in a script; the user of another one only asks to finish."""
+"""The scenario whose user's requests are in the host's script; users of other scenarios only ask to finish."""
 USER = "demo"
-"""The configuration with that script, for those that have none."""
+"""The configuration with that script, used for configurations without one."""
 
 
 _TOUCHED_LINK = TRUTH_LAYOUT.slices["contact_link"].start
@@ -49,10 +49,10 @@ class Cast(NamedTuple):
 def resolve(config: str, scenario_name: str, profile: str | None, seed: int | None, truth: str | None = None) -> Cast:
     """Read configuration, scenario and truth. Raises ConfigError, CodecError.
 
-    A configuration of an arm of one's own is played as that arm, unless a profile is given. Else the profile is the
-    given one, else that of the scenario's file, else the configuration's. A configuration without a
-    script gets the demo's user: who only watches can't acknowledge. The emulated arm's own configuration gets from it
-    what its motors hold, as from a data sheet; an arm of one's own runs by its file alone.
+    If the configuration describes an arm of one's own, the emulator plays that arm, unless a profile is given.
+    Otherwise the profile is the given one, else the scenario's, else the configuration's. A configuration without a
+    script gets the demo's user, since somebody has to acknowledge. A built-in arm gets its motors' holding torque from
+    its data sheet; an arm of one's own keeps the value of its file.
     """
     contract: EmulatedContract | None = None
     assumed: list[str] = []
@@ -64,7 +64,7 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
         settings = load_settings(config, profile or named_profile(scenario_name))
         scenario = load_scenario(scenario_name, settings.arm.profile, seed)
     operator = settings.operator
-    if not operator.script:  # nobody else plays the user of an emulated arm
+    if not operator.script:  # an emulated arm needs a scripted user
         operator = load_settings(USER).operator
     if scenario_name != SCENARIO:
         operator = dataclasses.replace(
@@ -79,14 +79,14 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
 
 
 class _TrueTouch:
-    """Since when the emulator's person touches the arm: for what is told of the run, not for the host."""
+    """Time since which the emulated person touches the arm: for the progress lines only, the host doesn't use it."""
 
     def __init__(self, truth: TruthLog) -> None:
         self.since_ns: int | None = None
         self._truth = truth
 
     def write(self, cycle: int, t_ns: int, block: Vector) -> None:
-        """Log the truth of one cycle."""
+        """Log the truth of one cycle, and update `since_ns`."""
         if block[_TOUCHED_LINK] == 0.0:
             self.since_ns = None
         elif self.since_ns is None:
@@ -102,12 +102,12 @@ def run_embedded(
     live: LiveView | None = None,
     on_started: Callable[[], None] = lambda: None,
 ) -> tuple[SessionSummary, Path]:
-    """Run host and arm in this process, logs in `out`; return how it ended and where the truth is.
+    """Run host and arm in this process, logs in `out`; return the summary and the path of the truth.
 
     Raises ConfigError, CodecError, LogError, OSError.
     """
     settings, scenario = cast.settings, cast.scenario
-    check_shared("lockstep", settings)  # an arm in this process has no neighbour
+    check_shared("lockstep", settings)  # an arm in this process is alone on its bus
     codec = load_contract(settings)
     contract = cast.contract or playable_contract(codec)
     clock = make_clock(clock_name)
@@ -141,7 +141,7 @@ def run_embedded(
             )
             with on_interrupt(session.interrupt):
                 summary = session.run()
-            bench.outlive_host()  # whatever ended the run, the truth ends with an arm at rest
+            bench.outlive_host()  # the truth ends with an arm at rest, even after an error
         except BaseException:
             truth.discard()
             raise

@@ -1,4 +1,4 @@
-"""`adacd-hil`: the commands. Each parses, calls one function, prints."""
+"""`adacd-hil`: the commands. Each one parses its options, calls one function, and prints the result."""
 
 import json
 import sys
@@ -45,17 +45,17 @@ def cli() -> None:
 @click.option(
     "--without-anchor",
     is_flag=True,
-    help="Don't ask: nothing bounds the torque offsets, so who leans on the arm before it moves is learnt.",
+    help="Start without a bound on the torque offsets; a push before the first motion is then learnt as offset.",
 )
 @click.option(
     "--history",
     type=WrittenPath(dir_okay=False),
-    help="What the arm's runs have certified; the last is compared with, and this run's are added.",
+    help="File of the arm's certificates: the last one is compared, this run's are added.",
 )
 @click.option(
     "--scenario",
     metavar="NAME|FILE",
-    help="Rehearse: requests are those of this scenario's user, as in `demo`. On a virtual interface only.",
+    help="Rehearse with this scenario's user, as in `demo`. On a virtual interface only.",
     shell_complete=complete_scenario,
 )
 @run_folder_option("run")
@@ -76,7 +76,7 @@ def run(
     """Run the scheme on an arm, real or emulated, that is on a bus.
 
     On a terminal, type `ack` to acknowledge a stop, `payload` before and `changed` after changing the payload, `accept`
-    to say that nobody touches the arm whose certificate is withheld, `relearn` to take back a certificate in a stop,
+    to confirm that the arm is free when its certificate is withheld, `relearn` to take back a certificate in a stop,
     and `finish` to end. Ctrl-C parks the arm and ends; a second Ctrl-C
     stops at once.
     """
@@ -91,11 +91,11 @@ def run(
 
 
 COMMAND_ENTRY_POINTS: Final = "adacd_hil.commands"
-"""The group of further commands: each entry is a sequence of click's."""
+"""Entry-point group of further commands: each entry is a sequence of click commands."""
 
 
 def further_commands() -> Iterator[click.Command]:
-    """Give the commands that packages add. Commands that can't be imported are named, and no others are lost."""
+    """Yield the commands of other packages; warn of entries that can't be imported and continue with the others."""
     for entry in entry_points(group=COMMAND_ENTRY_POINTS):
         try:
             yield from entry.load()
@@ -111,18 +111,18 @@ for command in (config, replay, *further_commands()):
 
 
 def _misused(error: click.ClickException) -> str:
-    """Say in one line what is wrong with a command line, and which help lists what is right."""
+    """Describe a wrong command line in one line, with the command that shows its help."""
     text = " ".join(error.format_message().split())
     context = error.ctx if isinstance(error, click.UsageError) else None
-    return text if context is None else f"{text} `{context.command_path} --help` lists what there is"
+    return text if context is None else f"{text} see `{context.command_path} --help`"
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line, by default that of this process, and exit with a documented status.
+    """Run the command line (default: this process's) and exit with a documented status.
 
-    `adacd_hil.cli.start_host` comes here.
+    `adacd_hil.cli.start_host` calls this.
     """
-    if is_completing():  # the shell reads what click writes
+    if is_completing():  # click writes completions in raw form
         prepare_completion()
     elif arguments is None:
         open_terminals()

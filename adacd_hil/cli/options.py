@@ -46,7 +46,7 @@ set_option = click.option(
 
 
 def run_folder_option(name: str) -> Callable[..., Any]:
-    """Give a command the option for the folder of its run; where it isn't given, `runs/NAME` leads to the last one."""
+    """Give a command the option for the folder of its run; the default is a new one by date, linked as `runs/NAME`."""
     return click.option(
         "--out",
         type=WrittenPath(file_okay=False),
@@ -56,12 +56,12 @@ def run_folder_option(name: str) -> Callable[..., Any]:
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
 clock_option = functools.partial(
-    click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="What drives SYNC."
+    click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="Clock of the cycles."
 )
 
 
 def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
-    """Give a command --from and --until; it takes them as a `TimeWindow`."""
+    """Give a command --from and --until; it receives them as a `TimeWindow`."""
 
     @functools.wraps(command)
     def bounded(*args: Any, from_s: float | None, until_s: float | None, **kwargs: Any) -> ExitCode:
@@ -108,12 +108,12 @@ def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
 
 
 def on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Give a command the options of a bus; it takes them as a `Connection` before its own."""
+    """Give a command the options of a bus; it receives a `Connection` before its own options."""
     return _connected(command, is_required=True)
 
 
 def on_bus_or_url(help_text: str) -> Callable[[Callable[..., ExitCode]], Callable[..., None]]:
-    """Give a command the options of a bus, or --url in their place; it takes a `Connection` or the URL first."""
+    """Give a command the options of a bus, or --url; it receives a `Connection` or the URL first."""
     url_option = click.option("--url", help=help_text)
     return lambda command: url_option(_connected(command, is_required=False))
 
@@ -145,9 +145,9 @@ def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[
 
 
 LIVE_ENTRY_POINTS: Final = "adacd_hil.live"
-"""The group of the one that makes a `LiveView` of host, port, origins, names and most viewers."""
+"""Entry-point group of the function that makes a `LiveView` of host, port, origins, names and most viewers."""
 PORT = 8765
-"""What viewers suggest."""
+"""Default port of Foxglove and Lichtblick."""
 HOST = "127.0.0.1"
 _OPTIONS = (  # last first: click lists them the other way round
     click.option(
@@ -164,10 +164,10 @@ _OPTIONS = (  # last first: click lists them the other way round
         "--live-origin",
         multiple=True,
         metavar="ORIGIN",
-        help="A web page that may watch beside Foxglove's and this machine's own, such as https://view.lab.example.",
+        help="A web page that may watch, in addition to Foxglove's and this machine's, such as https://view.lab.example.",
     ),
     click.option(
-        "--live-host", default=HOST, show_default=True, help="Address to listen on; 0.0.0.0: all, for anybody."
+        "--live-host", default=HOST, show_default=True, help="Address to listen on; 0.0.0.0: all, for any viewer."
     ),
     click.option(
         "--live-port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="0: any that is free."
@@ -177,14 +177,14 @@ _OPTIONS = (  # last first: click lists them the other way round
 
 
 def require_extra(asked_for: str, *modules: str) -> None:
-    """Raise CommandError when a module of the extra `live` is missing."""
+    """Raise CommandError if a module of the extra `live` is missing."""
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
         raise CommandError(f"{asked_for} needs the extra `live`: {install_command('live')}", ExitCode.USAGE)
 
 
 def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
-    """Give a command the options of the live view; it takes them as `live`, a LiveView or None."""
+    """Give a command the options of the live view; it receives `live`, a LiveView or None."""
 
     @functools.wraps(command)
     def run(
@@ -221,7 +221,7 @@ def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str,
 
 
 def _check_port(host: str, port: int) -> None:
-    """Raise CommandError where another program listens: before minutes are spent on compiling."""
+    """Raise CommandError if another program listens on the port: before minutes are spent on compiling."""
     try:
         places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM) if port else ()
         for family, kind, protocol, _, address in places:

@@ -1,6 +1,6 @@
-"""What commands print and write, and how they end: tables, progress, the file of a result, the folder of a run.
+"""Output and end of commands: tables, suggestions, the file of a result, the folder of a run, exit status.
 
-A command ends by an exit status, the same in every command, and where it fails by one line.
+Every command uses the same exit statuses; a command that fails prints one line.
 """
 
 import contextlib
@@ -24,16 +24,16 @@ from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import fold, in_line, one_line, painted, terminal_columns, write_screen, write_told
+from adacd_hil.terminal import fold, in_line, one_line, painted, terminal_columns, write_result, write_screen
 
 PROGRAM = "adacd-hil"
 
 if TYPE_CHECKING:
-    from adacd_hil.control.session import SessionSummary  # it compiles: seconds that a command without a run can spare
+    from adacd_hil.control.session import SessionSummary  # its import compiles, which takes seconds
 
 
 class ExitCode(IntEnum):
-    """Documented exit status."""
+    """Documented exit statuses."""
 
     OK = 0
     FAILURE = 1
@@ -61,7 +61,7 @@ class CommandError(Exception):
 
 
 def exit_code(summary: "SessionSummary") -> ExitCode:
-    """Choose the exit code of a run; the gravest reason wins."""
+    """Return the exit status of a run, for the gravest of its outcomes."""
     from adacd_hil.records import FaultReason
 
     if summary.result is None:
@@ -74,9 +74,9 @@ def exit_code(summary: "SessionSummary") -> ExitCode:
 
 
 def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
-    """List what may end a command, with its exit code; the first that fits counts.
+    """Return the errors that a command ends with in one line, each with its exit status; the first match counts.
 
-    Imported once something has ended one: numpy and cantools take longer to import than help takes to print.
+    Imported only after an error: numpy and cantools take longer to import than help takes to print.
     """
     from adacd_hil.log.log_files import LogError, LogExistsError
     from adacd_hil.settings.schema import ConfigError, DetectorError
@@ -98,7 +98,7 @@ def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
 
 
 def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Turn what a command raises into one line and its exit code."""
+    """Wrap a command: an error ends it with one line on standard error and its exit status."""
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -115,13 +115,13 @@ _REMEDY = "; give another place, or let its owner change the rights"
 
 
 def _is_forbidden(error: BaseException) -> bool:
-    """Whether the system refuses what this user may not do to a file."""
+    """Tell whether the system denied this user access to a file."""
     causes = (error, error.__cause__)
     return any(isinstance(one, OSError) and one.errno in (errno.EACCES, errno.EPERM, errno.EROFS) for one in causes)
 
 
 def complain(error: BaseException) -> ExitCode:
-    """Say in one line what ended a command; return its exit code. Raises what no command is to be ended by."""
+    """Print an error in one line and return its exit status; raise the error again if it is a bug."""
     if isinstance(error, KeyboardInterrupt):
         print("adacd-hil: interrupted", file=sys.stderr)
         return ExitCode.INTERRUPTED
@@ -144,13 +144,13 @@ def format_table(
 
 
 def show(text: str, *next_commands: str) -> None:
-    """Print a result for people, folded to their terminal; on standard error, what they may type next."""
-    write_told(text)
+    """Print a result for people, folded to their terminal, and suggest the next commands on standard error."""
+    write_result(text)
     suggest(*next_commands)
 
 
 def answer(as_json: bool, described: Any, text: str) -> None:
-    """Print a result: for machines as it is described, or for people."""
+    """Print a result: `described` as JSON for machines, or the text for people."""
     if as_json:
         print(json.dumps(described, indent=2))
     else:
@@ -158,7 +158,7 @@ def answer(as_json: bool, described: Any, text: str) -> None:
 
 
 def suggest(*next_commands: str) -> None:
-    """Name on standard error what may be typed next, with this program as its user called it."""
+    """Suggest next commands on standard error, with this program's name as its user typed it."""
     called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     for place, command in enumerate(next_commands):
         typed = f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
@@ -167,7 +167,7 @@ def suggest(*next_commands: str) -> None:
 
 
 def _as_typed(line: str) -> str:
-    """Part a command so that a shell takes it from a narrow terminal: its comment, and what a quote doesn't hold."""
+    """Fold a command to the terminal's width so that a shell still accepts it: with backslashes, outside of quotes."""
     columns = terminal_columns(sys.stderr)
     command, mark, comment = line.partition("   # ")
     if columns is None or len(line) <= columns:
@@ -179,9 +179,9 @@ def _as_typed(line: str) -> str:
 _GOES_ON = " \\"
 
 
-def counted(count: int, what: str) -> str:
-    """Say how many there are, in the plural unless it is one."""
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def counted(count: int, noun: str) -> str:
+    """Return count and noun, in the plural unless the count is one."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def quoted(path: Path) -> str:
@@ -190,10 +190,10 @@ def quoted(path: Path) -> str:
 
 
 @contextmanager
-def tried(out: Path | None) -> Iterator[None]:
-    """Before the block, make the folder of a result and a file in it that goes again; None: there is no file.
+def checked_place(out: Path | None) -> Iterator[None]:
+    """Before the block, make the folder of a result and test that a file can be written in it; None: do nothing.
 
-    A folder that was made and holds nothing afterwards goes, too. Raises CommandError.
+    A folder that was made and is empty at the end is removed. Raises CommandError.
     """
     if out is None:
         yield
@@ -209,10 +209,11 @@ def tried(out: Path | None) -> Iterator[None]:
         yield
 
 
-def tell(said: str, out: Path | None, content: str, has_all: bool) -> None:
-    """Write `content` to the file of a result, and print what is said of it.
+def print_and_write(text: str, out: Path | None, content: str, has_all: bool) -> None:
+    """Print a result's text and write `content` to its file.
 
-    Where the file can't be written its content is printed, too, unless what is said has all of it. Raises CommandError.
+    If the file can't be written, `content` is printed, too, unless the printed result contains it (`has_all`). Raises
+    CommandError.
     """
     failure = None
     if out is not None:
@@ -221,12 +222,12 @@ def tell(said: str, out: Path | None, content: str, has_all: bool) -> None:
             replace_file(out, content)
         except OSError as error:
             failure = error
-    print(said) if has_all else write_told(said)
+    print(text) if has_all else write_result(text)
     if failure is None:
         return
     if not has_all:
         print(f"\n{content}", end="")
-    raise CommandError(f"{out} can't be written: {failure.strerror}; what was found is printed above") from failure
+    raise CommandError(f"{out} can't be written: {failure.strerror}; the result is printed above") from failure
 
 
 RUNS = Path("runs")
@@ -236,13 +237,13 @@ _DATE = "%Y-%m-%dT%H-%M-%S"
 
 @dataclass(frozen=True)
 class RunFolder:
-    """The folder of a run. `links`: what leads to it once the run has started."""
+    """The folder of a run. `links`: symbolic links that are set to it when the run has started."""
 
     path: Path
     links: tuple[Path, ...] = ()
 
     def link(self, progress: Callable[[str], None] = lambda _: None) -> None:
-        """Let the links lead to it; one whose place something else has is left out, and that is told."""
+        """Set the links; skip one whose name is taken by a file or folder, and report it to `progress`."""
         for link in self.links:
             try:
                 _lead(link, self.path)
@@ -252,11 +253,11 @@ class RunFolder:
 
 @contextmanager
 def run_folder(out: Path | None, log_names: tuple[str, ...], name: str) -> Iterator[RunFolder]:
-    """Choose the folder of a run: `out`, or where that is None a new one below `runs`, by date.
+    """Choose the folder of a run: `out`, or a new one by date below `runs` if that is None.
 
-    log_names: of the logs that will be made. name: of the command; a link to its last run has it. When the block ends,
-    a folder that was made for the run and holds nothing is removed. Raises LogExistsError when `out` has such a log,
-    LogError, OSError.
+    log_names: file names of the logs that will be made. name: of the command, and of the link to its last run. When the
+    block ends, a folder that was made and is empty is removed. Raises LogExistsError if `out` has such a log, LogError,
+    OSError.
     """
     if out is not None:
         for log_name in log_names:
@@ -269,7 +270,7 @@ def run_folder(out: Path | None, log_names: tuple[str, ...], name: str) -> Itera
         try:
             yield RunFolder(path, (RUNS / LATEST, RUNS / name))
         finally:
-            with contextlib.suppress(OSError):  # it holds something
+            with contextlib.suppress(OSError):  # it isn't empty
                 path.rmdir()
 
 
@@ -285,7 +286,7 @@ def _make_dated() -> Path:
 
 
 def _lead(link: Path, path: Path) -> None:
-    """Make a link to `path`, or let one that is there lead to it, in one step. Raises OSError."""
+    """Set or replace a symbolic link to `path`, in one step. Raises OSError."""
     if is_there(link) and not link.is_symlink():
         raise FileExistsError(0, f"there is a {'folder' if link.is_dir() else 'file'} of that name")
     beside = link.with_name(f".{link.name}.{os.getpid()}")

@@ -1,4 +1,4 @@
-"""Where the console script `adacd-hil` enters."""
+"""Entry point of the console script `adacd-hil`."""
 
 from collections.abc import Callable
 from typing import NoReturn
@@ -6,7 +6,7 @@ from typing import NoReturn
 from adacd_hil.start import start_program
 
 INTERRUPTED = 130
-"""`adacd_hil.cli.output.ExitCode.INTERRUPTED`, which takes numpy to import."""
+"""Equals `adacd_hil.cli.output.ExitCode.INTERRUPTED`, whose module takes long to import."""
 
 
 def start_host() -> NoReturn:

@@ -1,1 +1,1 @@
-"""The cycle and what stands on both sides of the scheme in it."""
+"""The 1 kHz cycle: reading, requests, motion, controller, torque limits, commands; the session around it."""

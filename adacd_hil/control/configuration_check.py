@@ -1,4 +1,4 @@
-"""What is wrong with a configuration, and what is odd about it: all of it at once, a line each, without a bus."""
+"""Checks of a configuration without a bus: all errors and likely mistakes at once, a line each."""
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -28,23 +28,23 @@ from adacd_hil.wire.codec import Codec, CodecError
 Pair = tuple[float, float]
 
 _ARMS_OWN = ("arm.cad_theta", "controller.Kp", "controller.Kd")
-"""Keys that the built-in profiles give for an emulated arm."""
+"""Keys that the built-in profiles set for an emulated arm."""
 _MOST_RAD = 2.0 * math.pi
-"""A limit in degrees below this is less than a hand's breadth of motion, and likely radians."""
+"""A limit below this many degrees is hardly any motion, and probably meant in radians."""
 
 
 class ConfigurationFindings(NamedTuple):
-    """errors: why it can't be used. warnings: what it may not mean. `settings`: None with errors."""
+    """errors: reasons why it can't be used. warnings: likely mistakes. `settings`: None with errors."""
 
     errors: list[str]
     warnings: list[str]
     settings: Settings | None
     is_late: bool = False
-    """Whether the frames don't get through in the period."""
+    """Whether frames miss their deadlines in the period."""
 
 
 def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
-    """Look for everything that keeps a configuration from being used, and for what is likely a mistake."""
+    """Return all errors and likely mistakes of a configuration."""
     try:
         layers = configuration_layers(name_or_file, profile)
     except ConfigError as error:
@@ -69,7 +69,7 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
 
 
 def configuration_checks(settings: Settings) -> list[Check[Settings]]:
-    """Make doctor's checks of a configuration: what it may not mean, and one for each value that is a guess."""
+    """Return doctor's checks of a configuration: its likely mistakes, and one check for each guessed value."""
     known = known_keys()
     guesses = [key for key in settings.assumed if key in known]
     return [
@@ -89,9 +89,9 @@ def _check_oddities(settings: Settings) -> CheckOutcome:
 def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
     def ask(settings: Settings) -> CheckOutcome:
         value = value_of(settings, known.key)
-        told = "nothing is given" if value is None else f"{in_words(value)} is a guess"
+        text = "nothing is given" if value is None else f"{in_words(value)} is a guess"
         remedy = f"measure it or look it up, write it, and take `{known.key}` off `assumed`"
-        return warning(f"{told}: {known.meaning}", remedy)
+        return warning(f"{text}: {known.meaning}", remedy)
 
     return ask
 
@@ -105,7 +105,7 @@ def _asking_for_profile(value: float) -> Callable[[Settings], CheckOutcome]:
 
 
 def profile_guesses(settings: Settings) -> dict[str, float]:
-    """Return the guesses within the profiles of the devices, as `my-drive.toml: scale.gear_ratio`."""
+    """Return the guesses in the profiles of the devices, as `my-drive.toml: scale.gear_ratio`."""
     found = {}
     for kind, names in (("drive", settings.devices.drive), ("sensor", settings.devices.sensor)):
         for name in dict.fromkeys(names):
@@ -121,16 +121,16 @@ def _oddities(settings: Settings) -> list[str]:
 
 
 _MOST_NAMED = 4
-"""Guesses that a run names; `config check` names all."""
+"""Most guesses that a run names; `config check` names all."""
 
 
 def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
-    """Say in a line which values of a configuration are guesses, but for those that are measured; "" without any."""
+    """Name the guessed values of a configuration in one line, without measured ones; "" if there are none."""
     guesses = [f"`{key}`" for key in (*profile_guesses(settings), *settings.assumed) if key not in measured]
     more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
     named = f"{', '.join(guesses[:_MOST_NAMED])}{more}"
     remedy = "`adacd-hil config check` names all" if more else "`adacd-hil doctor` asks for each"
-    return f"guesses that nobody has confirmed: {named}; {remedy}" if guesses else ""
+    return f"unconfirmed guesses: {named}; {remedy}" if guesses else ""
 
 
 def _device_problems(settings: Settings) -> list[str]:
@@ -157,7 +157,7 @@ _BOUNDS = (
     ("arm.torque_limit_Nm", "arm.rated_torque_Nm", "Nm", ""),
     ("reaction.velocity_limit_deg_s", "arm.velocity_limit_deg_s", "deg/s", "; a withdrawal keeps to the smaller one"),
 )
-"""Keys of pairs that must not be larger than those of other keys, and what comes of it."""
+"""Pairs of keys: the first must not exceed the second; then the consequence."""
 
 
 def _over(settings: Settings) -> Iterator[str]:
@@ -165,8 +165,8 @@ def _over(settings: Settings) -> Iterator[str]:
         pairs = zip(value_of(settings, key), value_of(settings, bound_key), strict=True)
         for joint, (value, bound) in enumerate(pairs):
             if value > bound:
-                told = f"`{bound_key}[{joint}]` = {bound:g} {unit}"
-                yield f"`{key}[{joint}]` = {value:g} {unit} exceeds {told}{outcome}"
+                limit = f"`{bound_key}[{joint}]` = {bound:g} {unit}"
+                yield f"`{key}[{joint}]` = {value:g} {unit} exceeds {limit}{outcome}"
 
 
 def _radians(settings: Settings) -> Iterator[str]:
@@ -189,12 +189,12 @@ _LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (_over, _radians, _unk
 
 
 def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
-    """Look at who says what: a file of one's own arm with numbers of the emulated one."""
+    """Warn of a file that describes its own arm but inherits numbers of an emulated one."""
     own = [layer for layer in layers if layer.origin not in builtin_names() and "[profiles." not in layer.origin]
     if not own:
         return
     if not any("scheme" in layer.table for layer in layers if layer.origin != "paper"):
-        yield 'the scheme is the paper\'s, which certifies nothing; `extends = "certified"` gives the certified one'
+        yield 'the scheme is the paper\'s, without certificates; `extends = "certified"` gives the certified one'
     if not any("arm" in layer.table or "devices" in layer.table for layer in own):
         return
     origins = origins_of(layers)
@@ -205,7 +205,7 @@ def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
 
 
 def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
-    """Say for each key that a layer gives which one it is from: the uppermost."""
+    """Return for each key the topmost layer that sets it."""
     found = {}
     for origin, table in layers:
         for section, content in table.items():
@@ -215,7 +215,7 @@ def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
 
 
 def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
-    """Look for torque sensors whose frames can't carry the rated torque."""
+    """Warn of torque sensors whose frames can't carry the rated torque."""
     for joint, rated_Nm in enumerate(settings.arm.rated_torque_Nm):
         message = codec.message(f"Sensor{joint + 1}Torque")
         signal = message.values[message.place("torque")]

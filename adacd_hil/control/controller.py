@@ -1,4 +1,4 @@
-"""The desired torque: of the controller that follows a desired motion, and of an arm that floats.
+"""Desired torque of the controller that follows a motion, and of an arm that floats.
 
 Shapes: vectors (2,); theta (p,). Units: rad, rad/s, Nm.
 """
@@ -12,12 +12,12 @@ from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.configuration import Settings
 
 HANDOVER_S = 0.5
-"""From the old parameters to the new. Switched at once, profile M's residual peaks at 0.071 Nm 7 ms later; led over
-in 0.5 s it stays within what it is anyway."""
+"""Blending time from old to new parameters. Switched at once, profile M's residual peaks at 0.071 Nm 7 ms later;
+blended in 0.5 s it stays as before."""
 
 
 class Controller:
-    """The joint controller."""
+    """The joint controller: PD on position and velocity, plus the model's feedforward."""
 
     def __init__(self, settings: Settings) -> None:
         self._Kp = np.array(settings.controller.Kp)
@@ -30,21 +30,21 @@ class Controller:
         self._cycles_left = 0
 
     def compile(self) -> None:
-        """Run the compiled part once, so that nothing compiles in the cycle."""
+        """Call the compiled part once, so that it doesn't compile in the cycle."""
         zeros = np.zeros(JOINTS)
         fill_torque(
             zeros, zeros, zeros, zeros, zeros, self._theta, self._Kp, self._Kd, self._level_rad, np.zeros(JOINTS)
         )
 
     def feed_forward(self, theta: Vector) -> None:
-        """Use these parameters (p,) from now on; the same array again changes nothing."""
+        """Blend the feedforward to these parameters (p,); the same array again changes nothing."""
         if theta is self._new or not self._has_feedforward:
             return
         self._old, self._new = self._theta, theta
         self._cycles_left = self._handover_cycles
 
     def torque(self, q: Vector, dq: Vector, q_d: Vector, dq_d: Vector, ddq_d: Vector, tau_d: Vector) -> None:
-        """Fill the desired torque `tau_d` (2,), Nm, from measured and desired motion; to be called once a cycle."""
+        """Fill the desired torque `tau_d` (2,), Nm, from measured and desired motion; call it once a cycle."""
         if self._cycles_left > 0:
             self._cycles_left -= 1
             share = self._cycles_left / self._handover_cycles
@@ -72,22 +72,22 @@ def fill_torque(
 
 
 TURNED_rad_s = 0.05
-"""Slower than this a joint counts as standing, and Coulomb friction is compensated in proportion."""
+"""A slower joint counts as standing: Coulomb friction is compensated in proportion to its speed."""
 
 
 FIRM = 3.0
-"""The controller's velocity gain times this holds the speed limit: 110 1/s for joint 2 of profile P unloaded, a third
-of what the delays would bear."""
+"""Factor on the controller's velocity gain that holds the speed limit: 110 1/s for joint 2 of profile P unloaded, a
+third of the gain at which the delays would make it unstable."""
 
 
 class Floating:
-    """The torque of an arm that gives way to whoever pushes it, in place of the controller's.
+    """Torque of an arm that yields to a push, in place of the controller's.
 
         tau_d = share (F_v dq + F_c tanh(dq / v_0)) + g(q) - D dq
 
-    Less than all of the friction is compensated and D damps, so what moves comes to rest by itself. A joint that still
-    moves by what it did before the contact is braked first, as hard as the controller can, until it stands or moves
-    with the push. Beyond the speed limit and near the position limits the controller's gains hold against more.
+    Part of the friction is compensated and D damps, so the arm comes to rest by itself. A joint that still moves from
+    before the contact is first braked, as hard as the controller can, until it stands or moves with the push. Beyond
+    the speed limit and near the position limits the controller's gains act against the motion.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -101,11 +101,11 @@ class Floating:
         self._is_braking = [True] * JOINTS
 
     def begin(self) -> None:
-        """Start anew: brake what moves."""
+        """Restart: brake every joint that moves."""
         self._is_braking = [True] * JOINTS
 
     def torque(self, q: Vector, dq: Vector, tau_ext_hat: Vector, theta: Vector, tau_d: Vector) -> None:
-        """Fill the desired torque; theta is the model of friction and gravity, zeros for none."""
+        """Fill the desired torque `tau_d` (2,), Nm; theta (p,): model of friction and gravity, zeros for none."""
         tau_d[:] = regressor.inverse_dynamics(q, np.zeros(JOINTS), np.zeros(JOINTS), theta, self._level_rad)
         friction = theta[regressor.F_V1 : regressor.F_C2 + 1]
         for i in range(JOINTS):

@@ -14,7 +14,7 @@ from adacd_hil.clock import Clock
 from adacd_hil.control.controller import Controller, Floating
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.fault_recovery import FaultReport, SelfChecks, StopEscalation
-from adacd_hil.control.first_motion import FirstMotion, is_told
+from adacd_hil.control.first_motion import FirstMotion, is_shown
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator, RunNarration
 from adacd_hil.control.pacing import DetectorTiming, Pacer
@@ -267,8 +267,8 @@ class Cycle:
         for source in self._sources:
             for event in source.take_events():
                 recorder.event(t_ns, event)
-                if event.name in CERTIFICATE_EVENTS or event.name == MOTION or is_told(event):
-                    self._narration.event(t_ns, event.told)
+                if event.name in CERTIFICATE_EVENTS or event.name == MOTION or is_shown(event):
+                    self._narration.event(t_ns, event.operator_text)
         if output.state is not self._state:
             event = self._transition(output, arm)
             recorder.event(t_ns, event)

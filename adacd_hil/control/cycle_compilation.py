@@ -1,6 +1,6 @@
-"""Compilation of what a cycle calls, on two processors: a second process compiles the longest part of it beside.
+"""Compilation of the functions of a cycle, on two processors: a second process compiles the longest ones.
 
-Both keep what they have compiled in the same cache, and neither compiles what the other one is compiling.
+Both keep their results in the same cache, and neither compiles a function that the other is compiling.
 """
 
 import contextlib
@@ -20,9 +20,9 @@ _MODULE = "adacd_hil.control.cycle_compilation"
 
 @contextmanager
 def compiling_cycle(settings: Settings, further: Sequence[Any] = ()) -> Iterator[None]:
-    """Compile the cycle in the block, and `further` compiled functions: who listens is told how far it is.
+    """Compile the functions of the cycle, and `further` ones, in the block, with progress for the listeners.
 
-    Where there is a second processor, and something to compile, another process helps; it ends with the block.
+    If there is a second processor and anything to compile, a second process helps; it ends with the block.
     """
     helpers: list[subprocess.Popen[bytes]] = []
 

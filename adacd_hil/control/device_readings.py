@@ -1,25 +1,26 @@
-"""Ways in which the devices may be at the joints, and which of them the arm's own motion bears out.
+"""Detects exchanged, reversed or wrongly scaled devices from the arm's own motion.
 
-A reading says what the true q, tau of the arm are by what the devices count: exchanged, reversed, or in another scale.
-The equation of a 2R arm, linear in theta, is fitted to each reading, with offsets and what the torque is late,
+A reading is a hypothesis: it gives the true q, tau of the arm from the devices' values, with devices exchanged,
+reversed, or in another scale. The equation of a 2R arm, linear in theta, is fitted to each reading, with offsets and
+the lag of the torque,
 
-    tau_J = W(q, dq, ddq) theta + offset − l dtau_J/dt
+    tau_J = W(q, dq, ddq) theta + offset - l dtau_J/dt
 
-The configuration is refuted when a reading leaves a far smaller share of the squares unexplained and has an inertia
-that an arm can have. Of 95 scenarios of the package, touched arms included, none comes below 0.5 times the share as
-told; of the mistakes below, each comes to 0.1 times or less, a mounting to 0.17. That says that something is wrong, not
-yet what. One reading is of the mounting: gravity acts in any direction of the plane of motion, so a4 and a5 have
-columns of sin(q1 - level_rad), too. A reading is refuted
+The configuration is refuted if another reading leaves a far smaller share of the squares unexplained and has the
+inertia of a possible arm. In 95 scenarios of the package, touched arms included, no other reading leaves less than 0.5
+times the configuration's share; of the mistakes below, each leaves 0.1 times or less, a mounting 0.17. A refuted
+configuration doesn't yet identify the mistake. One reading is of the mounting: gravity acts in any direction of the
+plane of motion, so a4 and a5 have columns of sin(q1 - level_rad), too. A reading is refuted
 
-    by the equation   where it leaves 1 / `_BETTER` times the least share of all, at a likelihood that is at least
-                      exp(`_LOG_ODDS`) times smaller, or where its inertia is no arm's by `_DEVIATIONS` standard
+    by the equation   if it leaves 1 / `_BETTER` times the least share of all, at a likelihood that is at least
+                      exp(`_LOG_ODDS`) times smaller, or if its inertia is outside any arm's by `_DEVIATIONS` standard
                       deviations: gravity and a short motion leave the inertia open
-    by the torques    where sensed over commanded torque isn't what it predicts, as far as that ratio is known
+    by the torques    if sensed over commanded torque differs from its prediction by more than that ratio's error
 
-`left` returns the readings that neither refutes. One alone is certain.
+`left` returns the readings that neither refutes. A single one is certain.
 
-Not told apart: an arm without gravity is its own mirror image, so of two joints of which one is reversed nothing says
-which, nor that both are. Torques in one wrong scale make an arm that is as much heavier.
+Indistinguishable: an arm without gravity equals its mirror image, so if one of two joints is reversed, the motion can't
+show which, nor that both are. If all torques have one wrong scale, the arm seems heavier by it.
 """
 
 import math
@@ -35,24 +36,24 @@ from adacd_hil.settings.configuration import Settings
 
 _FEWEST_BLOCKS: Final = 15
 _BETTER: Final = 0.2
-"""Share over that of the configuration, at most, of a reading that is right."""
+"""Most that the right reading leaves of the configuration's share."""
 _EXPLAINED: Final = 0.004
-"""Largest unexplained share of it."""
+"""Largest unexplained share of the right reading."""
 _UNEXPLAINED: Final = 1e-4
-"""Least share as told: what explains all but 1 % of the torque is right. Mistakes leave 2 % and more."""
+"""Unexplained share below which the configuration is accepted: it explains 99 % of the torque. Mistakes leave 2 %."""
 _JUDGED_EVERY: Final = 4
 _ROUNDS: Final = 3
-"""Verdicts in a row that have to agree."""
+"""Equal verdicts in a row that are needed."""
 _SUSPECT_BLOCKS: Final = 6
 _CORRELATED: Final = 4.0
-"""Blocks that count as one: what the equation lacks lasts longer than a block."""
+"""Number of blocks that count as one: the errors of the equation last longer than a block."""
 _DEVIATIONS: Final = 5.0
 _LOG_ODDS: Final = 7.0
-"""Of 1000 to 1, for blocks of normal errors: n / 2 times the logarithm of the ratio of shares."""
+"""Logarithm of 1000 : 1, for blocks of normal errors: n / 2 times the logarithm of the ratio of shares."""
 _OTHERS: Final = 0.4
 """Largest difference of a sensor's share of the other joint's command from the predicted one."""
 _MOST_NAMED: Final = 8
-"""Causes in one line; if more are left, the motion has told nothing."""
+"""Most causes in one line; if more are left, the motion shows nothing."""
 _SHORT: Final = {
     "reversed": "one of the joints reversed (arm.sign)",
     "joints": "joints exchanged (devices.drive_node and devices.sensor_node)",
@@ -68,18 +69,18 @@ _SHORT: Final = {
     "torque": "scale of a torque sensor wrong (devices.sensor[0] or devices.sensor[1])",
     "mounting": "mounting wrong, link 1 hangs at about q1 = {hangs:.0f} deg (arm.mounting_deg[1] or arm.zero_deg[0])",
 }
-"""A cause beside others, by kind."""
+"""Text of each cause in a list, by kind."""
 RIDGE: Final = 1e-9
-"""Of the scaled equations, so that what a motion doesn't tell is 0."""
+"""Ridge of the scaled equations, which sets parameters that the motion doesn't show to 0."""
 _MOUNTING_BLOCKS: Final = 60
-"""Before, a small motion hardly tells gravity from an offset: two more parameters explain any torque."""
+"""With fewer blocks, a small motion hardly tells gravity from an offset: two more parameters explain any torque."""
 _TURNED_DEG: Final = 10.0
-"""Least angle by which a mounting is wrong."""
+"""Smallest error of a mounting angle that is reported."""
 _SCALES: Final = (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
 
 
 class TorqueRatio(NamedTuple):
-    """What a sensor measures of the torque that its own joint's drive is commanded, and of the other's."""
+    """Sensed torque over the torque commanded to its own joint's drive, and to the other joint's."""
 
     own: float
     other: float
@@ -88,7 +89,7 @@ class TorqueRatio(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """One way. position, torque, motor: factors on what is counted and commanded, by joint. kind: of its text.
+    """One hypothesis. position, torque, motor: factors on measured and commanded values, by joint. kind: of its text.
 
     is_turned: gravity acts in any direction.
     """
@@ -103,13 +104,13 @@ class Reading(NamedTuple):
 
     @property
     def joint(self) -> int:
-        """The joint that is read otherwise, 0 or 1."""
+        """The joint that this reading changes, 0 or 1."""
         return 0 if (self.position[0], self.torque[0], self.motor[0]) != (1.0, 1.0, 1.0) else 1
 
     def allows(self, found: Sequence[TorqueRatio | None], error: float) -> bool:
-        """Tell whether it predicts sensed over commanded torque as found, by node; None: not known.
+        """Tell whether it predicts the ratios of sensed to commanded torque that were found, by node; None: unknown.
 
-        error: by how much a torque constant or a scale may be off, 0 to 1.
+        error: possible relative error of a torque constant or a scale, 0 to 1.
         """
         for i in range(JOINTS):
             drive, sensor = 1 - i if self.is_drive_exchanged else i, 1 - i if self.is_sensor_exchanged else i
@@ -129,12 +130,12 @@ class Reading(NamedTuple):
 
     @property
     def row(self) -> tuple[float, ...]:
-        """The numbers of it, for compiled functions."""
+        """Its numbers, for compiled functions."""
         return (self.is_drive_exchanged, self.is_sensor_exchanged, *self.position, *self.torque, self.is_turned)
 
 
 READINGS: Final = (
-    Reading("told"),
+    Reading("configured"),
     Reading("reversed", position=(1.0, -1.0), torque=(1.0, -1.0), motor=(1.0, -1.0)),
     Reading("joints", True, True),
     Reading("joints", True, True, (1.0, -1.0), (1.0, -1.0), (1.0, -1.0)),
@@ -201,7 +202,7 @@ def add_block(
 def solve_readings(normals: Vector, count: int, blocks: int, shares: Vector, solutions: Vector) -> None:
     """Solve the normal equations (h, k, k) of so many blocks: unexplained share (h,) of squares, unknowns (h, k - 1).
 
-    By Cholesky's factors of the equations, scaled to a diagonal of ones.
+    By Cholesky factors of the equations, scaled to a diagonal of ones.
     """
     size = normals.shape[1] - 1
     L, x, unit = np.zeros((size, size)), np.zeros(size), np.zeros(size)
@@ -237,7 +238,7 @@ class DeviceReadings:
     """Fits all readings to the blocks of a motion."""
 
     def __init__(self, settings: Settings) -> None:
-        """Begin without a block."""
+        """Start without blocks."""
         self._settings = settings
         self._level_rad = settings.level_rad
         self._count = len(settings.estimator.parameter_names)
@@ -248,24 +249,24 @@ class DeviceReadings:
         self._normals = np.zeros((readings, unknowns + 1, unknowns + 1))
         self._blocks = 0
         self._shares, self._solutions = np.ones(readings), np.zeros((readings, unknowns))
-        self._refuted = 0  # times in a row
+        self._refuted = 0  # rounds in a row in which the configuration was refuted
 
     def compile(self) -> None:
-        """Compile what `add` calls."""
+        """Compile the functions that `add_means` calls."""
         zero = np.zeros(JOINTS)
         add_block(self._rows, zero, zero, zero, zero, zero, self._level_rad, self._count, self._normals.copy())
         solve_readings(self._normals, self._count, 1, self._shares.copy(), self._solutions.copy())
         is_positive_definite(self._solutions[0])
 
-    def add(self, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector) -> None:
-        """Take in the means of a block, (2,) each."""
+    def add_means(self, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector) -> None:
+        """Add the means of a block, (2,) each."""
         add_block(self._rows, q, dq, ddq, tau_J, dtau_J, self._level_rad, self._count, self._normals)
         self._blocks += 1
 
-    def step(self, is_torque_known: bool) -> bool:
-        """Judge every few blocks; return whether the configuration is certainly not how the devices are.
+    def judge_blocks(self, is_torque_known: bool) -> bool:
+        """Judge every few blocks; return whether the configuration is refuted.
 
-        is_torque_known: a scale of the torques is judged only where the commanded ones have confirmed it.
+        is_torque_known: torque scales are judged only if the commanded torques have confirmed them.
         """
         if self._blocks < _FEWEST_BLOCKS or self._blocks % _JUDGED_EVERY:
             return False
@@ -276,9 +277,9 @@ class DeviceReadings:
         return self._refuted >= _ROUNDS and (is_torque_known or self._readings[best].kind != "torque")
 
     def left(self, found: Sequence[TorqueRatio | None], error: float) -> list[Reading]:
-        """Return the readings that neither equation nor torques refute, best first; of each kind and joint the best.
+        """Return the readings that neither equation nor torques refute, best first; the best of each kind and joint.
 
-        Nothing where the best reading of all, which is refuted, explains far more than the others: the right one isn't
+        Empty if the best reading of all is refuted but explains far more than the others: then the right one is not
         among them.
         """
         if self._blocks < _SUSPECT_BLOCKS:
@@ -300,23 +301,23 @@ class DeviceReadings:
         return list(texts.values())
 
     def is_unlike_an_arm(self) -> bool:
-        """Whether no arm has the inertia that the motion has as it was told, or too little of a motion is known."""
+        """Whether the configured devices give an inertia that no arm has, or the motion is too short to know."""
         self._solve(())
         return 0 < self._blocks < _SUSPECT_BLOCKS or not is_positive_definite(self._solutions[0])
 
     def describe(self, left: Sequence[Reading]) -> str:
-        """Name the causes that are left, how well each explains the torque, and what to change; empty: no cause.
+        """Describe the remaining causes, their unexplained shares, and the remedies; "" without a cause.
 
-        Where even the best explains little, the cause is not among the readings, or they are several at once.
+        If even the best reading explains little, the cause is not among the readings, or there are several.
         """
-        wrong = [reading for reading in left if reading.kind != "told"]
+        wrong = [reading for reading in left if reading.kind != "configured"]
         places = [self._readings.index(reading) for reading in wrong]
         if not wrong or len(wrong) > _MOST_NAMED or min(self._shares[places]) > _EXPLAINED:
             return ""
         shares = 100.0 * np.sqrt(self._shares[[0, *places]])
-        told = f"unexplained of the torque: {shares[0]:.1f} % as told"
+        unexplained = f"unexplained of the torque: {shares[0]:.1f} % as configured"
         if len(wrong) == 1:
-            return f"{self._text(wrong[0])} ({told}, {shares[1]:.1f} % so)"
+            return f"{self._text(wrong[0])} ({unexplained}, {shares[1]:.1f} % so)"
         names = [
             _SHORT[reading.kind].format(
                 joint=reading.joint + 1,
@@ -327,10 +328,10 @@ class DeviceReadings:
             for reading in wrong
         ]
         texts = " or ".join(f"{name}: {so:.1f} %" for name, so in zip(names, shares[1:], strict=True))
-        return f"either {texts}; the motion doesn't say which ({told})"
+        return f"either {texts}; the motion can't distinguish them ({unexplained})"
 
     def _text(self, reading: Reading) -> str:
-        """Say what is wrong, and what to change."""
+        """Return the text of one cause: the mistake and its remedy."""
         sign, joint = list(self._settings.arm.sign), reading.joint
         drives, sensors = list(self._settings.devices.drive_node), list(self._settings.devices.sensor_node)
         drive, sensor = f"devices.drive_node[{joint}]", f"devices.sensor_node[{joint}]"
@@ -382,33 +383,33 @@ class DeviceReadings:
 
     @property
     def _hangs_deg(self) -> float:
-        """The q1 at which link 1 points down, deg, by the reading of the mounting."""
+        """The q1 at which link 1 points down, deg, in the reading of the mounting."""
         return (self._settings.mounting_deg[1] + self._turned_deg + 180.0) % 360.0 - 180.0
 
     @property
     def _freedom(self) -> int:
-        """Torques beyond the unknowns of the equation, 1 at least."""
+        """Number of torques beyond the unknowns of the equation, at least 1."""
         return max(JOINTS * self._blocks - (self._normals.shape[1] - 1), 1)
 
     def _rank(self, place: int) -> float:
-        """Return the share that a reading leaves, infinite where it is no arm's or not distinct."""
+        """Return the unexplained share of a reading; infinite if no arm has its inertia or it isn't distinct."""
         is_right = self._is_distinct(place) and is_positive_definite(self._solutions[place])
         return float(self._shares[place]) if is_right else math.inf
 
     def _is_distinct(self, place: int) -> bool:
-        """Whether a reading is another one than as told: not gravity of a small motion, or turned by little."""
+        """Whether a reading differs from the configuration: not by gravity in a small motion, nor by a small angle."""
         if not self._readings[place].is_turned:
             return True
         return self._blocks >= _MOUNTING_BLOCKS and abs(self._turned_deg) >= _TURNED_DEG
 
     @property
     def _turned_deg(self) -> float:
-        """By how much gravity is turned, deg, in the direction of +q."""
+        """Angle by which gravity is turned, deg, in the direction of +q."""
         mounted = self._solutions[-1]
         return math.degrees(math.atan2(mounted[-2:].sum(), mounted[A4 : A5 + 1].sum()))
 
     def _may_be_arms(self, places: Sequence[int]) -> list[bool]:
-        """Tell of each reading whether an arm has its inertia, or one that the motion doesn't tell from it."""
+        """Tell for each reading whether its inertia, within its error, is that of a possible arm."""
         normals = self._normals[list(places), :-1, :-1]
         size = np.sqrt(np.maximum(np.diagonal(normals, axis1=1, axis2=2), 1e-12))
         scaled = normals / (size[:, :, np.newaxis] * size[:, np.newaxis, :])
@@ -419,7 +420,7 @@ class DeviceReadings:
         return [may_be_arm(self._solutions[place], slack[row]) for row, place in enumerate(places)]
 
     def _solve(self, among: Iterable[int]) -> int:
-        """Solve for all readings; return the best of some, 0 of none."""
+        """Solve for all readings; return the index of the best of some, 0 if `among` is empty."""
         solve_readings(self._normals, self._count, max(self._blocks, 1), self._shares, self._solutions)
         return min(among, key=self._rank, default=0)
 

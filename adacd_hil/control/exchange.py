@@ -13,7 +13,7 @@ from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, ArmState, CycleRecord, Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import NOTHING_QUEUED, Frame, SilenceError, Tap
-from adacd_hil.wire.kernel_frames import TroubleKind, decode_error
+from adacd_hil.wire.error_frames import TroubleKind, decode_error
 
 QUEUES_S = 0.01
 

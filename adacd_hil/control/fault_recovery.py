@@ -1,14 +1,13 @@
-"""A fault: what the host finds itself, what the log's line of it says, and the way out of it.
+"""Faults: the host's own checks, the causes in the log, and the recovery.
 
-`SelfChecks` compare what the host wanted with what came of it: torque, motion, the devices' parameters, and what the
-first motion says of the configuration. The scheme
-knows none of it: what fails goes to it as a request for FAULT, so that a log replays to the same decision.
-`FaultReport` gives the causes, by the fault's reason, and what is wrong with the devices.
+`SelfChecks` compares commands with their effects: torque, motion, the devices' parameters, and the first motion with
+the configuration. A failed check is passed to the scheme as a request for FAULT, so that a log replays to the same
+decision. `FaultReport` lists the causes, by the fault's reason, and the devices' errors.
 
-After a latched fault, drives that go on are stopped (`StopEscalation`), and the user finds the way out. Nothing of
-before the fault survives: what waits in the socket and in the interface's transmit queue is dropped, so that no old
-command reaches a drive when the bus comes back; then the devices are booted anew, fresh feedback is awaited, and the
-drives are enabled at the present position with zero torque first.
+After a latched fault, drives that stay enabled are stopped (`StopEscalation`), and the user decides how to continue.
+Frames from before the fault are dropped from the socket and the interface's transmit queue, so that no old command
+reaches a drive when the bus returns; then the devices are booted again, fresh feedback is awaited, and the drives are
+enabled at the present position with zero torque first.
 """
 
 import math
@@ -33,21 +32,21 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import BusError, Tap
 
 TORQUE_STATUSES = 2
-"""Statuses in a row that have to show a wrong torque. One may be of the moment in which a command was late."""
+"""Statuses in a row that must show a wrong torque. A single one may be of the moment in which a command was late."""
 TORQUE_S = 0.05
-"""How long a drive's torque may differ at the least: five times the settling time of a slow current loop."""
+"""Shortest time for which a drive's torque must differ: five times the settling time of a slow current loop."""
 _RUN_AWAY = (FaultReason.LIMIT, FaultReason.FOLLOWING)
 _JUDGED = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR, SchemeState.PAYLOAD)
-"""States in which the arm follows a motion that nothing disturbs."""
+"""States in which the arm follows an undisturbed motion."""
 
 
 class SelfChecks:
-    """Judges every cycle of an enabled arm. `reason`, `line`: what failed first; NONE and empty before."""
+    """Checks every cycle of an enabled arm. `reason`, `line`: of the first failure; before, NONE and empty."""
 
     def __init__(
         self, settings: Settings, arm: Arm, parameters: ParameterWatch, q_d: Vector, first_motion: FirstMotion
     ) -> None:
-        """`q_d` (2,): the desired position, rad, as it was when the present cycle began."""
+        """`q_d` (2,): the desired position, rad, at the beginning of the present cycle."""
         self._first_motion = first_motion
         period_s = settings.bus.period_s
         self._arm, self._parameters, self._q_d = arm, parameters, q_d
@@ -56,12 +55,12 @@ class SelfChecks:
         self._torque_share = settings.arm.torque_error_share
         self._torque_cycles = max(1, round(TORQUE_S / period_s))
         self._away_cycles = 0
-        self._wrong: dict[str, tuple[int, int]] = {}  # since which cycle, how many statuses
+        self._wrong: dict[str, tuple[int, int]] = {}  # by drive: first cycle, number of statuses
         self.reason = FaultReason.NONE
         self.line = ""
 
     def judge(self, arm: ArmState, state: SchemeState) -> Request:
-        """Take in a cycle, with the scheme's state after the one before; return what is to be asked of the scheme."""
+        """Check a cycle; `state`: of the scheme after the previous one. Return the request for the scheme."""
         if not arm.is_enabled:
             return Request.NONE
         if self._parameters.difference:
@@ -75,7 +74,7 @@ class SelfChecks:
         return self._fail(FaultReason.FOLLOWING, Request.FAULT_FOLLOWING, line) if line else Request.NONE
 
     def suspicions(self, fault: FaultReason) -> list[str]:
-        """Say what may have led to a fault of an arm that has run away in its first motion; mostly nothing."""
+        """Return possible causes of a fault of an arm that ran away in its first motion; usually []."""
         line = self._first_motion.suspicion() if fault in _RUN_AWAY else ""
         return [line] if line else []
 
@@ -121,9 +120,9 @@ class SelfChecks:
 
     @staticmethod
     def _excess(drive: Drive) -> float:
-        """Return by how much, per mille, a drive's torque is beyond all that it was told of late.
+        """Return by how much, per mille, a drive's torque is outside the range of its recent commands.
 
-        A drive that says that it is at a limit of its own may have less.
+        A drive that reports a limit of its own may have less.
         """
         low, high = min(drive.recent_permille), max(drive.recent_permille)
         if drive.is_limited:
@@ -133,7 +132,7 @@ class SelfChecks:
 
 
 class FaultReport:
-    """Knows who can say why, for every reason."""
+    """Lists the causes of a fault, from the arm, its devices, the scheme and the host's own checks."""
 
     def __init__(
         self,
@@ -163,11 +162,11 @@ class FaultReport:
         }
 
     def note(self, state: SchemeState, arm: ArmState) -> None:
-        """Take in a cycle; `state`: that of the scheme after the cycle before."""
-        self._commission.note(state, arm)
+        """Take in a cycle; `state`: of the scheme after the previous one."""
+        self._commission.count_cycle(state, arm)
 
     def describe(self, fault: FaultReason) -> list[str]:
-        """Say what has led to a fault, one line each: the causes by its reason first."""
+        """Describe the causes of a fault, one line each: first those of its reason."""
         return [
             *([self._checks.line] if fault is self._checks.reason else ()),
             *self._checks.suspicions(fault),
@@ -182,7 +181,7 @@ _STATES = (SchemeState.INIT, SchemeState.COMMISSION)
 
 
 class _RestBound(NamedTuple):
-    """What every joint of an arm at rest stays below. `says`: of a joint that doesn't."""
+    """Upper bound for every joint of an arm at rest. `says`: text for a joint beyond it."""
 
     says: str
     setting: str
@@ -198,7 +197,7 @@ class _Unrest(NamedTuple):
 
 
 class CommissionReport:
-    """Why an arm does not get through INIT and COMMISSION: what kept it from being ready, and in how many cycles."""
+    """Counts the reasons why an arm stays in INIT or COMMISSION, by cycles."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         self._arm = arm
@@ -214,8 +213,8 @@ class CommissionReport:
         self._causes: Counter[str | _Unrest] = Counter()
         self._worst: dict[_Unrest, float] = {}
 
-    def note(self, state: SchemeState, arm: ArmState) -> None:
-        """Take in a cycle; `state`: that of the scheme after the cycle before."""
+    def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
+        """Take in a cycle; `state`: of the scheme after the previous one."""
         if state not in _STATES:
             return
         self._cycles += 1
@@ -231,7 +230,7 @@ class CommissionReport:
                     self._worst[cause] = max(self._worst.get(cause, 0.0), abs(float(value)))
 
     def describe(self) -> list[str]:
-        """Name the causes, the most frequent first, one line each; empty when nothing was wrong in any cycle."""
+        """Name the causes, the most frequent first, one line each; empty if every cycle was good."""
         lines = [
             f"{self._text(cause)} in {count} of {self._cycles} cycles" for cause, count in self._causes.most_common()
         ]
@@ -247,13 +246,13 @@ class CommissionReport:
 
 
 _LOOK_NS = 10_000_000
-"""How often the user is asked and the bus is read while a fault is latched."""
+"""Interval at which the user's answer and the bus are read while a fault is latched."""
 _RETRY_NS = 500_000_000
-"""How often a bus that can't be emptied yet, such as an interface that is down, is tried again."""
+"""Interval between attempts to empty a bus, for instance while its interface is down."""
 
 
 class Recovery:
-    """The way out: the user acknowledges, the bus is emptied, and everything begins again."""
+    """Recovery from a latched fault: the user acknowledges, the bus is emptied, the run starts again."""
 
     def __init__(
         self,
@@ -269,7 +268,7 @@ class Recovery:
         self._is_interrupted = is_interrupted
 
     def empty(self) -> bool:
-        """Drop what waits in the bus; False, with the reason in the log, when that isn't possible yet."""
+        """Drop all queued frames of the bus; if that isn't possible yet, log the reason and return False."""
         try:
             self._tap.recover()
         except BusError as error:
@@ -279,7 +278,7 @@ class Recovery:
         return True
 
     def await_acknowledgement(self) -> bool:
-        """Wait for the user's answer to a fault; True when the run is to begin again, on an emptied bus."""
+        """Wait for the user's answer to a fault; True: start again, on an emptied bus; False: end the run."""
         start_ns = self._clock.now_ns()
         is_announced = False
         while not self._is_interrupted():
@@ -303,7 +302,7 @@ class Recovery:
         return False
 
     def _idle(self, duration_ns: int) -> None:
-        """Let time pass; what the bus still carries goes to the log."""
+        """Wait; log the frames that the bus still carries."""
         self._clock.sleep_until_ns(self._clock.now_ns() + duration_ns)
         self._tap.held_ns = None
         try:
@@ -311,7 +310,7 @@ class Recovery:
                 if self._tap.receive(0.0) is None:
                     break
         except BusError:
-            pass  # said when it ended the run, and again when it is to be emptied
+            pass  # logged when it ended the run, and again if it can't be emptied
         self._recorder.cycle(self._clock.now_ns(), [], self._tap.take())
 
     def _say(self, level: str, line: str) -> None:
@@ -320,16 +319,15 @@ class Recovery:
 
 
 PATIENCE_CYCLES = 10
-"""Cycles in which a quick stop by command shows in a drive's status: it acts at the next SYNC, and the status comes
-with that one; eight more for lost frames."""
+"""Cycles until a quick stop by command shows in a drive's status: it acts at the next SYNC, whose status shows it;
+eight more for lost frames."""
 
 
 class StopEscalation(RateLimitedEvents):
-    """The second stage of a stop: NMT takes a drive out of Operation enabled that is still in it after FAULT.
+    """Second stage of a stop: NMT takes a drive out of Operation enabled if it is still enabled after FAULT.
 
-    The first stage is a quick stop by command. Where somebody else commands the drive, too, or where it doesn't hear,
-    that is not enough: in Pre-operational it takes no command from anybody, and by its own watchdog it faults and
-    brakes.
+    The first stage is a quick stop by command. It fails if another node commands the drive, too, or if the drive
+    doesn't receive. In Pre-operational the drive takes no commands; its own watchdog makes it fault and brake.
     """
 
     def __init__(self, arm: Arm, master: Master) -> None:
@@ -338,9 +336,9 @@ class StopEscalation(RateLimitedEvents):
         self._due = 0
 
     def step(self, cycles: int, t_ns: int, fault: FaultReason) -> None:
-        """Send NMT pre-operational where it is due; `cycles`: since FAULT. Raises BusError.
+        """Send NMT pre-operational if it is due; `cycles`: since FAULT. Raises BusError.
 
-        Without patience where somebody else is heard: who would command a drive against a quick stop.
+        After FOREIGN_FRAMES it is due at once: another node may command the drive against the quick stop.
         """
         patience = 1 if fault is FaultReason.FOREIGN_FRAMES else PATIENCE_CYCLES
         if cycles < max(self._due, patience):

@@ -1,19 +1,19 @@
-"""The first motion compared with what the host was told of the arm: signs, order and scales of its devices.
+"""Checks the first motion against the configuration: signs, order and scales of the devices.
 
-At rest a horizontal arm shows none of them. In motion, means over blocks of 20 ms show, joint by joint,
+A horizontal arm at rest shows none of them. In motion, means over blocks of 20 ms show, joint by joint,
 
-    tau_J = k tau_c + x tau_c of the other joint − l dtau_c/dt − R ddq − v dq − c sgn(dq) + offset    by least squares
+    tau_J = k tau_c + x tau_c of the other joint - l dtau_c/dt - R ddq - v dq - c sgn(dq) + offset    by least squares
 
-The sensor sits between motor and link, so k = 1 and x = 0 whoever touches the arm, whatever it carries. k = −1 is a
-sensor that counts the other way than its drive, k = 2 a count of torque or a torque constant that is worth half or
-twice what was told, and k = 0 with x = 1 at both joints are drives or sensors that are exchanged. Before the sensor lie
-l, by which drive and bus are later than usual, the rotor R, and friction v, c.
+The sensor sits between motor and link, so k = 1 and x = 0 for any touch and any payload. k = -1 is a sensor that counts
+against its drive, k = 2 a torque unit or a torque constant of half or twice the configured one, and k = 0 with x = 1 at
+both joints are exchanged drives or sensors. Before the sensor lie l, extra delay of drive and bus, the rotor R, and
+friction v, c.
 
-    position    Δq = s ∫ dq dt,  s = 1 where increments and counts of velocity are worth what was told
+    position    Δq = s ∫ dq dt,  s = 1 if the increments and the velocity unit are as configured
 
-Each joint is judged until it is known well enough to be right or wrong. What is wrong stops the arm: `line`. What is
-off by less is worth a warning, for a torque constant has a tolerance. Until the first certificate `DeviceReadings` ask
-the arm's own equation, too, on shorter blocks: it knows of joints that are exchanged or reversed as a whole.
+Each joint is judged until its ratios are known well enough. A wrong one stops the arm: `line`. A smaller error gives a
+warning, for a torque constant has a tolerance. Until the first certificate `DeviceReadings` fits the arm's own
+equation, too, on shorter blocks, which shows joints that are exchanged or reversed as a whole.
 """
 
 import math
@@ -33,61 +33,61 @@ from adacd_hil.settings.configuration import Settings
 
 BLOCK_S, SHORT_BLOCK_S = 0.02, 0.008
 _FEWEST_BLOCKS: Final = 20
-"""In motion, of a joint: twice and a half as many as the regression has unknowns."""
+"""Fewest blocks in motion, per joint: two and a half times the unknowns of the regression."""
 _JUDGED_EVERY: Final = 5
 _LONGEST_S: Final = 60.0
-"""A joint that is not known after so long with power is named, and judged no more."""
+"""After so long with power, an unknown joint is reported and no longer judged."""
 _MOVING_RAD_S: Final = 0.05
-"""Slower, friction before the sensor may hold anything."""
+"""At a lower speed, friction before the sensor may hold any torque."""
 _CORRELATED: Final = 4.0
-"""Blocks that count as one: what the regression lacks lasts longer than a block."""
+"""Number of blocks that count as one: the errors of the regression last longer than a block."""
 _DEVIATIONS: Final = 5.0
 _SURE: Final = 0.06
-"""Largest standard deviation of k by which a joint is wrong."""
+"""Largest standard deviation of k at which a joint can be judged wrong."""
 _KNOWN: Final = 0.02
-"""Largest one by which it is right, and judged no more."""
+"""Largest standard deviation of k at which a joint is accepted, and no longer judged."""
 _WARNED: Final = 0.15
-"""A k that is off by more is worth a warning: torque constants are within ±10 %."""
+"""An error of k beyond this is worth a warning: torque constants are within ±10 %."""
 _NOTHING: Final = 0.1
-"""Largest |k| of a sensor that measures nothing of its joint."""
+"""Largest |k| of a sensor that doesn't measure its joint."""
 _LEAST_WAY_RAD: Final = 0.2
-"""Way from which on a joint's position is compared with its velocity; it is known no sooner."""
+"""Shortest way over which a joint's position is compared with its velocity."""
 _UNEVEN: Final = 0.1
-"""Largest share of Σ Δq² that one scale leaves over: a position that is stuck at times leaves a half."""
+"""Largest share of Σ Δq² that one scale may leave unexplained: a position that sticks at times leaves a half."""
 _ALIGNED: Final = 0.7
-"""Correlation of torque and acceleration from which on one is along the other, or against it."""
+"""Correlation of torque and acceleration from which they count as aligned, or opposed."""
 _IN_SCALE: Final = 0.95
-"""Correlation of commanded and sensed torque from which on they differ by a scale: it is 0.995 of wrong gears, 0.76 at
-most of exchanged drives."""
+"""Correlation of commanded and sensed torque from which they differ by a scale only: 0.995 for wrong gears, 0.76 at
+most for exchanged drives."""
 _FAR: Final = 2.5
-"""Sensed over commanded torque from which on scales are the likeliest reason of an arm that runs away or lags."""
+"""Sensed over commanded torque from which wrong scales are the likeliest reason of an arm that runs away or lags."""
 _EXCHANGES: Final = ("drives", "sensors", "joints")
 _NO_CAUSE: Final = (
-    "the motion contradicts the arm as it was told, and doesn't say why: check nodes, signs and scales of the devices"
+    "the motion contradicts the configuration, for an unknown reason: check nodes, signs and scales of the devices"
 )
 _TOO_SHORT: Final = (
     "perhaps a node, sign or scale of the devices is wrong, or something pushed the arm; the motion was too short to "
-    "say which"
+    "distinguish them"
 )
 _OWN, _OTHER = 0, 1
 _COLUMNS: Final = 7
 
 
-def is_told(event: Event) -> bool:
-    """Whether the user is told of an event as it happens."""
+def is_shown(event: Event) -> bool:
+    """Tell whether the operator sees an event as it happens."""
     return event.name == GEOMETRY or (event.name == "first motion" and event.level == "warning")
 
 
 class FirstMotion:
-    """Judges an arm that moves for the first time. `line`: what contradicts the configuration, empty while nothing."""
+    """Judges the arm's first motion. `line`: the contradiction to the configuration, empty without one."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
-        """Begin; `safety.first_motion_error` = 0 judges nothing."""
+        """Start; with `safety.first_motion_error` = 0 it doesn't judge."""
         self._arm = arm
         self._settings = settings
         self._error = settings.safety.first_motion_error
         self._period_s = settings.bus.period_s
-        # A command of cycle k acts from the next SYNC on, and the sample after that shows it; pipelined one later.
+        # A command of cycle k acts from the next SYNC on, the sample after that shows it; pipelined one later.
         self._commands = np.zeros((4 if settings.bus.is_pipelined else 3, JOINTS))
         self._long, self._short = (_Blocks(span_s, self._period_s) for span_s in (BLOCK_S, SHORT_BLOCK_S))
         self._blocks = self._powered = 0  # powered: cycles
@@ -110,17 +110,17 @@ class FirstMotion:
         return bool(self._open or self._readings) and not self.line
 
     def compile(self) -> None:
-        """Compile what `note` calls."""
+        """Compile the functions that `note` calls."""
         if self._readings is not None:
             self._readings.compile()
 
     def take_events(self) -> list[Event]:
-        """Return what is worth a line since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def note(self, arm: ArmState, state: SchemeState, tau_c: Vector) -> None:
-        """Take in a cycle; `tau_c` (2,): what was commanded in it, Nm. `state`: of the scheme before it."""
+        """Take in a cycle; `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme before it."""
         if not self.is_on:
             return
         self._powered += arm.periods if state in POWERED else 0
@@ -136,35 +136,35 @@ class FirstMotion:
             self._short.break_off()
             return
         acting = commands[-1]
-        block = self._long.take(arm, acting)
+        block = self._long.add_cycle(arm, acting)
         if block is not None:
             self._take_block(block)
-        self._read(self._short.take(arm, acting), state)
+        self._read(self._short.add_cycle(arm, acting), state)
 
     def _read(self, block: "_Block | None", state: SchemeState) -> None:
-        """Ask the arm's equation until the first certificate."""
+        """Fit the arm's equation, until the first certificate."""
         readings = self._readings
         if readings is None or self.line:
             return
         if state is SchemeState.MONITOR:
             self._readings = None
         elif block is not None:
-            readings.add(block.q, block.dq, block.ddq, block.tau_J, block.dtau_J)
+            readings.add_means(block.q, block.dq, block.ddq, block.tau_J, block.dtau_J)
             ddq, tau_c, tau_J = block.ddq, block.tau_c, block.tau_J
             squares = ddq * ddq, tau_c * tau_c, tau_J * tau_J
             self._pushed += *squares, tau_c * ddq, tau_J * ddq, tau_c * block.dq, tau_c * tau_J
-            if readings.step(is_torque_known=not self._open):
+            if readings.judge_blocks(is_torque_known=not self._open):
                 self.line = readings.describe(self._left()) or _NO_CAUSE
 
     def certify(self, certificates: tuple[Certificate, ...]) -> None:
-        """Compare the first certificate of the run, if there is one, with the lengths that the host was told."""
+        """Compare the first certificate of the run, if any, with the configured lengths."""
         self.is_certified = True
         event = geometry_event(self._settings, certificates[0]) if certificates else None
         if event is not None:
             self._events.append(event)
 
     def suspicion(self) -> str:
-        """Say what may have made the arm run away, by its first motion; empty where nothing is likely."""
+        """Describe the likely causes of an arm that runs away, by its first motion; empty if nothing is likely."""
         if self._readings is None or self.line:
             return ""
         if scales := self._suspect_scales():
@@ -183,7 +183,7 @@ class FirstMotion:
         return f"perhaps {text.removeprefix('either ')}" if text else _TOO_SHORT
 
     def _left(self) -> list[Reading]:
-        """Return how the devices may be, by the arm's equation and by the commanded torques."""
+        """Return the device readings that agree with the arm's equation and with the commanded torques."""
         return [] if self._readings is None else self._readings.left(self._ratios(), self._error)
 
     def _ratios(self) -> list[TorqueRatio | None]:
@@ -193,7 +193,7 @@ class FirstMotion:
         ]
 
     def _suspect_scales(self) -> str:
-        """Name the joint whose sensor measures far more or less than is commanded, though along it."""
+        """Name the joint whose sensor measures far more or less than its command, though correlated with it."""
         _, tau_c, tau_J, _, _, _, both = self._pushed
         found = [
             (abs(math.log(ratio)), joint, ratio)
@@ -225,11 +225,11 @@ class FirstMotion:
             self._judge()
 
     def _give_up(self) -> None:
-        """Judge nothing more, and say what is not known."""
+        """Stop judging, and report the joints that are still unknown."""
         for joint in sorted(self._open):
             text = (
                 f"joint {joint + 1} is not known after {_LONGEST_S:g} s, since it moves too little, a drive is at a "
-                "limit, or cycles are missing: nothing has checked its signs, scales of position and velocity, "
+                "limit, or cycles are missing: unchecked are its signs, scales of position and velocity, "
                 f"{self._scales(joint)}"
             )
             self._events.append(Event("warning", "first motion", text))
@@ -246,7 +246,7 @@ class FirstMotion:
             common, way, travel = self._path[:, joint].tolist()
             ratio = common / way
             if travel - ratio * common > _UNEVEN * travel:
-                continue  # it has not been the same all the time: no scale
+                continue  # the ratio varied during the motion: not a scale
             if not 1.0 - self._error <= ratio <= 1.0 / (1.0 - self._error):
                 return (
                     f"joint {joint + 1}: its position moves {ratio:+.2f} times as far as its velocity says, "
@@ -259,7 +259,7 @@ class FirstMotion:
         found = self._ratios()
         first, second = found
         if first is not None and second is not None and is_of_other(first) and is_of_other(second):
-            head = "joints 1 and 2: each torque sensor measures what the drive of the other joint is commanded: "
+            head = "joints 1 and 2: each torque sensor measures the commanded torque of the other joint: "
             causes = "" if self._readings is None else self._readings.describe(self._left())
             return head + (causes or "the drives or the sensors are exchanged")
         for joint, ratio in enumerate(found):
@@ -267,7 +267,7 @@ class FirstMotion:
                 continue
             slack = _DEVIATIONS * ratio.own_std
             if ratio.own + slack < 1.0 - self._error or ratio.own - slack > 1.0 / (1.0 - self._error):
-                if abs(ratio.other) > 0.5:  # perhaps exchanged: the other joint tells
+                if abs(ratio.other) > 0.5:  # perhaps exchanged: the other joint's ratios decide
                     continue
                 return self._describe(joint, ratio)
             is_right = 1.0 - self._error <= ratio.own - slack and ratio.own + slack <= 1.0 / (1.0 - self._error)
@@ -276,7 +276,7 @@ class FirstMotion:
         return ""
 
     def _close(self, joint: int, ratio: "TorqueRatio") -> None:
-        """Judge a joint no more; it is as it was told, or almost."""
+        """Stop judging a joint that agrees with the configuration; warn if its torque ratio is off."""
         self._open.remove(joint)
         is_off = abs(ratio.own - 1.0) > _WARNED
         text = (
@@ -299,8 +299,8 @@ class FirstMotion:
         head = f"joint {joint + 1}: its torque sensor measures {ratio.own:+.2f} times the commanded torque"
         if abs(ratio.own) <= _NOTHING:
             return (
-                f"{head}, +1 expected, so nothing of it: check that the sensor of devices.sensor_node[{joint}] is at "
-                f"this joint and measures, and {self._scales(joint)}"
+                f"{head}, +1 expected, so not its joint's torque: check that the sensor of "
+                f"devices.sensor_node[{joint}] is at this joint and measures, and {self._scales(joint)}"
             )
         if ratio.own < 0.0:
             causes = "" if self._readings is None else self._readings.describe(self._left())
@@ -313,9 +313,9 @@ class FirstMotion:
 
 
 class _Block(NamedTuple):
-    """Means over a block, (2,) each, and changes over it: per second, but for `travel` of q and `way`, ∫ dq dt, rad.
+    """Means over a block, (2,) each, and changes per second over it; `travel`: change of q, `way`: ∫ dq dt, rad.
 
-    least_speed: the smaller one at its ends, negative where the joint has turned round.
+    least_speed: the smaller of the speeds at its ends, negative if the joint has reversed.
     """
 
     q: Vector
@@ -331,7 +331,7 @@ class _Block(NamedTuple):
 
 
 class _Blocks:
-    """Collects cycles in a row into blocks."""
+    """Collects consecutive cycles into blocks."""
 
     def __init__(self, span_s: float, period_s: float) -> None:
         self._period_s = period_s
@@ -340,11 +340,11 @@ class _Blocks:
         self._seen = 0
 
     def break_off(self) -> None:
-        """Begin a new block: cycles are missing."""
+        """Begin a new block, since cycles are missing."""
         self._seen = 0
 
-    def take(self, arm: ArmState, acting: Vector) -> _Block | None:
-        """Take in a cycle; return a block that it completes, which shares it with the next."""
+    def add_cycle(self, arm: ArmState, acting: Vector) -> _Block | None:
+        """Take in a cycle; return the block that it completes, if any. The cycle also begins the next block."""
         last = np.array((arm.q, arm.dq, arm.tau_J, acting))
         if self._seen == 0:
             self._sums[:], self._first = 0.0, last
@@ -362,7 +362,7 @@ class _Blocks:
 
 
 def is_of_other(ratio: TorqueRatio) -> bool:
-    """Tell whether the sensor measures the other joint's torque and not its own."""
+    """Tell whether the sensor measures the other joint's torque instead of its own."""
     is_known = max(ratio.own_std, ratio.other_std) < 2.0 * _SURE
     return is_known and abs(ratio.own) < 0.4 and abs(ratio.other) > 0.6
 
@@ -370,7 +370,7 @@ def is_of_other(ratio: TorqueRatio) -> bool:
 def ratio_of(normal: NDArray[np.float64], blocks: int) -> TorqueRatio:
     """Solve the normal equations (8, 8) of a joint that has moved in so many blocks.
 
-    A motion that doesn't tell the unknowns apart is fitted well by any of them: what the ridge took counts as unknown.
+    If the motion can't separate unknowns, the ridge shrinks them; the shrinkage is added to their standard deviation.
     """
     A, b, square = normal[:-1, :-1], normal[:-1, -1], float(normal[-1, -1])
     size = np.sqrt(np.maximum(np.diag(A), 1e-12))

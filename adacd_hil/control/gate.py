@@ -1,4 +1,4 @@
-"""The last stage before the wire: what leaves here is finite, within the arm's limits, and zero unless allowed."""
+"""The last stage before the wire: commanded torques are finite, within the arm's limits, and zero unless allowed."""
 
 import math
 from enum import IntFlag
@@ -8,7 +8,7 @@ from adacd_hil.settings.arm_settings import ArmSettings
 
 
 class GateFlag(IntFlag):
-    """What the gate changed in one cycle."""
+    """Changes that the gate made to the torque in one cycle."""
 
     NONE = 0
     TORQUE = 1  # clipped to torque_limit_Nm
@@ -19,14 +19,14 @@ class GateFlag(IntFlag):
 
 
 KEPT_CYCLES = 5
-"""How long old feedback may keep a torque up: as long as the model may be blind. What is commanded by older feedback
-belongs to no motion that anybody knows."""
+"""Age of the feedback, in cycles, up to which the torque is kept: as long as the model may be blind. A command from
+older feedback doesn't fit the present motion."""
 FADING = 0.8
-"""The part of it that is left in each further cycle: 1 % after 20."""
+"""Factor on the torque in each further cycle: 1 % is left after 20."""
 
 
 class Gate:
-    """Limits the torques of both joints. Knows what it let through last, for the rate."""
+    """Limits the torques of both joints. Keeps the last commanded torque, for the rate limit."""
 
     def __init__(self, settings: ArmSettings, period_s: float) -> None:
         self._limit_Nm = settings.torque_limit_Nm
@@ -34,10 +34,10 @@ class Gate:
         self._last_Nm = [0.0] * JOINTS
 
     def limit(self, tau_d: Vector, is_open: bool, tau_c: Vector, age: int = 0) -> GateFlag:
-        """Fill `tau_c` (2,) with what may be commanded for `tau_d` (2,), Nm, and say what was changed.
+        """Fill `tau_c` (2,) with the commanded torque for `tau_d` (2,), Nm; return the changes that were made.
 
-        Torque goes to zero at once when the gate closes, and rises from zero at the limited rate when it opens. `age`:
-        of the feedback in cycles; beyond 1 the torque doesn't grow, beyond `KEPT_CYCLES` it fades.
+        Torque drops to zero at once when the gate closes, and rises from zero at the limited rate when it opens. `age`:
+        of the feedback in cycles; beyond 1 the torque can't grow, beyond `KEPT_CYCLES` it fades.
         """
         desired = tau_d.tolist()
         if not all(map(math.isfinite, desired)):

@@ -1,15 +1,14 @@
-"""What a first certificate says of the lengths that the host was told, and what nothing says.
+"""Compares a first certificate with the configured link lengths; names lengths that can't be checked.
 
-Torques at the joints depend on a length through the inertia alone, whatever the length is called:
+Torques at the joints depend on a length through the inertia alone:
+    a2 = m2 c2 l1,   a1 - a3 = I1 + m1 c1² + m2 l1²,   a3 = I2 + m2 c2²        c: centre of mass, from the link's joint
 
-    a2 = m2 c2 l1,   a1 − a3 = I1 + m1 c1² + m2 l1²,   a3 = I2 + m2 c2²        c: centre of mass, from the link's joint
+so a link that is s times as long as configured, its masses in their places, has
 
-so a link that is s times as long as told, its masses in their places, has
+    link 1:  a2 → s a2,  a1 - a3 → s² (a1 - a3),  a3 unchanged     link 2:  a2 → s a2,  a3 → s² a3,  a1 - a3 unchanged
 
-    link 1:  a2 → s a2,  a1 − a3 → s² (a1 − a3),  a3 as told        link 2:  a2 → s a2,  a3 → s² a3,  a1 − a3 as told
-
-of `arm.cad_theta`. Where gravity acts, a5 = m2 c2 g', and l1 = g' a2 / a5; g' = g sin(tilt) acts in the plane of
-motion, and a tilt that is smaller than told makes l1 longer. An a5 below 0 is gravity in the other direction.
+relative to `arm.cad_theta`. With gravity a5 = m2 c2 g', and l1 = g' a2 / a5; g' = g sin(tilt) acts in the plane of the
+of motion, and a tilt smaller than configured makes l1 longer. An a5 below 0 is gravity in the other direction.
 """
 
 from typing import Final
@@ -23,16 +22,16 @@ from adacd_hil.settings.configuration import Settings
 
 EVENT: Final = "geometry"
 _ALIKE: Final = 0.08
-"""Share by which two figures may differ that agree; a CAD model is off by as much."""
+"""Largest relative difference of two equal figures; the error of a CAD model."""
 _LONGER: Final = 0.12
-"""Share by which a length has to be off to be told."""
+"""Smallest relative error of a length that is reported."""
 
 _SEEN: Final = 0.1
-"""Share of the expected a5 from which on its sign is no error of an arm that gravity hardly turns."""
+"""Share of the expected a5 from which its sign counts: gravity hardly acts on an arm with less."""
 
 
 def geometry_event(settings: Settings, certificate: Certificate) -> Event | None:
-    """Compare the lengths with a certificate of the arm without a payload; None where they agree."""
+    """Compare the configured lengths with a certificate of the arm without payload; None if they agree."""
     theta, lengths = certificate.parameters, settings.arm.link_length_m
     cad, is_upright = settings.arm.cad_theta, len(theta) > A5
     has_masses = any(cad[: A3 + 1])
@@ -44,10 +43,7 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
     if event is not None or has_masses:
         return event
     unchecked = f"arm.link_length_m[1] = {lengths[1]:g} m" if is_upright else f"arm.link_length_m = {list(lengths)} m"
-    text = (
-        f"assumed: {unchecked}, which nothing checks, since torques don't tell a length; "
-        "places and forces of contacts are wrong by as much as it is"
-    )
+    text = f"assumed: {unchecked}, which torques alone can't check; its error shifts places and forces of contacts"
     return Event("info", EVENT, text)
 
 
@@ -62,22 +58,22 @@ def _by_direction(settings: Settings, theta: tuple[float, ...]) -> Event | None:
 
 
 def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
-    told_m, told_tilt_deg = settings.arm.link_length_m[0], settings.mounting_deg[0]
+    configured_m, configured_tilt_deg = settings.arm.link_length_m[0], settings.mounting_deg[0]
     if theta[A2] == 0.0 or theta[A5] == 0.0:
         return None
     gravity_m_s2 = GRAVITY_M_S2 * np.sin(settings.tilt_rad)
     found_m = gravity_m_s2 * abs(theta[A2] / theta[A5])
-    if 1.0 / (1.0 + _LONGER) <= found_m / told_m <= 1.0 + _LONGER:
+    if 1.0 / (1.0 + _LONGER) <= found_m / configured_m <= 1.0 + _LONGER:
         return None
-    told = f"arm.link_length_m[0] = {told_m:g} m"
-    if found_m > told_m:  # a smaller tilt looks like it
-        tilt_deg = np.degrees(np.arcsin(np.sin(settings.tilt_rad) * told_m / found_m))
+    setting = f"arm.link_length_m[0] = {configured_m:g} m"
+    if found_m > configured_m:  # a smaller tilt has the same effect
+        tilt_deg = np.degrees(np.arcsin(np.sin(settings.tilt_rad) * configured_m / found_m))
         text = (
-            f"{told} is right if the arm moves at {tilt_deg:.0f} deg to the level (arm.mounting_deg[0]); at "
-            f"{told_tilt_deg:g} deg link 1 is"
+            f"{setting} is right if the arm moves at {tilt_deg:.0f} deg to the level (arm.mounting_deg[0]); at "
+            f"{configured_tilt_deg:g} deg link 1 is"
         )
         return Event("info", EVENT, f"{text} {found_m:.3f} m long by inertia over gravity")
-    text = f"link 1 is {found_m:.3f} m long by inertia over gravity, or shorter; {told}: measure it"
+    text = f"link 1 is {found_m:.3f} m long by inertia over gravity, or shorter; {setting}: measure it"
     return Event("warning", EVENT, f"{text}; places and forces of contacts are wrong by as much")
 
 
@@ -98,8 +94,8 @@ def _by_cad(theta: tuple[float, ...], cad: tuple[float, ...], lengths: tuple[flo
     return None
 
 
-def _ratio(found: float, told: float) -> float:
-    return found / told if told else 0.0
+def _ratio(found: float, expected: float) -> float:
+    return found / expected if expected else 0.0
 
 
 def _is_alike(found: float, expected: float) -> bool:

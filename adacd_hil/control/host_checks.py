@@ -1,7 +1,7 @@
 """Doctor's diagnosis, and its checks of the host: kernel, CAN interface, permissions, scheduler.
 
-A diagnosis is named checks, each with a reason and a remedy, run in the order of a table. A check whose prerequisite
-failed is skipped and says so; nothing later is then tried on a bus that isn't right.
+A diagnosis is a table of named checks, run in order, each with a reason and a remedy. A check is skipped if a check
+that it needs has failed, so that a bad bus is not used further.
 """
 
 import errno
@@ -19,7 +19,7 @@ from adacd_hil.wire.can_interface import CANFD_MTU, InterfaceState, can_interfac
 
 
 class Status(Enum):
-    """How a check came out."""
+    """Outcome of a check."""
 
     OK = "ok"
     WARNING = "warning"
@@ -28,7 +28,7 @@ class Status(Enum):
 
 
 class CheckOutcome(NamedTuple):
-    """What a check found. `remedy`: what to do about it; "" when there is nothing to do."""
+    """Outcome of a check with its reason. `remedy`: the user's next step; "" if none is needed."""
 
     status: Status
     reason: str
@@ -48,7 +48,7 @@ Examination = TypeVar("Examination")
 
 
 class Check(NamedTuple, Generic[Examination]):
-    """One line of the table. `needs`: names of checks before it that must not have failed."""
+    """One line of the table. `needs`: names of earlier checks that must not have failed."""
 
     name: str
     run: Callable[[Examination], CheckOutcome]
@@ -56,22 +56,22 @@ class Check(NamedTuple, Generic[Examination]):
 
 
 def ok(reason: str) -> CheckOutcome:
-    """Say that there is nothing to do."""
+    """Return the outcome of a passed check."""
     return CheckOutcome(Status.OK, reason)
 
 
 def warning(reason: str, remedy: str) -> CheckOutcome:
-    """Say that the arm can run, with less margin than it should have."""
+    """Return the outcome for an arm that can run with reduced margin."""
     return CheckOutcome(Status.WARNING, reason, remedy)
 
 
 def failed(reason: str, remedy: str) -> CheckOutcome:
-    """Say that the arm must not or can't run."""
+    """Return the outcome for an arm that must not or can't run."""
     return CheckOutcome(Status.FAILED, reason, remedy)
 
 
 def skipped(reason: str) -> CheckOutcome:
-    """Say that it can't be told here."""
+    """Return the outcome of a check that isn't possible here."""
     return CheckOutcome(Status.SKIPPED, reason)
 
 
@@ -81,12 +81,12 @@ def diagnose(
     report: Callable[[Finding], None],
     earlier: Sequence[Finding] = (),
 ) -> list[Finding]:
-    """Run the checks in order, reporting each as it is done. What the bus or a device raises fails the check.
+    """Run the checks in order, reporting each one. An error of the bus or a device fails the check.
 
     `earlier`: findings of another table that these checks may need.
     """
     findings: list[Finding] = []
-    # check → the failed one behind it
+    # failed or skipped check → the failed check that caused it
     blocked = {finding.name: finding.name for finding in earlier if finding.status is Status.FAILED}
     for check in checks:
         cause = next((blocked[name] for name in check.needs if name in blocked), None)
@@ -107,7 +107,7 @@ def _run(check: Check[Examination], examination: Examination) -> CheckOutcome:
     try:
         return check.run(examination)
     except DeviceError as error:
-        return failed(str(error), error.remedy or "see the device's manual; `adacd-hil scan` lists who is there")
+        return failed(str(error), error.remedy or "see the device's manual; `adacd-hil scan` lists the nodes")
     except BusError as error:
         return failed(str(error), "check wiring, termination and bit rate")
 
@@ -119,19 +119,19 @@ def summarise(findings: Sequence[Finding]) -> str:
 
 
 QUEUE_FRAMES = 10
-"""txqueuelen to have: the kernel's default, three cycles' worth of a cycle's three frames."""
+"""Recommended txqueuelen: the kernel's default, three cycles' worth of a cycle's three frames."""
 LONG_QUEUE_FRAMES = 100
-"""From here on a dead bus keeps over 30 cycles of old commands for when it comes back."""
+"""A queue this long keeps over 30 cycles of old commands on a dead bus, which are sent when it returns."""
 _SAMPLE_POINT = (0.70, 0.90)
-"""CiA 301 table 1 recommends 87.5 %; 70 to 90 % works with it on the short bus of an arm."""
+"""CiA 301 table 1 recommends 87.5 %; 70 to 90 % is compatible with it on the short bus of an arm."""
 _CAP_NET_ADMIN = 12
 _RT_SHARE = 0.9
-"""The kernel's default is 0.95; waiting for feedback aside, a cycle works for less than half of its period."""
+"""The kernel's default is 0.95; apart from waiting for feedback, a cycle works for less than half of its period."""
 
 
 @dataclass(frozen=True)
 class Host:
-    """What is examined. `link`: None when there is no such CAN interface. `root`: where /proc and /sys are.
+    """The host to examine. `link`: None if there is no such CAN interface. `root`: folder with /proc and /sys.
 
     `cpu`: the setting `realtime.cpu`.
     """
@@ -152,7 +152,7 @@ class Host:
 
 
 def check_kernel(host: Host) -> CheckOutcome:
-    """Check that SocketCAN is there and lets us in."""
+    """Check that the kernel has SocketCAN and gives us raw sockets."""
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} does not use the kernel's CAN")
     return look_for_socketcan()
@@ -187,7 +187,7 @@ def check_interface(host: Host) -> CheckOutcome:
 
 
 def _with_hardware(check: Callable[[Host, InterfaceState], CheckOutcome]) -> Callable[[Host], CheckOutcome]:
-    """Skip a check that says nothing of a virtual bus."""
+    """Skip a check that is meaningless on a virtual bus."""
 
     def run(host: Host) -> CheckOutcome:
         if host.link is None:
@@ -202,7 +202,7 @@ def _with_hardware(check: Callable[[Host, InterfaceState], CheckOutcome]) -> Cal
 def check_bitrate(host: Host, link: InterfaceState) -> CheckOutcome:
     """Check that the bit rates are the contract's."""
     if link.bitrate is None:
-        return skipped("the kernel does not tell it here; install iproute2")
+        return skipped("the kernel does not report it here; install iproute2")
     remedy = f"ip link set {link.name} down; ip link set {link.name} up type can bitrate {host.bitrate}"
     if host.data_bitrate:
         remedy += f" dbitrate {host.data_bitrate} fd on"
@@ -214,9 +214,9 @@ def check_bitrate(host: Host, link: InterfaceState) -> CheckOutcome:
 
 
 def check_sample_point(_host: Host, link: InterfaceState) -> CheckOutcome:
-    """Check that the sample point suits the devices'."""
+    """Check that the sample point is compatible with the devices'."""
     if link.sample_point is None:
-        return skipped("the kernel does not tell it here; install iproute2")
+        return skipped("the kernel does not report it here; install iproute2")
     text = f"{100.0 * link.sample_point:.1f} %"
     low, high = _SAMPLE_POINT
     if not low <= link.sample_point <= high:
@@ -225,9 +225,9 @@ def check_sample_point(_host: Host, link: InterfaceState) -> CheckOutcome:
 
 
 def check_restart(_host: Host, link: InterfaceState) -> CheckOutcome:
-    """Check what happens after bus-off."""
+    """Check the automatic restart after bus-off."""
     if link.restart_ms is None:
-        return skipped("the kernel does not tell it here; install iproute2")
+        return skipped("the kernel does not report it here; install iproute2")
     if link.restart_ms == 0:
         return warning(
             "off: after bus-off the interface stays silent",
@@ -239,7 +239,7 @@ def check_restart(_host: Host, link: InterfaceState) -> CheckOutcome:
 def check_controller(_host: Host, link: InterfaceState) -> CheckOutcome:
     """Check that the controller takes part in the bus."""
     if link.state is None:
-        return skipped("the kernel does not tell it here; install iproute2")
+        return skipped("the kernel does not report it here; install iproute2")
     counters = f"{link.state}, error counters rx {link.rx_errors or 0}, tx {link.tx_errors or 0}"
     if link.state == "BUS-OFF":
         return failed(counters, f"find the cause, then `ip link set {link.name} type can restart`")
@@ -249,7 +249,7 @@ def check_controller(_host: Host, link: InterfaceState) -> CheckOutcome:
 
 
 def check_queue(host: Host) -> CheckOutcome:
-    """Check that the transmit queue holds no more than what is worth sending."""
+    """Check that the transmit queue is short enough not to hold outdated commands."""
     if host.link is None:
         return skipped("no SocketCAN interface")
     length, name = host.link.txqueuelen, host.link.name
@@ -264,7 +264,7 @@ def check_queue(host: Host) -> CheckOutcome:
 
 
 def check_mtu(host: Host) -> CheckOutcome:
-    """Check that CAN FD frames fit, where the contract has some."""
+    """Check that CAN FD frames fit, if the contract has some."""
     if host.link is None:
         return skipped("no SocketCAN interface")
     if not host.data_bitrate:
@@ -282,7 +282,7 @@ def check_permissions(host: Host) -> CheckOutcome:
         status = (host.root / "proc/self/status").read_text()
         effective = int(next(line for line in status.splitlines() if line.startswith("CapEff:")).split()[1], 16)
     except (OSError, StopIteration, ValueError):
-        return skipped("/proc does not tell")
+        return skipped("/proc does not report it")
     if not effective >> _CAP_NET_ADMIN & 1:
         return warning(
             "without CAP_NET_ADMIN: the interface's queue can't be emptied after a fault",
@@ -301,13 +301,13 @@ def check_scheduler(host: Host) -> CheckOutcome:
 
 
 def check_throttling(host: Host) -> CheckOutcome:
-    """Check that the kernel doesn't stop a real-time process that has worked for a while."""
+    """Check that the kernel doesn't throttle a real-time process."""
     folder = host.root / "proc/sys/kernel"
     try:
         runtime_us = int(_read(folder / "sched_rt_runtime_us"))
         period_us = int(_read(folder / "sched_rt_period_us"))
     except ValueError:
-        return skipped("/proc does not tell")
+        return skipped("/proc does not report it")
     if runtime_us < 0:
         return ok("off: a real-time process that never sleeps keeps its processor")
     share = runtime_us / period_us
@@ -339,7 +339,7 @@ def check_processor(host: Host) -> CheckOutcome:
 
 
 def check_isolation(host: Host) -> CheckOutcome:
-    """Check that the processor the cycle runs on is its own."""
+    """Check that the processor of the cycle is isolated."""
     isolated = isolated_cpus(host.root / "sys/devices/system/cpu")
     names = ", ".join(map(str, isolated)) or "none"
     isolate = "isolcpus={0} nohz_full={0} rcu_nocbs={0} on the kernel's command line, and no interrupts there"

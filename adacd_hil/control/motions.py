@@ -36,7 +36,7 @@ PEAK_ACCELERATION_FACTOR = 10.0 / math.sqrt(3.0)
 
 
 class QuinticMove:
-    """A straight move in joint space from rest to rest, all joints at once: the slowest one says how long it takes.
+    """A straight move in joint space from rest to rest, all joints together; the slowest joint sets the duration.
 
     Speed and acceleration stay within their limits, and each position stays between start and end.
     """
@@ -44,7 +44,7 @@ class QuinticMove:
     def __init__(
         self, start: Vector, end: Vector, speed_rad_s: Vector, acceleration_rad_s2: Vector, shortest_s: float
     ) -> None:
-        """Plan. start, end (2,); limits (2,); shortest_s: least duration, s."""
+        """Plan the move. start, end (2,); limits (2,); shortest_s: least duration, s."""
         self._start, self._end, self._travel = start.copy(), end.copy(), end - start
         distance = np.abs(self._travel)
         by_speed_s = PEAK_SPEED_FACTOR * distance / speed_rad_s
@@ -52,7 +52,7 @@ class QuinticMove:
         self.duration_s = max(shortest_s, float(by_speed_s.max()), float(by_acceleration_s.max()))
 
     def evaluate(self, elapsed_s: float, q: Vector, dq: Vector, ddq: Vector) -> None:
-        """Fill the motion (2,) at this time since the start; the end from the end on."""
+        """Fill the motion (2,) at this time since the start; after the end, the end position at rest."""
         if elapsed_s >= self.duration_s:
             q[:], dq[:], ddq[:] = self._end, 0.0, 0.0
             return
@@ -63,11 +63,11 @@ class QuinticMove:
 
 
 CHANGE_S = 0.15
-"""Shortest change of pace. From 100 °/s to rest it takes 0.2 s, for 700 °/s² leave no more."""
+"""Shortest change of pace. From 100 °/s to rest it takes 0.2 s, since 700 °/s² allow no faster one."""
 
 
 class Pace:
-    """The share of its planned speed with which the arm moves along a path.
+    """Speed along a path, as a share of the planned speed.
 
     A change of the share takes CHANGE_S, and longer where the path leaves less acceleration for it. Of each joint,
 
@@ -82,11 +82,11 @@ class Pace:
         self.restart()
 
     def restart(self) -> None:
-        """Begin a new path at full speed."""
+        """Restart at full speed, for a new path."""
         self.share, self.change = 1.0, 0.0
-        """Share now, and by how much it changes, 1/s."""
+        """Present share, and its rate of change, 1/s."""
         self.lag_s = 0.0
-        """How far the arm is behind the plan, s."""
+        """Delay of the arm behind the plan, s."""
         self._from = self._to = self._phase = 1.0
 
     @property
@@ -95,7 +95,7 @@ class Pace:
         return self.share == 1.0 and self.change == 0.0
 
     def step(self, wanted: float, dq: Vector, ddq: Vector) -> None:
-        """Take the share one period closer to the wanted one. dq, ddq (2,): of the path as planned, at this place."""
+        """Move the share one period closer to the wanted one. dq, ddq (2,): of the planned path at this place."""
         if wanted != self._to:
             self._from, self._to, self._phase = self.share, wanted, 0.0
         before = self.share
@@ -107,7 +107,7 @@ class Pace:
         self.lag_s += (1.0 - self.share) * self._period_s
 
     def _phase_step(self, dq: Vector, ddq: Vector) -> float:
-        """Return by how much of the change one period may take the share on."""
+        """Return how far one period may advance the change, as a part of it."""
         step, x = self._period_s / CHANGE_S, self._phase
         steepest = min(max(x, 0.5), x + step)  # where d(share)/dx is largest in this period
         slope = abs(self._to - self._from) * 6.0 * steepest * (1.0 - steepest)
@@ -121,10 +121,10 @@ class Pace:
 
 
 class Excitation:
-    """The motion by which the certified scheme learns the arm: a short Fourier series per joint.
+    """The motion by which the certified scheme identifies the arm: a short Fourier series per joint.
 
-    It begins and ends at rest in the trajectory's start corner and moves both joints at once and both ways, so that no
-    combination of parameters stays hidden (`analysis.excitation_search` finds the coefficients).
+    It begins and ends at rest in the trajectory's start corner and moves both joints at once and both ways, so that
+    every combination of parameters shows in the torques (`lab.tune.excitation_search` finds the coefficients).
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -146,7 +146,7 @@ class Excitation:
         return q, dq, ddq
 
     def evaluate(self, elapsed_s: float, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Fill the desired motion (2,) at this time since its start; it goes on and on."""
+        """Fill the desired motion (2,) at this time since its start; it repeats forever."""
         cosine, sine = np.cos(self._rad_s * elapsed_s), np.sin(self._rad_s * elapsed_s)
         q_d[:] = self._corner + self._cosine @ (cosine - 1.0) + self._sine @ sine
         dq_d[:] = self._sine @ (self._rad_s * cosine) - self._cosine @ (self._rad_s * sine)
@@ -154,12 +154,12 @@ class Excitation:
 
 
 class Admittance:
-    """A desired motion that is that of a virtual mass with a damper under the external torque, joint by joint.
+    """Desired motion of a virtual mass with a damper under the external torque, joint by joint.
 
         mass ddq_d = tau_ext_hat (beyond its dead band) - drag dq_d
 
-    It begins with the motion of that moment, which the damper brakes. Acceleration, speed and position have bounds;
-    speed toward a position limit is no larger than what can be braked before it. `step` carries the motion on in place.
+    It begins with the present motion, which the damper brakes. Acceleration, speed and position are limited; the speed
+    toward a position limit is such that the joint can brake before it. `step` advances the motion in place.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -172,7 +172,7 @@ class Admittance:
         self._bound = (settings.arm.position_limit_rad - np.radians(wish.position_margin_deg)).tolist()
 
     def step(self, tau_ext_hat: Vector, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Take the desired motion (2,) each one period further."""
+        """Advance the desired motion (2,) each by one period."""
         for i in range(JOINTS):
             speed, tau = float(dq_d[i]), float(tau_ext_hat[i])
             push = math.copysign(max(abs(tau) - self._deadband[i], 0.0), tau)
@@ -180,7 +180,7 @@ class Admittance:
             wanted = speed + self._period_s * (push - self._drag[i] * speed) / self._mass[i]
             limit = self._speed_limit[i]
             room = self._bound[i] - math.copysign(float(q_d[i]), wanted * float(q_d[i]))
-            room -= (abs(speed) + step) * self._period_s  # what this period may still take of it
+            room -= (abs(speed) + step) * self._period_s  # the most that this period may use of it
             limit = min(limit, math.sqrt(2.0 * self._acceleration_limit[i] * max(room, 0.0)))
             new = min(max(min(max(wanted, -limit), limit), speed - step), speed + step)
             q_d[i] += 0.5 * (speed + new) * self._period_s
@@ -189,11 +189,11 @@ class Admittance:
 
 
 _TOLERANCE = 1e-3
-"""Part by which an excitation may be over a limit: the search for it ends a little outside."""
+"""Relative excess over a limit that an excitation may have: the search for it ends a little outside."""
 
 
 def motion_problems(settings: Settings) -> list[str]:
-    """Say of trajectory and excitation which limit of the arm they leave, a line each; empty if none."""
+    """List the arm's limits that trajectory and excitation exceed, a line each; empty if none."""
     arm, trajectory = settings.arm, settings.trajectory
     travel = 2.0 * np.array(trajectory.amplitude_deg)
     half_period_s = np.array(trajectory.half_period_s)

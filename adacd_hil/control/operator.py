@@ -1,6 +1,6 @@
-"""The user of a running arm: a script, the console, or both; and the lines in which a run tells a person what it does.
+"""The user of a running arm, by script or on the console, and the progress lines of a run for the user.
 
-A request is what the scheme is asked in one cycle. The lines stand beside the names of states that the log has.
+A request goes to the scheme in one cycle. The progress lines also show the states' names as in the log.
 """
 
 import contextlib
@@ -26,27 +26,27 @@ CONSOLE_WORDS = {
 
 
 class FaultAnswer(Enum):
-    """What the user says to a fault."""
+    """The user's answer to a fault."""
 
     WAIT = "nothing yet"
     RECOVER = "the cause is gone, begin again"
-    END = "end the run, or nobody is there to ask"
+    END = "end the run, or no user is there"
 
 
 class Operator(Protocol):
-    """Somebody who may ask something of the arm in each cycle."""
+    """A source of requests to the arm, one per cycle at most."""
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
         """Return this cycle's request. `elapsed_s`: since the drives were enabled, None before."""
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Say how a faulted run goes on; asked again until the answer is not WAIT. `elapsed_s`: since the fault."""
+        """Return how a faulted run continues; called again while the answer is WAIT. `elapsed_s`: since the fault."""
 
 
 class ScriptedOperator:
     """Plays the user by the clock: requests at given times, acknowledgement a given time after each stop.
 
-    A faulted arm is asked nothing: what falls due then is asked once it has been enabled again.
+    Requests that are due during a fault are made once the arm is enabled again.
     """
 
     def __init__(self, settings: OperatorSettings) -> None:
@@ -57,7 +57,7 @@ class ScriptedOperator:
         self._acknowledge_fault_after_s = settings.acknowledge_fault_after_s
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Acknowledge as many faults as the settings say, each after its time."""
+        """Acknowledge as many faults as the settings allow, each after its time."""
         if self._faults_left == 0:
             return FaultAnswer.END
         if elapsed_s < self._acknowledge_fault_after_s:
@@ -66,7 +66,7 @@ class ScriptedOperator:
         return FaultAnswer.RECOVER
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return what the script asks at this time."""
+        """Return the script's request at this time."""
         if elapsed_s is None or state is SchemeState.FAULT:
             return Request.NONE
         if self._script and elapsed_s >= self._script[0].at_s:
@@ -86,7 +86,7 @@ class ScriptedOperator:
 
 
 class ConsoleOperator:
-    """Takes words from a terminal, a line each, on a thread of its own, and passes on what a script asks."""
+    """Reads commands from a terminal, one per line, in a thread of its own; also returns the script's requests."""
 
     def __init__(self, script: ScriptedOperator, stream: TextIO = sys.stdin) -> None:
         self._script = script
@@ -101,21 +101,21 @@ class ConsoleOperator:
 
     def _listen(self) -> None:
         if isinstance(self._stream, io.TextIOWrapper):
-            self._stream.reconfigure(errors="replace")  # a key that is no letter is no word, and not the end
-        with contextlib.suppress(OSError):  # the terminal has hung up, or has others in its foreground
+            self._stream.reconfigure(errors="replace")  # an invalid character must not end the thread
+        with contextlib.suppress(OSError):  # the terminal has hung up, or this process is in its background
             for line in self._stream:
                 request = CONSOLE_WORDS.get(line.strip().lower())
                 if request is not None:
                     self._asked.append(request)
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return what the user asked first, else what the script asks; of a faulted arm, leave it to `answer_fault`."""
+        """Return the user's next request, else the script's; none during a fault, see `answer_fault`."""
         if self._asked and state is not SchemeState.FAULT:
             return self._asked.popleft()
         return self._script.request(elapsed_s, state)
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Wait for `ack` or `finish` while somebody may still type; what was asked for otherwise is forgotten."""
+        """Return the answer if the user has typed `ack` or `finish`; without a user the script's answer."""
         while self._asked:
             request = self._asked.popleft()
             if request is Request.ACKNOWLEDGE:
@@ -131,7 +131,7 @@ _STATES = {
     SchemeState.ADAPT: "learns the arm's model on the move: keep off",
     SchemeState.CERTIFY: "tests the model on motion it has not seen",
     SchemeState.MONITOR: "watches for touches",
-    SchemeState.STOPPED: "stands still, until somebody acknowledges",
+    SchemeState.STOPPED: "stopped, until you acknowledge",
     SchemeState.PAYLOAD: "parks, so that the payload can be changed",
     SchemeState.FAULT: "fault: the drives are disabled",
 }
@@ -144,13 +144,13 @@ _REACTIONS = {
     Reaction.SLOW_DOWN: "slows down",
 }
 _LATEST_MS = 1000.0
-"""A touch that began longer before than this is not the one that was found."""
+"""A touch that began longer ago than this is not taken for the one that was detected."""
 
 
 class RunNarration:
-    """Tells states and touches by the time since the drives were enabled, as the report does.
+    """Prints states and contacts with the time since the drives were enabled, as the report does.
 
-    touched_ns: since when something touches the arm, on the clock of the cycles, where somebody knows; else None.
+    touched_ns: returns the time since which the arm is touched, on the clock of the cycles, or None if unknown.
     """
 
     def __init__(self, progress: Callable[[str], None], touched_ns: Callable[[], int | None]) -> None:
@@ -158,12 +158,12 @@ class RunNarration:
         self._enabled_ns: int | None = None
 
     def event(self, t_ns: int, text: str) -> None:
-        """Tell what has happened in a cycle."""
+        """Print an event of a cycle."""
         since = "" if self._enabled_ns is None else f"{(t_ns - self._enabled_ns) * 1e-9:.2f} s"
         self._progress(f"{since:>9}  {text}")
 
     def transition(self, t_ns: int, output: SchemeOutput, logged: str) -> None:
-        """Tell a change of the state. logged: the log's line of it, with the names of both and what is against it."""
+        """Print a change of state. logged: its line in the log, with both states' names and the details."""
         names, _, details = logged.partition(": ")
         if output.state is SchemeState.ADAPT and self._enabled_ns is None:
             self._enabled_ns = t_ns
@@ -190,7 +190,7 @@ class RunNarration:
         return f"{what}{found}: {_REACTIONS[contact.reaction]}"
 
     def contact(self, t_ns: int, contact: ContactReport) -> None:
-        """Tell on which link a contact was, once that is final: the first alarm may be of the other joint."""
+        """Print the link of a contact once it is final: the first alarm may be of the other joint."""
         if contact.is_final:
             first, second = contact.tau_ext_peak
             peak = f"{first:+.1f} / {second:+.1f} Nm at the joints"

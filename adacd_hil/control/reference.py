@@ -1,15 +1,15 @@
-"""Where the arm should be: the desired motion in each state of the scheme.
+"""The desired motion in each state of the scheme.
 
-MONITOR follows the trajectory, ADAPT and CERTIFY the excitation where there is one, else the trajectory too. REACT does
-what the reaction says. STOPPED keeps to it, or holds. PAYLOAD and the end of a run park the arm in the trajectory's
-start corner. Elsewhere the desired motion is the measured place. A run that ends while the arm reacts or is stopped
-does not move it: it ends there, or is parked when the stop has been acknowledged.
+MONITOR follows the trajectory, ADAPT and CERTIFY the excitation if there is one, else the trajectory. REACT carries out
+the reaction. STOPPED continues it, or holds the position. PAYLOAD and the end of a run park the arm in the trajectory's
+start corner. In other states the desired position is the measured one. If a run ends while the arm reacts or is
+stopped, the arm doesn't move: the run ends there, or the arm is parked once the stop has been acknowledged.
 
 **Limits.** The desired motion stays within the arm's position and velocity limits and the reaction's acceleration limit
 by construction. Trajectory and excitation are checked before the run. On the way to the corner the arm first comes to
-rest on the path that it is on (`Pace`), then goes straight (`QuinticMove`). Where there is no path, as after a
-reaction, it brakes with the acceleration limit. If it is too fast to stop before a position limit, it brakes all the
-same, and an event says so.
+rest on its present path (`Pace`), then goes straight (`QuinticMove`). Without a path, as after a reaction, it brakes
+with the acceleration limit. If it is too fast to stop before a position limit, it brakes with the same limit, and an
+event reports it.
 
 Shapes: positions, velocities, accelerations (2,). Units: rad, s, Nm.
 """
@@ -27,26 +27,26 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 
 SHORTEST_APPROACH_S = 0.6
-"""Shortest way to the corner."""
+"""Shortest duration of the way to the corner."""
 PARK_SETTLE_S = 0.3
 """How long a parked arm settles before its drives are disabled: three periods of joint 2's swing with 1 kg, 0.1 s."""
 AT_CORNER_RAD = 1e-3
-"""Nearer than this the trajectory starts at once: a fifth of a degree, ten encoder steps of the noise."""
+"""Distance below which the arm counts as in the corner: a fifth of a degree, ten times the encoder noise."""
 THROWN_S = 0.15
-"""How long after a contact a blow may move the arm off its way: 5 times a blow against a chest."""
+"""Time after a contact in which a blow may push the arm off its path: 5 times a blow against a chest."""
 THROWN_rad_s = 0.2
-"""Faster than planned by this, away from what pushes, an arm has been thrown."""
+"""Excess over the planned speed, away from the contact, from which the arm counts as thrown."""
 
 OLD_CYCLES = 1
-"""Age of the feedback up to which the desired motion goes on."""
+"""Age of the feedback, in cycles, up to which the desired motion continues."""
 LOST_CYCLES = 5
-"""After so many cycles of waiting the arm is no longer where it was: the motion begins anew from where it is found."""
+"""After so many cycles of waiting the arm may have moved: the motion restarts from the measured position."""
 
 ENDING = 0.6
-"""A blow ends when its torque has fallen to this part of its largest."""
+"""A blow ends when its torque has fallen to this share of its peak."""
 
 MOTION = "motion"
-"""Name of the events that say what the desired motion can't keep."""
+"""Name of the events that report limits which the desired motion can't keep."""
 
 _FOLLOWING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
 _ON_PATH = (Reaction.NONE, Reaction.SLOW_DOWN)
@@ -59,7 +59,7 @@ class Reference:
     """The desired motion. `q_d`, `dq_d`, `ddq_d` (2,) are views of the control block that it fills."""
 
     def __init__(self, settings: Settings, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Prepare. Raises ConfigError if trajectory or excitation leave the arm's limits."""
+        """Prepare the motions. Raises ConfigError if trajectory or excitation leave the arm's limits."""
         if problems := motion_problems(settings):
             raise ConfigError("; ".join(problems))
         self._settings = settings
@@ -83,9 +83,9 @@ class Reference:
         self._pace = Pace(settings)
         self._start_cycle = 0
         self._is_stopping = False
-        """Whether the arm comes to rest to go to the corner then."""
+        """Whether the arm is coming to rest before it goes to the corner."""
         self._arrival_cycle: int | None = None
-        """When a way to the corner ends that has begun."""
+        """Cycle in which the present way to the corner ends; None without one."""
         self._push = np.zeros(JOINTS)
         self._contact_q = np.zeros(JOINTS)
         self._strongest = 0.0
@@ -94,10 +94,10 @@ class Reference:
         self._waited_cycles = 0
         self._events: list[Event] = []
         self._beyond: set[int] = set()
-        """Joints that brake beyond their position limit in this state; said once."""
+        """Joints that brake beyond their position limit in this state; reported once."""
 
     def compile(self) -> None:
-        """Evaluate every kind of motion once, so that nothing compiles in the cycle."""
+        """Evaluate every kind of motion once, so that it doesn't compile in the cycle."""
         zeros, scratch = np.zeros(JOINTS), np.zeros((3, JOINTS))
         self._follow(0.0, *scratch)
         if self._excitation.is_on:
@@ -105,23 +105,23 @@ class Reference:
         Withdrawal(self._settings, zeros, zeros, np.ones(JOINTS)).evaluate(0.0, *scratch)
 
     def take_events(self) -> list[Event]:
-        """Return what is worth a line since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     @property
     def is_floating(self) -> bool:
-        """Whether there is no desired motion: the arm gives way."""
+        """Whether there is no desired motion: the arm yields."""
         return self._state in REACTING and self._reaction is Reaction.FLOAT
 
     def park(self) -> None:
-        """From the next step on, go to the start corner and stay there; stay where it is while the arm is stopped."""
+        """Go to the start corner from the next step on, and stay there; while the arm is stopped, stay in place."""
         self._is_parking = True
         if self._state not in REACTING:
             self._approach()
 
     def is_parked(self, cycle: int) -> bool:
-        """Whether a commanded parking has come to its end."""
+        """Whether the arm has arrived in the corner after `park` and has settled."""
         if not self._is_parking or self._state is SchemeState.REACT:
             return False
         if self._state is SchemeState.STOPPED:
@@ -147,7 +147,7 @@ class Reference:
         self._advance(arm.cycle)
 
     def _waits(self, arm: ArmState) -> bool:
-        """Let the desired motion wait while the feedback is old; go on, or begin anew, once it is fresh."""
+        """Pause the desired motion while the feedback is old; then continue or restart. Return whether it is paused."""
         if max(arm.age_q) > OLD_CYCLES:
             self._waited_cycles += arm.periods
             self._start_cycle += arm.periods
@@ -160,7 +160,7 @@ class Reference:
         return False
 
     def _begin_anew(self, arm: ArmState) -> None:
-        """Brake from the measured motion, then do what the state asks for."""
+        """Brake from the measured motion, then continue with the motion of the state."""
         self._q_d[:], self._dq_d[:], self._ddq_d[:] = arm.q, arm.dq, 0.0
         if self._path is None:
             return
@@ -169,7 +169,7 @@ class Reference:
             self._approach()
 
     def _is_yielding(self, arm: ArmState, output: SchemeOutput) -> bool:
-        """Fill the desired motion of a reaction that has no plan, or plan a blow's anew; tell whether it is filled."""
+        """Fill the desired motion of a reaction without a plan, or plan again after a blow; tell whether it is full."""
         if self._reaction is Reaction.FLOAT:
             self._stay(arm)
             return True
@@ -187,7 +187,7 @@ class Reference:
         self._ddq_d[:] = 0.0
 
     def _advance(self, cycle: int) -> None:
-        """Fill the desired motion of the path, along which the arm may move slowly, or stop."""
+        """Fill the desired motion of the path, at the present pace."""
         self._follow_on(cycle)
         path, pace, motion = self._path, self._pace, (self._q_d, self._dq_d, self._ddq_d)
         assert path is not None
@@ -207,7 +207,7 @@ class Reference:
         return self._slow_share if self._reaction is Reaction.SLOW_DOWN and self._state in REACTING else 1.0
 
     def _follow_on(self, cycle: int) -> None:
-        """Begin the motion of the state once the arm has come to the corner."""
+        """Begin the motion of the state when the arm has reached the corner."""
         late = self._pace.lag_s / self._period_s
         has_come = self._arrival_cycle is not None and cycle - late >= self._arrival_cycle
         if not has_come or self._is_parking or self._state is SchemeState.PAYLOAD:
@@ -243,7 +243,7 @@ class Reference:
             self._path, self._arrival_cycle, self._is_stopping = None, None, False
 
     def _react(self, output: SchemeOutput, arm: ArmState) -> None:
-        """Begin what the reaction says."""
+        """Begin the reaction."""
         self._reaction = output.reaction
         self._contact_cycle = arm.cycle
         if self._reaction in _ON_PATH:
@@ -261,10 +261,10 @@ class Reference:
             self._warn_beyond(self._stop_from(self._q_d, self._dq_d))
 
     def _is_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> bool:
-        """Tell whether a blow that ends has made the arm faster than planned, away from what it has hit.
+        """Tell whether an ending blow has made the arm faster than planned, away from the contact.
 
-        While it is still pushed the controller resists; also while it learns, because an adaptation that begins anew
-        forgets the push that goes on.
+        During the push the controller resists. False while the arm learns, because an adaptation that restarts forgets
+        a push that continues.
         """
         if not self._has_model:
             return False
@@ -277,7 +277,7 @@ class Reference:
         return float(np.max(ahead)) >= THROWN_rad_s
 
     def _follow_thrown(self, arm: ArmState) -> None:
-        """Go on from the measured motion; else the controller would pull the arm back to what it has hit."""
+        """Continue from the measured motion; otherwise the controller would pull the arm back to the contact."""
         if self._reaction is Reaction.ADMITTANCE:
             self._q_d[:], self._dq_d[:] = arm.q, arm.dq
             self._warn_beyond(self._stop_from(arm.q, arm.dq))
@@ -288,13 +288,13 @@ class Reference:
             self._withdraw(self._stop_from(arm.q, arm.dq), arm.cycle)
 
     def _withdraw(self, withdrawal: Withdrawal, cycle: int) -> None:
-        """Begin a way from the present motion."""
+        """Begin a withdrawal from the present motion."""
         self._warn_beyond(withdrawal)
         self._start(withdrawal.evaluate, cycle)
         self._arrival_cycle, self._is_stopping = None, False
 
     def _warn_beyond(self, withdrawal: Withdrawal) -> None:
-        """Say, once in a state, which joints can't stop within their position limit."""
+        """Report, once per state, joints that can't stop within their position limit."""
         for joint in withdrawal.beyond:
             if joint not in self._beyond:
                 self._events.append(Event("warning", MOTION, withdrawal.describe_beyond(joint)))
@@ -311,7 +311,7 @@ class Reference:
         self._arrival_cycle, self._is_stopping = None, True
 
     def _stop(self, cycle: int) -> None:
-        """Go to the corner if the arm is at rest; brake where there is no path on which it comes to rest."""
+        """Go to the corner if the arm is at rest; without a path to come to rest on, brake."""
         if self._pace.share == 0.0 or not (np.any(self._dq_d) or np.any(self._ddq_d)):
             self._go(cycle)
         elif self._path is None:

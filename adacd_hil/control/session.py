@@ -9,12 +9,13 @@ from typing import NamedTuple, Protocol
 
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
-from adacd_hil.control.arm_records import HISTORY_NAME, TARE_NAME, UsedHistory, UsedTare
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.fault_recovery import Recovery
+from adacd_hil.control.history_file import HISTORY_NAME, UsedHistory
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.pacing import Pacer, make_pacer, prepare_spin
+from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
@@ -41,10 +42,10 @@ from adacd_hil.wire.codec import Codec
 
 @dataclass(frozen=True)
 class SessionSummary:
-    """How a session ended. `error`: empty, or the one line that ended the run early.
+    """Result of a session. `error`: empty, or the one line that ended the run early.
 
-    `has_started`: whether the devices had been put into operation, so that the arm may have moved. `reached`: cycles
-    and state of the last attempt, however it ended. `recoveries`: how often a fault was acknowledged and the run begun
+    `has_started`: whether the devices were set to Operational, so that the arm may have moved. `reached`: cycles and
+    state of the last attempt, however it ended. `recoveries`: number of acknowledged faults after which the run started
     again. `elapsed_s`: by the host's clock, from the first frame to the last, without compiling. `certificates`: those
     that were not taken back; `identities`: of the devices.
     """
@@ -62,14 +63,14 @@ class SessionSummary:
 
 
 class LiveView(Protocol):
-    """A live view that was asked for."""
+    """Options of a live view that the user requested."""
 
     def server(self, settings: Settings, robot: str) -> LiveService:
-        """Return what serves it, for an arm; robot: its URDF."""
+        """Return the server of the view for an arm; robot: its URDF."""
 
 
 class Attempt(NamedTuple):
-    """What one attempt to run the arm works with; nothing of it survives a fault."""
+    """Objects of one attempt to run the arm; a recovery makes new ones."""
 
     arm: Arm
     master: Master
@@ -77,7 +78,7 @@ class Attempt(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """How an attempt ended. `error`: empty, or the one line that ended it."""
+    """End of an attempt. `error`: empty, or the one line that ended it."""
 
     result: RunResult | None
     error: str
@@ -93,8 +94,7 @@ class Ending(NamedTuple):
 class Session:
     """One run on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time.
 
-    `on_started` is called when the devices are put into operation for the first time. `touched_ns`: as of
-    `RunNarration`.
+    `on_started` is called when the devices are set to Operational for the first time. `touched_ns`: see `RunNarration`.
     """
 
     settings: Settings
@@ -122,21 +122,21 @@ class Session:
         return isinstance(self.clock, VirtualClock)
 
     def interrupt(self) -> None:
-        """Ask the run to park the arm and end; a second time, to stop at once. Safe in a signal handler."""
+        """Park the arm and end the run; a second call stops at once. Safe in a signal handler."""
         self._is_interrupted = True
         if self._cycle is not None:
             self._cycle.interrupt()
 
     def run(self) -> SessionSummary:
-        """Run to the end. What ends the run early is in the summary; the log is closed and readable in any case.
+        """Run to the end. An early end is described in the summary; the log is closed and readable in any case.
 
-        Raises LogExistsError when there is one already, LogError when it can't be created.
+        Raises LogExistsError if there is a log already, LogError if it can't be created.
         """
         if self.is_lockstep:  # a simulated arm moves by whole periods, however late the modelled host sends SYNC
             realtime = replace(self.settings.realtime, sample_period="nominal")
             self.settings = replace(self.settings, realtime=realtime)
         safety = replace(self.settings.safety, enable_timeout_s=enable_timeout_s(self.settings))
-        self.settings = replace(self.settings, safety=safety)  # with the log, which replays without the profiles
+        self.settings = replace(self.settings, safety=safety)  # logged, so that a replay needs no profiles
         tap = Tap(self.bus, self.clock)
         pacer = make_pacer(self.settings, self.clock, tap, self.codec.message("Sync").can_id)
         with compiling_cycle(self.settings):
@@ -190,7 +190,7 @@ class Session:
         return request_realtime(self.settings.realtime_request)
 
     def _prepare(self, tap: Tap, pacer: Pacer) -> Attempt:
-        """Build and compile everything that must know nothing of an attempt before."""
+        """Make and compile the objects of a new attempt."""
         arm = Arm(self.settings, self.codec, tap)
         master = Master(self.settings, self.codec, tap, watch_host=not self.is_lockstep)
         cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.clock, self.touched_ns)
@@ -219,12 +219,12 @@ class Session:
             self.progress(ending.error)
         for line in (*ArmReport(arm).describe_checks(), *master.describe_checks()):
             recorder.event(self.clock.now_ns(), Event("info", "frame checks", line))
-        for certificate in cycle.certificates:  # as numbers, for whoever compares runs
+        for certificate in cycle.certificates:  # as numbers, to compare runs
             recorder.event(self.clock.now_ns(), Event("info", CERTIFIED_MODEL, json.dumps(certificate._asdict())))
         return ending
 
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:
-        """Bring the devices from whatever they were in to pre-operational and configured. Raises DeviceError."""
+        """Reset the devices and configure them in Pre-operational. Raises DeviceError."""
         master.reset()
         self._identities = identities = tuple(master.identify())
         for identity in identities:
@@ -249,7 +249,7 @@ class Session:
                 self._stop(master, recorder, tap)
 
     def _stop(self, master: Master, recorder: Recorder, tap: Tap) -> None:
-        """Take the devices out of operation, as far as the bus still carries it."""
+        """Stop the devices by NMT, as far as the bus still carries it."""
         try:
             master.stop()
         except BusError as error:
@@ -289,7 +289,7 @@ class Session:
         return recorder
 
     def _write_beside(self, robot: bytes, recorder: Recorder) -> None:
-        """Put beside the log what viewers want as files; all of it is in the log, too."""
+        """Write the viewers' files beside the log; the log contains them, too."""
         for write in (
             lambda: place_file(self.out / ROBOT_NAME, robot),
             lambda: place_file(self.out / LAYOUT_NAME, viewer_layout(robot)),
@@ -332,7 +332,7 @@ def _describe(identity: Identity) -> str:
 
 
 def git_commit() -> str:
-    """Name the commit of the source tree, empty when installed without one."""
+    """Return the commit of the source tree, empty if installed without one."""
     try:
         done = subprocess.run(
             ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],

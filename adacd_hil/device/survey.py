@@ -386,7 +386,7 @@ class BusView:
             self._error_frames += 1
             return
         try:
-            self._load.add(frame)
+            self._load.count_frame(frame)
         except ValueError:  # a length that the contract's bus can't carry
             self._strange_frames += 1
         entry = self._entries.get(frame.can_id)
@@ -413,7 +413,7 @@ class BusView:
             frames=self.frames,
             error_frames=self._error_frames,
             strange_frames=self._strange_frames,
-            load_percent=self._load.take(t_ns).percent,
+            load_percent=self._load.take_load(t_ns).percent,
             nodes=[
                 self._node(can_id & 0x7F, entry, t_ns)
                 for can_id, entry in wanted.items()

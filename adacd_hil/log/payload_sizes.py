@@ -1,4 +1,4 @@
-"""Whose schema a channel has, and how long its payloads are."""
+"""Payload size of a channel, if this package defines its schema."""
 
 import contextlib
 
@@ -19,7 +19,7 @@ _SIZES = ((CAN_FRAME, CAN_FRAME_DTYPE.itemsize), (JOINT_STATE, JOINT_STATE_DTYPE
 
 
 def payload_size(channel: Channel, schema: Schema | None) -> int | None:
-    """Return how long the payloads of a channel are, where we wrote its schema and they have one size."""
+    """Return the payload size of a channel, bytes; None if its schema is not ours or its payloads vary in size."""
     if schema is None or channel.message_encoding != "cdr":
         return None
     for own, size in _SIZES:
@@ -32,6 +32,6 @@ def payload_size(channel: Channel, schema: Schema | None) -> int | None:
 
 
 def is_own(channel: Channel, schema: Schema, own: MessageType) -> bool:
-    """Tell whether a channel has a schema of ours, to the letter."""
+    """Tell whether a channel's schema is exactly the given one of ours."""
     is_named = channel.message_encoding == "cdr" and schema.encoding == "ros2msg" and schema.name == own.name
     return is_named and schema.data == own.text.encode()

@@ -6,16 +6,16 @@ where `arm.mounting_deg` has it.
 
 Masses and friction are those of the CAD model, `arm.cad_theta`, without payload. It knows inertia about the joint axes
 only; about the link's own axis it is that of a bar of LINK_WIDTH_M. Without a CAD model the links have no inertia, and
-a comment says so: an engine then refuses the file, a viewer doesn't mind.
+a comment in the file gives the reason: an engine then refuses the file, a viewer still shows it.
 
-The parameters of eq. (17) are lumped, in the frame of `records.PARAMETER_NAMES`; two rigid links that move so:
+The parameters of eq. (17) are lumped, in the frame of `records.PARAMETER_NAMES`; two rigid links with this motion:
 
     a1 - a3 = I1 + m1 c1² + m2 l1²     a2 = l1 m2 c2     a3 = I2 + m2 c2²     a4 = g (m1 c1 + m2 l1)     a5 = g m2 c2
 
-m mass kg, c place of the centre of mass along the link m, I inertia about it kg m², l length m. Every distribution of
-masses that fits is as right as any other: torque and motion are the same. Link 2's centre of mass must lie within
+m mass kg, c place of the centre of mass along the link m, I inertia about it kg m², l length m. All mass distributions
+with these parameters give the same torque and motion. Link 2's centre of mass must lie within
 l1 a2 / (a1 - a3) < c2 < l1 a3 / a2, or an inertia is negative; the geometric mean of both is taken. Link 1 is a uniform
-rod, unless gravity says where its centre of mass is.
+rod, unless gravity determines its centre of mass.
 """
 
 import math
@@ -32,7 +32,7 @@ from adacd_hil.settings.configuration import Settings
 _A1, _A2, _A3, _A4, _A5 = 0, 1, 2, 7, 8
 _ROD_C, _ROD_I = 1.0 / 2.0, 1.0 / 12.0  # of a uniform rod: place of its centre and inertia about it
 _AGREEMENT = 0.01
-"""Share by which a5 may differ from what a2 makes of it."""
+"""Largest relative difference between a5 and its value computed from a2."""
 
 
 class LinkBody(NamedTuple):
@@ -44,13 +44,13 @@ class LinkBody(NamedTuple):
 
 
 class ModelError(ValueError):
-    """Parameters that belong to no rigid links; one line."""
+    """No two rigid links have these parameters; the message is one line."""
 
 
 def find_bodies(
     theta: Sequence[float], length1_m: float, gravity_m_s2: float = GRAVITY_M_S2
 ) -> tuple[LinkBody, LinkBody]:
-    """Find two links with these parameters (p,), 7 or 9 of them. Raises ModelError when there are none.
+    """Find two links with these parameters (p,), 7 or 9 of them. Raises ModelError if there are none.
 
     gravity_m_s2: in the plane of motion.
     """
@@ -157,7 +157,7 @@ def _add_inertia(link: Element, body: LinkBody) -> None:
     SubElement(inertial, "origin", xyz=f"{_text(body.center_m)} 0 0", rpy="0 0 0")
     SubElement(inertial, "mass", value=_text(body.mass_kg))
     across = body.inertia_kg_m2
-    along = min(across, body.mass_kg * LINK_WIDTH_M**2 / 6.0)  # any more would be more than a rigid body can have
+    along = min(across, body.mass_kg * LINK_WIDTH_M**2 / 6.0)  # the most that a rigid body can have
     moments = {"ixx": along, "iyy": across, "izz": across}
     SubElement(inertial, "inertia", {"ixy": "0", "ixz": "0", "iyz": "0"} | {k: _text(v) for k, v in moments.items()})
 
@@ -170,5 +170,5 @@ def _add_shape(link: Element, color: str, shape: str, x_m: float = 0.0, **sizes:
 
 
 def _text(value: float | np.floating) -> str:
-    """Write a number so that it is read back the same."""
+    """Format a number so that it reads back to the same value."""
     return repr(float(value))

@@ -1,4 +1,4 @@
-"""The layout of panels that a log brings along for its viewers, Foxglove and Lichtblick."""
+"""The panel layout for viewers of a log, Foxglove and Lichtblick."""
 
 import base64
 import json
@@ -7,7 +7,7 @@ from typing import Any
 from adacd_hil.log.robot_description import WORLD
 
 SCENE_TOPIC = "/scene"
-"""A topic that only the live view has."""
+"""Topic of the 3-D arm, which only the live view has."""
 LAYOUT_NAME = "viewer-layout.json"
 
 
@@ -36,7 +36,7 @@ def _both_joints(field: str) -> tuple[str, str]:
 
 
 def _scene(robot: bytes) -> dict[str, Any]:
-    """Describe the arm in 3-D. Its URDF is in the layout itself: a log can't serve files, and needs no server."""
+    """Describe the 3-D panel. The URDF is part of the layout: a log can't serve files, and a server isn't needed."""
     arm = {
         "instanceId": "arm",
         "layerId": "foxglove.Urdf",
@@ -60,9 +60,9 @@ def _scene(robot: bytes) -> dict[str, Any]:
 
 
 def viewer_layout(robot: bytes = b"") -> bytes:
-    """Write the layout: torques against thresholds, motion, states, parameters, contacts, timing, queues, events.
+    """Return the layout as JSON: torques and thresholds, motion, states, parameters, contacts, timing, queues, events.
 
-    robot: the arm's URDF, empty where it isn't known; then nothing is drawn in 3-D.
+    robot: the arm's URDF; if empty, there is no 3-D panel.
     """
     panels = {
         "Plot!contact": _plot(
@@ -106,7 +106,7 @@ def viewer_layout(robot: bytes = b"") -> bytes:
 
 
 def _stack(first: str, *others: str) -> Any:
-    """Put panels below each other, all equally high."""
+    """Stack panels of equal height."""
     if not others:
         return first
     share = 100.0 / (1 + len(others))

@@ -1,8 +1,8 @@
 """A replay's decisions against the log's: every field of /scheme, every contact report, events, the user's requests.
 
-Two values are the same if they have the same bits. Between machines whose arithmetic differs (`same_arithmetic`) a real
-value may be off by `TOLERANCE` of the largest one that its field has had so far, and by as much of one unit; then, too,
-counts, names, switches, and values that are infinite or not a number have to be the same.
+Two values are the same if they have the same bits. Between machines whose arithmetic differs (`different_arithmetic`) a
+real value may be off by `TOLERANCE` of the largest one that its field has had so far, and by as much of one unit; then,
+too, counts, names, switches, and values that are infinite or not a number have to be the same.
 
 Where nobody typed anything, the configuration's script made the requests. The script depends on the time since the
 drives were enabled and on the state; the caller hands in its player, `control.operator` live.

@@ -18,7 +18,7 @@ SLIGHT_TILT_DEG = 2.0
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """The arm: what the host may know of it."""
+    """The arm, as far as the host may know it."""
 
     profile: str = setting("P", choices=("P", "S", "M"), meaning="emulated arm that this configuration is for")
     link_length_m: tuple[float, float] = setting((0.35, 0.30), unit="m", low=0.01, high=5.0, meaning="joint to joint")
@@ -80,7 +80,7 @@ class ArmSettings:
         (250.0, 300.0), unit="deg/s", low=1.0, high=3600.0, meaning="largest |dq|; beyond it the run faults"
     )
     cad_theta: tuple[float, ...] = setting((), low=0.0, meaning="the CAD model's parameters; empty: no model")
-    # How the emulator plays the arm of this file; the host has no use for it.
+    # Properties of the emulated arm of this file; the host doesn't use them.
     mass_kg: tuple[float, float] | None = setting(
         None, unit="kg", low=1e-4, high=1000.0, meaning="mass of each link, for the emulator only"
     )
@@ -124,7 +124,7 @@ class ArmSettings:
 
 @dataclass(frozen=True)
 class DevicesSettings:
-    """Which devices are on the bus, by joint, and the contract that describes their frames."""
+    """Devices on the bus, by joint, and the contract that describes their frames."""
 
     drive: tuple[str, str] = setting(
         ("adacd-drive", "adacd-drive"), meaning="device profile: a built-in name or a file"
@@ -163,7 +163,7 @@ def _radians(degrees: tuple[float, float]) -> Vector:
 
 @dataclass(frozen=True)
 class BusSettings:
-    """Timing on the bus, and who else is on it."""
+    """Timing on the bus, and the other hosts on it."""
 
     period_us: int = setting(1000, unit="µs", low=500, high=10_000, meaning="SYNC period, 0x1006")
     heartbeat_ms: int = setting(100, unit="ms", low=10, high=10_000, meaning="heartbeat period, 0x1017")
@@ -244,7 +244,7 @@ class DataSettings:
 
 @dataclass(frozen=True)
 class LockstepSettings:
-    """What stands for the time that passes by itself on an arm; lockstep only."""
+    """Modelled durations of the host and the bus; lockstep only."""
 
     latency: str = setting(
         "constant",

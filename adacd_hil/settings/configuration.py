@@ -1,8 +1,8 @@
-"""A configuration: all sections as one value, from a built-in name or a TOML file and what that extends.
+"""A configuration: all sections as one value, from a built-in name or a TOML file and the files that it extends.
 
-The catalogue gives every key with its type, default, bounds, unit and meaning, as declared. Changes give some keys
-other values: a key is dotted, `detector.threshold_Nm`; a value is TOML, where a word may go without quotes and a number
-stands for a list of such numbers. Of the settings of a log, those that made its numbers stay.
+`known_keys` lists every key with type, default, bounds, unit and meaning. `apply_settings` changes single keys: a key
+is dotted, `detector.threshold_Nm`; a value is TOML, where a word needs no quotes and a number stands for a list of that
+number. Settings that determined the numbers of a log can't be changed for its replay.
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ from adacd_hil.settings.scheme_settings import (
 from adacd_hil.settings.toml_files import builtin_folder, builtin_names, find_toml, parse_toml, read_toml, to_toml
 
 _LONGEST_CHAIN = 8
-"""Configurations that extend each other."""
+"""Most configurations that may extend each other in a row."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Settings:
     termination: TerminationSettings = setting(TerminationSettings, meaning="end of adaptation")
     detector: DetectorSettings = setting(DetectorSettings, meaning="collision detection")
     certified: CertifiedSettings = setting(CertifiedSettings, meaning="the scheme beyond the paper")
-    reaction: ReactionSettings = setting(ReactionSettings, meaning="what is done about a contact")
+    reaction: ReactionSettings = setting(ReactionSettings, meaning="reactions to a contact")
     trajectory: TrajectorySettings = setting(TrajectorySettings, meaning="the motion")
     excitation: ExcitationSettings = setting(ExcitationSettings, meaning="the motion of the certified adaptation")
     controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")
@@ -98,7 +98,7 @@ class Settings:
 
     @property
     def further_names(self) -> tuple[str, ...]:
-        """Names of what the certified scheme estimates beside the dynamic parameters, in order; none of the paper's."""
+        """Names of the certified scheme's further parameters, after the dynamic ones; () for the paper's scheme."""
         if self.scheme == "paper":
             return ()
         by_place = POSITION_TERMS if self.arm.position_torque_Nm > 0.0 else ()
@@ -113,12 +113,12 @@ class Settings:
 
     @property
     def filter_count(self) -> int:
-        """Filters in the certified scheme's bank; 0 of the paper's."""
+        """Number of filters in the certified scheme's bank; 0 for the paper's scheme."""
         return len(self.certified.cutoffs_rad_s) if self.scheme == "certified" else 0
 
     @property
     def channel_count(self) -> int:
-        """Residuals per joint that have a threshold: each filter's smoothed, and all but the slowest one's bare."""
+        """Number of residuals per joint with a threshold: one smoothed per filter, one bare for all but the slowest."""
         return max(2 * self.filter_count - 1, 0)
 
     @property
@@ -128,7 +128,7 @@ class Settings:
 
     @property
     def mounting_deg(self) -> tuple[float, float]:
-        """Tilt of the plane of motion, and the q1 at which link 1 hangs; see `arm.mounting_deg`."""
+        """Tilt of the plane of motion, and the q1 at which link 1 hangs down, deg; see `arm.mounting_deg`."""
         if self.arm.mounting_deg is not None:
             return self.arm.mounting_deg
         return (UPRIGHT_DEG, -90.0) if self.estimator.gravity else (0.0, 0.0)
@@ -140,17 +140,17 @@ class Settings:
 
     @property
     def gravity_m_s2(self) -> float:
-        """Gravity in the plane of motion; 0 where it is not in the model."""
+        """Gravity in the plane of motion, m/s²; 0 if the model has no gravity."""
         return GRAVITY_M_S2 * math.sin(self.tilt_rad) if self.estimator.gravity else 0.0
 
     @property
     def level_rad(self) -> float:
-        """The q1 at which link 1 is level and q1 grows uphill, rad; 0 where gravity is not in the model."""
+        """The q1 at which link 1 is level and q1 grows uphill, rad; 0 if the model has no gravity."""
         return math.radians(self.mounting_deg[1] + 90.0) if self.estimator.gravity else 0.0
 
     @property
     def realtime_request(self) -> RealtimeRequest:
-        """What the control process asks of the operating system."""
+        """Real-time request of the control process to the operating system."""
         wish = self.realtime
         return RealtimeRequest(wish.scheduler, wish.priority, wish.cpu, wish.lock_memory, self.bus.period_ns)
 
@@ -174,9 +174,9 @@ class Settings:
 
 
 def renewed(table: dict[str, Any]) -> dict[str, Any]:
-    """Return the configuration of a log with today's keys in place of those that older versions had.
+    """Return the configuration of a log with the keys of older versions replaced by today's.
 
-    A log has every key that there was when it was written, so one that is missing was not in the model.
+    A log holds every key of the version that wrote it. So a term whose key is missing was not in that version's model.
     """
     certified = table.get("certified")
     if isinstance(certified, dict) and "cross_talk_std" not in certified:
@@ -194,7 +194,7 @@ def renewed(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Lay one TOML table over another, section by section."""
+    """Merge two TOML tables, section by section; `over` wins."""
     merged = dict(base)
     for key, value in over.items():
         if isinstance(value, dict) and isinstance(merged.get(key), dict):
@@ -205,29 +205,29 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 class ConfigurationLayer(NamedTuple):
-    """What one file says, or one profile of it; `origin` names it."""
+    """Settings of one file, or of one profile in it; `origin` names it."""
 
     origin: str
     table: dict[str, Any]
 
 
 def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Settings:
-    """Resolve a configuration: a built-in name, or a TOML file laid over the one it `extends` (default `paper`).
+    """Resolve a configuration: a built-in name, or a TOML file merged over the one it `extends` (default `paper`).
 
-    `profile` picks the `[profiles.X]` table that is laid over the rest. Raises ConfigError.
+    `profile` picks the `[profiles.X]` table. Raises ConfigError.
     """
     return parse(Settings, resolved_table(configuration_layers(name_or_file, profile)))
 
 
 def resolved_table(layers: Sequence[ConfigurationLayer]) -> dict[str, Any]:
-    """Lay the layers of a configuration over each other."""
+    """Merge the layers of a configuration, later over earlier."""
     return functools.reduce(merge, (layer.table for layer in layers), {})
 
 
 def configuration_layers(name_or_file: str, profile: str | None = None) -> list[ConfigurationLayer]:
-    """Read a configuration and all that it extends, the undermost first. Raises ConfigError.
+    """Read a configuration and all that it extends, the base first. Raises ConfigError.
 
-    What the files say of the arm outweighs the profiles' own values, not the other way round.
+    A profile's values come first: keys of the files override them.
     """
     files = _load_chain(name_or_file)
     table = resolved_table(files)
@@ -250,7 +250,7 @@ def configuration_layers(name_or_file: str, profile: str | None = None) -> list[
 
 
 def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
-    """Return a table within a table, empty where it isn't there. Raises ConfigError when it is no table."""
+    """Return a table within a table, empty if absent. Raises ConfigError if the value is not a table."""
     value = table.get(key, {})
     if not isinstance(value, dict):
         raise ConfigError(f"{name} = {value!r} must be a table")
@@ -258,7 +258,7 @@ def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
 
 
 def _find_beside(table: dict[str, Any], folder: Path) -> None:
-    """Let the files of devices and contract that lie beside the configuration be found from anywhere."""
+    """Make the paths of device and contract files absolute if the files lie in the configuration's folder."""
 
     def found(name: Any) -> Any:
         is_beside = isinstance(name, str) and Path(name).suffix and exists(folder / name)
@@ -274,7 +274,7 @@ def _find_beside(table: dict[str, Any], folder: Path) -> None:
 
 
 def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[ConfigurationLayer]:
-    """Read a configuration and all that it extends; a relative path is taken from the file that names it."""
+    """Read a configuration and all that it extends; relative paths start in the folder of the file that names them."""
     if name_or_file in seen:
         raise ConfigError(f"configuration {name_or_file} extends itself")
     if len(seen) > _LONGEST_CHAIN:
@@ -294,25 +294,25 @@ def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[Configura
 
 
 class KnownKey(NamedTuple):
-    """One setting. `key` is dotted; one of a row in a list has `[]` behind the list's name."""
+    """One setting. `key` is dotted; a key in the rows of a list has `[]` after the list's name."""
 
     key: str
     kind: Any
     default: str
-    """As TOML has it; `required` where there is none, `none` where it is absent."""
+    """As TOML; `required` if there is no default, `none` if the setting is absent by default."""
     bounds: str
-    """The choices, or the bounds with the unit; empty where there are none."""
+    """The choices, or the bounds with the unit; empty without bounds."""
     meaning: str
     choices: tuple[str, ...]
 
     @property
     def is_in_row(self) -> bool:
-        """Whether it belongs to a row of a list, which only a file can give."""
+        """Whether the key belongs to the rows of a list, which only a file can set."""
         return "[]" in self.key
 
 
 def sections() -> Iterator[tuple[str, type[Any], str]]:
-    """Give name, class and meaning of each table of a configuration; the first, without a name, is the top."""
+    """Yield name, class and meaning of each table of a configuration; first the top of the file, with an empty name."""
     yield "", Settings, "top of the file"
     hints = typing.get_type_hints(Settings)
     for field in dataclasses.fields(Settings):
@@ -321,7 +321,7 @@ def sections() -> Iterator[tuple[str, type[Any], str]]:
 
 
 def keys_of(section: type[Any], prefix: str) -> Iterator[KnownKey]:
-    """Give the settings of a table, rows within it included; tables within it are sections of their own."""
+    """Yield the settings of a table, rows of its lists included; tables within it are sections of their own."""
     hints = typing.get_type_hints(section)
     for field in dataclasses.fields(section):
         kind = hints[field.name]
@@ -350,7 +350,7 @@ def value_of(settings: Settings, key: str) -> Any:
 
 
 def in_words(value: Any) -> str:
-    """Write a value as a configuration would, numbers as short as they can be told."""
+    """Format a value as in a configuration, numbers with six significant digits at most."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
         return f"{{{', '.join(f'{name} = {in_words(inner)}' for name, inner in fields)}}}"
@@ -362,7 +362,7 @@ def in_words(value: Any) -> str:
 
 
 def explain_unknown(key: str) -> str:
-    """Say in one line that a key is unknown, with its successor, the nearest known one, or those of its section."""
+    """Return one line that a key is unknown, with its successor, the nearest known key, or the keys of its section."""
     keys = [name for name, known in known_keys().items() if not known.is_in_row]
     below = [known for known in keys if known.startswith(f"{key}.")]
     if below:
@@ -391,13 +391,13 @@ def _bounds(metadata: Any) -> str:
 
 
 _FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", "rated_torque_Nm")
-"""Settings of the arm that made the numbers of a log."""
+"""Settings of the arm that determined the numbers of a log."""
 
 
 def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
     """Return the settings with some keys changed, each `section.key` to a TOML value.
 
-    Raises ConfigError, of an unknown key with the nearest known one.
+    Raises ConfigError; for an unknown key it names the nearest known one.
     """
     table = tomllib.loads(to_toml(settings))
     known = known_keys()
@@ -413,7 +413,7 @@ def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
 
 
 def refuse_facts(changes: Mapping[str, str]) -> None:
-    """Raise ConfigError if a key is what made the numbers of a log: no other value can be given to it afterwards."""
+    """Raise ConfigError if a key determined the numbers of a log, such as a sign or a device."""
     facts = {f"arm.{name}" for name in _FACTS} | {"bus.period_us", "realtime.sample_period"}
     for key in changes:
         if key in facts or key.startswith("devices."):
@@ -430,7 +430,7 @@ def _read_value(key: str, text: str) -> Any:
 
 
 def _spread(value: Any, kind: Any, present: Any) -> Any:
-    """Let a single value stand for a list of it, as long as the one that is there."""
+    """Repeat a single value to a list as long as the present one, if the setting is a list."""
     if typing.get_origin(kind) is tuple and not isinstance(value, list):
         elements = [element for element in typing.get_args(kind) if element is not Ellipsis]
         count = len(present) if isinstance(present, list) else len(elements)
@@ -439,11 +439,11 @@ def _spread(value: Any, kind: Any, present: Any) -> Any:
 
 
 def keep_facts(own: Settings, other: Settings) -> Settings:
-    """Return other settings with what a log says of its arm, bus and devices, and of how time went.
+    """Return `other` with the settings of a log's arm, bus, devices and sample period.
 
-    Signs, torque offsets, rated torques, the contract and the sample period made the numbers of the log: no
-    configuration changes them afterwards. What the motors hold without power, and how much torque depends on the place,
-    are the arm's, if the log says it.
+    Signs, torque offsets, rated torques, the contract and the sample period determined the numbers of the log, so that
+    no configuration may change them afterwards. Holding torque and position-dependent torque come from the log, too, if
+    it has them.
     """
     facts = {name: getattr(own.arm, name) for name in _FACTS}
     if own.arm.holding_torque_Nm is not None:
@@ -456,7 +456,7 @@ def keep_facts(own: Settings, other: Settings) -> Settings:
 
 
 def parse_changes(given: Sequence[str]) -> dict[str, str]:
-    """Read `key=value` of several options. Raises ConfigError."""
+    """Parse `key=value` texts of repeated options. Raises ConfigError."""
     changes: dict[str, str] = {}
     for text in given:
         key, equals, value = text.partition("=")
@@ -467,13 +467,13 @@ def parse_changes(given: Sequence[str]) -> dict[str, str]:
 
 
 def parse_variations(given: Sequence[str]) -> list[dict[str, str]]:
-    """Read `key=a,b,c` of several options and return every combination. Raises ConfigError."""
+    """Parse `key=a,b,c` texts of repeated options; return every combination. Raises ConfigError."""
     lists = [[(key, value) for value in split_list(text)] for key, text in parse_changes(given).items()]
     return [dict(choice) for choice in itertools.product(*lists)]
 
 
 def split_list(text: str) -> list[str]:
-    """Split at the commas that are outside brackets and quotes."""
+    """Split a text at its commas outside brackets and quotes."""
     parts, depth, quote, start = [], 0, "", 0
     for place, letter in enumerate(text):
         if quote:
@@ -491,7 +491,7 @@ def split_list(text: str) -> list[str]:
 
 
 def changed_keys(before: Settings, after: Settings) -> dict[str, tuple[str, str]]:
-    """Return the settings that differ, in words, by their keys."""
+    """Return the settings that differ, by key: both values, formatted."""
     tables = [_flat(tomllib.loads(to_toml(settings)), "") for settings in (before, after)]
     keys = [*tables[0], *(key for key in tables[1] if key not in tables[0])]
     words = {key: (tables[0].get(key, "unset"), tables[1].get(key, "unset")) for key in keys}

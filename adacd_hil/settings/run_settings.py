@@ -1,4 +1,4 @@
-"""Settings of a run: who asks for what, time, log, motion and reaction, and what is known before it begins."""
+"""Settings of a run: operator, real time, log, motion, reactions, safety, tare, history."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class RequestSettings:
 
 @dataclass(frozen=True)
 class OperatorSettings:
-    """The user, where a script plays the user."""
+    """The user's role: requests by script, automatic acknowledgement."""
 
     script: tuple[RequestSettings, ...] = setting((), meaning="the user's requests, by time")
     acknowledge_after_s: float = setting(
@@ -28,18 +28,18 @@ class OperatorSettings:
         1.0, unit="s", low=0.0, high=3600.0, meaning="time after which such a fault is acknowledged"
     )
     acknowledge_on_hardware: bool = setting(
-        False, meaning="allow acknowledgement without the user where a real arm may be on the bus"
+        False, meaning="allow automatic acknowledgement where a real arm may be on the bus"
     )
 
     @property
     def acknowledges(self) -> bool:
-        """Whether stops or faults are acknowledged by themselves."""
+        """Whether stops or faults are acknowledged automatically."""
         return self.acknowledge_after_s > 0.0 or self.acknowledge_faults > 0
 
 
 @dataclass(frozen=True)
 class RealtimeSettings:
-    """How the process that runs the cycle gets on time, and what is done when it doesn't."""
+    """Real-time scheduling of the control process, and its behaviour when cycles are late."""
 
     scheduler: str = setting(
         "fifo", choices=("fifo", "deadline", "other"), meaning="SCHED_FIFO, SCHED_DEADLINE, or none of real time"
@@ -80,7 +80,7 @@ class RealtimeSettings:
 
 @dataclass(frozen=True)
 class LogSettings:
-    """The log: what may wait for its writer, and when a part of it ends and the next one begins."""
+    """The log: memory for its writer, and the length of its parts."""
 
     buffer_MiB: int = setting(
         4, unit="MiB", low=1, high=256, meaning="memory between control process and writer; 6 s of cycles at 1 kHz"
@@ -92,7 +92,7 @@ class LogSettings:
 
 
 REACTIONS = tuple(reaction.name.lower() for reaction in Reaction)
-"""What can be done about a contact, as a configuration says it."""
+"""Names of the reactions to a contact, as in a configuration."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class ControllerSettings:
     Kp: tuple[float, float] = setting((250.0, 20.0), unit="Nm/rad", low=0.0, high=1e5, meaning="position gain")
     Kd: tuple[float, float] = setting((12.5, 0.75), unit="Nm s/rad", low=0.0, high=1e4, meaning="velocity gain")
     following_window_deg: tuple[float, float] = setting(
-        (20.0, 30.0), unit="deg", low=0.1, high=360.0, meaning="largest |q - q_d| of an arm that nobody touches"
+        (20.0, 30.0), unit="deg", low=0.1, high=360.0, meaning="largest |q - q_d| of an arm without contact"
     )
     following_timeout_s: float = setting(
         0.1, unit="s", low=0.001, high=60.0, meaning="time beyond that window after which the run faults"
@@ -155,7 +155,7 @@ class ControllerSettings:
 
 @dataclass(frozen=True)
 class ReactionSettings:
-    """What is done about a contact, by its level and link. Link 1's joint is joint 1; pairs of numbers are joints."""
+    """Reaction to a contact, by its level and link. Pairs of numbers are by joint."""
 
     distance_deg: tuple[float, float] = setting((8.0, 8.0), unit="deg", low=0.0, high=90.0, meaning="how far back")
     velocity_limit_deg_s: tuple[float, float] = setting(
@@ -168,7 +168,7 @@ class ReactionSettings:
         3.0, unit="deg", low=0.0, high=90.0, meaning="how far the withdrawal stays from the position limits"
     )
     clear_s: float = setting(
-        0.5, unit="s", low=0.0, high=60.0, meaning="time without a push after which the arm goes on from a contact"
+        0.5, unit="s", low=0.0, high=60.0, meaning="time without a push after which the arm resumes after a contact"
     )
     patience_s: float = setting(
         10.0, unit="s", low=0.1, high=3600.0, meaning="a contact that lasts longer must be acknowledged"
@@ -203,7 +203,7 @@ class ReactionSettings:
         (3.0, 1.2), unit="Nm s/rad", low=1e-3, high=1000.0, meaning="admittance: virtual damping of each joint"
     )
     deadband_Nm: tuple[float, float] = setting(
-        (0.2, 0.1), unit="Nm", low=0.0, high=100.0, meaning="admittance: external torque that moves nothing"
+        (0.2, 0.1), unit="Nm", low=0.0, high=100.0, meaning="admittance: dead band of the external torque"
     )
     yield_limit_deg_s: tuple[float, float] = setting(
         (60.0, 90.0), unit="deg/s", low=1.0, high=360.0, meaning="float, admittance: speed that a push may give a joint"
@@ -233,7 +233,7 @@ class SafetySettings:
         unit="s",
         low=0.1,
         high=600.0,
-        meaning="longest ENABLE; absent: phase_timeout_s, or what the drives' profiles ask for if that is more",
+        meaning="longest ENABLE; absent: phase_timeout_s, or the drives' profiles' time if longer",
     )
     tolerated_emergencies: tuple[int, ...] = setting(
         (0x8200, 0x8210, 0x8240),
@@ -246,10 +246,10 @@ class SafetySettings:
 
 @dataclass(frozen=True)
 class TareSettings:
-    """Tare of the joint torque sensors: how long, how still, how far apart, and how old.
+    """Tare of the joint torque sensors: poses, durations, limits of spread and drift, age.
 
-    The bounds on spread and drift are a small part of the detection threshold (0.15 Nm); an offset that is off by the
-    threshold is a contact that nobody made.
+    The bounds on spread and drift are a small part of the detection threshold (0.15 Nm): an offset that is wrong by the
+    threshold reads as a contact.
     """
 
     poses: int = setting(1, low=1, high=50, meaning="poses to measure in")
@@ -300,13 +300,13 @@ class TareSettings:
     )
 
     def drift_variance(self, age_s: float) -> float:
-        """Return by how much a sensor's zero may have moved in so long, as a variance in Nm²."""
+        """Return the variance of a sensor's zero, Nm², after a drift of so many seconds."""
         return (self.drift_Nm_K * self.temperature_K) ** 2 + self.drift_Nm_sqrt_s**2 * age_s
 
 
 @dataclass(frozen=True)
 class HistorySettings:
-    """What the arm's last certificate, of another run, says of it; `run --history` fills it in from the arm's file."""
+    """The arm's last certificate, of an earlier run; `run --history` reads it from the arm's file."""
 
     date_utc: str = setting("", meaning="time of the last certificate, ISO 8601, UTC; empty: none")
     friction_Nm: tuple[float, ...] = setting(
@@ -343,5 +343,5 @@ class HistorySettings:
 
     @property
     def is_known(self) -> bool:
-        """Whether there is a last certificate."""
+        """Whether a last certificate is known."""
         return bool(self.date_utc)

@@ -18,7 +18,7 @@ class ConfigError(ValueError):
 
 
 class DetectorError(ConfigError):
-    """A live detector that can't run here: it isn't registered, doesn't keep the contract, or is too slow."""
+    """A live detector that can't run here: it isn't registered, breaks the detectors' contract, or is too slow."""
 
 
 SUCCESSORS = {
@@ -27,7 +27,7 @@ SUCCESSORS = {
     "certified.sigmas": "`certified.noise_sigmas` and `certified.model_sigmas`",
     "safety.commission_cycles": "`safety.commission_s`",
 }
-"""Keys that are gone, and by what they are replaced, as an error says it."""
+"""Removed keys, and the keys that replace them, as an error prints them."""
 
 
 def setting(
@@ -54,63 +54,67 @@ def parse(section: type[Section], table: dict[str, Any], where: str = "") -> Sec
 
     Raises ConfigError for an unknown key, a missing key, a wrong type or a value outside its bounds.
     """
-    fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, section))}
+    problems: list[ConfigError] = []
+    made = _read_section(section, table, where, problems)
+    if problems:
+        raise problems[0]
+    return typing.cast(Section, made)
+
+
+def find_problems(section: type[Any], table: dict[str, Any]) -> list[str]:
+    """List every reason for which `parse` would refuse a table, a line each.
+
+    Conditions on several keys are checked only if each key is valid by itself; the first violation is reported.
+    """
+    problems: list[ConfigError] = []
+    _read_section(section, table, "", problems)
+    return [str(problem) for problem in problems]
+
+
+def _read_section(section: type[Any], table: dict[str, Any], where: str, problems: list[ConfigError]) -> Any:
+    """Make a section, or add its problems to the list and return None."""
+    fields = {field.name: field for field in dataclasses.fields(section)}
     hints = typing.get_type_hints(section)
-    for key in table:
-        if key not in fields:
-            raise ConfigError(_unknown(key, fields, where))
+    found = [ConfigError(_unknown(key, fields, where)) for key in table if key not in fields]
     values = {}
     for name, field in fields.items():
         if name in table:
-            values[name] = _parse_value(hints[name], table[name], f"{where}{name}", field.metadata)
+            values[name] = _read_value(hints[name], table[name], f"{where}{name}", field.metadata, found)
         elif _is_required(field):
-            raise ConfigError(f"missing key `{where}{name}`")
+            found.append(ConfigError(f"missing key `{where}{name}`"))
+    problems += found
+    if found:
+        return None
     place = where.rstrip(".")
     try:
         return section(**values)
     except ConfigError as error:
-        if place in str(error):
-            raise
-        raise ConfigError(f"`{place}`: {error}") from error
+        problems.append(error if place in str(error) else ConfigError(f"`{place}`: {error}"))
     except ValueError as error:
-        raise ConfigError(f"{place}: {error}" if place else str(error)) from error
+        problems.append(ConfigError(f"{place}: {error}" if place else str(error)))
+    return None
 
 
-def find_problems(section: type[Any], table: dict[str, Any], where: str = "") -> list[str]:
-    """List everything for which `parse` would refuse a table, a line each.
-
-    What concerns several keys of a section is looked at only where each of them is right, and then the first of it.
-    """
-    fields = {field.name: field for field in dataclasses.fields(section)}
-    hints = typing.get_type_hints(section)
-    problems = [_unknown(key, fields, where) for key in table if key not in fields]
-    for name, field in fields.items():
-        if name in table:
-            problems += _value_problems(hints[name], table[name], f"{where}{name}", field.metadata)
-        elif _is_required(field):
-            problems.append(f"missing key `{where}{name}`")
-    if not problems:
-        try:
-            parse(section, table, where)
-        except ConfigError as error:
-            problems.append(str(error))
-    return problems
-
-
-def _value_problems(hint: Any, value: Any, key: str, metadata: Any) -> list[str]:
-    options = [option for option in typing.get_args(hint) if option is not type(None)]
+def _read_value(hint: Any, value: Any, key: str, metadata: Any, problems: list[ConfigError]) -> Any:
+    """Convert a value to its type, or add its problems to the list; of a list of plain values only the first."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return _value_problems(options[0], value, key, metadata)
-    if dataclasses.is_dataclass(hint) and isinstance(value, dict):
-        return find_problems(typing.cast(type[Any], hint), value, f"{key}.")
-    if typing.get_origin(hint) is tuple and dataclasses.is_dataclass(options[0]) and isinstance(value, list):
-        rows = enumerate(value)
-        return [text for index, row in rows for text in _value_problems(options[0], row, f"{key}[{index}]", metadata)]
+        hint = next(option for option in typing.get_args(hint) if option is not type(None))
     try:
-        _parse_value(hint, value, key, metadata)
+        if dataclasses.is_dataclass(hint):
+            if not isinstance(value, dict):
+                raise ConfigError(f"`{key}` = {value!r} must be a table")
+            return _read_section(typing.cast(type[Any], hint), value, f"{key}.", problems)
+        if typing.get_origin(hint) is not tuple:
+            return _parse_scalar(hint, value, key, metadata)
+        hints = _element_hints(hint, value, key)
     except ConfigError as error:
-        return [str(error)]
-    return []
+        problems.append(error)
+        return None
+    found: list[ConfigError] = []
+    pairs = enumerate(zip(hints, value, strict=True))
+    items = tuple(_read_value(element, item, f"{key}[{index}]", metadata, found) for index, (element, item) in pairs)
+    problems += found if any(map(dataclasses.is_dataclass, hints)) else found[:1]
+    return items
 
 
 def _unknown(key: str, known: Iterable[str], where: str) -> str:
@@ -126,16 +130,8 @@ def _is_required(field: "dataclasses.Field[Any]") -> bool:
     return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
-def _parse_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
-    if dataclasses.is_dataclass(hint):
-        if not isinstance(value, dict):
-            raise ConfigError(f"`{key}` = {value!r} must be a table")
-        return parse(typing.cast(type[Any], hint), value, f"{key}.")
-    if typing.get_origin(hint) is tuple:
-        return _parse_tuple(hint, value, key, metadata)
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        hint = next(option for option in typing.get_args(hint) if option is not type(None))
-        return _parse_value(hint, value, key, metadata)
+def _parse_scalar(hint: Any, value: Any, key: str, metadata: Any) -> Any:
+    """Convert a value that is no list or table, within its bounds and choices. Raises ConfigError."""
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
@@ -149,20 +145,16 @@ def _parse_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
     return value
 
 
-def _parse_tuple(hint: Any, value: Any, key: str, metadata: Any) -> tuple[Any, ...]:
+def _element_hints(hint: Any, value: Any, key: str) -> tuple[Any, ...]:
+    """Return the type of each element of a list. Raises ConfigError for another value or length."""
     if not isinstance(value, list | tuple):
         raise ConfigError(f"`{key}` = {value!r} must be a list")
-    arguments = typing.get_args(hint)
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        element_hints: tuple[Any, ...] = (arguments[0],) * len(value)
-    else:
-        element_hints = arguments
-    if len(value) != len(element_hints):
-        raise ConfigError(f"`{key}` has {len(value)} values, {len(element_hints)} expected")
-    return tuple(
-        _parse_value(element, item, f"{key}[{index}]", metadata)
-        for index, (element, item) in enumerate(zip(element_hints, value, strict=True))
-    )
+    hints = typing.get_args(hint)
+    if len(hints) == 2 and hints[1] is Ellipsis:
+        return (hints[0],) * len(value)
+    if len(value) != len(hints):
+        raise ConfigError(f"`{key}` has {len(value)} values, {len(hints)} expected")
+    return hints
 
 
 def _check_bounds(value: float, key: str, metadata: Any) -> None:
@@ -189,11 +181,11 @@ _OTHER_UNITS = {
     "rad": (("deg", math.radians(1.0)),),
     "rad/s": (("Hz", math.tau), ("deg/s", math.radians(1.0))),
 }
-"""Units that a value may have been meant in, with their worth in the setting's own."""
+"""Other units in which a value may have been given by mistake, as factors to the setting's unit."""
 
 
 def _other_unit(value: float, metadata: Any) -> str:
-    """Say what a value out of bounds would be in another unit, if it is within them then."""
+    """Return a hint if a value out of bounds would be within them in another unit."""
     for unit, worth in _OTHER_UNITS.get(metadata["unit"], ()):
         if value and metadata["low"] <= value * worth <= metadata["high"]:
             return f"; {value:g} {unit} are {value * worth:g} {metadata['unit']}"

@@ -17,7 +17,7 @@ class FilterSettings:
 
 
 _GRAVITY_P0 = (50.0, 50.0)
-"""Gravity's torques are some ten times those of Coulomb friction, whose gain is 0.5; a gain goes by their square."""
+"""Gravity torques are about ten times Coulomb friction, whose gain is 0.5; a gain goes with the square."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class TerminationSettings:
 
 @dataclass(frozen=True)
 class LiveDetectorSettings:
-    """One detector that watches beside the scheme's own thresholds."""
+    """One detector that runs live beside the scheme's own thresholds."""
 
     name: str = setting(meaning="a channel of `thresholds`, or a registered detector")
     threshold: tuple[float, float] = setting(
@@ -116,17 +116,17 @@ class DetectorSettings:
 FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")
 """Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.model.regressor`."""
 CROSS_TALK = "cross_talk"
-"""What each torque sensor shows of the other joint's torque, Nm/Nm."""
+"""Share of the other joint's torque in a torque sensor's value, Nm/Nm."""
 
 _KINDS = "inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm, torque offset Nm, lag s, further friction Nm"
 
 
 @dataclass(frozen=True)
 class CertifiedSettings:
-    """The scheme that goes beyond the paper: what is believed, when it is enough, and what stands out from it.
+    """The certified scheme: prior and process noise of the parameters, evidence for a certificate, thresholds.
 
-    Seven numbers are by kind of parameter: inertia, viscous friction, Coulomb friction, gravity, torque offset, lag,
-    further friction.
+    Lists of seven numbers are by kind of parameter: inertia, viscous friction, Coulomb friction, gravity, torque
+    offset, lag, further friction.
     """
 
     cutoffs_rad_s: tuple[float, ...] = setting(
@@ -165,30 +165,35 @@ class CertifiedSettings:
         0.05, unit="rad/s", low=1e-3, high=10.0, meaning="speed over which static friction falls off"
     )
     prior_std: tuple[float, ...] = setting(
-        (1.0, 0.5, 0.5, 10.0, 0.3, 0.001, 0.2), low=0.0, high=1e6, meaning=f"what an arm may be: {_KINDS}"
+        (1.0, 0.5, 0.5, 10.0, 0.3, 0.001, 0.2), low=0.0, high=1e6, meaning=f"prior standard deviation: {_KINDS}"
     )
     enough_std: tuple[float, ...] = setting(
-        (0.02, 0.04, 0.04, 0.2, 0.04, 0.004, 0.2), low=0.0, high=1e6, meaning=f"how well it must be known: {_KINDS}"
+        (0.02, 0.04, 0.04, 0.2, 0.04, 0.004, 0.2),
+        low=0.0,
+        high=1e6,
+        meaning=f"largest standard deviation for a certificate: {_KINDS}",
     )
     drift_std: tuple[float, ...] = setting(
         (0.0, 0.0015, 0.0015, 0.0, 0.0005, 0.0, 0.0015),
         low=0.0,
         high=1e3,
-        meaning=f"how far it may wander in a second of monitoring: {_KINDS}",
+        meaning=f"drift in a second of monitoring, standard deviation: {_KINDS}",
     )
     model_error: tuple[float, ...] = setting(
         (0.003, 0.01, 0.01, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"
     )
     payload_std_kg: float = setting(3.0, unit="kg", low=0.0, high=1000.0, meaning="deviation of a payload's mass")
     payload_inertia_std: float = setting(
-        0.02, unit="kg m²", low=0.0, high=100.0, meaning="what it may add to each inertia beside a point mass"
+        0.02, unit="kg m²", low=0.0, high=100.0, meaning="deviation of its inertia about its own centre"
     )
     residual_Nm: float = setting(0.02, unit="Nm", low=1e-4, high=10.0, meaning="deviation of one filtered residual")
     learn_every: int = setting(4, low=1, high=100, meaning="the estimator learns from one sample in so many")
     hold_back_s: float = setting(
         0.06, unit="s", low=0.0, high=1.0, meaning="how long a sample waits until it is learnt; a contact discards it"
     )
-    recover_s: float = setting(0.5, unit="s", low=0.0, high=60.0, meaning="nothing is learnt so long after a contact")
+    recover_s: float = setting(
+        0.5, unit="s", low=0.0, high=60.0, meaning="time after a contact in which samples are not learnt"
+    )
     fit_s: tuple[float, float] = setting(
         (1.4, 0.45), unit="s", low=0.05, high=600.0, meaning="shortest fit: of the arm, of a payload"
     )

@@ -18,13 +18,13 @@ _DEEPEST = 16
 _LONGEST_KEY = 80
 _TOO_DEEP = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){64}""")
 _MOST_NAMES = 12
-"""More built-in names than this make no line that anybody reads."""
+"""Most built-in names that an error message lists."""
 
 
 def read_toml(path: Path, kind: str = "configuration") -> dict[str, Any]:
-    """Read one TOML file; `kind` says what it is in errors.
+    """Read one TOML file; errors call it `kind`.
 
-    Raises ConfigError when it is missing, no regular file, too large or not TOML.
+    Raises ConfigError if it is missing, not a regular file, too large or not TOML.
     """
     try:
         return parse_toml(read_input(path, _MOST_TOML_BYTES))
@@ -36,7 +36,7 @@ def read_toml(path: Path, kind: str = "configuration") -> dict[str, Any]:
 
 
 def _instead(path: Path, kind: str) -> str:
-    """Name the file beside it that may have been meant, or how one is made."""
+    """Suggest the file with the nearest name beside it, or the command that writes one."""
     try:
         beside = sorted(other.name for other in path.parent.glob("*.toml"))
     except OSError:
@@ -47,27 +47,27 @@ def _instead(path: Path, kind: str) -> str:
 
 
 def parse_toml(text: bytes | str) -> dict[str, Any]:
-    """Read TOML, tables at most 16 deep and integers of 64 bits. Raises ConfigError with what is wrong.
+    """Parse TOML, tables at most 16 deep and integers of 64 bits. Raises ConfigError with the reason.
 
-    A byte order mark at the beginning, which editors on Windows write, is left out.
+    A byte order mark at the beginning, as editors on Windows write it, is ignored.
     """
     try:
         text = (text if isinstance(text, str) else text.decode("utf-8")).removeprefix("\ufeff")
-        if _TOO_DEEP.search(text):  # such a key takes its reader a time that goes by the square
+        if _TOO_DEEP.search(text):  # tomllib takes quadratic time for such a key
             raise RecursionError
         table = tomllib.loads(text)
     except RecursionError:
         raise ConfigError(f"more than {_DEEPEST} tables or lists within each other") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"byte {error.start} is not UTF-8; save the file as UTF-8") from None
-    except ValueError as error:  # of TOML, and of integers that are too long to be read
+    except ValueError as error:  # TOML syntax, or an integer that is too long to be parsed
         raise ConfigError(one_line(error)) from None
     _check_extent(table)
     return table
 
 
 def _check_extent(table: dict[str, Any]) -> None:
-    """Refuse what would not end well further on: very deep tables, integers that no float can hold."""
+    """Raise ConfigError for tables that are too deep and for integers of more than 64 bits, which float can't hold."""
     waiting: list[tuple[str, Any, int]] = [("", table, 0)]
     while waiting:
         key, value, depth = waiting.pop()
@@ -82,22 +82,22 @@ def _check_extent(table: dict[str, Any]) -> None:
 
 
 def builtin_folder() -> Traversable:
-    """Return the folder of the configurations that come with the package."""
+    """Return the folder of the built-in configurations."""
     return resources.files("adacd_hil") / "configs"
 
 
 def builtin_names() -> list[str]:
-    """Name the configurations that come with the package."""
+    """Return the names of the built-in configurations."""
     return toml_names(builtin_folder())
 
 
 def toml_names(folder: Traversable) -> list[str]:
-    """Name the TOML files of a package's folder, without their ending."""
+    """Return the names of the TOML files in a package's folder, without `.toml`."""
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
 def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
-    """Find the file that a built-in name or a path stands for. Raises ConfigError with the nearest built-in name."""
+    """Return the file of a built-in name, or the given path. Raises ConfigError with the nearest built-in name."""
     names = toml_names(folder)
     if name_or_file in names:
         return Path(str(folder / f"{name_or_file}.toml"))
@@ -118,14 +118,14 @@ def to_toml(settings: Any) -> str:
 
 
 def to_short_toml(settings: Any) -> str:
-    """Write what differs from the defaults, a row per line, as TOML that `parse` reads back to the same value."""
+    """Write the settings that differ from their defaults, one row a line, as TOML that `parse` reads back."""
     lines: list[str] = []
     _write_section(settings, "", lines, is_short=True)
     return "\n".join(lines).strip() + "\n"
 
 
 def is_default(field: "dataclasses.Field[Any]", value: Any) -> bool:
-    """Tell whether a setting has the value that it has when it is absent."""
+    """Tell whether a setting has its default value."""
     if field.default_factory is not dataclasses.MISSING:
         return bool(value == field.default_factory())
     return field.default is not dataclasses.MISSING and bool(value == field.default)
@@ -168,7 +168,7 @@ _TOML_ESCAPES = {code: f"\\u{code:04X}" for code in (*range(0x20), 0x7F)} | {
 
 
 def toml_value(value: Any) -> str:
-    """Write a value as TOML that is read back to the same."""
+    """Write a value as TOML that reads back to the same value."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

@@ -1,19 +1,19 @@
-"""Bit budget of a contract: whether its frames get through in time, from the DBC alone.
+"""Bit budget of a contract: whether its frames meet their deadlines, from the DBC alone.
 
-| trigger | counted as | must be through |
+| trigger | counted as | deadline |
 |---|---|---|
 | sync | once per SYNC, SYNC itself included | before the next SYNC |
 | command | once per SYNC, after the feedback | before the next SYNC |
 | event | once per inhibit time; without one, per cycle time; without both, per 100 ms | within its cycle time |
-| request | not while operating, or one SDO frame per SYNC | at leisure |
+| request | not while operating, or one SDO frame per SYNC | none |
 
 All cyclic frames are taken as queued together with SYNC. That is never better than the truth for the last of them, and
-needs nothing known about the devices' and the host's delays. Response times are found for three kinds of traffic:
+needs no knowledge of the devices' and the host's delays. Response times are computed for three kinds of traffic:
 operation (without requests and EMCY), which decides whether the contract fits; the same with one SDO frame per SYNC;
-and with the EMCY of every device besides. What the last two make late is said, not failed: a command that is late acts
-one SYNC later. NMT commands begin and end operation and disturb none of them.
+and with the EMCY of every device besides. Deadlines missed under the last two are reported but don't fail the contract:
+a late command acts one SYNC later. NMT commands begin and end operation and disturb none of them.
 
-On a bus that arms share, what has no node id counts once and everything else once per arm.
+On a bus that several arms share, messages without a node id count once and all others once per arm.
 
 Worst-case response times of messages that share a bus by fixed priority, without preemption: Davis, Burns, Bril,
 Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited and revised", Real-Time Systems 35
@@ -41,7 +41,7 @@ from adacd_hil.wire.contract_frames import (
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FrameBits, unstuffed_frame, worst_case_frame
 
 HORIZON_NS = 1_000_000_000
-"""Longest busy period that is followed; what isn't through after it counts as unbounded."""
+"""Longest busy period that is followed; response times after it count as unbounded."""
 
 
 class Stream(NamedTuple):
@@ -57,7 +57,7 @@ class Stream(NamedTuple):
 
 
 class ResponseTime(NamedTuple):
-    """A response time; where no bound was found, a time that it reaches at least."""
+    """A response time; if unbounded, a time that it reaches at least."""
 
     time_ns: int
     is_bounded: bool = True
@@ -68,8 +68,8 @@ def response_time(
 ) -> ResponseTime:
     """Return the worst-case response time of a message.
 
-    higher: the messages that win arbitration; blocking_ns: the longest frame of those that lose it; bit_ns: one bit at
-    the nominal rate. Where messages use up the bus, a time beyond `deadline_ns` (or the horizon) is returned.
+    higher: messages of higher priority; blocking_ns: the longest frame of lower priority; bit_ns: one bit at the
+    nominal rate. If the bus is overloaded, a time beyond `deadline_ns` (or the horizon) is returned.
     """
     if is_overloaded((*higher, stream)):
         return _exceeded(stream, higher, blocking_ns, bit_ns, HORIZON_NS if deadline_ns is None else deadline_ns)
@@ -95,7 +95,7 @@ def response_time(
 
 
 def is_overloaded(streams: Sequence[Stream]) -> bool:
-    """Tell whether messages together need more than all of the bus."""
+    """Tell whether messages together need more than the whole bus."""
     common = math.lcm(*(stream.interval_ns for stream in streams))
     return sum(stream.duration_ns * (common // stream.interval_ns) for stream in streams) > common
 
@@ -103,13 +103,13 @@ def is_overloaded(streams: Sequence[Stream]) -> bool:
 def _waiting(
     stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, instance: int, waiting_ns: int
 ) -> int:
-    """One step of eq. (9): what is sent before instance q while it waits."""
+    """Return the next iteration of eq. (9): the time of all frames sent before instance q, while it waits."""
     before_ns = sum(s.arrivals(waiting_ns + bit_ns) * s.duration_ns for s in higher)
     return blocking_ns + instance * stream.duration_ns + before_ns
 
 
 def _exceeded(stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, limit_ns: int) -> ResponseTime:
-    """Return a time, beyond `limit_ns` where there is one, that some frame of an endless busy period takes at least."""
+    """Return a time beyond `limit_ns`, if given, that some frame of an endless busy period takes at least."""
     worst_ns = 0
     waiting_ns = blocking_ns
     instance = 0
@@ -124,7 +124,7 @@ def _exceeded(stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns
 
 
 class LoadCase(Enum):
-    """Which frames are on the bus besides the cyclic ones."""
+    """Frames on the bus besides the cyclic ones."""
 
     OPERATION = "operation"
     REQUESTS = "requests"
@@ -133,7 +133,7 @@ class LoadCase(Enum):
 
 @dataclass(frozen=True)
 class FrameBudget:
-    """What a message needs and how long it may take."""
+    """Bits, durations, deadline and response times of a message."""
 
     frame: ContractFrame
     unstuffed: FrameBits
@@ -144,7 +144,7 @@ class FrameBudget:
     responses: dict[LoadCase, ResponseTime]
 
     def late_ns(self, traffic: LoadCase = LoadCase.OPERATION) -> int:
-        """How far it may be beyond its deadline (at least, where the response is unbounded); 0: in time."""
+        """Time by which its response misses the deadline (at least, if unbounded); 0: in time."""
         response = self.responses[traffic]
         if self.deadline_ns is None:
             return 0
@@ -166,48 +166,48 @@ class Budget:
 
     @property
     def cyclic(self) -> tuple[FrameBudget, ...]:
-        """The frames of every cycle."""
+        """Frames that are sent in every cycle."""
         return tuple(entry for entry in self.frames if entry.frame.is_cyclic)
 
     @property
     def unstuffed_bits(self) -> int:
-        """Bits of a cycle without stuffing, of both rates."""
+        """Bits of a cycle's frames without stuff bits, at both rates."""
         return sum(entry.unstuffed.total for entry in self.cyclic)
 
     @property
     def worst_bits(self) -> int:
-        """Bits of a cycle at worst, of both rates."""
+        """Bits of a cycle's frames with the most stuff bits, at both rates."""
         return sum(entry.worst.total for entry in self.cyclic)
 
     @property
     def feedback_ns(self) -> int:
-        """From SYNC until the last feedback is in."""
+        """Time from SYNC to the end of the last feedback frame."""
         return self._sum_ns(Trigger.SYNC)
 
     @property
     def command_ns(self) -> int:
-        """Time of the commands."""
+        """Duration of the command frames."""
         return self._sum_ns(Trigger.COMMAND)
 
     @property
     def cyclic_ns(self) -> int:
-        """Time of all frames of a cycle."""
+        """Duration of all frames of a cycle."""
         return self.feedback_ns + self.command_ns
 
     @property
     def host_ns(self) -> int:
-        """What is left between the last feedback and the last moment to send commands; negative: it doesn't fit."""
+        """Time for the host between the last feedback and the last moment to send commands; negative: doesn't fit."""
         return self.period_us * 1000 - self.cyclic_ns
 
     @property
     def longest_event_ns(self) -> int:
-        """The longest event frame: it can be in the way of SYNC, of feedback and of commands."""
+        """Duration of the longest event frame, which can delay SYNC, feedback and commands."""
         events = [e.duration_ns for e in self.frames if e.frame.trigger is Trigger.EVENT and not e.frame.is_emergency]
         return max(events, default=0)
 
     @property
     def cyclic_load(self) -> float:
-        """Share of the time that cyclic frames take at worst."""
+        """Share of the time that cyclic frames take at most."""
         return self.cyclic_ns / (self.period_us * 1000)
 
     @property
@@ -219,17 +219,17 @@ class Budget:
 
     @property
     def late(self) -> tuple[FrameBudget, ...]:
-        """The frames that may miss their deadline in operation."""
+        """Frames that may miss their deadline in operation."""
         return tuple(entry for entry in self.frames if entry.late_ns() > 0)
 
     @property
     def is_fit(self) -> bool:
-        """Whether every frame gets through in time in operation."""
+        """Whether every frame meets its deadline in operation."""
         return not self.late
 
     @property
     def line(self) -> str:
-        """The verdict."""
+        """The verdict in one line."""
         where = f"{self.contract.name} at {self.period_us} µs"
         if self.is_fit:
             return f"{where} fits: {us(self.cyclic_ns)} µs of cyclic frames, {us(self.host_ns)} µs left for the host"
@@ -242,7 +242,7 @@ class Budget:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What disturbs a contract, one line each."""
+        """Remarks on event frames, requests and EMCY, one line each."""
         notes = []
         if self.longest_event_ns:
             notes.append(f"each event frame in the way takes up to {us(self.longest_event_ns)} µs of the host's time")
@@ -269,7 +269,7 @@ class Budget:
 
 
 def us(time_ns: int) -> str:
-    """Write a time in µs, with a decimal where there is one."""
+    """Format a time in µs, with one decimal unless it is whole."""
     return f"{time_ns / 1000:.0f}" if time_ns % 1000 == 0 else f"{time_ns / 1000:.1f}"
 
 
@@ -287,7 +287,7 @@ def check_budget(
     data_bitrate: int | None = None,
     arms: int = 1,
 ) -> Budget:
-    """Find the budget of a contract, or of several arms of it on one bus.
+    """Compute the budget of a contract, or of several arms of it on one bus.
 
     Period in µs and rates in bit/s default to the DBC's own. Raises CodecError.
     """
@@ -298,7 +298,7 @@ def check_budget(
 def find_budget(
     contract: ContractTiming, period_us: int | None = None, bitrate: int | None = None, data_bitrate: int | None = None
 ) -> Budget:
-    """Find the budget of a contract; see `check_budget`."""
+    """Compute the budget of a contract; see `check_budget`."""
     period_us = _given(contract, "BusPeriod_us", period_us, contract.period_us)
     bitrate = _given(contract, "Baudrate", bitrate, contract.bitrate)
     is_fd = any(frame.length > CLASSIC_BYTES for frame in contract.frames)
@@ -337,7 +337,7 @@ def _is_sent(entry: FrameBudget, traffic: LoadCase) -> bool:
 def _respond(
     entries: list[FrameBudget], place: int, traffic: LoadCase, bit_ns: int, period_ns: int, hosts: int
 ) -> ResponseTime:
-    """Response time of the frame at `place` in the order of arbitration, one request at most of a host in a period."""
+    """Return the response time of the frame at `place` in arbitration order; each host sends one request a period."""
     entry = entries[place]
     above = [other for other in entries[:place] if _is_sent(other, traffic)]
     below = [other for other in entries[place + 1 :] if _is_sent(other, traffic)]
@@ -348,7 +348,7 @@ def _respond(
     if request_ns:
         higher.extend([Stream(request_ns, period_ns)] * hosts)
     blocking_ns = max((o.duration_ns for o in below), default=0)
-    # A frame that this traffic doesn't have is judged as a single one.
+    # A frame that doesn't occur in this load case is judged as a single one.
     interval_ns = entry.interval_ns if _is_sent(entry, traffic) else ASSUMED_INTERVAL_MS * 1_000_000
     stream = Stream(entry.duration_ns, interval_ns)
     return response_time(stream, higher, blocking_ns, bit_ns, entry.deadline_ns)

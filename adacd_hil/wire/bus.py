@@ -1,7 +1,7 @@
-"""Where frames enter and leave: one seam over SocketCAN, the embedded bus, and every other python-can interface.
+"""The bus interface: one Protocol for SocketCAN, the embedded bus, and every other python-can interface.
 
-The embedded bus joins host and emulator in one process, without threads: what the host sends is handled before `send`
-returns. A tap around a bus remembers every frame that passes, both ways, for the log.
+The embedded bus joins host and emulator in one process, without threads: the emulator handles a frame before the host's
+`send` returns. A tap around a bus records every frame in both directions, for the log.
 """
 
 from collections import deque
@@ -16,23 +16,23 @@ class BusError(OSError):
 
 
 class BusMissingError(BusError):
-    """The bus can't be opened; one line with what there is."""
+    """The bus can't be opened; the message is one line with the interfaces that are present."""
 
 
 class TransmitQueueError(BusError):
-    """The transmit queue stays full: nobody acknowledges, or it is too short. What waits in it is old by then."""
+    """The transmit queue stays full: no node acknowledges, or it is too short. Frames in it are outdated."""
 
 
 class SilenceError(BusError):
-    """No device answered a SYNC in lockstep, where nothing goes on without an answer."""
+    """No device answered a SYNC in lockstep, where the run can't continue without an answer."""
 
 
 class InterfaceDownError(BusError):
-    """The interface was taken down or has vanished. The bus end stays dead until `recover`."""
+    """The interface was taken down or has vanished. This bus end stays closed until `recover`."""
 
 
 class BusOffError(BusError):
-    """The controller has left the bus after too many errors. `frame` is the error frame that said so."""
+    """The controller has left the bus after too many errors. `frame` is the error frame that reported it."""
 
     def __init__(self, message: str, frame: "Frame") -> None:
         super().__init__(message)
@@ -40,7 +40,7 @@ class BusOffError(BusError):
 
 
 class QueueBytes(NamedTuple):
-    """What waits in a bus end's queues, in bytes of the kernel's memory: about 700 a frame."""
+    """Fill of a bus end's queues, in bytes of the kernel's memory: about 700 a frame."""
 
     received: int
     sent: int
@@ -52,7 +52,7 @@ NOTHING_QUEUED = QueueBytes(0, 0)
 class Frame(NamedTuple):
     """One CAN frame. t_ns: host time of its reception or transmission.
 
-    An error frame has the error class for its identifier; `adacd_hil.wire.kernel_frames` reads it.
+    The identifier of an error frame holds its error class; `adacd_hil.wire.error_frames` decodes it.
     """
 
     can_id: int
@@ -62,40 +62,40 @@ class Frame(NamedTuple):
 
 
 class Bus(Protocol):
-    """One end of a CAN bus. Those that derive from it may leave what has a body here."""
+    """One end of a CAN bus. Subclasses may leave out methods that have a body here."""
 
     channel: str
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
-        """Identifiers of what was sent and would be overtaken by SYNC now, as far as this end can know."""
+        """Identifiers of sent frames that SYNC would overtake now, as far as this end can know."""
         return ()
 
     @property
     def frames_lost(self) -> int:
-        """Count of received frames that were dropped because this end didn't read them in time, as far as it knows."""
+        """Number of received frames dropped because this end didn't read them in time, as far as it knows."""
         return 0
 
     def queue_bytes(self) -> QueueBytes:
-        """Look at how much waits to be read and to be sent; where the kernel keeps the queues, a system call."""
+        """Read the fill of both queues; a system call if the kernel keeps them."""
         return NOTHING_QUEUED
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Hand a frame to the bus. Raises BusError, of it TransmitQueueError and InterfaceDownError."""
+        """Queue a frame for transmission. Raises BusError, such as TransmitQueueError and InterfaceDownError."""
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Hand some frames to the bus, in this order and at once where that is possible. Raises as `send`."""
+        """Queue several frames in this order, together if possible. Raises as `send`."""
         for can_id, data in frames:
             self.send(can_id, data)
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None when none came within `timeout_s`.
+        """Return the next frame, or None after `timeout_s`.
 
-        Raises BusError, of it BusOffError and InterfaceDownError.
+        Raises BusError, such as BusOffError and InterfaceDownError.
         """
 
-    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:  # noqa: ARG002 (this one has no more at once)
-        """Return the next frame and, up to `most` in all, those that are there with it; [] when none came in time.
+    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:  # noqa: ARG002 (here at most one)
+        """Return the next frame and the received ones behind it, up to `most` in all; [] after `timeout_s`.
 
         An error frame is returned alone. Raises as `receive`.
         """
@@ -103,20 +103,20 @@ class Bus(Protocol):
         return [] if frame is None else [frame]
 
     def recover(self) -> None:
-        """Drop everything queued both ways, here and in the interface, so that no old frame gets out or in.
+        """Drop all queued frames of both directions, here and in the interface, so that no outdated frame passes.
 
         Raises BusError when that isn't possible yet; may be called again.
         """
 
     def close(self) -> None:
-        """Release the bus; twice is once."""
+        """Release the bus; a second call does nothing."""
 
 
 class EmbeddedBus(Bus):
-    """The host's end of a bus within one process; the device's end is `attach` and `deliver`.
+    """The host's end of a bus within one process; the device uses `attach` and `deliver`.
 
-    Frames that the device sends from within the host's `send` are in the host's queue when `send` returns. Waiting is
-    pointless, so `receive` never does.
+    Frames that the device sends during the host's `send` are in the host's queue when `send` returns. No frame can come
+    later, so `receive` never waits.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -126,20 +126,20 @@ class EmbeddedBus(Bus):
         self._device: Callable[[Frame], None] | None = None
 
     def attach(self, device: Callable[[Frame], None]) -> None:
-        """Connect the device's receiver."""
+        """Register the function that receives the host's frames."""
         self._device = device
 
     def deliver(self, can_id: int, data: bytes, is_error: bool = False) -> None:
-        """Send from the device to the host, or report an error as the host's controller does."""
+        """Send a frame from the device to the host, or report an error as the host's controller would."""
         self._received.append(Frame(can_id, data, self._clock.now_ns(), is_error))
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Hand a frame to the device; it has acted on it when this returns."""
+        """Send a frame to the device, which has handled it when this returns."""
         if self._device is not None:
             self._device(Frame(can_id, data, self._clock.now_ns()))
 
     def receive(self, timeout_s: float) -> Frame | None:  # noqa: ARG002 (the protocol's signature)
-        """Return the next frame, or None."""
+        """Return the next frame, or None; doesn't wait."""
         return self._received.popleft() if self._received else None
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:  # noqa: ARG002 (the protocol's signature)
@@ -147,16 +147,16 @@ class EmbeddedBus(Bus):
         return take_first(self._received, most)
 
     def recover(self) -> None:
-        """Drop what the host has not read."""
+        """Drop the frames that the host has not read."""
         self._received.clear()
 
     def close(self) -> None:
-        """Disconnect the device."""
+        """Disconnect the device; later frames are dropped."""
         self._device = None
 
 
 def take_first(received: deque[Frame], most: int) -> list[Frame]:
-    """Take up to `most` frames off a queue, none behind an error frame and that one alone."""
+    """Remove up to `most` frames from a queue and return them: none behind an error frame, and an error frame alone."""
     frames: list[Frame] = []
     while received and len(frames) < most:
         if received[0].is_error:
@@ -166,9 +166,9 @@ def take_first(received: deque[Frame], most: int) -> list[Frame]:
 
 
 class Tap(Bus):
-    """Wraps a bus; `take` returns and forgets the frames since the last call, oldest first, True for sent.
+    """Records the frames of a bus; `take` returns those since the last call, oldest first, with True for sent ones.
 
-    `held_ns` stamps sent frames instead of the clock when it is set: the cycle has just read the clock itself.
+    `held_ns`, if set, is the stamp of sent frames instead of a new reading of the clock.
     """
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
@@ -181,33 +181,33 @@ class Tap(Bus):
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
-        """Identifiers of what was sent and would be overtaken by SYNC, as far as the bus behind it knows."""
+        """Identifiers of sent frames that SYNC would overtake, as far as the wrapped bus knows."""
         return self._bus.waiting_frames
 
     @property
     def frames_lost(self) -> int:
-        """Count of received frames that the bus behind it knows to have dropped."""
+        """Number of received frames that the wrapped bus has dropped."""
         return self._bus.frames_lost
 
     def queue_bytes(self) -> QueueBytes:
-        """Look at how much waits in the bus behind it."""
+        """Read the fill of the wrapped bus's queues."""
         return self._bus.queue_bytes()
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send and remember a frame. Raises BusError."""
-        # Remembered first: on the embedded bus the answers come while `send` runs.
+        """Send and record a frame. Raises BusError."""
+        # Recorded before sending: on the embedded bus the answers come while `send` runs.
         t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
         self._passed.append((True, Frame(can_id, data, t_ns)))
         self._bus.send(can_id, data)
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Send and remember some frames. Raises BusError."""
+        """Send and record several frames. Raises BusError."""
         t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
         self._passed += [(True, Frame(can_id, data, t_ns)) for can_id, data in frames]
         self._bus.send_all(frames)
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Receive and remember a frame. Raises BusError."""
+        """Receive and record a frame. Raises BusError."""
         if self._unread is not None:
             unread, self._unread = self._unread, None
             return unread
@@ -221,7 +221,7 @@ class Tap(Bus):
         return frame
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Receive and remember frames that are there together. Raises BusError."""
+        """Receive and record the frames that are received together. Raises BusError."""
         if self._unread is not None or most == 1:
             frame = self.receive(timeout_s)
             return [] if frame is None else [frame]
@@ -234,19 +234,19 @@ class Tap(Bus):
         return frames
 
     def unread(self, frame: Frame) -> None:
-        """Put a received frame back: it is the next one to be received."""
+        """Put a received frame back; the next `receive` returns it."""
         self._unread = frame
 
     def take(self) -> list[tuple[bool, Frame]]:
-        """Return the frames since the last call."""
+        """Return the frames recorded since the last call, and forget them."""
         passed, self._passed = self._passed, []
         return passed
 
     def recover(self) -> None:
-        """Drop everything queued in the bus behind it; what has passed stays. Raises BusError."""
+        """Drop all queued frames of the wrapped bus; recorded ones stay. Raises BusError."""
         self._unread = None
         self._bus.recover()
 
     def close(self) -> None:
-        """Close the bus behind it."""
+        """Close the wrapped bus."""
         self._bus.close()

@@ -1,6 +1,6 @@
-"""CAN network interfaces of this machine: their state, what waits in a transmit queue, taking one down and up.
+"""CAN network interfaces of this machine: state, fill of the transmit queue, taking one down and up.
 
-The state is what the kernel reports by iproute2 (rtnetlink, IFLA_CAN_*) or, without it, by sysfs.
+The state comes from iproute2 (rtnetlink, IFLA_CAN_*) or, without it, from sysfs.
 
 Sources: Linux netdevice(7) for the flags, rtnetlink(7) for the queueing discipline, linux/can/raw.h; Linux,
 Documentation/networking/can.rst, "CAN network device driver interface".
@@ -43,7 +43,7 @@ _TCA_STATS2, _TCA_STATS_QUEUE = 7, 3
 
 
 class CanInterface:
-    """An interface by its name, present or not."""
+    """A CAN interface by name, present or not."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -51,12 +51,12 @@ class CanInterface:
 
     @property
     def is_up(self) -> bool:
-        """Whether it is present and up."""
+        """Whether the interface is present and up."""
         return bool(self._number("flags", 16) & _IFF_UP)
 
     @property
     def is_virtual(self) -> bool:
-        """Whether surely no controller is behind it, which could hold frames of its own."""
+        """Whether the interface certainly has no controller, which could hold frames of its own."""
         return is_virtual("socketcan", self.name)
 
     def _number(self, file: str, base: int) -> int:
@@ -66,7 +66,7 @@ class CanInterface:
             return 0
 
     def problem(self, is_fd: bool) -> str:
-        """Say in one line why it can't be used, with the remedy; "" when it can."""
+        """Return the reason why it can't be used, with the remedy, in one line; "" if it can."""
         present = can_interfaces()
         if self.name not in present:
             known = f"present: {', '.join(present)}" if present else "no CAN interface is present"
@@ -85,7 +85,7 @@ class CanInterface:
         return ""
 
     def restart(self) -> None:
-        """Take it down and up, which drops every frame in its queue and in its controller.
+        """Take the interface down and up, which drops every frame in its queue and in its controller.
 
         Raises InterfaceDownError when it doesn't come up again, BusError with the command when it isn't permitted.
         """
@@ -114,9 +114,10 @@ class CanInterface:
         fcntl.ioctl(control, _SIOCSIFFLAGS, _FLAGS_REQUEST.pack(self.name.encode(), flags))
 
     def waiting_frames(self) -> int:
-        """Count the frames of all processes that wait in the queueing discipline; needs no permission.
+        """Return the number of frames in the queueing discipline, of all processes; needs no permission.
 
-        What the controller has already taken is not in it. Raises InterfaceDownError when the interface is absent.
+        Frames that the controller has already fetched are not counted. Raises InterfaceDownError if the interface is
+        absent.
         """
         try:
             index = socket.if_nametoindex(self.name)
@@ -126,7 +127,7 @@ class CanInterface:
 
 
 def _queues() -> Iterator[tuple[int, int, int]]:
-    """List (interface, parent, frames waiting) of all queueing disciplines; the root's count includes the others'."""
+    """Yield (interface, parent, frames waiting) of all queueing disciplines; a root's count includes the others'."""
     size = _NETLINK_HEAD.size + _TRAFFIC_HEAD.size
     request = _NETLINK_HEAD.pack(size, _RTM_GETQDISC, _NLM_F_REQUEST_DUMP, 1, 0) + _TRAFFIC_HEAD.pack(0, 0, 0, 0, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as netlink:
@@ -164,7 +165,7 @@ def _attributes(data: bytes) -> dict[int, bytes]:
 
 
 def can_interfaces() -> list[str]:
-    """Name the CAN interfaces of this machine, up or down."""
+    """Return the names of the CAN interfaces of this machine, up or down."""
     names = []
     for folder in sorted(_INTERFACES.glob("*")):
         with contextlib.suppress(OSError):
@@ -174,10 +175,10 @@ def can_interfaces() -> list[str]:
 
 
 def is_virtual(interface: str, channel: str) -> bool:
-    """Tell whether a channel surely has no wire behind it: vcan, vxcan, python-can's own virtual bus.
+    """Tell whether a channel certainly has no wire: vcan, vxcan, python-can's own virtual bus.
 
-    A serial adapter (slcan) has no device of its own and is no such channel. Where the kernel doesn't say what kind an
-    interface is, its name does.
+    False for a serial adapter (slcan), although it has no device of its own. If the kernel doesn't report the kind of
+    an interface, its name decides.
     """
     if interface != "socketcan":
         return interface == "virtual"
@@ -192,7 +193,7 @@ _IP_TIMEOUT_S = 5.0
 
 @dataclass(frozen=True)
 class InterfaceState:
-    """One CAN interface. What the source doesn't say is None.
+    """State of a CAN interface. Fields that the source doesn't report are None.
 
     kind: the driver's rtnetlink kind, `vcan`, `can`, `vxcan`, `slcan`; "" unknown. state: CAN controller state, such
     as ERROR-ACTIVE. sample_point: share of the bit time. restart_ms: 0 is off. rx/tx: the controller's error counters.
@@ -214,12 +215,12 @@ class InterfaceState:
 
     @property
     def is_virtual(self) -> bool:
-        """Whether no wire is behind it."""
+        """Whether the interface has no wire."""
         return self.kind in ("vcan", "vxcan")
 
 
 def read_link(name: str) -> InterfaceState | None:
-    """Read the state of a CAN interface; None when there is no such interface or it is not CAN."""
+    """Read the state of a CAN interface; None if there is no such interface or it is not CAN."""
     ip = shutil.which("ip", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if ip is not None:
         with contextlib.suppress(OSError, subprocess.SubprocessError, ValueError, LookupError):
@@ -230,7 +231,7 @@ def read_link(name: str) -> InterfaceState | None:
 
 
 def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
-    """Read one entry of `ip -details -json link`; None when it is not CAN."""
+    """Parse one entry of `ip -details -json link`; None if it is not CAN."""
     if link.get("link_type") != "can":
         return None
     info = link.get("linkinfo", {})
@@ -256,7 +257,7 @@ def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
 
 
 def read_sysfs_link(folder: Path) -> InterfaceState | None:
-    """Read what sysfs says of an interface, without bit timing; None when it is not there or not CAN."""
+    """Read the state of an interface from sysfs, without bit timing; None if it is absent or not CAN."""
     try:
         if (folder / "type").read_text().strip() != _ARPHRD_CAN:
             return None
@@ -272,16 +273,16 @@ def read_sysfs_link(folder: Path) -> InterfaceState | None:
 
 
 def _kind_of(folder: Path) -> str:
-    """Guess by its name what kind an interface without a device is: sysfs doesn't say. "" where it may be any."""
+    """Guess the kind of an interface without a device from its name, since sysfs doesn't report it; "" if unknown."""
     if (folder / "device").exists():
         return ""
     return next((kind for kind in ("vcan", "vxcan", "slcan") if folder.name.startswith(kind)), "")
 
 
 def carried_frames(name: str) -> int | None:
-    """Count the frames that an interface has carried so far, both ways; None where the kernel doesn't say.
+    """Return the number of frames that an interface has carried, both ways; None if the kernel doesn't report it.
 
-    A virtual interface counts what it sends as received, too.
+    A virtual interface counts its sent frames as received, too.
     """
     folder = _INTERFACES / name / "statistics"
     try:

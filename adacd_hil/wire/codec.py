@@ -1,11 +1,11 @@
 """The cyclic codec: bytes to physical values and back, generated at start from the DBC.
 
-Only what the hot path can do quickly is accepted: little-endian integers of 8, 16, 32 or 64 bits on byte borders, and
-bit fields within one byte. A DBC that asks for more is refused with the signal's name. A frame is decoded all or
-nothing: length first, then (for protected messages) counter and CRC, by `adacd_hil.wire.e2e`.
+Accepted are only layouts that the hot path decodes fast: little-endian integers of 8, 16, 32 or 64 bits on byte
+borders, and bit fields within one byte. Any other layout is refused with the signal's name. A frame is decoded all or
+nothing: `adacd_hil.wire.e2e` first checks its length, then (for protected messages) counter and CRC.
 
-A message of more than 8 bytes is a CAN FD frame and says so in the DBC (VFrameFormat); its length is one that ISO
-11898-1 has a data length code for.
+A message of more than 8 bytes is a CAN FD frame, marked in the DBC by VFrameFormat; its length must have a data length
+code in ISO 11898-1.
 """
 
 import logging
@@ -30,7 +30,7 @@ from adacd_hil.wire.e2e import (
 )
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
 
-logging.getLogger("cantools").addHandler(logging.NullHandler())  # it tells a terminal what is refused here in a line
+logging.getLogger("cantools").addHandler(logging.NullHandler())  # our errors replace its output on the terminal
 
 _FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h"} | {
     (4, False): "I",
@@ -38,11 +38,11 @@ _FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h"} | 
     (8, False): "Q",
     (8, True): "q",
 }
-"""Of a container, by its bytes and whether it is signed. Source: the module struct."""
+"""Letter of the module struct for a container, by bytes and whether it is signed."""
 _MOST_MESSAGES = 1000
-"""Of a contract: to judge their budget takes 3 s, and four times that for twice as many."""
+"""Most messages of a contract: its budget takes 3 s to compute, and four times that for twice as many."""
 WIRE_VERSION = "WireVersion"
-"""The attribute by which a DBC says that it is a contract."""
+"""The DBC attribute that marks a contract."""
 E2E_SIGNALS = ("e2e_crc", "e2e_counter", "e2e_status")
 _E2E_BITS = {
     Protection.PROFILE_2: ((0, 8), (8, 4), (12, 4)),
@@ -61,12 +61,12 @@ class MessageCodec(MessageTable):
     def __init__(self, message: Message) -> None:
         _check_length(message)
         self.protection, self.data_ids = _protection(message)
-        """How the frames are protected; Profile 2: the list of 16 bytes, Profile 5: two bytes, the low one first."""
+        """Protection of the frames; data ids: 16 bytes for Profile 2, two bytes, low first, for Profile 5."""
         super().__init__(message.name, message.frame_id, message.length, _lay_out(message))
         self.senders: tuple[str, ...] = tuple(message.senders)
         self._struct = _container_struct(self.signals)
         self.values = self.signals[len(E2E_SIGNALS) if self.is_protected else 0 :]
-        """The signals without the end-to-end header."""
+        """The signals behind the end-to-end header."""
         # The hot path: values that each fill a container of their own need no shifting.
         is_plain = all(signal.mask == 0 for signal in self.values)
         self._scales = tuple((signal.scale, signal.offset) for signal in self.values)
@@ -80,23 +80,23 @@ class MessageCodec(MessageTable):
 
     @property
     def header_bytes(self) -> int:
-        """How many bytes the end-to-end header takes: 0, 2 or 4."""
+        """Length of the end-to-end header in bytes: 0, 2 or 4."""
         return self.protection.header_bytes
 
     @property
     def is_fd(self) -> bool:
-        """Whether the frames are CAN FD: those of up to 8 bytes are classic on every bus."""
+        """Whether the frames are CAN FD; frames of up to 8 bytes are classic on every bus."""
         return self.length > CLASSIC_BYTES
 
     def place(self, name: str) -> int:
-        """Return the place of a signal among `values`. Raises CodecError when it isn't there."""
+        """Return the index of a signal in `values`. Raises CodecError if there is no such signal."""
         for place, signal in enumerate(self.values):
             if signal.name == name:
                 return place
         raise CodecError(f"{self.name} has no signal {name}")
 
     def sender(self) -> E2eSender:
-        """Make the end-to-end sender of this message; without protection it changes nothing."""
+        """Make the end-to-end sender of this message; without protection it leaves frames unchanged."""
         if self.protection is Protection.PROFILE_2:
             return Profile2Sender(self.data_ids)
         if self.protection is Protection.PROFILE_5:
@@ -104,7 +104,7 @@ class MessageCodec(MessageTable):
         return E2eSender()
 
     def receiver(self) -> E2eReceiver:
-        """Make the end-to-end receiver of this message; without protection it says OK of every frame."""
+        """Make the end-to-end receiver of this message; without protection it accepts every frame as OK."""
         if self.protection is Protection.PROFILE_2:
             return Profile2Receiver(self.data_ids, self.length)
         if self.protection is Protection.PROFILE_5:
@@ -143,11 +143,11 @@ class MessageCodec(MessageTable):
         return tuple(values)
 
     def decode_values(self, data: bytes) -> tuple[float, ...]:
-        """Decode what follows the end-to-end header, in the order of `values`; `data` must have the right length."""
+        """Decode the signals behind the end-to-end header, in the order of `values`; the length must be right."""
         if self._body is None:
             return self.decode(data)[len(self.signals) - len(self.values) :]
         raw = self._body.unpack_from(data, self._body_offset)
-        # A comprehension costs more than what it computes for the one or two values of a classic frame.
+        # For the one or two values of a classic frame a comprehension would cost more than the arithmetic.
         if len(raw) == 1:
             ((scale, offset),) = self._scales
             return (raw[0] * scale + offset,)
@@ -157,11 +157,11 @@ class MessageCodec(MessageTable):
         return tuple([r * scale + offset for r, (scale, offset) in zip(raw, self._scales, strict=True)])
 
     def takes(self, length: int) -> bool:
-        """Say whether a frame of so many bytes can be decoded."""
+        """Tell whether a frame of so many bytes can be decoded."""
         return length == self.length
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
-        """Decode what follows the end-to-end header to (signal, value, unit)."""
+        """Decode the signals behind the end-to-end header to (name, value, unit)."""
         return tuple(
             (signal.name, value, signal.unit)
             for signal, value in zip(self.values, self.decode_values(data), strict=True)
@@ -192,7 +192,7 @@ def _quantise(signal: SignalCodec, value: float) -> int:
 
 
 def _check_length(message: Message) -> None:
-    """Refuse a length that no frame can have, and a frame format that doesn't fit the length."""
+    """Raise CodecError for a length that no frame has, or a frame format that doesn't fit the length."""
     if message.length > CLASSIC_BYTES and message.length not in FD_LENGTHS:
         lengths = ", ".join(map(str, FD_LENGTHS))
         raise CodecError(f"{message.name}: no CAN frame has {message.length} bytes; beyond 8 there are {lengths}")
@@ -286,7 +286,7 @@ def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
 
 
 def _check_messages(database: Database) -> None:
-    """Refuse messages that share a name or an identifier, of which the last would silently count, and too many."""
+    """Raise CodecError for two messages of the same name or identifier, and for too many messages."""
     by_name: dict[str, Message] = {}
     by_id: dict[tuple[int, bool], Message] = {}
     for message in database.messages:
@@ -351,11 +351,11 @@ def contract_folder() -> Path:
 
 _SIGNAL_PLACE = re.compile(rb"\|\s*0*(?P<bits>\d+)\s*@")
 _MOST_BITS = "512"
-"""Of a frame of 64 bytes."""
+"""Bits of the longest frame, 64 bytes."""
 
 
 def read_dbc(path: Path | None = None) -> tuple[bytes, Path]:
-    """Read a DBC (default: the one that comes with the package), and return where it is. Raises CodecError."""
+    """Read a DBC (default: the package's); return its text and path. Raises CodecError."""
     path = path or contract_folder() / "arm.dbc"
     try:
         return read_input(path), path
@@ -364,12 +364,12 @@ def read_dbc(path: Path | None = None) -> tuple[bytes, Path]:
 
 
 def load_codec(path: Path | None = None) -> Codec:
-    """Generate the codec from a DBC (default: the one that comes with the package). Raises CodecError."""
+    """Generate the codec from a DBC (default: the package's). Raises CodecError."""
     return parse_codec(*read_dbc(path))
 
 
 def parse_codec(text: bytes, path: Path) -> Codec:
-    """Generate the codec from the text of a DBC; `path` is where it is, or would be. Raises CodecError."""
+    """Generate the codec from the text of a DBC; `path`: its file, existing or not. Raises CodecError."""
     database = parse_database(text, path)
     try:
         _check_messages(database)
@@ -379,13 +379,13 @@ def parse_codec(text: bytes, path: Path) -> Codec:
 
 
 def parse_database(text: bytes, path: Path) -> Database:
-    """Read the text of any DBC that cantools takes, in UTF-8 or in a code of Windows. Raises CodecError."""
-    for found in _SIGNAL_PLACE.finditer(text):  # cantools makes a character of each of its bits
+    """Parse the text of any DBC that cantools accepts, in UTF-8 or a Windows code page. Raises CodecError."""
+    for found in _SIGNAL_PLACE.finditer(text):  # cantools allocates a character for each bit
         if len(found["bits"]) > len(_MOST_BITS) or int(found["bits"]) > int(_MOST_BITS):
             raise CodecError(f"DBC {path}: a signal has {found['bits'].decode()[:20]} bits, more than {_MOST_BITS}")
     try:
         database = cantools.database.load_string(decode_dbc(text), "dbc")
-    except Exception as error:  # cantools has no class for all that it meets
+    except Exception as error:  # cantools has no common class of its errors
         reason = " ".join(str(error).split()) or type(error).__name__
         raise CodecError(f"DBC {path} can't be read: {reason}") from None
     if not isinstance(database, Database):
@@ -394,7 +394,7 @@ def parse_database(text: bytes, path: Path) -> Database:
 
 
 def decode_dbc(text: bytes) -> str:
-    """Decode the text of a DBC: UTF-8, else the code that vendors' tools write, as cantools assumes."""
+    """Decode the text of a DBC: UTF-8, else the code page of vendors' tools, as cantools assumes."""
     try:
         return text.decode("utf-8-sig")
     except UnicodeDecodeError:

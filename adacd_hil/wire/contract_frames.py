@@ -1,11 +1,11 @@
-"""What a contract says of its frames besides their layout: when they are sent, at which bit rates, at which node ids.
+"""Timing and node ids of a contract's frames: triggers, cycle times, bit rates, moved node ids.
 
 DBC attributes: of the network `Baudrate`, `BaudrateCANFD` (bit/s; 0: classic), `BusPeriod_us`; of a message `Trigger`,
 `GenMsgCycleTime` (ms, period of an event frame), `GenMsgDelayTime` (ms, its inhibit time).
 
-What a node sends and receives follows its node id, the low seven bits of an identifier. So a contract serves another
-arm on the bus, or a host that isn't node 127, once its node ids are moved. NMT, SYNC and everything else without a node
-stay; layouts, data ids and names stay too. Source: CiA 301 clause 7.3.3 (predefined connection set).
+A device's identifiers follow from its node id, the low seven bits. So a contract serves another arm on the bus, or a
+host other than node 127, once its node ids are moved. NMT, SYNC and other identifiers without a node id stay; layouts,
+data ids and names stay, too. Source: CiA 301 clause 7.3.3 (predefined connection set).
 """
 
 import re
@@ -20,18 +20,18 @@ from adacd_hil.wire.dbc_decoder import DbcDecoder
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 HOST_NODE = 127
-"""Node id of the host unless said otherwise."""
+"""Node id of the host by default."""
 NODE_MASK = 0x7F
 HOST_HEARTBEAT = "HostHeartbeat"
 NMT_ID, SYNC_ID, EMERGENCY_ID, HEARTBEAT_ID = 0x000, 0x080, 0x080, 0x700
 SDO_RESPONSE_ID, SDO_REQUEST_ID = 0x580, 0x600
-"""Identifiers of the predefined connection set; all but the first two plus the node id."""
+"""Base identifiers of the predefined connection set; a node adds its id to all but the first two."""
 SYNC_OVERFLOW = 240
 """0x1019: the SYNC counter runs 1…240, as long as CiA 301 lets it."""
 NOT_VALID = 1 << 31
-"""Of a COB-ID, CiA 301 clause 7.5.2.35: the PDO or EMCY is switched off."""
+"""Bit 31 of a COB-ID, CiA 301 clause 7.5.2.35: the PDO or EMCY is switched off."""
 DEFAULT_BITRATE = 1_000_000
-"""Of a DBC that doesn't say, bit/s."""
+"""Bit rate of a DBC without that attribute, bit/s."""
 ASSUMED_INTERVAL_MS = 100
 """Interval of an event frame that declares none: the usual heartbeat period."""
 _LAST_DEVICE = 126
@@ -40,14 +40,14 @@ _STATEMENT = re.compile(
     r"""|BA_\s+"\w+"\s+(?:BO_|SG_))\s+)(?P<id>\d+)\b""",
     re.MULTILINE,
 )
-"""A statement of a DBC that is about one message, up to its identifier."""
+"""Matches a DBC statement about one message, up to its identifier."""
 
 
 def move_contract(codec: Codec, node_offset: int, host_node: int | None = None) -> Codec:
-    """Return the contract with all devices' node ids moved and the host at `host_node` (default: where it is).
+    """Return the contract with all devices' node ids moved and the host at `host_node` (default: unchanged).
 
-    Its path is the file's name alone: it has no file yet. Without a change it is the contract itself. Raises CodecError
-    for a node id beyond 126, one that the host has, and an identifier that holds no node id.
+    Its path is the file's name alone, since it has no file yet. Without a change the same object is returned. Raises
+    CodecError for a node id beyond 126, a node id equal to the host's, and a device's identifier without a node id.
     """
     host_id = codec.message(HOST_HEARTBEAT).can_id
     if host_node is None:
@@ -98,7 +98,7 @@ class Trigger(Enum):
 
 @dataclass(frozen=True)
 class ContractFrame:
-    """What a contract says of a message."""
+    """Frame of a contract: identifier, length, trigger, times."""
 
     name: str
     can_id: int
@@ -110,7 +110,7 @@ class ContractFrame:
 
     @property
     def priority(self) -> tuple[int, int]:
-        """Order of arbitration; the lower wins. A base frame wins over an extended one with the same first 11 bits."""
+        """Arbitration order; lower wins. A base frame wins over an extended one with the same first 11 bits."""
         return (self.can_id >> 18, 1 + (self.can_id & 0x3FFFF)) if self.is_extended else (self.can_id, 0)
 
     @property
@@ -131,17 +131,17 @@ class ContractFrame:
 
     @property
     def has_interval(self) -> bool:
-        """Whether something bounds how often it is sent; a heartbeat keeps its time."""
+        """Whether an inhibit or cycle time bounds its rate; heartbeats always have one."""
         return self.trigger is not Trigger.EVENT or self.inhibit_ms > 0 or self._function == HEARTBEAT_ID
 
     def interval_ns(self, period_ns: int) -> int:
-        """Smallest time between two of them that is counted with."""
+        """Smallest interval between two of them that the budget assumes."""
         if self.trigger is Trigger.EVENT:
             return (self.inhibit_ms or self.cycle_ms or ASSUMED_INTERVAL_MS) * 1_000_000
         return period_ns
 
     def deadline_ns(self, period_ns: int) -> int | None:
-        """Time within which it must be through; None: at leisure."""
+        """Time within which it must be transmitted; None: no deadline."""
         if self.is_cyclic:
             return period_ns
         return self.cycle_ms * 1_000_000 if self.trigger is Trigger.EVENT and self.cycle_ms else None
@@ -149,9 +149,9 @@ class ContractFrame:
 
 @dataclass(frozen=True)
 class ContractTiming:
-    """Frames of a DBC in the order of arbitration; rates in bit/s; a period of 0 is not given.
+    """Frames of a DBC in arbitration order; rates in bit/s; period 0: not given.
 
-    `arms`: how many, each with a host.
+    `arms`: number of arms on the bus, each with its host.
     """
 
     name: str
@@ -167,7 +167,7 @@ def read_contract(text: bytes, name: str) -> ContractTiming:
     database = parse_database(text, Path(name))
     definitions = database.dbc.attribute_definitions if database.dbc else {}
     if "Trigger" not in definitions:
-        raise CodecError(f"DBC {name} doesn't say when its messages are sent: it has no Trigger attribute")
+        raise CodecError(f"DBC {name} has no attribute Trigger, which tells when messages are sent")
     frames = [_read_frame(message, name) for message in database.messages]
     return ContractTiming(
         name,
@@ -194,7 +194,7 @@ def _read_frame(message: Message, contract: str) -> ContractFrame:
 
 
 def _attribute(owner: Database | Message, name: str) -> int | str:
-    """Value of an attribute, its default, or 0 where the DBC doesn't know it."""
+    """Return the value of an attribute, its default, or 0 if the DBC doesn't define it."""
     if owner.dbc is None or name not in owner.dbc.attribute_definitions:
         return 0
     attribute = owner.dbc.attributes.get(name)
@@ -203,7 +203,7 @@ def _attribute(owner: Database | Message, name: str) -> int | str:
 
 
 def share_bus(contract: ContractTiming, arms: int) -> ContractTiming:
-    """Return what is on a bus that several arms of a contract share, whatever their order on it.
+    """Return the frames of several arms of one contract on a bus, for any order of the arms.
 
     The devices' node ids follow each other from 1, the hosts' go down from the contract's. Raises CodecError for an
     identifier without node id.

@@ -1,6 +1,6 @@
-"""A DBC that only decodes: any that cantools reads, with big-endian, multiplexed and float signals, gaps and overlaps.
+"""Decoder for any DBC that cantools reads, with big-endian, multiplexed and float signals, gaps and overlaps.
 
-The rules of a contract hold in `adacd_hil.wire.codec`, for the frames of a cycle.
+A contract, which is stricter, is decoded by `adacd_hil.wire.codec`.
 """
 
 from collections import Counter
@@ -19,28 +19,28 @@ class MessageDecoder:
     is_protected = False
 
     def __init__(self, message: Message, is_exact: bool) -> None:
-        """Take cantools' message. is_exact: frames of another length are none, as in a contract."""
+        """Take cantools' message. is_exact: frames of another length are refused, as in a contract."""
         self.name = message.name
         self.can_id = message.frame_id
         self.is_extended = message.is_extended_frame
         self.senders = tuple(message.senders)
         self.units = {signal.name: signal.unit or "" for signal in message.signals}
-        """Of each signal, by name, in the order of their places."""
+        """Unit of each signal, by name, in the order of their places."""
         self.partly_decoded: Counter[str] = Counter()
-        """Frames whose multiplexer has a value that the DBC doesn't list, by cantools' words for it."""
+        """Number of frames whose multiplexer has a value that the DBC doesn't list, by cantools' error text."""
         self._message = message
         self._is_exact = is_exact
         plain = [signal for signal in message.signals if not signal.multiplexer_ids]
         self._plain = plain, create_encode_decode_formats(plain, message.length)
 
     def takes(self, length: int) -> bool:
-        """Say whether a frame of so many bytes is decoded: of a contract a whole one, of others what is there."""
+        """Tell whether a frame of so many bytes is decoded; short frames only if the DBC is no contract."""
         return length == self._message.length or not self._is_exact
 
     def decode(self, data: bytes) -> dict[str, float]:
-        """Decode the signals that a frame holds: not all where it is short, or multiplexed.
+        """Decode the signals that a frame holds; a short or multiplexed frame doesn't hold all.
 
-        Of a multiplexer whose value the DBC doesn't know, those that are always there.
+        If the DBC doesn't list the multiplexer's value, only the signals outside the multiplexer are decoded.
         """
         try:
             values = self._message.decode_simple(data, decode_choices=False, allow_truncated=True)
@@ -50,15 +50,15 @@ class MessageDecoder:
         return {name: float(value) for name, value in values.items()}  # type: ignore[arg-type]
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
-        """Decode a frame to (signal, value, unit)."""
+        """Decode a frame to its signals' (name, value, unit)."""
         return tuple((name, value, self.units[name]) for name, value in self.decode(data).items())
 
 
 class DbcDecoder:
-    """All messages of one DBC. Of messages that share a name the last one counts, as for cantools."""
+    """All messages of one DBC. Of several messages with one name the last counts, as for cantools."""
 
     def __init__(self, text: bytes, path: Path) -> None:
-        """Read it; `path` is where it is, or would be. Raises CodecError."""
+        """Parse the text; `path`: its file, existing or not. Raises CodecError."""
         self.path = path
         self.database = parse_database(text, path)
         self.messages = {message.name: MessageDecoder(message, self.is_contract) for message in self.database.messages}
@@ -67,10 +67,10 @@ class DbcDecoder:
 
     @property
     def is_contract(self) -> bool:
-        """Whether it says that it is a contract; then its rules hold."""
+        """Whether the DBC is marked as a contract; then frames of a wrong length are refused."""
         return self.database.dbc is not None and WIRE_VERSION in self.database.dbc.attributes
 
 
 def load_decoder(path: Path | None = None) -> DbcDecoder:
-    """Read a DBC (default: the one that comes with the package). Raises CodecError."""
+    """Read a DBC (default: the package's). Raises CodecError."""
     return DbcDecoder(*read_dbc(path))

@@ -6,7 +6,7 @@ the message's data id list, picked by the counter. The low nibble of byte 1 is t
 Profile 5, four bytes. Bytes 0 and 1 are the CRC-16 (polynomial 0x1021, initial 0xFFFF, no final XOR; little-endian)
 over bytes 2… and the data id, low byte first. Byte 2 is the counter 0…255.
 
-What the header has left, the high nibble of byte 1 and the whole of byte 3, is the sender's status. The CRC covers it.
+The rest of the header, the high nibble of byte 1 and byte 3, is the sender's status. The CRC covers it.
 Source: AUTOSAR FO PRS E2E Protocol, specifications of E2E Profile 2 and Profile 5.
 """
 
@@ -55,7 +55,7 @@ class Protection(Enum):
 
     @property
     def header_bytes(self) -> int:
-        """How many bytes of each frame the header takes."""
+        """Length of the header in bytes."""
         return {Protection.NONE: 0, Protection.PROFILE_2: 2, Protection.PROFILE_5: 4}[self]
 
 
@@ -63,7 +63,7 @@ _LAST_VALID = 1  # OK_SOME_LOST: a plain number, since looking it up costs more 
 
 
 class E2eStatus(IntEnum):
-    """What the receiver's check says of one cycle of one message. The numbers are logged."""
+    """Result of the check of one message in one cycle. The numbers are logged."""
 
     OK = 0  # also the first frame of all: it sets the sequence
     OK_SOME_LOST = 1  # the counter jumped, within the tolerance
@@ -81,36 +81,37 @@ class E2eStatus(IntEnum):
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How much loss a receiver forgives. The names in brackets are the standard's."""
+    """Losses that a receiver tolerates. The names in brackets are the standard's."""
 
     max_delta: int
-    """Largest step of the counter that is loss and not a wrong sequence. Profile 2 (MaxDeltaCounterInit): one more, and
-    one more again for each cycle since the last frame in sequence. Profile 5 (MaxDeltaCounter): as it stands."""
+    """Largest step of the counter that counts as loss; a larger one is a wrong sequence. Profile 2
+    (MaxDeltaCounterInit): plus one, and plus one for each cycle since the last frame in sequence. Profile 5
+    (MaxDeltaCounter): as it stands."""
     max_missing: int
     """Cycles in a row without a new frame, after which the sequence counts as lost [MaxNoNewOrRepeatedData]."""
     sync_frames: int
-    """Frames in sequence that only show the sequence, after it was lost [SyncCounterInit]."""
+    """Frames in sequence needed after a lost sequence before values are used again [SyncCounterInit]."""
 
 
 # A run ends when a value is older than `bus.max_age_cycles`, 3 unless set otherwise. So a frame after 3 lost ones must
 # be usable at once, and after a single wrong sequence the third frame. Four missing cycles let Profile 2 take steps up
 # to 7, less than half the counter's circle: none of the last 8 frames is taken for a new one. One frame of SYNC is the
 # least that confirms a new sequence before it is used: a stray old frame has no successor.
-# Profile 5's step is what four missing cycles amount to.
+# Profile 5's step is the equivalent of four missing cycles.
 PROFILE_2_TOLERANCE = Tolerance(max_delta=2, max_missing=4, sync_frames=1)
 PROFILE_5_TOLERANCE = Tolerance(max_delta=5, max_missing=4, sync_frames=1)
 
 
 class E2eSender:
-    """Sends the frames of one message as they are; a profile's sender counts and signs them."""
+    """Sends frames unchanged; the sender of a profile adds counter and CRC."""
 
     def protect(self, frame: bytearray) -> bytes:
-        """Fill in the header of `frame`, but for the sender's status, and return it as bytes."""
+        """Fill in counter and CRC of `frame` and return it as bytes; the sender's status stays."""
         return bytes(frame)
 
 
 class Profile2Sender(E2eSender):
-    """Counts and signs the frames of one message by Profile 2."""
+    """Adds counter and CRC of Profile 2 to the frames of one message."""
 
     def __init__(self, data_ids: bytes) -> None:
         """`data_ids`: 16 bytes, one for each counter."""
@@ -127,7 +128,7 @@ class Profile2Sender(E2eSender):
 
 
 class Profile5Sender(E2eSender):
-    """Counts and signs the frames of one message by Profile 5."""
+    """Adds counter and CRC of Profile 5 to the frames of one message."""
 
     def __init__(self, data_id: bytes) -> None:
         """`data_id`: two bytes, the low one first."""
@@ -145,63 +146,63 @@ class Profile5Sender(E2eSender):
 
 
 class E2eReceiver:
-    """Takes the frames of one message as they are, and counts; a profile's receiver checks them."""
+    """Accepts the frames of one message unchecked, and counts them; the receiver of a profile checks them."""
 
     def __init__(self) -> None:
         self.counts = [0] * len(E2eStatus)
-        """How often each status was found; the index is its number."""
+        """Number of frames by status; the index is the status."""
         self.status = E2eStatus.NO_NEW_DATA
-        """What the last frame's check said."""
+        """Status of the last frame."""
 
     @property
     def counter_range(self) -> int:
-        """How many values the counter has; 0 without one."""
+        """Number of values of the counter; 0 without counter."""
         return 0
 
     @property
     def counter(self) -> int | None:
-        """The last frame's counter while that frame was in sequence; None when it wasn't, none came, or none counts."""
+        """Counter of the last frame; None before the first, after a frame out of sequence, or without counter."""
         return None
 
     def check(self, frame: bytes) -> E2eStatus:
-        """Check one frame; only a valid one may change a value."""
+        """Check one frame and return its status; use its values only if the status is valid."""
         status = self.status = self._judge(frame)
         self.counts[status] += 1
         return status
 
     def step_of(self, frame: bytes) -> int | None:  # noqa: ARG002
-        """Say by how much a frame's counter is ahead of the last one's, unchecked; None without counter, or before."""
+        """Return the step of a frame's counter from the last one's, unchecked; None before the first, or no counter."""
         return None
 
     def is_signed(self, frame: bytes) -> bool:  # noqa: ARG002
-        """Tell whether length and CRC of a frame are right; changes nothing."""
+        """Tell whether length and CRC of a frame are right; doesn't count it."""
         return True
 
     def miss(self) -> E2eStatus:
-        """Note a cycle in which no frame came."""
+        """Count a cycle without a frame."""
         self._note_silence()
         self.counts[E2eStatus.NO_NEW_DATA] += 1
         return E2eStatus.NO_NEW_DATA
 
     @property
     def rejected(self) -> int:
-        """How many frames came and weren't valid."""
+        """Number of frames that were not valid."""
         return sum(self.counts[s] for s in E2eStatus if not s.is_valid) - self.counts[E2eStatus.NO_NEW_DATA]
 
     def tally(self) -> list[tuple[E2eStatus, int]]:
-        """Return how often each status was found so far."""
+        """Return the number of frames by status."""
         return list(zip(E2eStatus, self.counts, strict=True))
 
     def restart(self) -> None:
-        """Forget the sequence: the next frame with a right CRC sets it. The counts stay."""
+        """Forget the sequence: the next frame with a right CRC starts a new one. The counts stay."""
 
     def skip(self, count: int) -> None:
-        """Take so many frames for OK that were checked elsewhere; the next frame with a right CRC sets the sequence."""
+        """Count so many frames as OK that were checked elsewhere; the next frame with a right CRC starts a sequence."""
         self.counts[E2eStatus.OK] += count
         self.restart()
 
     def follow(self) -> None:
-        """Take the frame that follows the last one for OK, checked elsewhere; `counter` was not None."""
+        """Count the next frame in sequence as OK, checked elsewhere; requires `counter` other than None."""
         self.counts[E2eStatus.OK] += 1
         self.status = E2eStatus.OK
 
@@ -213,7 +214,7 @@ class E2eReceiver:
 
 
 class _SequenceReceiver(E2eReceiver):
-    """What the receivers of both profiles do once a frame is in sequence, and after a silence."""
+    """Common part of both profiles' receivers: sequence, silence, SYNC."""
 
     def __init__(self, length: int, tolerance: Tolerance) -> None:
         super().__init__()
@@ -222,18 +223,18 @@ class _SequenceReceiver(E2eReceiver):
         self.restart()
 
     def restart(self) -> None:
-        """Forget the sequence: the next frame with a right CRC sets it. The counts stay."""
+        """Forget the sequence: the next frame with a right CRC starts a new one. The counts stay."""
         self._last: int | None = None
         self._missing = 0
         self._to_sync = 0
 
     @property
     def counter(self) -> int | None:
-        """The last frame's counter while that frame was in sequence; None when it wasn't or none came."""
+        """Counter of the last frame; None before the first and after a frame out of sequence."""
         return self._last if self._missing == self._to_sync == 0 else None
 
     def follow(self) -> None:
-        """Take the frame that follows the last one for OK, checked elsewhere; `counter` was not None."""
+        """Count the next frame in sequence as OK, checked elsewhere; requires `counter` other than None."""
         super().follow()
         self._last = ((self._last or 0) + 1) % self.counter_range
 
@@ -241,7 +242,7 @@ class _SequenceReceiver(E2eReceiver):
         self._missing += 1
 
     def _begin(self, counter: int) -> E2eStatus:
-        """Take the first frame. The standard calls it INITIAL; here it may be used, and silence before it is none."""
+        """Accept the first frame, the standard's INITIAL. Its values are used; silence before it is ignored."""
         self._last = counter
         self._missing = 0
         return E2eStatus.OK
@@ -252,7 +253,7 @@ class _SequenceReceiver(E2eReceiver):
         return E2eStatus.WRONG_SEQUENCE
 
     def _accept(self, delta: int) -> E2eStatus:
-        """Judge a frame in sequence by what went before it."""
+        """Return the status of a frame in sequence: OK, OK_SOME_LOST, or SYNC after a silence."""
         missing, self._missing = self._missing, 0
         if missing > self._tolerance.max_missing:
             self._to_sync = self._tolerance.sync_frames
@@ -266,7 +267,7 @@ class _SequenceReceiver(E2eReceiver):
 class Profile2Receiver(_SequenceReceiver):
     """Checks the frames of one message by Profile 2 (E2E_P02Check).
 
-    As in the standard the tolerated step grows with each cycle that brings nothing usable, wrong CRCs included.
+    As in the standard the tolerated step grows with each cycle without a usable frame, wrong CRCs included.
     """
 
     def __init__(self, data_ids: bytes, length: int, tolerance: Tolerance = PROFILE_2_TOLERANCE) -> None:
@@ -275,28 +276,28 @@ class Profile2Receiver(_SequenceReceiver):
         self._data_ids = data_ids
 
     def restart(self) -> None:
-        """Forget the sequence: the next frame with a right CRC sets it. The counts stay."""
+        """Forget the sequence: the next frame with a right CRC starts a new one. The counts stay."""
         super().restart()
         self._max_delta = self._tolerance.max_delta
 
     @property
     def counter(self) -> int | None:
-        """The last frame's counter while that frame was in sequence; None when it wasn't or none came."""
+        """Counter of the last frame; None before the first and after a frame out of sequence."""
         return super().counter if self._max_delta == self._tolerance.max_delta else None
 
     @property
     def counter_range(self) -> int:
-        """How many values the counter has."""
+        """Number of values of the counter."""
         return _COUNTER_MASK_2 + 1
 
     def step_of(self, frame: bytes) -> int | None:
-        """Say by how much a frame's counter is ahead of the last one's, unchecked; None before the first."""
+        """Return the step of a frame's counter from the last one's, unchecked; None before the first."""
         if self._last is None or len(frame) != self._length:
             return None
         return (frame[1] - self._last) & _COUNTER_MASK_2
 
     def is_signed(self, frame: bytes) -> bool:
-        """Tell whether length and CRC of a frame are right; changes nothing."""
+        """Tell whether length and CRC of a frame are right; doesn't count it."""
         return len(frame) == self._length and frame[0] == crc8(frame, self._data_ids[frame[1] & _COUNTER_MASK_2])
 
     def _note_silence(self) -> None:
@@ -320,7 +321,7 @@ class Profile2Receiver(_SequenceReceiver):
             self._missing += 1
             return E2eStatus.REPEATED
         is_in_sequence = delta <= self._max_delta
-        if is_in_sequence or self._tolerance.sync_frames:  # without SYNC only a wider tolerance leads back
+        if is_in_sequence or self._tolerance.sync_frames:  # without SYNC only a wider tolerance recovers
             self._last = counter
             self._max_delta = self._tolerance.max_delta
         return self._accept(delta) if is_in_sequence else self._lose_sequence()
@@ -329,8 +330,8 @@ class Profile2Receiver(_SequenceReceiver):
 class Profile5Receiver(_SequenceReceiver):
     """Checks the frames of one message by Profile 5 (E2E_P05Check).
 
-    The standard's check has no SYNC: it leaves that to a state machine over it. Here the SYNC of Profile 2 stands for
-    it, so that both profiles answer a silence alike.
+    The standard's check has no SYNC: it leaves that to a state machine above it. Here Profile 2's SYNC is used, so that
+    both profiles treat a silence alike.
     """
 
     def __init__(self, data_id: bytes, length: int, tolerance: Tolerance = PROFILE_5_TOLERANCE) -> None:
@@ -340,17 +341,17 @@ class Profile5Receiver(_SequenceReceiver):
 
     @property
     def counter_range(self) -> int:
-        """How many values the counter has."""
+        """Number of values of the counter."""
         return _COUNTER_MASK_5 + 1
 
     def step_of(self, frame: bytes) -> int | None:
-        """Say by how much a frame's counter is ahead of the last one's, unchecked; None before the first."""
+        """Return the step of a frame's counter from the last one's, unchecked; None before the first."""
         if self._last is None or len(frame) != self._length:
             return None
         return (frame[2] - self._last) & _COUNTER_MASK_5
 
     def is_signed(self, frame: bytes) -> bool:
-        """Tell whether length and CRC of a frame are right; changes nothing."""
+        """Tell whether length and CRC of a frame are right; doesn't count it."""
         return len(frame) == self._length and frame[0] | frame[1] << 8 == crc16(frame, self._data_id)
 
     def _judge(self, frame: bytes) -> E2eStatus:

@@ -1,7 +1,7 @@
-"""The text of an EDS without what describes no object and would end its reading.
+"""Repairs the text of an EDS: removes or completes sections that make canopen refuse the file.
 
-Vendors leave comments out that they announce, numbers of `[DeviceInfo]` empty, and dummies that they don't have.
-canopen reads these sections first, and refuses the file for each of them.
+Vendors announce comments and omit them, leave numbers of `[DeviceInfo]` empty, and list dummies that don't exist.
+canopen reads these sections first, and fails on each of them.
 """
 
 import re
@@ -13,7 +13,7 @@ _DUMMIES = range(1, 8)
 
 
 def readable_eds(text: str) -> str:
-    """Leave out comments and device data that are no numbers, and complete the dummies."""
+    """Return the text without comments and empty device numbers, and with all announced dummies."""
     return "\n".join(_readable(text.splitlines()))
 
 

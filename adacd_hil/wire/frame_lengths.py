@@ -1,10 +1,10 @@
-"""What a CAN frame can be: its identifier, its bytes, its length in bits without stuffing and at worst.
+"""Lengths of CAN frames: bits without stuffing and at worst, allowed data lengths, identifiers.
 
-Exactly, with the stuff bits of its content: `adacd_hil.wire.frame_time`.
-All counts go from start of frame to the end of the intermission (3 bits), after which the next frame can begin, and are
-of data frames (no remote frames). Source: ISO 11898-1, frame formats and frame coding; the worst case of classic
-frames: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited and
-revised", Real-Time Systems 35 (2007), eq. (1) and (2).
+`adacd_hil.wire.frame_time` computes the exact length with the stuff bits of a frame's content.
+All counts go from start of frame to the end of the intermission (3 bits), after which the next frame can begin, and
+are those of data frames (no remote frames). Source: ISO 11898-1, frame formats and frame coding; the worst case of
+classic frames: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited
+and revised", Real-Time Systems 35 (2007), eq. (1) and (2).
 
 A frame with more than 8 bytes is CAN FD (ISO, not the first Bosch format) with bit rate switch; all others are classic.
 In CAN FD the bits from BRS to the CRC delimiter run at the data bit rate. Each of these two bits changes the rate at
@@ -17,11 +17,11 @@ from typing import NamedTuple
 CLASSIC_BYTES = 8
 """A frame with more data is CAN FD with bit rate switch; one with less is classic, on an FD bus too."""
 MAX_STANDARD_ID = 0x7FF
-"""Identifiers beyond it are 29-bit ones."""
+"""Larger identifiers are 29-bit ones."""
 FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
-"""Counts of data bytes that an FD frame can have beyond those of a classic one. Source: ISO 11898-1, table of DLC."""
+"""Data lengths of FD frames beyond those of classic ones. Source: ISO 11898-1, table of DLC."""
 FRAME_LENGTHS = (*range(CLASSIC_BYTES + 1), *FD_LENGTHS)
-"""Bytes that CAN FD can carry, by data length code."""
+"""Data lengths of CAN FD, by data length code."""
 TAIL_BITS = 3 + 7 + 3  # CRC delimiter, acknowledgement, its delimiter; end of frame; intermission
 _FD_TAIL_BITS = 2 + 7 + 3  # the CRC delimiter is a data bit
 _LONG_CRC_BYTES = 16  # CRC-17 up to here, CRC-21 above
@@ -35,7 +35,7 @@ class FrameBits(NamedTuple):
 
     @property
     def total(self) -> int:
-        """All bits."""
+        """Sum of the bits at both rates."""
         return self.nominal + self.data
 
     def duration_ns(self, bitrate: int, data_bitrate: int = 0) -> int:
@@ -49,18 +49,18 @@ class FrameBits(NamedTuple):
 
 
 def unstuffed_bits(length: int, is_extended: bool = False) -> int:
-    """Bits of a classic frame with `length` bytes, stuff bits left out. Raises ValueError over 8 bytes."""
+    """Return the bits of a classic frame with `length` bytes, without stuff bits. Raises ValueError over 8 bytes."""
     return _stuffable_bits(length, is_extended) + TAIL_BITS
 
 
 def worst_case_bits(length: int, is_extended: bool = False) -> int:
-    """Most bits that a classic frame with `length` bytes can have. Raises ValueError over 8 bytes."""
+    """Return the most bits of a classic frame with `length` bytes. Raises ValueError over 8 bytes."""
     stuffable = _stuffable_bits(length, is_extended)
     return stuffable + TAIL_BITS + (stuffable - 1) // 4
 
 
 def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
-    """Bits of a CAN FD frame, dynamic stuff bits left out. Raises ValueError when no such frame exists."""
+    """Return the bits of a CAN FD frame, without dynamic stuff bits. Raises ValueError if no such frame exists."""
     if length not in FRAME_LENGTHS:
         above = next((known for known in FRAME_LENGTHS if known > length), FRAME_LENGTHS[-1])
         raise ValueError(f"a CAN FD frame can't have {length} bytes; next possible: {above}")
@@ -70,10 +70,10 @@ def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
 
 
 def worst_case_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
-    """Most bits that a CAN FD frame can have.
+    """Return the most bits of a CAN FD frame.
 
-    Stuff bits from start of frame to the end of the data as in a classic frame; as many of them as can be before the
-    rate switches are counted there, where they take longest. Raises ValueError when no such frame exists.
+    Stuff bits from start of frame to the end of the data, as in a classic frame; as many of them as possible are
+    counted before the rate switch, where they take longest. Raises ValueError if no such frame exists.
     """
     plain = unstuffed_fd_bits(length, is_extended)
     head = fd_head_bits(is_extended)
@@ -83,26 +83,26 @@ def worst_case_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
 
 
 def unstuffed_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Bits of a frame, classic up to 8 bytes, stuff bits that depend on the content left out. Raises ValueError."""
+    """Return the bits of a frame, classic up to 8 bytes, without content-dependent stuff bits. Raises ValueError."""
     if length > CLASSIC_BYTES:
         return unstuffed_fd_bits(length, is_extended)
     return FrameBits(unstuffed_bits(length, is_extended))
 
 
 def worst_case_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Most bits that a frame can have, classic up to 8 bytes. Raises ValueError."""
+    """Return the most bits of a frame, classic up to 8 bytes. Raises ValueError."""
     if length > CLASSIC_BYTES:
         return worst_case_fd_bits(length, is_extended)
     return FrameBits(worst_case_bits(length, is_extended))
 
 
 def _stuffable_bits(length: int, is_extended: bool) -> int:
-    """Start of frame to CRC."""
+    """Return the bits from start of frame to CRC."""
     if not 0 <= length <= CLASSIC_BYTES:
         raise ValueError(f"a classic frame can't have {length} bytes, at most {CLASSIC_BYTES}")
     return (54 if is_extended else 34) + 8 * length
 
 
 def fd_head_bits(is_extended: bool) -> int:
-    """Start of frame to BRS."""
+    """Return the bits from start of frame to BRS."""
     return 36 if is_extended else 17

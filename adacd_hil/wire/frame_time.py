@@ -1,11 +1,11 @@
-"""How long frames take on the bus, exactly: at the pace of an emulated one, and as the load of one that is listened to.
+"""Exact durations of frames on the bus, and the bus load.
 
-Compiled, a byte at a time by table: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding; what
-is counted, and CAN FD: `adacd_hil.wire.frame_lengths`.
+Compiled, a byte at a time by table: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding; for
+the counted bits, and CAN FD, see `adacd_hil.wire.frame_lengths`.
 
-The load is how much of the time frames take with the stuff bits that they really have. The bits of classic frames are
-those of can-utils' `canbusload -e`: from start of frame to the end of the intermission. CAN FD, which `canbusload -e`
-can't count, is measured likewise, each part of a frame at its own rate.
+The load is the share of time that frames take with their actual stuff bits. The bits of classic frames are those of
+can-utils' `canbusload -e`: from start of frame to the end of the intermission. CAN FD, which `canbusload -e` can't
+count, is measured likewise, each part of a frame at its own rate.
 """
 
 from collections.abc import Callable
@@ -34,14 +34,14 @@ _EXTENDED_HEAD_BITS: Final = 39  # and SRR, 18 bits more of the identifier, r1
 _FD_CONTROL_BITS: Final = 5  # ESI, DLC
 
 FrameTime = Callable[[int, bytes], int]
-"""Gives the time of a frame on the bus, ns, by identifier and data."""
+"""Returns the duration of a frame on the bus, ns, from identifier and data."""
 
 
 _STUFF_RUN: Final = 5
 
 
 def _stuffing(bits: int) -> NDArray[np.int64]:
-    """Tabulate for so many bits at once, by state and bits: stuff bits added << 3 | next state.
+    """Return a table for so many bits at once, by state and bits: stuff bits added << 3 | next state.
 
     State: (length of the run of equal bits - 1) << 1 | the last bit. A stuff bit begins a run.
     """
@@ -59,7 +59,7 @@ def _stuffing(bits: int) -> NDArray[np.int64]:
 
 
 def _crc_15() -> NDArray[np.int64]:
-    """Tabulate the CRC of a classic frame by byte."""
+    """Return the table of a classic frame's CRC by byte."""
     table = np.arange(256, dtype=np.int64) << 7
     for _ in range(8):
         table = np.where(table & 0x4000, (table << 1) ^ _CRC_POLYNOMIAL, table << 1) & 0x7FFF
@@ -73,8 +73,8 @@ _CRC_15: Final = _crc_15()
 
 @compiled
 def _stuffed(head: int, head_bits: int, data: int, length: int) -> int:
-    """Count the bits of a classic frame up to its CRC's end, stuff bits included. data: bytes as one integer."""
-    crc = state = added = 0  # as start of frame, one dominant bit, leaves them
+    """Count the bits of a classic frame to the end of its CRC, stuff bits included. data: bytes as one integer."""
+    crc = state = added = 0  # after start of frame, one dominant bit
     left = head_bits - 1
     while left & 7:
         left -= 1
@@ -124,7 +124,7 @@ def _fd_stuff_bits(head: int, head_bits: int, body: NDArray[np.uint8], code: int
         else:
             run = 1
             last = bit
-        # The fixed stuff bit that begins the CRC field stands for a dynamic one after the last bit of the data.
+        # The fixed stuff bit that begins the CRC field replaces a dynamic one after the last bit of the data.
         if run == 5 and place < total - 1:
             if place < head_bits:
                 before += 1
@@ -136,10 +136,10 @@ def _fd_stuff_bits(head: int, head_bits: int, body: NDArray[np.uint8], code: int
 
 
 def exact_frame(can_id: int, data: bytes) -> FrameBits:
-    """Bits of this frame of an error active sender, classic up to 8 bytes; identifiers beyond 0x7FF are 29-bit ones.
+    """Return the bits of a frame of an error active sender, classic up to 8 bytes; identifiers beyond 0x7FF: 29 bits.
 
-    Where the data of CAN FD end with five equal bits, the fixed stuff bit that begins the CRC field stands for the
-    dynamic one. Raises ValueError when no such frame exists.
+    If the data of CAN FD end with five equal bits, the fixed stuff bit that begins the CRC field replaces the dynamic
+    one. Raises ValueError if no such frame exists.
     """
     length, is_extended = len(data), can_id > MAX_STANDARD_ID
     if length <= CLASSIC_BYTES:
@@ -154,9 +154,9 @@ def exact_frame(can_id: int, data: bytes) -> FrameBits:
 
 
 def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
-    """Make the exact time of frames at rates in bit/s, in ns, rounded up per rate.
+    """Return a function for the exact duration of frames at rates in bit/s, in ns, rounded up per rate.
 
-    The result raises ValueError for a length that no frame has. Frames of more than 8 bytes are CAN FD with rate
+    That function raises ValueError for a length that no frame has. Frames of more than 8 bytes are CAN FD with rate
     switch.
     """
     classic_bits = _classic_bits
@@ -173,7 +173,7 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
 
 
 def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
-    """Make the longest time of frames of a length at rates in bit/s, whatever is in them, in ns."""
+    """Return a function for the longest duration of frames of a length, whatever their content, in ns."""
     by_length: dict[tuple[int, bool], int] = {}
 
     def time_ns(can_id: int, data: bytes) -> int:
@@ -188,27 +188,26 @@ def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
 
 @dataclass(frozen=True)
 class Load:
-    """What passed in an interval."""
+    """Frames and bits of an interval, and the rates."""
 
     interval_ns: int
     frames: int
     bits: FrameBits
-    payload_bits: int
     bitrate: int
     data_bitrate: int
 
     @property
     def percent(self) -> float:
-        """Share of the interval in which the bus was taken, in percent; 0 for an empty interval."""
+        """Share of the interval in which the bus was busy, in percent; 0 for an empty interval."""
         if self.interval_ns <= 0:
             return 0.0
         return 100.0 * self.bits.duration_s(self.bitrate, self.data_bitrate) / (self.interval_ns * 1e-9)
 
 
 class LoadMeter:
-    """Counts frames; `take` returns the load since the last call. For `monitor`, not the cycle.
+    """Counts frames; `take_load` returns the load since the last call. For `monitor`, not the cycle.
 
-    Error frames don't count: what they took of the bus isn't known. Identifiers above 0x7FF are taken as extended.
+    Error frames don't count: their duration is unknown. Identifiers above 0x7FF are extended ones.
     """
 
     def __init__(self, bitrate: int, data_bitrate: int = 0, start_ns: int | None = None) -> None:
@@ -219,10 +218,10 @@ class LoadMeter:
         self._bitrate = bitrate
         self._data_bitrate = data_bitrate
         self._start_ns = start_ns
-        self._frames = self._nominal = self._data = self._payload = 0
+        self._frames = self._nominal = self._data = 0
 
-    def add(self, frame: Frame) -> None:
-        """Count a frame. Raises ValueError for one that can't be: no such length, or CAN FD without a data bit rate."""
+    def count_frame(self, frame: Frame) -> None:
+        """Count a frame. Raises ValueError for an impossible length, or CAN FD without a data bit rate."""
         if frame.is_error:
             return
         bits = exact_frame(frame.can_id, frame.data)
@@ -235,13 +234,12 @@ class LoadMeter:
         self._frames += 1
         self._nominal += bits.nominal
         self._data += bits.data
-        self._payload += 8 * len(frame.data)
 
-    def take(self, t_ns: int) -> Load:
-        """Return the load from the last call until now, and begin anew."""
+    def take_load(self, t_ns: int) -> Load:
+        """Return the load since the last call, and start again from zero."""
         interval_ns = 0 if self._start_ns is None else t_ns - self._start_ns
         bits = FrameBits(self._nominal, self._data)
-        load = Load(interval_ns, self._frames, bits, self._payload, self._bitrate, self._data_bitrate)
+        load = Load(interval_ns, self._frames, bits, self._bitrate, self._data_bitrate)
         self._start_ns = t_ns
-        self._frames = self._nominal = self._data = self._payload = 0
+        self._frames = self._nominal = self._data = 0
         return load

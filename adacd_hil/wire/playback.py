@@ -1,7 +1,7 @@
-"""Frames sent at the times of a recording: absolute deadlines, and how well they were kept.
+"""Playback of recorded frames: sent at absolute deadlines, with statistics of their lateness.
 
-A frame is due at begin + (t_ns − first t_ns) / speed. Its lateness doesn't move those that follow; what is due at once
-goes out at once, in the order of the recording.
+A frame is due at begin + (t_ns - first t_ns) / speed. A late frame doesn't delay later ones; overdue frames are sent at
+once, in the order of the recording.
 """
 
 from collections import Counter
@@ -12,14 +12,14 @@ from adacd_hil.clock import Clock
 from adacd_hil.wire.bus import Bus
 
 LEAD_NS: Final = 5_000_000
-"""From the call to the first frame."""
+"""Time from the call to the first frame."""
 LOOP_PAUSE_NS: Final = 1_000_000
-"""From the last frame of a recording to the first of its repetition, by the recording's time."""
+"""Time from the last frame of a recording to the first of its repetition, by the recording's clock."""
 LATE_NS: Final = 1_000_000
 """A frame later than this is counted as late."""
 _BUCKET_NS = 1_000
 _STOP_NS = 50_000_000
-"""How soon a request to stop is noticed in a pause."""
+"""Longest pause between two looks at `is_stopped`."""
 _MOST_AT_ONCE = 64
 
 
@@ -32,16 +32,16 @@ class PlayedFrame(NamedTuple):
 
 
 class Lateness:
-    """How late frames were handed to the bus: counted by whole µs, so that hours take no memory."""
+    """Histogram of how late frames were handed to the bus, in whole µs, so that memory stays bounded."""
 
     def __init__(self) -> None:
         self.frames = 0
         self.late_frames = 0
-        """Those later than LATE_NS."""
+        """Frames later than LATE_NS."""
         self.worst_ns = 0
         self._counts: Counter[int] = Counter()
 
-    def add(self, lateness_ns: int) -> None:
+    def add_lateness(self, lateness_ns: int) -> None:
         """Count a frame."""
         self.frames += 1
         self.late_frames += lateness_ns > LATE_NS
@@ -49,7 +49,7 @@ class Lateness:
         self._counts[lateness_ns // _BUCKET_NS] += 1
 
     def quantile_us(self, share: float) -> int:
-        """Return the smallest whole number of µs that so large a share of the frames was not later than."""
+        """Return the smallest whole number of µs such that this share of the frames was not later."""
         needed = share * self.frames
         for bucket, count in sorted(self._counts.items()):
             needed -= count
@@ -67,10 +67,10 @@ def play(
     longest_pause_ns: int | None = None,
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Lateness:
-    """Send frames at their times until they end or `is_stopped`.
+    """Send frames at their times until they end or `is_stopped`; return the lateness.
 
-    longest_pause_ns: pauses of the recording are cut to this. Frames out of order are sent with those before them.
-    Raises BusError.
+    longest_pause_ns: longer pauses of the recording are shortened to this. Frames out of order are sent with the frames
+    before them. Raises BusError.
     """
     lateness = Lateness()
     for due_ns, group in _grouped(_scheduled(frames, clock, speed, longest_pause_ns)):
@@ -81,12 +81,12 @@ def play(
         late_ns = max(0, clock.now_ns() - due_ns)
         bus.send_all([(frame.can_id, frame.data) for frame in group])
         for _ in group:
-            lateness.add(late_ns)
+            lateness.add_lateness(late_ns)
     return lateness
 
 
 def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[PlayedFrame]:
-    """Give a recording several times, one after the other, by one clock; 0 times: for ever."""
+    """Yield a recording several times in a row, on one time axis; 0 times: forever."""
     shift_ns, end_ns, done = 0, None, 0
     while not times or done < times:
         is_first = True
@@ -104,7 +104,7 @@ def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[
 def _scheduled(
     frames: Iterable[PlayedFrame], clock: Clock, speed: float, longest_pause_ns: int | None
 ) -> Iterator[tuple[int, PlayedFrame]]:
-    """Give each frame with the time at which it is due, which never runs backwards."""
+    """Yield each frame with its due time, which never decreases."""
     begin_ns, first_ns, cut_ns, latest_ns = 0, None, 0, 0
     for frame in frames:
         if first_ns is None:
@@ -118,7 +118,7 @@ def _scheduled(
 
 
 def _grouped(scheduled: Iterable[tuple[int, PlayedFrame]]) -> Iterator[tuple[int, list[PlayedFrame]]]:
-    """Put frames that are due at the same time together, a handful at most."""
+    """Group frames that are due at the same time, a few at most."""
     group: list[PlayedFrame] = []
     group_ns = 0
     for due_ns, frame in scheduled:

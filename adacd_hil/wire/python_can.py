@@ -1,7 +1,7 @@
-"""Any interface that python-can offers, if it does not echo own frames.
+"""Any python-can interface that does not echo own frames.
 
-An interface of python-can fails in ways of its own: NameError without its maker's library, ImportError, TypeError for
-settings that it lacks, the maker's exceptions. Here each is one line with a remedy.
+python-can's interfaces raise many kinds of errors: NameError without the maker's library, ImportError, TypeError for
+missing settings, the maker's exceptions. Here each becomes one line with a remedy.
 """
 
 import contextlib
@@ -21,14 +21,14 @@ from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 _ECHOING_INTERFACES = ("udp_multicast",)
 _WITHOUT_HARDWARE = ("virtual", "udp_multicast", "socketcand")
 _EXTRAS = {"slcan": "serial", "robotell": "serial"}
-"""python-can's extra for an interface, where it isn't its name."""
+"""python-can's extra for an interface, if it differs from its name."""
 _MISSING = re.compile(r"missing \d+ required (?:positional|keyword-only) arguments?: (.+)")
-for _logger in ("can", "seeedbus"):  # they tell a terminal what is refused here in a line
+for _logger in ("can", "seeedbus"):  # our errors replace their output on the terminal
     logging.getLogger(_logger).addHandler(logging.NullHandler())
 
 
 def interface_names() -> list[str]:
-    """Name the interfaces that python-can knows, plugins included."""
+    """Return the names of the interfaces that python-can knows, plugins included."""
     return sorted(can.VALID_INTERFACES)
 
 
@@ -38,12 +38,12 @@ def is_usable(interface: str) -> bool:
 
 
 class PythonCanBus(Bus):
-    """Any other python-can interface. How CAN FD's second bit rate is set, python-can leaves to its own settings."""
+    """A python-can interface other than SocketCAN. The data bit rate of CAN FD comes from python-can's settings."""
 
     def __init__(
         self, interface: str, channel: str, clock: Clock, bitrate: int | None = None, is_fd: bool = False
     ) -> None:
-        """Open it, at `bitrate` bit/s where the interface sets one. Raises BusMissingError."""
+        """Open it, at `bitrate` bit/s if the interface sets one. Raises BusMissingError."""
         if interface in _ECHOING_INTERFACES:
             raise BusMissingError(f"interface {interface} echoes own frames and can't carry a cycle; use socketcan")
         if interface not in can.VALID_INTERFACES:
@@ -103,7 +103,7 @@ class PythonCanBus(Bus):
             timeout_s = max(deadline_ns - self._waiting.now_ns(), 0) * 1e-9
 
     def recover(self) -> None:
-        """Empty the transmit buffer where the interface can, and open it anew. Raises BusError."""
+        """Empty the transmit buffer if the interface can, and open it again. Raises BusError."""
         # Few interfaces can empty a buffer, and a broken one fails: `_open` raises if the interface doesn't work.
         with contextlib.suppress(Exception):
             self._bus.flush_tx_buffer()
@@ -111,7 +111,7 @@ class PythonCanBus(Bus):
         self._bus = self._open()
 
     def close(self) -> None:
-        """Shut the interface down; one that fails at that is gone anyway."""
+        """Shut the interface down; errors are ignored."""
         with contextlib.suppress(Exception):
             self._bus.shutdown()
 
@@ -120,14 +120,14 @@ def _in_words(error: Exception) -> str:
     """Describe an error of an interface in one line."""
     text = " ".join(str(error).split())
     if missing := _MISSING.search(text):
-        return f"it needs {missing[1]} besides, which python-can takes from ~/.canrc"
-    if isinstance(error, NameError | AttributeError):  # of a function that the library would have
+        return f"it also needs {missing[1]}, which python-can takes from ~/.canrc"
+    if isinstance(error, NameError | AttributeError):  # a function of a library that isn't installed
         return f"its maker's library is not installed ({text})"
     return text or type(error).__name__
 
 
 def _remedy(interface: str, error: Exception) -> str:
-    """Say how an interface that can't be opened is opened."""
+    """Return the remedy for an interface that can't be opened."""
     remedies = []
     extra = _EXTRAS.get(interface, interface.replace("_", "-"))
     is_here = isinstance(error, ImportError | can.CanInterfaceNotImplementedError) and "Windows" not in str(error)

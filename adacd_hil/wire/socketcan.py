@@ -1,11 +1,11 @@
 """SocketCAN through its raw socket, classic and FD: a `can.Message` costs more than everything else in a cycle.
 
-Sources: Linux Documentation/networking/can.rst; linux/can.h, linux/can/raw.h. Remote frames, and 29-bit identifiers
-that would read as 11-bit ones, are left to the kernel's filter.
+Sources: Linux Documentation/networking/can.rst; linux/can.h, linux/can/raw.h. The kernel's filter drops remote frames,
+and 29-bit identifiers that fit into 11 bits.
 
-The three ways in which a live bus fails are told apart: the transmit queue stays full (nobody acknowledges), the
-interface goes down or vanishes, the controller goes bus-off. After the second this end stays dead until `recover`, so
-that nothing is sent on an interface that others have set up anew.
+This end distinguishes three failures of a live bus: the transmit queue stays full (no node acknowledges), the interface
+down or vanishes, the controller goes bus-off. After the second this end stays closed until `recover`, so that no frame
+is sent on an interface that others have set up again.
 """
 
 import errno
@@ -30,8 +30,9 @@ from adacd_hil.wire.bus import (
     take_first,
 )
 from adacd_hil.wire.can_interface import CanInterface
+from adacd_hil.wire.error_frames import ERROR_CLASS_MASK, is_bus_off
+from adacd_hil.wire.frame_batches import CAN_ID_MASK, FrameReceiver, FrameSender
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS, MAX_STANDARD_ID
-from adacd_hil.wire.kernel_frames import CAN_ID_MASK, ERROR_CLASS_MASK, FrameReceiver, FrameSender, is_bus_off
 
 CAN_RTR_FLAG = 0x40000000
 CAN_EFF_FLAG = 0x80000000
@@ -46,7 +47,7 @@ _MEMINFO = struct.Struct("=9I")
 _RECEIVED, _SENT, _DROPS = 0, 2, 8  # of its numbers
 _DOWN = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 _LISTENER_BYTES = 1 << 24
-"""Room for what a listener has not read: some 20,000 frames, 2 s of a full bus at 1 Mbit/s."""
+"""Receive buffer of a listener: some 20,000 frames, 2 s of a full bus at 1 Mbit/s."""
 _LIVE_S = 0.25
 """Longest silence of a bus with two arms: 2.5 of the usual heartbeat periods."""
 _SEND_PATIENCE_S = 0.05
@@ -54,7 +55,7 @@ _SEND_PATIENCE_S = 0.05
 
 
 class SocketCanBus(Bus):
-    """A SocketCAN interface. What waits is taken at once; each frame carries the kernel's stamp of its reception."""
+    """A SocketCAN interface. Received frames are fetched in batches; each carries the kernel's reception stamp."""
 
     def __init__(
         self,
@@ -64,9 +65,9 @@ class SocketCanBus(Bus):
         is_fd: bool = False,
         is_shared: bool = False,
     ) -> None:
-        """Open `channel`, receiving only `can_ids` when given; `is_shared`: see `recover`. Raises BusMissingError.
+        """Open `channel`, receiving only `can_ids` if given; `is_shared`: see `recover`. Raises BusMissingError.
 
-        Who receives everything gets as much room for what it has not read as the system allows.
+        Without `can_ids` the receive buffer is as large as the system allows.
         """
         self._is_shared = is_shared
         self.channel = channel
@@ -76,7 +77,7 @@ class SocketCanBus(Bus):
         self._is_fd = is_fd
         self._interface = CanInterface(channel)
         self._patience = MonotonicClock()
-        self._lost_before = 0  # by the sockets before this one
+        self._lost_before = 0  # drops of earlier sockets
         self._is_down = False
         self._is_closed = False
         _require_socketcan(channel)
@@ -118,10 +119,10 @@ class SocketCanBus(Bus):
             self._send_patiently(packed)
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Queue some frames in one system call. Raises as `send`."""
+        """Queue several frames in one system call. Raises as `send`."""
         packed = [self._pack(can_id, data) for can_id, data in frames]
         sent = 0 if self._socket.fileno() < 0 else self._sender.send(packed)
-        for can_id, data in frames[sent:]:  # no room for all, or a failure that is said then
+        for can_id, data in frames[sent:]:  # no room for all, or an error, which `send` raises
             self.send(can_id, data)
 
     def _pack(self, can_id: int, data: bytes) -> bytes:
@@ -151,7 +152,7 @@ class SocketCanBus(Bus):
             else:
                 return
         raise TransmitQueueError(
-            f"transmit queue of {self.channel} stayed full for {_SEND_PATIENCE_S * 1000:.0f} ms: nobody acknowledges "
+            f"transmit queue of {self.channel} stayed full for {_SEND_PATIENCE_S * 1000:.0f} ms: no node acknowledges "
             f"(power, wiring, termination, bit rate), or it is too short: ip link set {self.channel} txqueuelen 64"
         )
 
@@ -175,7 +176,7 @@ class SocketCanBus(Bus):
         return frame
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return frames that are there together; none: []. Raises BusOffError, InterfaceDownError, BusError."""
+        """Return frames that are received together; [] after `timeout_s`. Raises as `receive`."""
         received = self._received
         if not received or received[0].is_error:
             frame = self.receive(timeout_s)
@@ -185,10 +186,10 @@ class SocketCanBus(Bus):
         return take_first(received, most)
 
     def _take(self, timeout_s: float) -> None:
-        """Take what waits, or what comes within `timeout_s`."""
+        """Fetch received frames; wait for the first up to `timeout_s`."""
         try:
             if timeout_s <= 0.0 or self._receiver.wait(timeout_s):
-                self._received.extend(self._receiver.take())
+                self._received.extend(self._receiver.take_frames())
         except BlockingIOError:
             return
         except OSError as error:
@@ -205,14 +206,14 @@ class SocketCanBus(Bus):
 
     @property
     def frames_lost(self) -> int:
-        """Count of received frames that the kernel dropped because this end didn't read them in time.
+        """Number of received frames that the kernel dropped because this end didn't read them in time.
 
-        Known from the first frame that came after them, or from `queue_bytes`.
+        Updated by the first frame after a drop, and by `queue_bytes`.
         """
         return self._lost_before + self._receiver.frames_lost
 
     def queue_bytes(self) -> QueueBytes:
-        """Look at what waits: a system call. What was sent waits until the interface has sent it."""
+        """Read the fill of both queues in a system call. Sent frames count until the interface has sent them."""
         if self._socket.fileno() < 0:
             return NOTHING_QUEUED
         info = _MEMINFO.unpack(self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))
@@ -220,13 +221,13 @@ class SocketCanBus(Bus):
         return QueueBytes(info[_RECEIVED], info[_SENT])
 
     def recover(self) -> None:
-        """Open the socket anew, and empty the interface's transmit queue by taking it down and up where need be.
+        """Open the socket again; if old frames may wait, empty the interface's queue by taking it down and up.
 
-        Need is: frames wait in the queue, or a controller is there, which may hold some. None is where the interface
-        has been down since this end last sent. Other sockets of the interface see it go down. Where it is shared, none
-        is either while the bus carries frames: what waits then leaves by itself.
+        Old frames may wait if the queue isn't empty, or if there is a controller, unless the interface has been down
+        since this end last sent. Other sockets of the interface see it go down. A shared interface is not taken down
+        while the bus carries frames: then the queue empties by itself.
 
-        Raises InterfaceDownError while the interface is down, BusError with the command where it isn't permitted.
+        Raises InterfaceDownError while the interface is down, BusError with the command if it isn't permitted.
         """
         if self._is_closed:
             raise BusError(f"recovering {self.channel}: closed")
@@ -234,7 +235,7 @@ class SocketCanBus(Bus):
         if problem:
             raise InterfaceDownError(problem)
         if not self._is_down and self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) in _DOWN:
-            self._is_down = True  # unheard of, so nothing was sent since
+            self._is_down = True  # not noticed before, so no frame was sent since
         may_hold = self._interface.waiting_frames() > 0 or not (self._is_down or self._interface.is_virtual)
         if may_hold and not (self._is_shared and self._carries_frames()):
             self._interface.restart()
@@ -243,13 +244,13 @@ class SocketCanBus(Bus):
         self._open()
 
     def _carries_frames(self) -> bool:
-        """Whether something is heard on the bus, a frame of another program's that is through included."""
+        """Tell whether any frame is received within 0.25 s, including transmitted frames of other programs."""
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as listener:
             listener.bind((self.channel,))
             return bool(select.select([listener], [], [], _LIVE_S)[0])
 
     def _retire_socket(self) -> None:
-        """Close the socket, keeping its count of drops; what it had received is dropped, too."""
+        """Close the socket and drop its received frames; keep its count of drops."""
         self.queue_bytes()
         self._lost_before = self.frames_lost
         self._receiver.frames_lost = 0
@@ -257,13 +258,13 @@ class SocketCanBus(Bus):
         self._socket.close()
 
     def close(self) -> None:
-        """Close the socket; twice is once."""
+        """Close the socket; a second call does nothing."""
         self._is_closed = True
         self._retire_socket()
 
 
 def _widen(opened: socket.socket) -> None:
-    """Give a socket a listener's room, or as much as the system gives to who may not set up networks."""
+    """Give a socket a listener's receive buffer, or the largest that the system allows an unprivileged user."""
     try:
         opened.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _LISTENER_BYTES)
     except PermissionError:
@@ -271,9 +272,9 @@ def _widen(opened: socket.socket) -> None:
 
 
 def _pack_filters(can_ids: Iterable[int] | None) -> bytes:
-    """Pack the kernel's receive filters; without `can_ids` everything but remote and ambiguous frames.
+    """Pack the kernel's receive filters; without `can_ids` for everything but remote and ambiguous frames.
 
-    A filter that asks for all three of identifier, 11 bits and no remote frame is looked up by table in the kernel.
+    The kernel looks a filter up by table if it asks for identifier, 11 bits and no remote frame.
     """
     flags = CAN_EFF_FLAG | CAN_RTR_FLAG
     if can_ids is not None:

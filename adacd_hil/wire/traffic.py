@@ -1,4 +1,4 @@
-"""Who sends what on a bus: every identifier seen, with count, rate, lengths and its last frame."""
+"""Statistics of bus traffic: every identifier seen, with count, rate, lengths and its last frame."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,12 @@ from adacd_hil.clock import Clock
 from adacd_hil.wire.bus import Bus, Frame
 
 _SLICE_S = 0.02
-"""How long one wait on the bus may take while listening: how soon the end is noticed on a silent bus."""
+"""Longest single wait on the bus while listening, so that the end is noticed on a silent bus."""
 
 
 @dataclass
 class Talk:
-    """One identifier's frames so far."""
+    """Frames of one identifier so far."""
 
     can_id: int
     count: int
@@ -29,7 +29,7 @@ class Talk:
 
     @property
     def length(self) -> str:
-        """Count of data bytes, as a range when it changes."""
+        """Number of data bytes, as a range if it changes."""
         return str(self.longest) if self.shortest == self.longest else f"{self.shortest}-{self.longest}"
 
 
@@ -40,7 +40,7 @@ class Traffic:
         self.talks: dict[int, Talk] = {}
         self.error_frames = 0
 
-    def accept(self, frame: Frame) -> None:
+    def count_frame(self, frame: Frame) -> None:
         """Count one frame."""
         if frame.is_error:
             self.error_frames += 1
@@ -60,12 +60,12 @@ class Traffic:
             talk.longest = length
 
     def sorted(self) -> list[Talk]:
-        """List what was seen, identifiers ascending."""
+        """Return the identifiers seen, ascending."""
         return [self.talks[can_id] for can_id in sorted(self.talks)]
 
 
 def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
-    """Wait for one frame until `end_ns`; None when the time is over. Raises BusError."""
+    """Wait for one frame until `end_ns`; None if none came. Raises BusError."""
     while (now_ns := clock.now_ns()) < end_ns:
         slice_ns = min(end_ns, now_ns + round(_SLICE_S * 1e9))
         frame = bus.receive((slice_ns - now_ns) * 1e-9)
@@ -76,7 +76,7 @@ def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
 
 
 def listen(bus: Bus, clock: Clock, duration_s: float, traffic: Traffic) -> None:
-    """Take in what passes for a while, sending nothing. Raises BusError."""
+    """Count the frames on the bus for a duration, sending none. Raises BusError."""
     end_ns = clock.now_ns() + round(duration_s * 1e9)
     while (frame := receive_until(bus, clock, end_ns)) is not None:
-        traffic.accept(frame)
+        traffic.count_frame(frame)

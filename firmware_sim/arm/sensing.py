@@ -5,7 +5,7 @@ velocity   critically damped tracking loop on the encoder at 10 kHz, v̂/q = ω�
            it lags a steady acceleration by 2/ω = 1.59 ms; sent with an LSB of 5e-4 rad/s
 torque     white noise of 0.02 Nm rms at the SYNC sample, then a 16-bit converter over ±50 Nm that saturates
 
-These are the defaults. What a scenario changes of them is in `torque_transducer`, `encoder` and `motor`.
+These are the defaults; a scenario changes them in its section `sensors`.
 """
 
 import math

@@ -6,23 +6,23 @@ counts all. The drive handles a fault that a watchdog caused, and the fault stay
 (EMCY: objects 0x1001, 0x1003, 0x1014, 0x1015), 7.2.8.3.2 (heartbeats: 0x1016, 0x1017), table 27 (0x8100 … 0x8250),
 7.2.5 (SYNC: object 0x1019, table 26); CiA 402-1, error codes 0x6320 "parameter error" and 0x8700 "sync controller".
 
-**The order of SYNCs**: which ones are odd, and how many of those one device has heard.
+**The order of SYNCs**: which ones are odd, and how many odd ones a device has received.
 
     odd SYNC         is                                                                   the device
     repeated         one with the counter of the SYNC before                              ignores it
     out of sequence  one whose counter runs backwards or, by the clock, further ahead     takes it; the count goes on
                      than time; one whose counter is 0 or beyond 0x1019                   from there. Ignores the latter
     early            one that comes in order and, by the clock, ahead of time             takes it
-    wrong length     one with a counter where 0x1019 is 0, without where it isn't         ignores it
+    wrong length     one with a counter if 0x1019 is 0, without one otherwise             ignores it
 
 A counter that runs forward means SYNCs that were lost. Ahead of time is more than 0.4 periods ahead of its place after
 the SYNC before, less the lateness of earlier SYNCs: a master that stalls may come back to its grid, and frames that
 waited for a busy receiver may come in a row. That lateness is forgotten with a time constant of 100 SYNCs, so that a
 master whose clock is slow gathers none.
 
-CAN itself may deliver a frame twice: if the last bit of its end-of-frame is disturbed, the sender repeats what
-receivers have taken already (ISO 11898-1). So a single odd SYNC is a warning. More than `TOLERATED` before
-`CLEAN_SYNCS` in a row were right mean that SYNC is no time base.
+CAN itself may deliver a frame twice: if the last bit of its end-of-frame is disturbed, the sender repeats a frame that
+receivers have accepted already (ISO 11898-1). So a single odd SYNC is a warning. More than `TOLERATED` without
+`CLEAN_SYNCS` right ones in a row between them mean that SYNC is no time base.
 """
 
 import struct
@@ -86,7 +86,7 @@ class ErrorReporter:
         self._allowed_ns = 0
 
     def poll(self, t_ns: int) -> int:
-        """Send what the inhibit time held back; return when to look again."""
+        """Send messages that the inhibit time held back; return the time of the next call."""
         while self._waiting and t_ns >= self._allowed_ns:
             self._allowed_ns = t_ns + self._inhibit_ns
             self._send(self._cob_id, self._waiting.popleft())
@@ -127,7 +127,7 @@ class HeartbeatProducer:
         self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
 
     def poll(self, t_ns: int) -> int:
-        """Send what is due; return when the next one is."""
+        """Send the heartbeat if it is due; return the time of the next one."""
         if t_ns >= self._due_ns:
             self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
             self._send(self._can_id, bytes([self._state()]))
@@ -176,7 +176,7 @@ class HeartbeatConsumer:
         self._node_id = (value >> 16) & 0x7F
         self._timeout_ns = (value & 0xFFFF) * 1_000_000
         self._due_ns = NEVER_NS
-        self._find(self._now_ns())  # what isn't monitored any more isn't missing
+        self._find(self._now_ns())  # a node that is no longer monitored can't be missing
 
     def _find(self, t_ns: int) -> None:
         if self.is_lost:

@@ -75,7 +75,7 @@ class TransmitPdo(PdoRecord):
         self._timer_due_ns = NEVER_NS
 
     def _make_sender(self) -> Callable[[], None]:
-        """Bind what sending needs, so that a frame costs little more than reading its values."""
+        """Return a function that sends the PDO, its references bound, so that a frame costs little."""
         pdos, can_id, layout, reads, sender = self._pdos, self.can_id, self.layout, self._reads, self._sender
         send, header_bytes, length = pdos.send, layout.header_bytes, layout.length
         pack, pack_into = layout.packing.pack, layout.packing.pack_into
@@ -112,7 +112,7 @@ class TransmitPdo(PdoRecord):
         return send_pair
 
     def on_sync(self) -> None:
-        """Send what this SYNC asks for: every n-th, or an event that waited."""
+        """Send if this SYNC is due: every n-th, or if an event waits."""
         if self.type == 0:
             self.compare()
             if self.is_due:
@@ -155,7 +155,7 @@ class ReceivePdo(PdoRecord):
         self.acted_ns: int | None = None
         """When its last frame acted; None before the first."""
         self.writes: tuple[Callable[[int], object], ...] = ()
-        """What takes the received values, in the order of the mapping."""
+        """Functions that take the received values, in the order of the mapping."""
         self.pending: tuple[int, ...] | None = None
         """Values that wait for SYNC."""
         self.is_command = False
@@ -216,12 +216,12 @@ class Pdos:
         self.send = send
         self.longest = longest
         self.message_ids = frozenset(messages)
-        """Identifiers of the contract, which are heard besides those that any PDO may have."""
+        """Identifiers of the contract, which are received in addition to those of PDOs."""
         self.user: PdoUser
         self.header = bytes(4)
         """Header of the last protected frame, received or sent."""
         self.header_status: Callable[[], int] = int
-        """What goes into the status field of a header that is sent."""
+        """Returns the status field of a sent header."""
         self.events: frozenset[tuple[int, int]] = frozenset()
         """Objects whose changes the device announces by `notify`."""
         self._is_commanded = False  # a command has acted since the last SYNC, without waiting for one
@@ -233,7 +233,7 @@ class Pdos:
         self.own_ns: Callable[[int], int] = lambda t_ns: t_ns
         """Turns the bench's time, with which frames come, into the device's."""
         self.on_sync: tuple[Callable[[], None], ...] = ()
-        """What sends the frames that belong to a SYNC."""
+        """Functions that send the frames of a SYNC."""
         self.answers: frozenset[int] = frozenset()
         """Identifiers of the frames that follow every SYNC."""
         self._asynchronous: tuple[TransmitPdo, ...] = ()
@@ -265,11 +265,11 @@ class Pdos:
         self._writers[index, subindex] = write
 
     def writer(self, index: int, subindex: int) -> Callable[[int], object]:
-        """Return what takes the received values of an object. A value that the object can't take is dropped."""
+        """Return the function that takes received values of an object; it drops values that the object refuses."""
         return self._writers.get((index, subindex)) or (lambda value: self.dictionary.take_over(index, subindex, value))
 
     def handlers(self) -> list[tuple[int, Callable[[bytes, int], None]]]:
-        """List the identifiers that are received now, with what takes their frames."""
+        """Return the identifiers that are received now, with the handlers of their frames."""
         return [(pdo.can_id, pdo.on_frame) for pdo in self._receiving]
 
     def set_operational(self, is_operational: bool, t_ns: int) -> None:
@@ -315,18 +315,18 @@ class Pdos:
             pdo.restart()
 
     def act_on_sync(self, t_ns: int) -> bool:
-        """Let what waited for SYNC act; tell whether a command has acted since the SYNC before."""
+        """Apply values that waited for SYNC; tell whether a command has acted since the previous SYNC."""
         is_commanded, self._is_commanded = self._is_commanded, False
         return self._act(self._waiting, t_ns) or is_commanded
 
     def act_at_once(self, pdo: ReceivePdo, t_ns: int) -> None:
-        """Let a frame act that doesn't wait for SYNC."""
+        """Apply a frame that doesn't wait for SYNC."""
         self._is_commanded |= self._act((pdo,), t_ns)
         self.user.act(t_ns)
 
     @staticmethod
     def _act(pdos: Iterable[ReceivePdo], t_ns: int) -> bool:
-        """Write what waits; tell whether a command was among it."""
+        """Write pending values; tell whether a command was among them."""
         is_commanded = False
         for pdo in pdos:
             values = pdo.pending
@@ -367,7 +367,7 @@ class Pdos:
         return any(pdo.is_due for pdo in self._compared)
 
     def poll(self, t_ns: int) -> int:
-        """Send what is due by event or time; return when to look again."""
+        """Send PDOs that are due by event or time; return the time of the next call."""
         due_ns = NEVER_NS
         for pdo in self._asynchronous:
             due_ns = min(due_ns, pdo.poll(t_ns))

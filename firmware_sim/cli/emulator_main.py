@@ -1,4 +1,4 @@
-"""`firmware-sim`: plays the arm on a CAN interface until it is told to stop."""
+"""`firmware-sim`: plays the arm on a CAN interface until it is stopped."""
 
 import json
 import logging
@@ -23,7 +23,7 @@ from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import in_line, one_line, open_terminals, terminal_columns, write_told
+from adacd_hil.terminal import in_line, one_line, open_terminals, terminal_columns, write_result
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from adacd_hil.wire.contract_frames import HOST_NODE, move_contract
@@ -42,7 +42,7 @@ from firmware_sim.scenario.scenario import Scenario, load_scenario, load_truth, 
 
 
 class EmulatorExit(IntEnum):
-    """What the exit statuses mean."""
+    """Exit statuses."""
 
     OK = 0
     FAILURE = 1
@@ -220,10 +220,10 @@ def play(
     is_once: bool,
     as_json: bool,
 ) -> int:
-    """Play the devices of a recording: on each SYNC the frames that answered it then; all else is answered live.
+    """Play the devices of a recording: on each SYNC its recorded answers; all other requests are answered live.
 
-    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. What the host commands moves nothing. After the recording's
-    last cycle SYNC is no longer answered. Prints "ready" on stderr once the nodes have announced themselves.
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. Commands of the host move nothing. After the recording's last
+    cycle SYNC is no longer answered. Prints "ready" on stderr once the nodes have announced themselves.
     """
     chosen = CONTRACTS[contract]
     codec = move_contract(load_codec(chosen.path), node_offset, host_node)
@@ -251,26 +251,26 @@ def play(
 @cli.command("list", epilog=EPILOG)
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def list_scenarios(as_json: bool) -> int:
-    """List the scenarios that come with the package: name, group, what happens."""
+    """List the scenarios that come with the package: name, group, description."""
     described = describe_all()
     if as_json:
         print(json.dumps(described, indent=2, ensure_ascii=False))
     else:
         columns = ("name", "group", "about")
         table = fit_table([columns, *([row[name] for name in columns] for row in described)], width=terminal_columns())
-        write_told("\n".join(table))
+        write_result("\n".join(table))
     return EmulatorExit.OK
 
 
 @cli.command("truths", epilog=EPILOG)
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def list_truths(as_json: bool) -> int:
-    """List the truths that come with the package: name, and what the host is told wrongly."""
+    """List the truths that come with the package: name, and the mistake in the host's configuration."""
     rows = [{"name": name, "about": load_truth(name)[0].about} for name in truth_names()]
     if as_json:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
     else:
-        write_told("\n".join(fit_table([(row["name"], row["about"]) for row in rows], width=terminal_columns())))
+        write_result("\n".join(fit_table([(row["name"], row["about"]) for row in rows], width=terminal_columns())))
     return EmulatorExit.OK
 
 
@@ -281,7 +281,7 @@ def list_truths(as_json: bool) -> int:
 @click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of the sensor noise; default: the scenario's.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON in place of TOML.")
 def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int | None, as_json: bool) -> int:
-    """Print a scenario, resolved, as TOML that loads to the same: what differs from the defaults."""
+    """Print a scenario, resolved, as TOML that loads to the same scenario: the differences from the defaults."""
     resolved = load_scenario(scenario, profile, seed)
     if as_json:
         print(json.dumps(tomllib.loads(show(resolved, is_whole)), indent=2, ensure_ascii=False))
@@ -303,7 +303,7 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
     if as_json:
         print(json.dumps([vars(finding) for finding in findings], indent=2, ensure_ascii=False))
     else:
-        write_told("\n".join(in_line(line) for finding in findings for line in finding.lines))
+        write_result("\n".join(in_line(line) for finding in findings for line in finding.lines))
     return EmulatorExit.USAGE if any(finding.problems for finding in findings) else EmulatorExit.OK
 
 
@@ -318,7 +318,7 @@ def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
 
 
 def _serve(service: Service) -> None:
-    """Announce the nodes, say so, and serve until it ends."""
+    """Announce the nodes, print "ready", and serve until the end."""
     # As a host does: with less, on a processor that both share and fill, the arm would never answer in time.
     for line in request_realtime().missing:
         _complain(f"not granted: {line}")
@@ -369,7 +369,7 @@ def _report(
 
 
 def _check_contract(log: Path, codec: Codec) -> None:
-    """Raise LogError when a log of ours says that it was recorded with another contract."""
+    """Raise LogError if one of our logs was recorded with another contract."""
     digest = run_metadata(log).get("layout_digest", "") if log.suffix.lower() == ".mcap" else ""
     own = f"0x{codec.layout_digest:08X}"
     if digest and digest.casefold() != own.casefold():

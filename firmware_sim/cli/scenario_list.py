@@ -40,12 +40,12 @@ def describe_all() -> list[dict[str, Any]]:
 
 
 def show(scenario: Scenario, is_whole: bool) -> str:
-    """Write a scenario as TOML that loads to the same: what differs from the defaults, or everything."""
+    """Write a scenario as TOML that loads to the same scenario: the differences from the defaults, or everything."""
     return to_toml(scenario) if is_whole else to_short_toml(scenario)
 
 
 def check(file: str, codec: Codec) -> ScenarioFinding:
-    """Look for everything that keeps a scenario from being played under a contract."""
+    """Return every problem that keeps a scenario from being played under a contract."""
     try:
         table = read_table(file)
     except ConfigError as error:

@@ -69,7 +69,7 @@ def test_a_model_of_one_recording_watches_another_and_names_of_others_are_taken(
 
 def test_a_recording_without_torque_is_not_explained(arm: OfflineArm, arrays: dict[str, Any]) -> None:
     noise = 0.01 * np.random.default_rng(2).standard_normal((6000, 1))
-    for tau_J, cause in ((np.zeros((6000, 1)), "is always 0 Nm"), (noise, "is noise: nothing of the motion is in it")):
+    for tau_J, cause in ((np.zeros((6000, 1)), "is always 0 Nm"), (noise, "is noise, unrelated to the motion")):
         model = detect({**arrays, "tau_J": tau_J}, arm).model
         assert not model.verdict.is_explained
         assert cause in model.verdict.reasons[0]

@@ -97,7 +97,7 @@ def test_seven_joints_are_explained_though_their_sensors_have_no_noise_and_the_m
     assert found.explained.min() > 0.99
     assert "of the torque at the worst joint; margin" in found.verdict.headline
     (remark,) = found.verdict.remarks
-    assert "what the model lacks is more than noise: contacts show from about joint" in remark
+    assert "contacts show from about joint" in remark
 
 
 # What can't be explained.
@@ -157,13 +157,13 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], tuple[str, ...], str]] 
     ),
     "noise": (
         lambda m: replace(m, tau=noise(m.tau.shape)),
-        ("the torque of joint1 and joint2 is noise: nothing of the motion is in it",),
+        ("the torque of joint1 and joint2 is noise, unrelated to the motion",),
         "`columns.tau_J` (tau1, tau2)",
     ),
     "noise of one sensor": (noisy_last, ("the torque of joint2 is noise",), "`columns.tau_J` (tau2)"),
     "a sensor that drifts": (
         drift,
-        ("nothing of the torque of joint1 and joint2 is explained: the sensor is dead",),
+        ("the torque of joint1 and joint2 is unexplained: the sensor is dead",),
         "`columns.tau_J`",
     ),
     "a stuck sensor": (stuck, ("the torque of joint1 (tau1) is stuck at", "for 0.99 s, from 4.5"), "--from"),
@@ -247,9 +247,7 @@ def test_a_passive_joint_is_told_from_a_dead_sensor(tmp_path: Path) -> None:
     verdict = judged(tmp_path, Motion(t_s, moved[:, :2], moved[:, 2:], tau), has_dq=True).verdict
     assert verdict.joints[0].is_explained
     (reason,) = verdict.reasons
-    assert reason.startswith(
-        "the torque of joint2 is noise, and by the model of the others there is hardly any: a passive"
-    )
+    assert reason.startswith("the torque of joint2 is noise, and by the model of the others it is tiny: a passive")
 
 
 def test_a_wrong_model_says_how_far_it_is_off(tmp_path: Path, upright: Motion) -> None:
@@ -285,7 +283,7 @@ def test_motion_that_tells_nothing_of_a_parameter_is_too_little_excitation(tmp_p
     ddq = np.gradient(held.dq, held.t, axis=0)
     tau = rigid_torque(arm, np.array([held.q, held.dq, ddq])) + 0.3 * np.sign(held.dq) + noise(held.q.shape)
     verdict = judged(tmp_path, replace(held, tau=tau), has_dq=True).verdict
-    assert any("too little excitation: the motion tells next to nothing of" in text for text in verdict.remarks)
+    assert any("too little excitation" in text for text in verdict.remarks)
     assert any("joint2 (q2) is always 0.3 rad" in text for text in (*verdict.remarks, *verdict.reasons))
 
 

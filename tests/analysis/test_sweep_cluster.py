@@ -140,5 +140,5 @@ def test_an_open_scheduler_is_called_open(tmp_path: Path, log: Path, monkeypatch
     words = ["sweep", str(log), "--scheduler", "tcp://127.0.0.1:1", "--out", str(tmp_path / "out")]
     refused = CliRunner().invoke(cli, words)
     assert refused.exit_code == 1
-    assert "tcp://127.0.0.1:1 is open: it runs whatever anybody sends who reaches it" in refused.stderr
+    assert "tcp://127.0.0.1:1 is open" in refused.stderr
     assert refused.stderr.splitlines()[-1].startswith("adacd-hil: no Dask scheduler at tcp://127.0.0.1:1: ")

@@ -98,5 +98,5 @@ def test_a_run_names_at_once_what_nobody_has_confirmed(
     config.write_text(f'extends = "certified"\nname = "mine"\nassumed = {assumed}\n')
     out = str(tmp_path / "run")
     status, _, stderr = call("run", "-i", "virtual", "-c", "x", "--config", str(config), "--out", out)
-    warnings = [] if line is None else [f"warning: guesses that nobody has confirmed: {line}"]
+    warnings = [] if line is None else [f"warning: unconfirmed guesses: {line}"]
     assert (status, stderr) == (1, [*warnings, "adacd-hil: no arm"])

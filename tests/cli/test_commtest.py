@@ -16,7 +16,7 @@ def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, Communicat
     rig.tap.take()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
-    loop.run(0.2, test.observe)
+    loop.run(0.2, test.observe_cycle)
     described = describe(test.report(), rig.settings, scheduler)
     return described | {"fault": "NONE", "device_faults": [], "events": []}, test.report()
 

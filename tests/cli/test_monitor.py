@@ -89,7 +89,7 @@ def test_a_full_bus_ends_in_time_and_misses_nothing() -> None:
 def test_a_terminal_is_redrawn_in_place_and_not_scrolled() -> None:
     written: list[str] = []
     screen = Screen(True, written.append)
-    screen.draw("\n".join(str(number) for number in range(200)))
+    screen.draw_table("\n".join(str(number) for number in range(200)))
     screen.end("last")
     assert written[0].startswith("\x1b[H\x1b[K0\n\x1b[K1\n")
     assert written[0].count("\n") < 200
@@ -100,7 +100,7 @@ def test_a_terminal_is_redrawn_in_place_and_not_scrolled() -> None:
 def test_without_a_terminal_lines_are_plain() -> None:
     written: list[str] = []
     screen = Screen(False, written.append)
-    screen.draw("a\nb")
+    screen.draw_table("a\nb")
     assert written == ["a\nb\n\n"]
 
 

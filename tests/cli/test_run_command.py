@@ -63,7 +63,7 @@ def test_on_a_terminal_the_user_says_that_an_arm_may_run_without_an_anchor(
     result = CliRunner().invoke(command, input=answer)
     assert ("started" in result.stdout) is is_started
     assert result.exit_code == (0 if is_started else 1)
-    assert "nothing bounds the torque offset of joint 2: " in result.stderr
+    assert "the torque offset of joint 2 has no bound" in result.stderr
     assert "`adacd-hil tare -i kvaser -c 0` first, then `run --tare tare.toml`" in result.stderr
 
 
@@ -76,7 +76,7 @@ def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
     refused = lab.run()
     assert refused.exit_code == 2
     (line,) = complaints(refused)
-    assert line.startswith("adacd-hil: nothing bounds the torque offset of joint 1 and joint 2: ")
+    assert line.startswith("adacd-hil: the torque offset of joint 1 and joint 2 ")
     assert not (tmp_path / "run.mcap").exists()
     assert lab.run("--without-anchor").exit_code == 0
 
@@ -85,7 +85,7 @@ def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
 def test_an_interface_that_cannot_be_used_is_named_before_any_question(interface: str) -> None:
     result = CliRunner().invoke(cli, ["run", "-i", interface, "-c", "can77", "--config", "certified"])
     assert result.exit_code == BUS_MISSING
-    assert "nothing bounds" not in result.stderr
+    assert "torque offset" not in result.stderr
 
 
 @pytest.mark.slow

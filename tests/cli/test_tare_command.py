@@ -8,7 +8,7 @@ import pytest
 from bus_lab import BUS_MISSING, OFFSET, SHORT_RUN, USAGE, Lab, complaints
 from experiment_runs import adacd_hil
 
-from adacd_hil.control.arm_records import read_tare
+from adacd_hil.control.tare_file import read_tare
 
 pytestmark = pytest.mark.slow
 

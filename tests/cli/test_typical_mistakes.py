@@ -119,7 +119,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     (f"{INIT} --eds other.eds", USAGE, ("other.eds names CiA 401", "a drive's (CiA 402)", "--drive-eds other.eds")),
     (f"{INIT} --length-m 350 300", USAGE, ("350.0 m is above 5 m", "350 mm are 0.35 m")),
     ("init my-arm.toml --no-bus --yes", USAGE, ("my-arm.toml exists", "--force to replace it")),
-    ("init new.toml", USAGE, ("stdin is no terminal", "give --channel or --no-bus")),
+    ("init new.toml", USAGE, ("stdin is not a terminal", "--channel or --no-bus")),
     # -- logs
     ("report folder", FAILURE, ("folder has no run.mcap, nor has any folder in it",)),
     ("report none.mcap", FAILURE, ("log none.mcap can't be read: No such file",)),

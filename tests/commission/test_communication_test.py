@@ -25,7 +25,7 @@ def run(rig: Rig, seconds: float = 0.2, is_enabling: bool = False) -> tuple[Comm
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master, is_enabling)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
     rig.tap.take()
-    fault = loop.run(seconds, test.observe)
+    fault = loop.run(seconds, test.observe_cycle)
     return test.report(), fault
 
 
@@ -107,7 +107,7 @@ def test_skipped_periods_count_as_without_data() -> None:
     rig.clock.oversleep_ns = lambda t_ns: 20 * PERIOD_NS + 5_000 if t_ns == begin_ns + 51 * PERIOD_NS else 0
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
-    loop.run(0.2, test.observe)
+    loop.run(0.2, test.observe_cycle)
     report = test.report()
     assert (report.overruns, report.cycles, report.periods) == (20, 180, 200)
     assert (report.share, report.verdict) == (0.9, Verdict.WARNING)
@@ -124,7 +124,7 @@ def test_the_record_of_a_cycle_has_its_queues_and_what_was_lost(monkeypatch) -> 
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
     records = []
-    loop.run(0.02, lambda cycle: records.append(test.observe(cycle, log_queue_bytes=99)))
+    loop.run(0.02, lambda cycle: records.append(test.observe_cycle(cycle, log_queue_bytes=99)))
     last = records[-1]
     assert (last.receive_queue_bytes, last.transmit_queue_bytes, last.log_queue_bytes) == (700, 1400, 99)
     assert (last.frames_lost, last.data_age) == (3, 0)

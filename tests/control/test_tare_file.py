@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from adacd_hil.clock import format_date
-from adacd_hil.control.arm_records import (
+from adacd_hil.control.tare_file import (
     PoseRecord,
     SensorRecord,
     Tare,

@@ -74,7 +74,7 @@ class Feed:
     def write(self) -> None:
         edges = np.cumsum([0, *map(len, self._packets)])
         data = np.frombuffer(b"".join(self._packets) + bytes(ROOM), np.uint8)
-        assert self._writer.write(data, edges[:-1], np.diff(edges)) == 0
+        assert self._writer.write_packets(data, edges[:-1], np.diff(edges)) == 0
         self._packets = []
 
     def file(self) -> bytes:

@@ -75,7 +75,7 @@ class Writer:
                 self.put(pack_event(cycle.t_ns, self.dropped, cycle.event))
 
     def put(self, packet):
-        while not self.ring.put(packet):
+        while not self.ring.put_packet(packet):
             os.sched_yield()
 
     def wait(self, condition):

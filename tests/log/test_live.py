@@ -336,8 +336,8 @@ def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_waits_for_nobo
     thread.start()
     with live_client(process.live.url) as client:
         assert client.receive(HANG_S)[:2] == ("/robot_description", EPOCH_NS + 3_000_000_000)
-        ring.put(pack_cycle(run.cycles[0].t_ns, 0, run.cycles[0].messages(), []))
-        ring.put(pack_event(run.cycles[0].t_ns, 0, LAST))
+        ring.put_packet(pack_cycle(run.cycles[0].t_ns, 0, run.cycles[0].messages(), []))
+        ring.put_packet(pack_event(run.cycles[0].t_ns, 0, LAST))
         clock.sleep_until_ns(clock.now_ns() + SHOW_PERIOD_NS)
         assert "/scheme" in by_topic(receive_until_last(client))
         ours.send(processes.END)

@@ -75,7 +75,7 @@ def described():
         fed.cycles(two_cycles(), 1)
         monitor = LiveMonitor(client)
         for message in receive_until_last(client):
-            monitor.accept(message)
+            monitor.accept_message(message)
     fed.close()
     return monitor.describe()
 
@@ -148,7 +148,7 @@ class CertifiedClient:
 def test_of_the_certified_scheme_the_filter_nearest_to_its_threshold_counts():
     client = CertifiedClient()
     monitor = LiveMonitor(client)
-    monitor.accept(LiveMessage("/scheme", 0, b""))
+    monitor.accept_message(LiveMessage("/scheme", 0, b""))
     assert [joint["share"] for joint in monitor.describe()["joints"]] == [0.9, 0.4]
     client.record["threshold_bank"] = np.inf
     assert [joint["share"] for joint in monitor.describe()["joints"]] == [None, None]
@@ -225,7 +225,7 @@ def test_no_escape_sequence_of_an_event_reaches_the_terminal():
         fed.cycles(run, 1)
         monitor = LiveMonitor(client)
         for message in receive_until_last(client):
-            monitor.accept(message)
+            monitor.accept_message(message)
     fed.close()
     text = as_text(monitor.describe())
     assert "\\u001b[2Jname" in text

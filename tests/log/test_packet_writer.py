@@ -67,7 +67,7 @@ class Pair:
     def _write(self):
         edges = np.cumsum([0, *map(len, self._packets)])
         data = np.frombuffer(b"".join(self._packets) + bytes(ROOM), np.uint8)
-        self.lost += self.writer.write(data, edges[:-1], np.diff(edges))
+        self.lost += self.writer.write_packets(data, edges[:-1], np.diff(edges))
         self._packets = []
 
     def flush(self):

@@ -37,10 +37,10 @@ def packets_of(data):
 
 def test_what_is_put_comes_out_in_order(ring, reader):
     packets = [bytes([number]) * number for number in range(50)]
-    assert all(ring.put(packet) for packet in packets)
+    assert all(ring.put_packet(packet) for packet in packets)
     assert ring.waiting == reader.waiting == sum(map(room_of, range(50)))
-    assert packets_of(reader.take(MOST)) == packets
-    assert reader.take(MOST) == b""
+    assert packets_of(reader.take_packets(MOST)) == packets
+    assert reader.take_packets(MOST) == b""
     assert ring.waiting == 0
 
 
@@ -49,45 +49,45 @@ def test_packets_of_any_size_go_round_the_ring_often(ring, reader):
     sent, received = [], []
     while len(sent) < 2000:
         packet = generator.bytes(int(generator.integers(0, 900)))
-        if ring.put(packet):
+        if ring.put_packet(packet):
             sent.append(packet)
         else:
-            received += packets_of(reader.take(int(generator.integers(1, LEAST_BYTES))))
-    while data := reader.take(MOST):
+            received += packets_of(reader.take_packets(int(generator.integers(1, LEAST_BYTES))))
+    while data := reader.take_packets(MOST):
         received += packets_of(data)
     assert received == sent
 
 
 def test_a_packet_without_room_changes_nothing_and_there_is_room_again_once_others_are_taken(ring, reader):
-    assert ring.put(bytes(LEAST_BYTES // 2))
-    assert not ring.put(bytes(LEAST_BYTES // 2 - 8))
+    assert ring.put_packet(bytes(LEAST_BYTES // 2))
+    assert not ring.put_packet(bytes(LEAST_BYTES // 2 - 8))
     assert ring.packets == 1
-    assert reader.take(MOST)
-    assert ring.put(b"second")
-    assert packets_of(reader.take(MOST)) == [b"second"]
+    assert reader.take_packets(MOST)
+    assert ring.put_packet(b"second")
+    assert packets_of(reader.take_packets(MOST)) == [b"second"]
 
 
 @pytest.mark.parametrize(("size", "fits"), [(LEAST_BYTES - 4, True), (LEAST_BYTES - 3, False)])
 def test_a_packet_may_fill_the_ring(size, fits, ring, reader):
     for _ in range(3):  # wherever it begins
-        assert ring.put(b"12345")
-        assert reader.take(MOST)
-        assert ring.put(bytes(size)) is fits
-        assert len(packets_of(reader.take(MOST))) == fits
+        assert ring.put_packet(b"12345")
+        assert reader.take_packets(MOST)
+        assert ring.put_packet(bytes(size)) is fits
+        assert len(packets_of(reader.take_packets(MOST))) == fits
 
 
 def test_no_more_is_taken_than_asked_for_but_one_packet(ring, reader):
     packets = [b"a" * 100, b"b" * 100, b"c" * 500, b"d"]
-    assert all(ring.put(packet) for packet in packets)
-    assert packets_of(reader.take(2 * room_of(100))) == packets[:2]
-    assert packets_of(reader.take(30)) == packets[2:3]
-    assert packets_of(reader.take(30)) == packets[3:]
+    assert all(ring.put_packet(packet) for packet in packets)
+    assert packets_of(reader.take_packets(2 * room_of(100))) == packets[:2]
+    assert packets_of(reader.take_packets(30)) == packets[2:3]
+    assert packets_of(reader.take_packets(30)) == packets[3:]
 
 
 def test_the_reader_remembers_the_most_that_waited(ring, reader):
     for count in (3, 7, 2):
-        assert all(ring.put(bytes(12)) for _ in range(count))
-        reader.take(MOST)
+        assert all(ring.put_packet(bytes(12)) for _ in range(count))
+        reader.take_packets(MOST)
     assert ring.peak == 7 * 16
 
 
@@ -99,10 +99,10 @@ def test_what_is_on_the_disk_is_counted(ring, reader):
 
 def test_a_packet_that_was_not_finished_is_not_there(ring, reader):
     """What a process leaves behind that is killed while it puts: HEAD has not moved."""
-    ring.put(b"whole")
+    ring.put_packet(b"whole")
     place = ring._counts.nbytes + room_of(5)
     ring._memory[place : place + 4] = (100).to_bytes(4, "little")
-    assert packets_of(reader.take(MOST)) == [b"whole"]
+    assert packets_of(reader.take_packets(MOST)) == [b"whole"]
 
 
 def test_all_pages_are_there_before_the_first_packet():

@@ -60,11 +60,11 @@ def test_the_next_file_takes_the_place_of_nothing(tmp_path):
     (tmp_path / "link").symlink_to("target")
     sink = Sink(os.open(tmp_path / "first", os.O_WRONLY | os.O_CREAT), tmp_path / "first")
     for name in ("target", "link"):
-        sink.begin(tmp_path / name)
+        sink.begin_file(tmp_path / name)
         sink.write(b"data", packets=3)
         sink.settle()
         assert (sink.error, sink.path) == (f"{name}: File exists after 0 bytes", None)
-    sink.begin(tmp_path / "second")
+    sink.begin_file(tmp_path / "second")
     sink.write(b"data")
     sink.close()
     assert (sink.error, sink.take_lost()) == ("", 6)
@@ -76,7 +76,7 @@ def test_a_file_is_begun_again_from_its_start(tmp_path):
     path = tmp_path / "file"
     sink = Sink(os.open(path, os.O_WRONLY | os.O_CREAT), path)
     sink.write(b"what came first")
-    sink.begin(path)
+    sink.begin_file(path)
     sink.write(b"again")
     sink.close()
     assert (sink.error, path.read_bytes()) == ("", b"again")

@@ -263,7 +263,7 @@ class TouchedLoop(ExcitedLoop):
         return [event.message for event in self.events if event.name == name]
 
     def told(self, name):
-        return [event.told for event in self.events if event.name == name]
+        return [event.operator_text for event in self.events if event.name == name]
 
     def levels(self, name):
         return [event.level for event in self.events if event.name == name]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.control.arm_records import read_tare
+from adacd_hil.control.tare_file import read_tare
 from adacd_hil.device.profile import load_profile
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.settings.configuration import load_settings

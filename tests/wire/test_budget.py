@@ -181,7 +181,7 @@ def test_a_length_between_those_of_can_fd_is_refused() -> None:
 
 def test_a_dbc_that_does_not_say_when_is_refused() -> None:
     text = "\n".join(line for line in ARM.text.decode().splitlines() if '"Trigger"' not in line)
-    with pytest.raises(CodecError, match="it has no Trigger attribute"):
+    with pytest.raises(CodecError, match="DBC x has no attribute Trigger"):
         read_contract(text.encode(), "x")
 
 

@@ -16,7 +16,7 @@ from hang import HANG_S
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.wire.bus import BusError, BusMissingError, BusOffError, Frame, InterfaceDownError, TransmitQueueError
 from adacd_hil.wire.can_interface import CanInterface
-from adacd_hil.wire.kernel_frames import TroubleKind, decode_error
+from adacd_hil.wire.error_frames import TroubleKind, decode_error
 from adacd_hil.wire.open_bus import open_bus
 from adacd_hil.wire.socketcan import SocketCanBus
 

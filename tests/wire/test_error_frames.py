@@ -3,7 +3,7 @@
 import pytest
 
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.kernel_frames import BusTrouble, TroubleKind, decode_error, is_bus_off
+from adacd_hil.wire.error_frames import BusTrouble, TroubleKind, decode_error, is_bus_off
 
 # error class, data, kind, text, counters
 REPORTS = [

@@ -9,7 +9,7 @@ from hang import HANG_S
 
 from adacd_hil.clock import MonotonicClock, VirtualClock, wall_offset_ns
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.kernel_frames import FrameReceiver, FrameSender
+from adacd_hil.wire.frame_batches import FrameReceiver, FrameSender
 
 CLASSIC = struct.Struct("=IB3x8s")
 FD = struct.Struct("=IBB2x64s")
@@ -55,7 +55,7 @@ def test_what_does_not_fit_into_a_batch_waits_for_the_next(pair: tuple[socket.so
     for first in range(0, 200, 4):  # as much at once as a local socket takes
         packed = [CLASSIC.pack(can_id, 0, b"") for can_id in range(first, first + 4)]
         assert sender.send(packed) == 4
-        seen += [frame.can_id for frame in receiver.take()]
+        seen += [frame.can_id for frame in receiver.take_frames()]
     assert seen == list(range(200))
 
 
@@ -65,7 +65,7 @@ def test_frames_carry_the_kernels_stamp_on_the_monotonic_clock(pair: tuple[socke
     before_ns = MonotonicClock().now_ns()
     near.send(CLASSIC.pack(0x181, 0, b""))
     after_ns = MonotonicClock().now_ns()
-    (frame,) = receiver.take()
+    (frame,) = receiver.take_frames()
     assert before_ns - STAMP_ERROR_NS <= frame.t_ns <= after_ns + STAMP_ERROR_NS
 
 
@@ -85,14 +85,14 @@ def test_a_wall_clock_that_was_set_is_compared_anew(
     near, far = pair
     # The offset of a wall clock that is about to be set by `step_ns`: the kernel's is the clock after it.
     offset_ns = wall_offset_ns() - step_ns
-    monkeypatch.setattr("adacd_hil.wire.kernel_frames.wall_offset_ns", lambda: offset_ns)
+    monkeypatch.setattr("adacd_hil.wire.frame_batches.wall_offset_ns", lambda: offset_ns)
     receiver = FrameReceiver(far, MonotonicClock())
     receiver._last_ns = MonotonicClock().now_ns() + offset_ns
     receiver._trusted_ns = receiver._last_ns + 1_000_000_000
-    monkeypatch.setattr("adacd_hil.wire.kernel_frames.wall_offset_ns", wall_offset_ns)
+    monkeypatch.setattr("adacd_hil.wire.frame_batches.wall_offset_ns", wall_offset_ns)
     before_ns = MonotonicClock().now_ns()
     near.send(CLASSIC.pack(0x181, 0, b""))
-    (frame,) = receiver.take()
+    (frame,) = receiver.take_frames()
     assert before_ns - STAMP_ERROR_NS <= frame.t_ns <= MonotonicClock().now_ns() + STAMP_ERROR_NS
 
 
@@ -101,7 +101,7 @@ def test_nothing_to_take_is_no_frame_but_an_error_of_the_socket(pair: tuple[sock
     receiver = FrameReceiver(far, MonotonicClock())
     assert not receiver.wait(1e-4)
     with pytest.raises(BlockingIOError):
-        receiver.take()
+        receiver.take_frames()
 
 
 def test_a_wait_ends_when_there_is_something(pair: tuple[socket.socket, socket.socket]) -> None:
@@ -122,7 +122,7 @@ def test_a_full_queue_takes_the_first_of_what_is_sent(pair: tuple[socket.socket,
     receiver = FrameReceiver(far, MonotonicClock())
     seen: list[int] = []
     while len(seen) < taken:
-        seen += [frame.can_id for frame in receiver.take()]
+        seen += [frame.can_id for frame in receiver.take_frames()]
     assert seen == [index % 60 for index in range(taken)]
 
 

@@ -88,6 +88,6 @@ def test_a_recording_is_repeated_for_ever_unless_it_is_empty():
 def test_quantiles_count_whole_microseconds():
     lateness = Lateness()
     for late_ns in [0] * 98 + [1_500, 7_000_999]:
-        lateness.add(late_ns)
+        lateness.add_lateness(late_ns)
     assert [lateness.quantile_us(share) for share in (0.5, 0.98, 0.99, 1.0)] == [1, 1, 2, 7001]
     assert Lateness().quantile_us(0.5) == 0

@@ -1,4 +1,4 @@
-"""Configurations: what one says and from where each value is, what is wrong with one, what a key means."""
+"""`adacd-hil config`: effective settings and their origins, errors and likely mistakes, the meaning of a key."""
 
 import json
 from typing import TYPE_CHECKING, Any
@@ -41,7 +41,7 @@ def config() -> None:
 def show_settings(
     keys: tuple[str, ...], name: str, profile: str | None, changes: tuple[str, ...], is_changed: bool, as_json: bool
 ) -> ExitCode:
-    """Show the settings in force, and where each is from: the default, a file or a profile of one, or --set.
+    """Show the effective settings and the origin of each: the default, a file or a profile in it, or --set.
 
     GROUP or KEY: these only.
     """
@@ -56,7 +56,7 @@ def show_settings(
 
 
 def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
-    """Give the settings in force with value and default as TOML, and origin. Raises ConfigError, CommandError."""
+    """Return the effective settings with value and default as TOML, and origin. Raises ConfigError, CommandError."""
     from adacd_hil.control.configuration_check import origins_of
     from adacd_hil.settings.configuration import (
         Settings,
@@ -92,13 +92,13 @@ def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tupl
 @json_option
 @explained
 def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCode:
-    """Say everything that is wrong with configurations at once, a line each, and what is likely a mistake."""
+    """List all errors and likely mistakes of configurations, a line each."""
     from adacd_hil.control.configuration_check import examine_configuration
 
     findings = {name: examine_configuration(name, profile) for name in names}
     if as_json:
-        told = {name: {"errors": found.errors, "warnings": found.warnings} for name, found in findings.items()}
-        print(json.dumps(told, indent=2))
+        described = {name: {"errors": found.errors, "warnings": found.warnings} for name, found in findings.items()}
+        print(json.dumps(described, indent=2))
     else:
         for name, found in findings.items():
             for kind, lines in (("error", found.errors), ("warning", found.warnings)):
@@ -119,8 +119,8 @@ def docs(keys: tuple[str, ...], as_json: bool) -> ExitCode:
         return ExitCode.OK
     rows = _chosen(keys)
     if as_json:
-        told = [{name: getattr(row, name) for name in ("key", "default", "bounds", "meaning")} for row in rows]
-        print(json.dumps(told, indent=2))
+        described = [{name: getattr(row, name) for name in ("key", "default", "bounds", "meaning")} for row in rows]
+        print(json.dumps(described, indent=2))
     elif len(rows) == 1:
         (row,) = rows
         show(f"{row.key}\n  {row.meaning}\n  default: {row.default}" + (f"\n  bounds: {row.bounds}" * bool(row.bounds)))
@@ -145,7 +145,7 @@ def _list_groups(as_json: bool) -> None:
 
 
 def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":
-    """Give the settings of these groups and keys, all where there are none. Raises CommandError."""
+    """Return the settings of these groups and keys; without any, all. Raises CommandError."""
     from adacd_hil.remedies import nearest_name
     from adacd_hil.settings.configuration import explain_unknown, known_keys, sections
 

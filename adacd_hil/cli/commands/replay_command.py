@@ -1,4 +1,4 @@
-"""`adacd-hil replay`: a log once more through arm and scheme, compared with itself or set beside other settings."""
+"""`adacd-hil replay`: feeds a log to arm and scheme again; compares the result with the log or other settings."""
 
 import json
 from pathlib import Path
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 _EPILOG = (
     "Exit status: 0 identical, or other settings were replayed; 1 something differs, or a log can't be read; 2 wrong "
-    "usage or configuration; 3 what could be compared is identical, but not all of the log could; 6 a live detector of "
-    "the log can't run here; 130 interrupted."
+    "usage or configuration; 3 all compared cycles are identical, but part of the log can't be compared; 6 a live "
+    "detector of the log can't run here; 130 interrupted."
 )
 _MOST_COLUMNS = 6
-"""Variants beside the log's own that are set side by side; more are rows."""
+"""Most variants that are printed as columns beside the log's own; more are printed as rows."""
 
 
 @click.command(epilog=_EPILOG)
@@ -43,7 +43,11 @@ _MOST_COLUMNS = 6
 @profile_option
 @click.option("--dbc", type=GivenPath(dir_okay=False), help="Contract of a recording without a log.")
 @click.option("--against", type=GivenPath(), help="Log of the run that a recording is of, to compare with.")
-@click.option("--tolerance", type=click.FloatRange(0.0, 1.0), help="Of real values; default: 0 on the same machine.")
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(0.0, 1.0),
+    help="Relative tolerance of real values; default: 0 on the same machine.",
+)
 @click.option("--shown", type=click.IntRange(min=0), default=20, show_default=True, help="Mismatches to print.")
 @json_option
 @explained
@@ -64,14 +68,14 @@ def replay(
     """Replay logs: the raw frames once more through codec, arm and scheme.
 
     Without other settings, every field of /scheme and every contact report is compared with the log, bit for bit; a
-    folder stands for the run log in it. With --set, --vary or --config, the result stands beside the original: what
-    would have been detected, when, false alarms, parameters. The truth.mcap beside a log is joined to it.
+    folder stands for the run log in it. With --set, --vary or --config, the result stands beside the original: contacts
+    that would have been detected, when, false alarms, parameters. The truth.mcap beside a log is joined to it.
 
     Frames that others recorded (candump .log, BLF, ASC, MF4, TRC) are replayed --against the log of their run, or with
     --config alone, where the configuration's script plays the user.
 
-    With --from and --until, only that stretch is compared and told. The replay begins with the log all the same: its
-    filters and its model know what came before.
+    With --from and --until, only that stretch is compared and printed. The replay still begins with the log, because
+    filters and model depend on earlier cycles.
     """
     with Progress() as progress:
         results = [
@@ -94,7 +98,7 @@ def _next(given: Path, has_changes: bool) -> tuple[str, ...]:
 
 
 _Result = tuple[Path, "list[Replay]", list[str]]
-"""A log, the replays of it, the log's own first, and the names of the others."""
+"""A log, its replays (the log's own settings first), and the names of the variants."""
 
 
 def _replay_one(
@@ -142,7 +146,7 @@ def _replay_one(
 def _open(
     given: Path, configured: tuple[str | None, str | None, Path | None], against: Path | None
 ) -> "tuple[ReplaySource, bool]":
-    """Open a log or a recording; also say whether it is a recording alone."""
+    """Open a log or a recording; the second value tells whether it is a recording without a log."""
     from adacd_hil.device.contract import load_contract
     from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone
     from adacd_hil.replay.log_source import LogSource
@@ -156,9 +160,7 @@ def _open(
         return LogSource(path), False
     config, profile, dbc = configured
     if config is None:
-        raise CommandError(
-            f"{path} says nothing of the settings: --against the log of its run, or --config", ExitCode.USAGE
-        )
+        raise CommandError(f"{path} holds no settings: give --against the log of its run, or --config", ExitCode.USAGE)
     settings = load_settings(config, profile)
     return RecordingAlone(path, settings, load_codec(dbc) if dbc else load_contract(settings)), True
 

@@ -1,4 +1,4 @@
-"""Runs on a bus: opens it, lets a session run, says how it ended."""
+"""`adacd-hil run`: opens the bus, runs a session, prints its result."""
 
 import dataclasses
 import functools
@@ -24,10 +24,11 @@ from adacd_hil.cli.connection import (
 )
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
 from adacd_hil.clock import format_date, wall_ns
-from adacd_hil.control.arm_records import TARED, Origin, UsedHistory, use_history, use_tare
 from adacd_hil.control.configuration_check import guesses_in_brief
+from adacd_hil.control.history_file import Origin, UsedHistory, use_history
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
+from adacd_hil.control.tare_file import TARED, use_tare
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.progress_lines import Progress
@@ -43,9 +44,9 @@ from adacd_hil.wire.codec import Codec
 
 
 def check_budget_of(codec: Codec, settings: Settings) -> None:
-    """Refuse a contract whose frames don't get through in the configured period. Raises ConfigError, CodecError.
+    """Refuse a contract whose frames miss their deadlines in the configured period. Raises ConfigError, CodecError.
 
-    A DBC that doesn't say when its messages are sent can't be judged and passes.
+    A DBC without attribute Trigger can't be judged and passes.
     """
     if b'"Trigger"' not in codec.text:
         return
@@ -63,9 +64,9 @@ def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
 
 
 def drop_old_frames(bus: Bus, interface: str) -> None:
-    """Empty the transmit queue if a process before this one has left frames in it. Raises BusError.
+    """Empty the transmit queue of frames that an earlier process left. Raises BusError.
 
-    On a shared bus those of a neighbour leave by themselves.
+    On a shared bus a neighbour's frames leave by themselves.
     """
     if interface == "socketcan" and CanInterface(bus.channel).waiting_frames():
         bus.recover()
@@ -81,10 +82,10 @@ def run_on_bus(
     scenario: str | None = None,
     without_anchor: bool = False,
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Run the scheme on a bus, with the offsets of a tare and the arm's history when they are given.
+    """Run the scheme on a bus; with the offsets of a tare and the arm's history if given.
 
-    `out` None: a new folder by date. scenario: whose user acts, for an emulated arm. without_anchor: the user knows
-    that nothing bounds the torque offsets.
+    `out` None: a new folder by date. scenario: the emulated arm's scenario, whose user makes the requests.
+    without_anchor: the user accepts that no anchor bounds the torque offsets.
 
     Raises ConfigError, CodecError, BusMissingError, LogError, CommandError, OSError.
     """
@@ -100,7 +101,7 @@ def run_on_bus(
     history = None
     if history_path is not None:
         if settings.scheme != "certified":
-            raise CommandError(f"--history: scheme {settings.scheme!r} certifies nothing", ExitCode.USAGE)
+            raise CommandError(f"--history: scheme {settings.scheme!r} has no certificates", ExitCode.USAGE)
         history = use_history(history_path, wall_ns())
         settings = history.apply(settings)
         ask_first_run(history)
@@ -137,13 +138,13 @@ def run_on_bus(
         for used in (tare, history):
             for line in () if used is None else used.warnings:
                 progress(f"warning: {line}")
-        with on_interrupt(session.interrupt, signal.SIGTSTP):  # Ctrl-Z parks: an arm is not left alone
+        with on_interrupt(session.interrupt, signal.SIGTSTP):  # Ctrl-Z parks: a stopped process would send no commands
             summary = session.run()
     code, described = exit_code(summary), summarise(summary)
     if history is not None and summary.certificates:
         origin = Origin(format_date(wall_ns()), str(summary.log.path), settings.arm.profile, __version__)
         try:
-            described["history"] = history.add(summary.certificates, summary.identities, origin)
+            described["history"] = history.add_certificates(summary.certificates, summary.identities, origin)
         except (OSError, ConfigError) as error:
             described["history_error"] = str(error)
             print(in_line(f"adacd-hil: the certificate is not in the history: {error}"), file=sys.stderr)
@@ -152,38 +153,38 @@ def run_on_bus(
 
 
 def ask_first_run(history: UsedHistory) -> None:
-    """Have the user say on the terminal that nobody touches an arm of which nothing is known. Raises CommandError."""
+    """Have the user confirm on the terminal that an arm without history is free. Raises CommandError."""
     if not history.is_first_run or sys.stdin is None or not sys.stdin.isatty():
         return
     print(
-        f"{history.path} does not exist: this is the arm's first run.\nWho drags it while it learns is learnt as its "
-        "friction, and no run alone can tell. Nobody may touch it until it monitors.",
+        f"{history.path} does not exist: this is the arm's first run.\nA touch while it learns would be learnt as "
+        "friction, and a single run can't detect that. Keep off the arm until it monitors.",
         file=sys.stderr,
     )
-    if not click.confirm("Is nobody touching it?", err=True):
-        raise CommandError("not started: somebody touches the arm")
+    if not click.confirm("Is the arm free?", err=True):
+        raise CommandError("not started: the arm is touched")
 
 
 def ask_without_anchor(joints: list[int], arguments: str) -> None:
-    """Have the user say on the terminal that an arm may learn its torque offsets without an anchor.
+    """Have the user confirm on the terminal that an arm may learn its torque offsets without an anchor.
 
-    arguments: those of the command that name bus and arm. Raises CommandError where they don't, and where there is no
+    arguments: options of the command that name bus and arm. Raises CommandError if the user declines or there is no
     terminal.
     """
     if not joints:
         return
     named = " and ".join(f"joint {i + 1}" for i in joints)
     unknown = (
-        f"nothing bounds the torque offset of {named}: neither a tare nor a history is given, and "
-        "`arm.holding_torque_Nm` doesn't say that the motor holds little"
+        f"the torque offset of {named} has no bound: neither a tare nor a history is given, and "
+        "`arm.holding_torque_Nm` is unknown or large"
     )
     remedy = f"`adacd-hil tare {arguments}` first, then `run --tare tare.toml`"
     if sys.stdin is None or not sys.stdin.isatty():
         raise CommandError(f"{unknown}; {remedy}, or `run --without-anchor`", ExitCode.USAGE)
     print(
         in_line(
-            f"{unknown}. Who leans on the arm from before its first motion is learnt as the sensors' zero, and no run "
-            f"can tell. Better: {remedy}."
+            f"{unknown}. A push that begins before the first motion would be learnt as the sensors' zero, and a single "
+            f"run can't detect that. Better: {remedy}."
         ),
         file=sys.stderr,
     )
@@ -192,7 +193,7 @@ def ask_without_anchor(joints: list[int], arguments: str) -> None:
 
 
 def summarise(summary: SessionSummary) -> dict[str, Any]:
-    """Describe how a session ended, for people and machines."""
+    """Return the result of a session, for people and machines."""
     described: dict[str, Any] = {"log": str(summary.log.path), "scheduler": summary.grant.scheduler}
     if summary.error:
         described["error"] = summary.error
@@ -222,7 +223,7 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
 
 
 def next_of_run(result: dict[str, Any]) -> tuple[str, ...]:
-    """Name what may be typed after a run; after one that didn't begin the error has said it."""
+    """Return the commands to suggest after a run; () after a run that didn't start, whose error has a remedy."""
     if not {"cycles", "broke_off"} & set(result):
         return ()
     return (
@@ -232,7 +233,7 @@ def next_of_run(result: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _verdict(result: dict[str, Any]) -> str:
-    """Say in one line how a run ended."""
+    """Return one sentence on how a run ended."""
     if "broke_off" in result:
         certified = len(result["certificates"])
         known = f" and {certified} certificate{'s' * (certified > 1)}" if certified else ""
@@ -246,11 +247,11 @@ def _verdict(result: dict[str, Any]) -> str:
 
 
 _FOR_MACHINES = ("data", "certificates", "broke_off")
-"""Of what `summarise` says: told otherwise, or while it runs."""
+"""Keys of `summarise` that `as_text` prints in other words, or that the run has printed already."""
 
 
 def as_text(result: dict[str, Any]) -> str:
-    """Lay out what `summarise` says for people, a line each."""
+    """Format the result of `summarise` for people, a line each."""
     data = result.get("data")
     lines = [_verdict(result), *(f"{key}: {value}" for key, value in result.items() if key not in _FOR_MACHINES)]
     if data is not None:

@@ -1,4 +1,4 @@
-"""The draft of one's own arm as `init` makes it: scans the bus, asks, and lets what is known decide the rest."""
+"""The draft of an arm's configuration for `init`: scans the bus, asks the user, derives the other values."""
 
 import math
 import os
@@ -57,7 +57,7 @@ _NO_BUS = "none"
 
 @dataclass(frozen=True)
 class InitOptions:
-    """What the command line answers; None: not answered."""
+    """Answers on the command line; None: not answered."""
 
     interface: str | None = None
     channel: str | None = None
@@ -91,26 +91,26 @@ class InitOptions:
 
 @dataclass
 class DraftFiles:
-    """The files that are to be written: none replaces another unless asked for, and all of them or none."""
+    """Files to be written: all or none of them, and none over an existing file unless `--force`."""
 
     out: Path
     is_forced: bool
     contents: dict[Path, bytes] = field(default_factory=dict)
 
-    def check(self, path: Path) -> None:
-        """Raise CommandError where a file is in the way."""
+    def require_free(self, path: Path) -> None:
+        """Raise CommandError if a file of that name exists and may not be replaced."""
         if is_there(path) and not self.is_forced:
             raise CommandError(f"{path} exists; give another name, or --force to replace it", ExitCode.USAGE)
 
-    def add(self, path: Path, content: str | bytes) -> None:
-        """Add a file. Raises CommandError where another is in the way."""
+    def add_file(self, path: Path, content: str | bytes) -> None:
+        """Add a file. Raises CommandError if a file of that name exists and may not be replaced."""
         data = content.encode() if isinstance(content, str) else content
         if not (path.is_file() and path.read_bytes() == data):
-            self.check(path)
+            self.require_free(path)
         self.contents[path] = data
 
     def examine(self, text: str) -> ConfigurationFindings:
-        """Check a text for the file as `config check` does, beside the others. Raises CommandError."""
+        """Check a configuration's text together with the other files, as `config check`. Raises CommandError."""
         with tempfile.TemporaryDirectory() as folder:
             for path, data in (self.contents | {self.out: text.encode()}).items():
                 (Path(folder) / path.name).write_bytes(data)
@@ -120,8 +120,8 @@ class DraftFiles:
             raise CommandError(f"{self.out} is not written, as it could not be used: {line}", ExitCode.USAGE)
         return found
 
-    def finish(self, text: str) -> None:
-        """Write the file and those beside it. Raises CommandError."""
+    def write_files(self, text: str) -> None:
+        """Write the configuration and the other files. Raises CommandError."""
         self.contents[self.out] = text.encode()
         try:
             self.out.parent.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ class DraftFiles:
 
 
 class Drafting:
-    """One draft in the making: what was asked, what was found."""
+    """State of one draft: devices found, answers, warnings, drafted profiles."""
 
     def __init__(self, options: InitOptions, interview: Interview, writing: DraftFiles) -> None:
         self.options, self.interview, self.writing = options, interview, writing
@@ -140,13 +140,13 @@ class Drafting:
         self.bus: dict[str, Any] | None = None
         self.bitrate = options.bitrate
         self.guessed: set[str] = set()
-        """Profiles in which the worth of a count is a guess."""
+        """Profiles in which the scale of a count is a guess."""
         self._answers: dict[str, tuple[Any, str]] = {}
         self._drafts: dict[tuple[str, int], ProfileDraft] = {}
         """Drafted and completed profiles, by kind and joint."""
 
     def draft(self) -> tuple[str, dict[str, Any]]:
-        """Find out, ask, propose; return the text of the file and a summary."""
+        """Scan, ask, derive; return the text of the configuration and a summary."""
         facts = self._gather()
         title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
         title += f" from {self.bus['interface']} {self.bus['channel']}." if self.bus else " without hardware."
@@ -167,7 +167,7 @@ class Drafting:
         return text, summary
 
     def _gather(self) -> ArmFacts:
-
+        """Find devices, profiles, geometry and limits, asking the user for unknown ones."""
         options = self.options
         drives, sensors = self._find_devices()
         drive, sensor = self._profiles(drives, sensors)
@@ -177,9 +177,13 @@ class Drafting:
         ratings = [device.ratings for device in drives]
         rated = self._rated(ratings, profiles, geometry)
         torque = self._limit("torque_limit_Nm", "--torque-limit-nm", _torque_proposals(rated, ratings, geometry))
-        proposal = _position_proposals(ratings, scales, geometry)
+        scaled = list(zip(ratings, scales, strict=False))
+        by_drives = [rating.position_limit_deg(scale) for rating, scale in scaled]
+        proposal = _limit_proposal(geometry.position_limit_deg, by_drives, "0x607D of the drives", (75.0, 120.0))
         position = self._limit("position_limit_deg", "--position-limit-deg", proposal)
-        proposal = _speed_proposals(ratings, scales, geometry)
+        by_drives = [rating.velocity_limit_deg_s(scale) for rating, scale in scaled]
+        source = "0x6080 of the drives, by their gears"
+        proposal = _limit_proposal(geometry.velocity_limit_deg_s, by_drives, source, (250.0, 300.0))
         velocity = self._limit("velocity_limit_deg_s", "--velocity-limit-deg-s", proposal)
         nodes = [
             Fact(tuple(device.node.node_id for device in found), "found on the bus")
@@ -218,7 +222,7 @@ class Drafting:
         return load_profile(there, DRIVE).settings
 
     def _profile_guesses(self, facts: ArmFacts) -> list[str]:
-        """Name the guesses within profiles, each once."""
+        """Name the guesses in the profiles, each once."""
         keys: dict[str, None] = {}
         for kind, names in ((DRIVE, facts.drive.value), (SENSOR, facts.sensor.value)):
             for joint, name in enumerate(names):
@@ -232,7 +236,7 @@ class Drafting:
     # -- devices
 
     def _find_devices(self) -> tuple[list[RecognisedDevice], list[RecognisedDevice]]:
-        """Scan the bus, if there is one; return the drives and sensors of joint 1 and 2, or nothing."""
+        """Scan the bus, if there is one; return drives and sensors of joint 1 and 2, [] without a bus."""
         channel = self._ask_channel()
         if channel is None:
             return [], []
@@ -256,14 +260,14 @@ class Drafting:
         for node in found.nodes:
             if all(device.node is not node for device in devices):
                 self.interview.say(
-                    f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; --drive-node and "
-                    "--sensor-node say what such a node is"
+                    f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; give --drive-node "
+                    "or --sensor-node for such a node"
                 )
         chosen = [self._two(devices, kind, getattr(self.options, f"{kind}_node"), channel) for kind in (DRIVE, SENSOR)]
         return chosen[0], chosen[1]
 
     def _ask_channel(self) -> str | None:
-
+        """Return the channel of the arm's bus; None for an arm without hardware. Raises CommandError."""
         options = self.options
         if options.is_busless and (options.channel or options.interface):
             raise CommandError("--no-bus and --interface or --channel exclude each other", ExitCode.USAGE)
@@ -276,11 +280,11 @@ class Drafting:
         present = can_interfaces()
         kernel = look_for_socketcan()
         if kernel.status is not Status.OK:
-            told = f"{kernel.reason} ({kernel.remedy}); an arm without hardware can be rehearsed"
+            line = f"{kernel.reason} ({kernel.remedy}); an arm without hardware can be rehearsed"
         else:
-            told = f"CAN interfaces: {', '.join(present) or 'none is there'}"
+            line = f"CAN interfaces: {', '.join(present) or 'none is there'}"
         if self.interview.is_asking:
-            self.interview.say(told)
+            self.interview.say(line)
         proposal = Proposal(present[0] if self.interview.is_asking and present else _NO_BUS)
         question = f"CAN interface of the arm, `{_NO_BUS}` for an arm without hardware"
 
@@ -314,7 +318,7 @@ class Drafting:
                 raise ConfigError(f"{option} {chosen[0]} {chosen[1]}: the node ids must differ")
             return [known[number] for number in chosen]
 
-        # Of more than two, as of two arms, nobody but the user knows.
+        # Of more than two, as of two arms, only the user can choose.
         proposal = Proposal(tuple(known) if len(known) == 2 else None, "in the order of the node ids")
         answer, source = self.interview.ask(option, given, f"Node ids of the {kind}s of joint 1 and 2", read, proposal)
         if source != "given":
@@ -322,7 +326,7 @@ class Drafting:
         return answer
 
     def _profiles(self, drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]) -> tuple[Fact, Fact]:
-
+        """Return the device profiles of the drives and of the sensors, drafted from an EDS if needed."""
         options = self.options
         drafted = self._draft_profiles([*drives, *sensors])
         found = choose_family(drives, sensors) if drives else (("",) * 2, ("",) * 2)
@@ -359,7 +363,7 @@ class Drafting:
         return facts[0], facts[1]
 
     def _ask_eds(self, kind: str, joint: int, device: RecognisedDevice) -> str:
-        """Ask for the EDS of a device that no profile describes; return the name of its draft."""
+        """Ask for the EDS of a device without a profile; return the name of the drafted profile."""
 
         def read(text: str) -> str:
             eds = Path(text)
@@ -371,7 +375,7 @@ class Drafting:
         return self.interview.ask("--eds FILE", None, question, read)[0]
 
     def beside(self, name: str, kind: str) -> str:
-        """Return a profile's name as the file will have it: a file is named from where the configuration lies."""
+        """Return a profile's path relative to the configuration's folder, from which it will be read."""
         profile = load_profile(name, kind)
         if name in profile_names():
             return name
@@ -381,7 +385,7 @@ class Drafting:
         return os.path.relpath(name, self.writing.out.parent)
 
     def _draft_profiles(self, devices: Sequence[RecognisedDevice]) -> dict[tuple[str, int], str]:
-        """Draft a profile of each EDS, to lie beside the file; return the names by kind and joint."""
+        """Draft a profile of each EDS, beside the configuration; return the names by kind and joint."""
         names: dict[tuple[str, int], str] = {}
         for eds, kind in self._eds_files():
             identity = identity_of(eds)
@@ -404,7 +408,7 @@ class Drafting:
         return names
 
     def _eds_files(self) -> list[tuple[Path, str]]:
-        """List the EDS files with what each describes; asks where 0x1000 doesn't tell."""
+        """Return the EDS files with the kind of each; ask if 0x1000 names none."""
         options = self.options
         found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
         for eds in options.eds:
@@ -420,10 +424,10 @@ class Drafting:
         return found
 
     def _write_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
-        """Draft the profile of an EDS for some joints, ask for missing values; return the names of the files."""
+        """Draft the profile of an EDS for some joints, asking for missing values; return the names of the files."""
         drafts = self._draft(eds, kind, ratings)
         folder, stem = self.writing.out.parent, f"{self.writing.out.stem}-{eds.stem}"
-        self.writing.add(folder / eds.name, eds.read_bytes())
+        self.writing.add_file(folder / eds.name, eds.read_bytes())
         names: dict[tuple[str, int], str] = {}
         texts: dict[str, str] = {}
         for joint, draft in drafts.items():
@@ -431,11 +435,11 @@ class Drafting:
             names[kind, joint] = name
             self._note(kind, joint, name, draft)
         for text, name in texts.items():
-            self.writing.add(folder / name, text)
+            self.writing.add_file(folder / name, text)
         return names
 
     def _note(self, kind: str, joint: int, name: str, draft: ProfileDraft) -> None:
-        """Remember a draft, and warn of its guesses."""
+        """Store a draft, and warn of its guesses."""
         self._drafts[kind, joint] = draft
         for line in (*draft.guesses, *draft.remarks):
             if (warning := f"{name}: {line}") not in self.warnings:
@@ -445,7 +449,7 @@ class Drafting:
     def _draft(
         self, eds: Path, kind: str, ratings: dict[int, DeviceRatings], among: Collection[str] | None = None
     ) -> dict[int, ProfileDraft]:
-        """Draft the profile of an EDS for some joints, and ask for each guess; only for keys `among` these if given."""
+        """Draft the profile of an EDS for some joints, and ask for each guess, or only those with keys in `among`."""
         answers: dict[int, dict[str, float]] = {joint: {} for joint in ratings}
 
         def drafted() -> dict[int, ProfileDraft]:
@@ -497,21 +501,23 @@ class Drafting:
             else:
                 self.guessed.add(name)
         for text, file in texts.items():
-            self.writing.add(self.writing.out.parent / file, text)
+            self.writing.add_file(self.writing.out.parent / file, text)
         return tuple(completed)
 
     # -- the arm
 
     def _ask_geometry(self) -> tuple[PlanarArm, str, str, str]:
-        """Return the geometry, and who says the lengths, the masses, and whether gravity acts."""
+        """Return the geometry, and the sources of lengths, masses, and gravity's direction."""
         options, interview = self.options, self.interview
         urdf, arm = options.urdf, None
         if urdf is not None:
             if options.length_m is not None or options.mass_kg is not None:
-                raise CommandError("--urdf says lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE)
+                raise CommandError(
+                    "--urdf gives lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE
+                )
             if options.at_zero is not None or options.is_upright is not None:
                 raise CommandError(
-                    "--urdf says where gravity acts; --mounting floor, wall or ceiling says how its root is mounted",
+                    "--urdf gives the direction of gravity; --mounting floor, wall or ceiling gives that of its root",
                     ExitCode.USAGE,
                 )
             try:
@@ -553,7 +559,7 @@ class Drafting:
         return arm, length_source, "given masses, as uniform rods", gravity_source
 
     def _ask_mounting(self) -> tuple[Pair, str]:
-        """Return tilt of the plane of motion and the q1 at which link 1 hangs, deg, and who says so."""
+        """Return the tilt of the plane of motion and the q1 at which link 1 hangs down, deg, and their source."""
         options, interview = self.options, self.interview
         given = options.mounting
         if options.is_upright is not None and given is None:
@@ -581,7 +587,7 @@ class Drafting:
         return (tilt_deg, hangs_deg), source if at_zero_source else ""
 
     def _mount(self, urdf: Path, arm: PlanarArm) -> tuple[PlanarArm, str]:
-        """Turn a URDF's root as it is mounted; return the arm, and how that is."""
+        """Turn a URDF's root as it is mounted; return the arm, and a description of the mounting."""
         interview, given = self.interview, self.options.mounting
         if given is None and not interview.is_asking:
             return arm, "its root's z axis up"
@@ -596,7 +602,7 @@ class Drafting:
     def _rated(
         self, ratings: Sequence[DeviceRatings], profiles: Sequence[ProfileSettings], geometry: PlanarArm
     ) -> Fact:
-        """Take the rated torque at the joints from the drives, from their EDS, or ask."""
+        """Return the rated torque at the joints: from the drives, from their EDS, or from the user."""
         scales = [profile.scale for profile in profiles]
         by_drives = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
         drafts = [self._drafts.get((DRIVE, joint)) for joint in range(2)]
@@ -620,7 +626,7 @@ class Drafting:
         return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
 
     def _limit(self, key: str, option: str, proposal: Proposal) -> Fact:
-
+        """Ask for a pair of `arm.KEY`, within its bounds."""
         given = getattr(self.options, option[2:].replace("-", "_"))
         meaning = known_keys()[f"arm.{key}"].meaning
         value, source = self.interview.ask(
@@ -634,7 +640,7 @@ class Drafting:
 
 
 def _numbers(value: Any, kind: type, option: str) -> tuple[Any, Any]:
-    """Read two numbers, given or typed. Raises ConfigError."""
+    """Parse two numbers, given or typed. Raises ConfigError."""
     words = value.replace(",", " ").split() if isinstance(value, str) else list(value)
     try:
         first, second = (kind(word) for word in words)
@@ -649,11 +655,11 @@ def _checked(key: str, value: tuple[Any, Any]) -> Any:
 
 
 _PITCHES_DEG = {"floor": 0.0, "wall": 90.0, "ceiling": 180.0}
-"""Of a URDF's root about its y axis, by what its base is on."""
+"""Rotation of a URDF's root about its y axis, by mounting of the base."""
 _TILTS_DEG = {"flat": 0.0, "floor": 90.0, "wall": 90.0, "ceiling": 90.0}
-"""Of the plane of motion, by what the base of an arm with level axes is on."""
+"""Tilt of the plane of motion, by mounting of the base of an arm with level axes."""
 _HANGING_DEG = {"down": 0.0, "up": 180.0, "level": -90.0}
-"""The q1 at which link 1 hangs, by where it points at q1 = 0."""
+"""The q1 at which link 1 hangs down, by its direction at q1 = 0."""
 _USUAL_POSES = {"floor": "up", "wall": "level", "ceiling": "down"}
 
 
@@ -670,7 +676,7 @@ def _hanging(text: str) -> float:
 
 
 def _word_or_deg(option: str, text: str, words: dict[str, float], low: float, high: float) -> float:
-    """Read a word, or an angle within bounds, deg. Raises ConfigError."""
+    """Parse a word, or an angle within bounds, deg. Raises ConfigError."""
     if text.casefold() in words:
         return words[text.casefold()]
     try:
@@ -705,7 +711,7 @@ def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> Pla
 
 
 def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Proposal:
-    """Propose the least of what drives and URDF allow, and of the rated torque."""
+    """Propose the smallest of the drives' limit, the URDF's effort and the rated torque."""
     shares = [min(rating.torque_share or 1.0, 1.0) for rating in ratings] or [1.0, 1.0]
     efforts = geometry.effort_Nm or rated.value
     limit = tuple(min(rated.value[joint] * shares[joint], efforts[joint]) for joint in range(2))
@@ -713,30 +719,17 @@ def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: P
     return Proposal(limit, source if rated.source else "")
 
 
-def _position_proposals(
-    ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm
-) -> Proposal:
-    told = [rating.position_limit_deg(scale) for rating, scale in zip(ratings, scales, strict=False)]
-    if geometry.position_limit_deg is not None:
-        return Proposal(geometry.position_limit_deg, "the URDF's")
-    if told and None not in told:
-        return Proposal(tuple(told), "0x607D of the drives")
-    return Proposal((75.0, 120.0))
-
-
-def _speed_proposals(
-    ratings: Sequence[DeviceRatings], scales: Sequence[ScaleSettings], geometry: PlanarArm
-) -> Proposal:
-    told = [rating.velocity_limit_deg_s(scale) for rating, scale in zip(ratings, scales, strict=False)]
-    if geometry.velocity_limit_deg_s is not None:
-        return Proposal(geometry.velocity_limit_deg_s, "the URDF's")
-    if told and None not in told:
-        return Proposal(tuple(told), "0x6080 of the drives, by their gears")
-    return Proposal((250.0, 300.0))
+def _limit_proposal(by_urdf: Pair | None, by_drives: list[float | None], source: str, default: Pair) -> Proposal:
+    """Propose the URDF's limits, else those read from both drives, from this source, else a guess."""
+    if by_urdf is not None:
+        return Proposal(by_urdf, "the URDF's")
+    if by_drives and None not in by_drives:
+        return Proposal(tuple(by_drives), source)
+    return Proposal(default)
 
 
 _ESSENTIAL = {"scale.increments_per_joint_rev", "scale.torque_Nm", "scale.rated_torque_count_Nm"}
-"""Guesses in a profile that make `devices` of the configuration a guess, too."""
+"""Keys of a profile that, as guesses, make `devices` of the configuration a guess, too."""
 _VELOCITY_UNITS = {
     "increment/s": 0x00B50300,
     "rpm": 0x00B44700,
@@ -761,7 +754,7 @@ class ScaleQuestion:
 
     @property
     def answer(self) -> str:
-        """Name of the answer for `draft_profile`."""
+        """Key of the answer in `draft_profile`."""
         return "velocity_unit" if self.key == "scale.velocity_rad_s" else self.key.partition(".")[2]
 
     def given(self, options: InitOptions) -> Any:
@@ -769,13 +762,13 @@ class ScaleQuestion:
         return getattr(options, self.option.split()[0].lstrip("-").replace("-", "_"))
 
     def propose(self, value: float) -> Any:
-        """Return the guess as it would be typed."""
+        """Return the guess in the form in which the user types it."""
         if self.units:
             return next((name for name, worth in self.units.items() if worth == value), next(iter(self.units)))
         return (value, value)
 
     def read(self, value: Any) -> tuple[float, float]:
-        """Read an answer, for joint 1 and 2. Raises ConfigError."""
+        """Parse an answer, for joint 1 and 2. Raises ConfigError."""
         if not self.units:
             first, second = _numbers(value, float, self.option.split()[0])
         elif value in self.units:
@@ -854,7 +847,7 @@ def _drive_or_sensor(text: str) -> str:
 
 
 def _extension(name: str, shipped: ScaleSettings, scale: ScaleSettings, left: Sequence[str]) -> str:
-    """Write a profile that extends a shipped one by gear and encoder of the arm."""
+    """Return a profile that extends a shipped one by gear and encoder of the arm."""
     rows = [
         f"{key} = {value!r}" for key, value in vars(scale).items() if not math.isclose(value, getattr(shipped, key))
     ]

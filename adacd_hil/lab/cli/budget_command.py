@@ -21,7 +21,7 @@ _LEGEND = (
 
 
 class Judgement(NamedTuple):
-    """A contract's budget, what else there is to say of it, the exit status, and what its devices must tell."""
+    """A contract's budget, remarks, exit status, and the wire version and layout digest of its devices."""
 
     budget: Budget
     notes: list[str]
@@ -38,10 +38,10 @@ def judge(
     data_bitrate: int | None,
     arms: int | None = None,
 ) -> Judgement:
-    """Find the budget of a contract, and what else there is to say of it. Raises CodecError, ConfigError.
+    """Compute the budget of a contract, with remarks. Raises CodecError, ConfigError.
 
-    Without `dbc` it is that of the configuration's devices, loaded or composed. The configuration's period counts where
-    neither option nor DBC gives one, and how many arms share its bus.
+    Without `dbc` it is that of the configuration's devices, loaded or composed. The configuration's period counts if
+    neither option nor DBC gives one; so does its number of arms on the bus.
     """
     settings = load_settings(config)
     codec = load_contract(settings) if dbc is None else load_codec(find_contract(dbc))
@@ -57,7 +57,7 @@ def judge(
 
 
 def as_text(judgement: Judgement) -> str:
-    """Write a budget for people, as wide as their terminal, else 120 letters."""
+    """Format a budget for people, as wide as their terminal, else 120 letters."""
     budget = judgement.budget
     rates = f"{budget.bitrate} bit/s" + (f", data {budget.data_bitrate} bit/s" if budget.data_bitrate else "")
     findings = [
@@ -103,7 +103,7 @@ def _response(response: ResponseTime) -> str:
 
 
 def as_json(judgement: Judgement) -> dict[str, Any]:
-    """Describe a budget for machines."""
+    """Return a budget as a dictionary for JSON."""
     budget = judgement.budget
     return {
         "contract": budget.contract.name,

@@ -1,4 +1,4 @@
-"""Communication test: a while of cycles at zero torque, and a verdict on the connection."""
+"""Communication test: cycles at zero torque for a while, and a verdict on the connection."""
 
 import dataclasses
 import sys
@@ -49,7 +49,7 @@ _BINS = 12
 def run_commtest(
     connection: Connection, seconds: float, is_enabling: bool, out: Path | None
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Boot the arm, cycle at zero torque, judge. Exit code: FAILURE when the connection is not sufficient.
+    """Boot the arm, run cycles at zero torque, judge. Exit status FAILURE if the connection is not sufficient.
 
     Raises ConfigError, CodecError, BusMissingError, LogExistsError, LogError, CommandError.
     """
@@ -107,7 +107,7 @@ def _run(
     freeze_garbage()
 
     def observe(cycle: ZeroTorqueCycle) -> None:
-        record = test.observe(cycle, 0 if recorder is None else recorder.waiting_bytes)
+        record = test.observe_cycle(cycle, 0 if recorder is None else recorder.waiting_bytes)
         if recorder is not None:
             recorder.cycle(cycle.state.t_ns, [(ChannelId.CYCLE, pack_cycle(record))], cycle.frames)
 
@@ -155,9 +155,9 @@ def _open_log(
 def write_pictures(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
     """Write commtest.html, the tables and figures of the times as in the report of a run, and its figures as PNG.
 
-    Returns what was written, the page first; nothing without a cycle. Raises LogError when it can't be written.
+    Return the written files, the page first; [] without a cycle. Raises LogError if they can't be written.
     """
-    # Here and not above: plots take a second to import, and memory that the test itself has no use for.
+    # Imported here: plots take a second to import, and memory that the test itself doesn't need.
     from adacd_hil.lab.report.page import Heading, render_page
     from adacd_hil.lab.report.report_tables import timing_tables
     from adacd_hil.lab.report.timing_figures import draw_timing
@@ -183,7 +183,7 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
 
 
 def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:
-    """Put the report into plain values; times in µs."""
+    """Return the report as a dictionary for JSON; times in µs."""
     evidence = _evidence(report, settings.bus.period_us)
     return {
         "verdict": report.verdict.value,
@@ -213,7 +213,7 @@ def _evidence(report: CommunicationReport, period_us: float) -> TimingEvidence:
 
 
 def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
-    """Say what makes the figures worth less."""
+    """Return reasons why the figures are less significant."""
     warnings = []
     if not scheduler.startswith(("SCHED_FIFO", "SCHED_DEADLINE")):
         warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
@@ -226,7 +226,7 @@ def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
 
 
 def as_text(described: dict[str, Any]) -> str:
-    """Write the result for people."""
+    """Format the result for people."""
     lines = [
         f"cycles {described['cycles']}, complete {described['complete']}, overruns {described['overruns']}, "
         f"period {described['period_us']} µs, {described['scheduler']}, bus load {described['load_percent']:.1f} %"
@@ -248,7 +248,7 @@ def as_text(described: dict[str, Any]) -> str:
 
 
 def _timing_lines(described: dict[str, Any]) -> list[str]:
-    """Write percentiles and bars of each time, then the queues and what was lost."""
+    """Format percentiles and bars of each time, then queues and losses."""
     timing, lines = described["timing"], []
     for quantity in QUANTITIES:
         found = _percentile_text(timing["times_us"][quantity.name])
@@ -258,7 +258,7 @@ def _timing_lines(described: dict[str, Any]) -> list[str]:
         for entry in described["bins_us"][quantity.name]:
             label = f">= {previous:g}" if entry["below"] is None else f"< {entry['below']:g}"
             previous = entry["below"] or previous
-            if rows or entry["count"]:  # bins before the first value say nothing
+            if rows or entry["count"]:  # skip empty bins before the first value
                 rows.append((label, entry["count"]))
         lines += bar_chart([label for label, _ in rows], [count for _, count in rows])
     queues = "; ".join(f"{name} {_percentile_text(found)}" for name, found in timing["queues_bytes"].items())

@@ -63,7 +63,7 @@ def play(
 
 
 def next_of_report(html_path: Path) -> tuple[str, ...]:
-    """Name what may be typed after a demo."""
+    """Return the commands to suggest after a demo."""
     log_path = html_path.with_name(LOG_NAME)
     return (
         f"xdg-open {quoted(html_path)}",
@@ -72,7 +72,7 @@ def next_of_report(html_path: Path) -> tuple[str, ...]:
 
 
 def _ending(summary: SessionSummary) -> str:
-    """Say how a run ended that has no report."""
+    """Describe the end of a run that has no report."""
     result = summary.result
     if summary.error or result is None:
         return summary.error or "no cycle was run"
@@ -82,7 +82,7 @@ def _ending(summary: SessionSummary) -> str:
 
 
 def outcome_of(summary: SessionSummary, truth_path: Path) -> ScenarioOutcome:
-    """Read the logs of a run that has ended, to be compared with its scenario's `expect`. Raises LogError."""
+    """Read the logs of a finished run, to compare it with its scenario's `expect`. Raises LogError."""
     from adacd_hil.lab.report.run_reading import read_run
     from adacd_hil.lab.score.evaluation import evaluate
 
@@ -106,7 +106,7 @@ def outcome_of(summary: SessionSummary, truth_path: Path) -> ScenarioOutcome:
 
 
 def _end(summary: SessionSummary) -> str:
-    """Say how the run ended, by the names of `firmware_sim.scenario.scenario`."""
+    """Return the name of the run's end, as in `firmware_sim.scenario.scenario`."""
     if not summary.has_started:
         return "refused"
     if summary.result is None:

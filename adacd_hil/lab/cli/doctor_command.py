@@ -1,4 +1,4 @@
-"""Doctor: checks the host, the bus and the arm one by one, each with a reason and a remedy."""
+"""Doctor: checks host, bus and arm one by one, each with a reason and a remedy."""
 
 import sys
 from typing import Any
@@ -20,7 +20,7 @@ _MARKS = {Status.OK: "ok", Status.WARNING: "WARNING", Status.FAILED: "FAILED", S
 
 
 def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], ExitCode]:
-    """Run all checks; the drives stay disabled, the nodes end pre-operational. Exit code: FAILURE when one failed.
+    """Run all checks; the drives stay disabled, the nodes end pre-operational. Exit status FAILURE if one failed.
 
     Raises ConfigError, CodecError.
     """
@@ -57,7 +57,7 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
         if is_moving and sys.stdin is not None and sys.stdin.isatty():
             patient.ask = lambda line: progress(f">>> {line}")
         elif is_moving:
-            patient.no_move_reason = "nobody to ask: stdin is not a terminal"
+            patient.no_move_reason = "stdin is not a terminal"
         findings = diagnose(configuration_checks(settings), settings, report)
         findings += diagnose(HOST_CHECKS, host, report)
         try:
@@ -72,13 +72,13 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
 
 
 def as_json(findings: list[Finding]) -> dict[str, Any]:
-    """Put the findings into plain values."""
+    """Return the findings as a list for JSON."""
     checks = [finding._asdict() | {"status": finding.status.value} for finding in findings]
     return {"checks": checks, "summary": summarise(findings)}
 
 
 def as_text(findings: list[Finding]) -> str:
-    """Write the findings for people: one line each, its remedy below; what has failed once more at the end."""
+    """Format the findings for people: one line each, its remedy below; failed ones again at the end."""
     rows = []
     for finding in findings:
         rows.append((_MARKS[finding.status], finding.name, finding.reason))

@@ -25,7 +25,7 @@ _LABELS = (
 
 
 class ExcitationOutcome(NamedTuple):
-    """What a search came to; `present` is None where the configuration has no excitation."""
+    """Result of a search; `present` is None if the configuration has no excitation."""
 
     config: str
     present: Figures | None
@@ -35,7 +35,7 @@ class ExcitationOutcome(NamedTuple):
 
 
 def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> ExcitationOutcome:
-    """Search; `out` is where it will be written. Raises ConfigError, CommandError."""
+    """Search an excitation; `out`: the file for the result. Raises ConfigError, CommandError."""
     if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
         raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
     task = Search(load_settings(config, profile))
@@ -51,13 +51,13 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
 
 
 def as_toml(outcome: ExcitationOutcome) -> str:
-    """Write the excitation as a configuration that extends the one that it was found for."""
+    """Return the excitation as a configuration that extends the one it was found for."""
     base = outcome.config if outcome.config in builtin_names() else str(Path(outcome.config).resolve())
     return f"extends = {json.dumps(base)}\n\n[excitation]\n{to_toml(outcome.excitation)}"
 
 
 def as_json(outcome: ExcitationOutcome) -> str:
-    """Write everything as JSON."""
+    """Return the search's result as JSON."""
     named = {
         "present": None if outcome.present is None else dataclasses.asdict(outcome.present),
         "found": dataclasses.asdict(outcome.found),
@@ -68,7 +68,7 @@ def as_json(outcome: ExcitationOutcome) -> str:
 
 
 def as_text(outcome: ExcitationOutcome) -> str:
-    """Write the figures as a table, joint 1 / joint 2."""
+    """Format the figures as a table, joint 1 / joint 2."""
     limits = outcome.limits.as_json()
     rows = [
         (

@@ -1,4 +1,4 @@
-"""`adacd-hil history`: what an arm's runs have certified."""
+"""`adacd-hil history`: the certificates of an arm's runs."""
 
 import dataclasses
 from pathlib import Path
@@ -13,11 +13,11 @@ from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.control.arm_records import History
+    from adacd_hil.control.history_file import History
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _MIDDLE = slice(1, None, 3)
-"""Of friction at 0.2, 0.6, 1.2 rad/s, joint by joint: at 0.6 rad/s."""
+"""Index of the friction at 0.6 rad/s among that at 0.2, 0.6, 1.2 rad/s, joint by joint."""
 
 
 @click.command(epilog=EPILOG)
@@ -26,11 +26,11 @@ _MIDDLE = slice(1, None, 3)
 @json_option
 @explained
 def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
-    """List what an arm's runs have certified: friction, inertia, torque offsets, and what they are known by.
+    """List the certificates of an arm's runs: friction, inertia, torque offsets, and the sources of each.
 
-    `adacd-hil run --history FILE` makes the file. A file that is not as it was written is refused.
+    `adacd-hil run --history FILE` makes the file. A file that was damaged or edited is refused.
     """
-    from adacd_hil.control.arm_records import read_history
+    from adacd_hil.control.history_file import read_history
 
     found = read_history(file)
     if plot is not None:

@@ -1,4 +1,4 @@
-"""`adacd-hil identify`: a model of somebody else's arm from somebody else's recordings, and contacts in them."""
+"""`adacd-hil identify`: a model of another lab's arm from its recordings, and contacts in them."""
 
 import json
 import math
@@ -21,17 +21,15 @@ if TYPE_CHECKING:
 
 
 _RECORDING = GivenPath()
-"""A file, or the folder of a rosbag."""
+"""Path of a file, or of a rosbag's folder."""
 
 
 @click.command(
     epilog="Exit status: 0 done; 1 a recording can't be read; 2 wrong usage or map; 3 the model doesn't explain the "
-    "test; the verdict says why."
+    "test; the verdict gives the reason."
 )
 @click.argument("recordings", nargs=-1, required=True, type=_RECORDING)
-@click.option(
-    "--map", "map_path", type=WrittenPath(dir_okay=False), help="TOML: what the columns are, and of which arm."
-)
+@click.option("--map", "map_path", type=WrittenPath(dir_okay=False), help="TOML: meaning of the columns, and the arm.")
 @click.option("--init", "is_init", is_flag=True, help="Write that map: --init RECORDING URDF.")
 @click.option("--test", type=_RECORDING, help="Recording to test on; default: the last part of the last one fitted.")
 @click.option("--watch", multiple=True, type=_RECORDING, help="Recording in which to look for contacts; repeatable.")
@@ -53,9 +51,9 @@ def identify(
 ) -> ExitCode:
     """Identify an arm from RECORDINGS of positions, torques and, if there are some, velocities: CSV, MCAP, rosbags.
 
-    RECORDINGS are of free motion. The verdict says whether their torque is explained, why not, and what to do next.
-    With the model frozen, contacts are looked for in the recordings of --watch. With --init a recording and a URDF make
-    a map, whose guesses are told.
+    RECORDINGS are of free motion. The verdict tells whether the model explains their torque, the reasons if not, and
+    the next step. With the model frozen, contacts are detected in the recordings of --watch. With --init a recording
+    and a URDF make a map; its guesses are listed.
     """
     from adacd_hil.lab.offline.recording_identification import identify as run
     from adacd_hil.lab.offline.recording_import import read_recording
@@ -73,7 +71,7 @@ def identify(
         read: list[ForeignRecording] = []
         for place, path in enumerate((*recordings, *((test,) if test else ()), *watch)):
             progress(f"reading {path}")
-            # From 0 s on: nothing is left out before.
+            # From 0 s on: no earlier part is left out.
             span = TimeWindow(start_s or -math.inf, end_s) if place < len(recordings) else None
             read.append(read_recording(path, described, read[0].period_s if read else 0.0, span))
         fitted = [recording.between(start_s, end_s) for recording in read[: len(recordings)]]
@@ -91,7 +89,7 @@ def identify(
 
 
 def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
-    """Write the map of a recording, and tell what is guessed."""
+    """Write the map of a recording, and list its guesses."""
     from adacd_hil.lab.offline.map_draft import draft_map
     from adacd_hil.lab.offline.recording_map import read_map
 
@@ -110,8 +108,8 @@ def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
     read_map(target)
     rows = [(f"{key.section}.{key.key}", toml_value(key.value), key.reason) for key in draft.keys]
     table = format_table(("key", "value", "a guess, because"), [row for row in rows if row[2]])
-    told = f"{target} written" + (f"; look at these:\n{table}" if draft.guesses else ", nothing in it is a guess")
-    show(told, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
+    text = f"{target} written" + (f"; look at these:\n{table}" if draft.guesses else ", without guesses")
+    show(text, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
     return ExitCode.OK
 
 

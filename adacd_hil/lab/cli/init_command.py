@@ -1,4 +1,4 @@
-"""Init: writes the configuration of one's own arm, with what bus, URDF, log and user say, and marks what is a guess."""
+"""Init: writes the configuration of the user's arm from bus, URDF, log and answers, and marks guesses."""
 
 import json
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:
 @click.option("--no-bus", "is_busless", is_flag=True, help="Without hardware: an arm to rehearse.")
 @click.option("--from", "log", type=GivenPath(), help="Take all from the log of a run.", shell_complete=complete_run)
 @click.option("--urdf", type=GIVEN_FILE, help="A URDF with two moving joints.")
-@click.option("--lock", "locked", multiple=True, metavar="JOINT", help="A joint of the URDF that stays where it is.")
+@click.option("--lock", "locked", multiple=True, metavar="JOINT", help="A joint of the URDF that doesn't move.")
 @_pair("--length-m", "Joint to joint, joint to tip.")
 @_pair("--mass-kg", "Masses of the links; they are taken to be uniform rods.")
 @click.option("--upright/--flat", "is_upright", default=None, help="The same as --mounting wall, and --mounting flat.")
@@ -44,15 +44,15 @@ def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:
 @_pair("--drive-node", "Node ids of the drives of joint 1 and 2.", int)
 @_pair("--sensor-node", "Node ids of the sensors of joint 1 and 2.", int)
 @click.option("--eds", multiple=True, type=GIVEN_FILE, help="EDS of a device without a profile; repeatable.")
-@click.option("--drive-eds", multiple=True, type=GIVEN_FILE, help="The same, of a drive whose 0x1000 doesn't say so.")
-@click.option("--sensor-eds", multiple=True, type=GIVEN_FILE, help="The same, of a sensor.")
+@click.option("--drive-eds", multiple=True, type=GIVEN_FILE, help="EDS of a drive whose 0x1000 names no profile.")
+@click.option("--sensor-eds", multiple=True, type=GIVEN_FILE, help="EDS of a sensor whose 0x1000 names no profile.")
 @_pair("--gear", "Motor revolutions per revolution of joint 1 and 2.")
 @_pair("--gear-efficiency", "Part of the motor's torque that leaves the gear.")
 @_pair("--increments", "Position increments per revolution of joint 1 and 2.")
-@click.option("--velocity-unit", help="Of the drives' 0x606C: increment/s, rpm, 0.1rpm, mrpm, deg/s, rad/s.")
-@click.option("--rated-torque-unit", help="Of the drives' 0x6076: mNm, µNm, Nm, 0.01Nm.")
+@click.option("--velocity-unit", help="Unit of the drives' 0x606C: increment/s, rpm, 0.1rpm, mrpm, deg/s, rad/s.")
+@click.option("--rated-torque-unit", help="Unit of the drives' 0x6076: mNm, µNm, Nm, 0.01Nm.")
 @_pair("--torque-count-nm", "One count of the torque sensors, Nm.")
-@click.option("--yes", "takes_proposals", is_flag=True, help="Take what is proposed, guesses, too, and ask nothing.")
+@click.option("--yes", "takes_proposals", is_flag=True, help="Take all proposals, guesses included, without questions.")
 @click.option("--force", "is_forced", is_flag=True, help="Replace files that are there.")
 @click.option("--rehearse/--no-rehearse", default=None, help="Play the experiment with this file and an emulated arm.")
 @click.option("--doctor/--no-doctor", default=None, help="Check host, bus and arm with this file.")
@@ -70,21 +70,21 @@ def init(
 ) -> ExitCode:
     """Write the configuration of your own arm, FILE (default: my-arm.toml), and the profiles of its devices beside it.
 
-    On a terminal, asks for what no option says. Scans the bus by SDO uploads only; never enables a drive. What nobody
-    knows is a guess, listed in the file as `assumed`; `doctor` asks for each.
+    On a terminal, asks for values without an option. Scans the bus by SDO uploads only; never enables a drive. Unknown
+    values are guesses, listed in the file as `assumed`; `doctor` asks for each.
     """
     from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
     from adacd_hil.lab.cli.logged_arm import draft_from_log
 
     interview = Interview(takes_proposals)
     writing = DraftFiles(out, is_forced)
-    writing.check(out)
+    writing.require_free(out)
     options = InitOptions(**given)
     if log is None:
         text, summary = Drafting(options, interview, writing).draft()
     else:
         text, summary = draft_from_log(log, options, interview, writing)
-    writing.finish(text)
+    writing.write_files(text)
     summary |= {"file": str(out), "written": [str(path) for path in writing.contents]}
     bus, code = summary.pop("bus", None), ExitCode.OK
     if not as_json:
@@ -116,7 +116,7 @@ def init(
 
 
 def as_text(summary: dict[str, Any]) -> str:
-    """Say what was written, and what in it is a guess."""
+    """Describe the written files and the guesses in them."""
     lines = [f"written: {', '.join(summary['written'])}"]
     lines += [f"warning: {line}" for line in summary["warnings"]]
     if summary["assumed"]:
@@ -125,7 +125,7 @@ def as_text(summary: dict[str, Any]) -> str:
 
 
 def next_of_init(file: str, bus: dict[str, Any] | None) -> tuple[str, ...]:
-    """Name what may be typed after a draft, up to the first run. bus: where the arm was found."""
+    """Return the commands to suggest after a draft, up to the first run. bus: on which the arm was found."""
     from adacd_hil.cli.connection import Connection
 
     bus = bus or {"interface": "socketcan", "channel": "can0", "bitrate": None}
@@ -134,6 +134,6 @@ def next_of_init(file: str, bus: dict[str, Any] | None) -> tuple[str, ...]:
     return (
         f"adacd-hil demo --config {quoted(Path(file))}   # rehearse",
         f"adacd-hil doctor {arm}",
-        f"adacd-hil tare {arm} --out {tare}   # the zero of the torque sensors, while nobody touches the arm",
+        f"adacd-hil tare {arm} --out {tare}   # the zero of the torque sensors; don't touch the arm",
         f"adacd-hil run {arm} --tare {tare}   # moves the arm",
     )

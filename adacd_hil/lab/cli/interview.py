@@ -1,4 +1,4 @@
-"""Questions to the user, each of which an option answers, too: on a terminal they are asked, elsewhere the option."""
+"""Questions to the user that options answer, too: asked on a terminal; elsewhere an error names the option."""
 
 import sys
 from collections.abc import Callable
@@ -14,26 +14,26 @@ Answer = TypeVar("Answer")
 
 
 def is_terminal() -> bool:
-    """Whether somebody can type."""
+    """Tell whether a user can type answers."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
 class Proposal(NamedTuple):
-    """A value that is taken without a word. source: who says so; "" for a guess. value None: there is none."""
+    """A proposed answer. source: its origin; "" for a guess. value None: no proposal."""
 
     value: Any
     source: str = ""
 
 
 class Interview:
-    """Asks what no option has answered; without a terminal it takes proposals where it may, and names the option."""
+    """Asks questions that no option has answered; without a terminal it takes proposals if allowed, else fails."""
 
     def __init__(self, takes_proposals: bool) -> None:
         self.takes_proposals = takes_proposals
         self.is_asking = not takes_proposals and is_terminal()
 
     def say(self, line: str) -> None:
-        """Tell something that is neither question nor result."""
+        """Print a line that is neither question nor result."""
         print(in_line(line), file=sys.stderr, flush=True)
 
     def ask(
@@ -45,10 +45,10 @@ class Interview:
         proposal: Proposal = Proposal(None),  # noqa: B008 (immutable)
         explanation: str = "",
     ) -> tuple[Answer, str]:
-        """Return an answer and its source: "given", the proposal's, or "" for a guess that nobody has changed.
+        """Return an answer and its source: "given", the proposal's, or "" for an unchanged guess.
 
-        read: makes an answer of an option's value, of what was typed, or of a proposal; raises ConfigError for what is
-        none, and the question is asked again. explanation: what `?` gets. Raises CommandError where nothing answers.
+        read: makes an answer from an option's value, typed text, or a proposal; raises ConfigError for an invalid one,
+        and the question is asked again. explanation: printed on `?`. Raises CommandError if there is no answer.
         """
         if given is not None:
             return read(given), "given"
@@ -58,10 +58,10 @@ class Interview:
             )
             return self._prompt(question, read, proposal, help_text)
         if proposal.value is None:
-            raise CommandError(f"nobody to ask, as stdin is no terminal: give {option} ({question})", ExitCode.USAGE)
+            raise CommandError(f"stdin is not a terminal: give {option} ({question})", ExitCode.USAGE)
         if not self.takes_proposals:
             raise CommandError(
-                f"nobody to ask, as stdin is no terminal: give {option} ({question}), or --yes for {told(proposal)}",
+                f"stdin is not a terminal: give {option} ({question}), or --yes for {as_typed(proposal)}",
                 ExitCode.USAGE,
             )
         return read(proposal.value), proposal.source
@@ -70,7 +70,7 @@ class Interview:
         self, question: str, read: Callable[[Any], Answer], proposal: Proposal, help_text: str
     ) -> tuple[Answer, str]:
         while True:
-            default = None if proposal.value is None else told(proposal)
+            default = None if proposal.value is None else as_typed(proposal)
             text = click.prompt(in_line(question), default=default, err=True, show_default=default != "")
             if text.strip() == "?":
                 self.say(help_text)
@@ -83,7 +83,7 @@ class Interview:
                 self.say(str(error))
 
     def confirm(self, answer: bool | None, question: str) -> bool:
-        """Return what an option says, else ask; without a terminal the answer is no."""
+        """Return the option's answer if given, else ask; without a terminal the answer is no."""
         if answer is not None:
             return answer
         return self.is_asking and click.confirm(in_line(question), default=False, err=True)
@@ -92,11 +92,11 @@ class Interview:
 def _origin(proposal: Proposal) -> str:
     if proposal.value is None:
         return ""
-    return f"Enter takes {told(proposal)}: {proposal.source or 'a guess'}"
+    return f"Enter takes {as_typed(proposal)}: {proposal.source or 'a guess'}"
 
 
-def told(proposal: Proposal) -> str:
-    """Write a proposed value as it would be typed."""
+def as_typed(proposal: Proposal) -> str:
+    """Format a proposed value in the form in which the user types it."""
     value = proposal.value
     if isinstance(value, tuple | list):
         return " ".join(f"{one:g}" if isinstance(one, float) else str(one) for one in value)

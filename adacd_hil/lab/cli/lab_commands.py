@@ -1,4 +1,4 @@
-"""The commands of the lab that are one function each. Each parses, calls one function, prints."""
+"""Commands of the lab that are one function each: each parses its options, calls one function, prints the result."""
 
 import json
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, answer, explained, show, tell, tried
+from adacd_hil.cli.output import EPILOG, ExitCode, answer, checked_place, explained, print_and_write, show
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
@@ -46,13 +46,13 @@ if TYPE_CHECKING:
     default="paper",
     show_default=True,
     metavar="NAME|FILE",
-    help="What happens: one that `firmware-sim list` names, or a TOML file.",
+    help="Scenario: a name that `firmware-sim list` prints, or a TOML file.",
     shell_complete=complete_scenario,
 )
 @click.option(
     "--truth",
     metavar="NAME|FILE",
-    help="What the real arm is where the configuration says otherwise: a name or a TOML file.",
+    help="Differences of the real arm from the configuration: a name or a TOML file.",
     shell_complete=complete_truth,
 )
 @run_folder_option("demo")
@@ -75,8 +75,7 @@ def demo(
 ) -> ExitCode:
     """Play the paper's experiment, or another scenario, with an emulated arm in this process, and report it.
 
-    The arm is that of the configuration: a file with an arm of one's own is rehearsed, and what it lacks is assumed
-    and told.
+    The arm is that of the configuration: a file of your own arm is rehearsed; missing values are assumed, and listed.
 
     The configuration's script plays the user of the paper's experiment. In any other scenario the user acknowledges
     stops as the configuration says, and asks to finish at the scenario's `lasts_s`.
@@ -171,18 +170,18 @@ def thresholds(
     as_json: bool,
     stretch: "TimeWindow",
 ) -> ExitCode:
-    """Find every detector's thresholds for a rate of false alarms, from what nobody touched in these logs.
+    """Find every detector's thresholds for a rate of false alarms, from contact-free motion in these logs.
 
-    Each comes with what limits it, and with the rate that half of the motion predicts for the other half. --from and
-    --until choose a stretch of each log.
+    Each comes with the cause that limits it, and with the rate that half of the motion predicts for the other half.
+    --from and --until choose a stretch of each log.
     """
     from adacd_hil.lab.cli import thresholds_command as command
     from adacd_hil.lab.thresholds.detector_comparison import write_comparison
 
-    with tried(out):
+    with checked_place(out):
         found, comparison = command.find(logs, rate_per_h, report is not None, stretch)
-        said = command.as_json(found, comparison) if as_json else command.as_text(found, comparison)
-        tell(said, out, to_toml(found), as_json)
+        text = command.as_json(found, comparison) if as_json else command.as_text(found, comparison)
+        print_and_write(text, out, to_toml(found), as_json)
     if report is not None and comparison is not None:
         write_comparison(comparison, report)
     return ExitCode.OK
@@ -198,22 +197,26 @@ def thresholds(
     show_default=True,
     help="How long to begin new climbs; the one under way is ended.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Where the climbs begin.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the climbs' starting points."
+)
 @click.option("--out", type=WrittenPath(dir_okay=False), help="Write a configuration with it here.")
 @json_option
 @explained
 def excitation(
     config: str, profile: str | None, seconds: float, seed: int, out: Path | None, as_json: bool
 ) -> ExitCode:
-    """Search the motion that shows a model soonest, within the limits of the arm and its trajectory.
+    """Search the motion that identifies a model soonest, within the limits of the arm and its trajectory.
 
-    Prints what the configuration's excitation shows and needs, and what the one found does.
+    Prints the figures of the configuration's excitation beside those of the one found.
     """
     from adacd_hil.lab.cli import excitation_command as command
 
-    with tried(out):
+    with checked_place(out):
         outcome = command.search(config, profile, seconds, seed, out)
-        tell(command.as_json(outcome) if as_json else command.as_text(outcome), out, command.as_toml(outcome), as_json)
+        print_and_write(
+            command.as_json(outcome) if as_json else command.as_text(outcome), out, command.as_toml(outcome), as_json
+        )
     return ExitCode.OK
 
 
@@ -245,7 +248,7 @@ def budget(
     arms: int | None,
     as_json: bool,
 ) -> ExitCode:
-    """Say whether the frames of a contract get through in time: bits, response times, what is left for the host."""
+    """Check whether the frames of a contract meet their deadlines: bits, response times, time left for the host."""
     from adacd_hil.lab.cli import budget_command as budgets
 
     found = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
@@ -260,7 +263,7 @@ def budget(
 )
 @json_option
 def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
-    """Find the nodes on a bus: what they are, what they send, and whether that is the configured arm.
+    """Find the nodes on a bus, their frames, and whether they are the configured arm.
 
     Sends SDO uploads only and changes no node's state. Exit status 5 when a node is missing or not the expected one.
     """
@@ -276,9 +279,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 @click.option(
     "--seconds", type=click.FloatRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test."
 )
-@click.option(
-    "--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: nothing holds the arm."
-)
+@click.option("--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: the arm isn't held.")
 @click.option("--out", type=WrittenPath(file_okay=False), help="Folder for a log; default: none.")
 @json_option
 def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
@@ -299,7 +300,7 @@ def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: P
 @click.option("--move", "is_moving", is_flag=True, help="Ask for each joint to be moved by hand, to check its signs.")
 @json_option
 def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode:
-    """Check host, bus and arm one by one, and say what to do about what is wrong. The drives are never enabled.
+    """Check host, bus and arm one by one, with a remedy for each failure. The drives are never enabled.
 
     Exit status 1 when a check failed. Resets the nodes' communication and leaves them pre-operational; does neither
     when it hears another master.
@@ -340,4 +341,4 @@ COMMANDS: Final[Sequence[click.Command]] = (
     budget, commtest, compare, demo, doctor, excitation, history, identify, init, log, monitor, play, report, runs,
     scan, sweep, tare, thresholds, trend, tune,
 )  # fmt: skip
-"""Entry point of `adacd_hil.commands`."""
+"""Sequence for the entry point `adacd_hil.commands`."""

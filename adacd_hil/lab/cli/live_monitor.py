@@ -37,7 +37,7 @@ _EVENTS, _CONTACTS = 8, 5
 
 
 class LiveMonitor:
-    """Keeps the latest of what a live view has sent, and describes it."""
+    """Keeps the latest messages of a live view, and describes them."""
 
     def __init__(self, client: LiveClient) -> None:
         self.messages = 0
@@ -49,7 +49,7 @@ class LiveMonitor:
         self._contacts: deque[dict[str, Any]] = deque(maxlen=_CONTACTS)
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
 
-    def accept(self, message: LiveMessage) -> None:
+    def accept_message(self, message: LiveMessage) -> None:
         """Take in a message."""
         if message.topic not in TOPICS:
             return
@@ -68,7 +68,7 @@ class LiveMonitor:
             self._cycle = self._client.decode(message)
 
     def describe(self) -> dict[str, Any]:
-        """Put what has been seen into plain values; times are since the first message."""
+        """Return the latest values as a dictionary for JSON; times are since the first message."""
         begin_ns = self._log_ns if self._begin_ns is None else self._begin_ns
         described: dict[str, Any] = {"messages": self.messages, "t_s": round((self._log_ns - begin_ns) * 1e-9, 3)}
         if self._scheme is not None:
@@ -104,7 +104,7 @@ def _describe_scheme(scheme: Any) -> dict[str, Any]:
 
 
 def _shares(scheme: Any) -> Any:
-    """Return how far each joint is on its way to the nearest of its thresholds (2,); NaN: detection is off."""
+    """Return each joint's largest ratio of residual to threshold (2,); NaN: detection is off."""
     has_bank = "tau_ext_bank" in scheme.dtype.names
     torque, threshold = ("tau_ext_bank", "threshold_bank") if has_bank else ("tau_ext_hat", "threshold")
     shares = np.abs(scheme[torque]) / np.where(np.isfinite(scheme[threshold]), scheme[threshold], np.nan)
@@ -129,7 +129,7 @@ def _finite(value: float) -> float | None:
 
 
 def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
-    """Watch a live view for `seconds` (None: until interrupted or it ends) and print; `is_live`: also on the way.
+    """Watch a live view for `seconds` (None: until interrupted or it ends) and print; `is_live`: also meanwhile.
 
     Raises LogError.
     """
@@ -151,13 +151,13 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
             wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
             if (message := client.receive(max(0.0, (wake_ns - now_ns) * 1e-9))) is not None:
                 with _understood():
-                    monitor.accept(message)
+                    monitor.accept_message(message)
             now_ns = clock.now_ns()
             if now_ns >= due_ns:
                 drawn_ns = now_ns
                 if is_live and not as_json:
                     with _understood():
-                        screen.draw(as_text(monitor.describe(), is_cut=screen.is_redrawn))
+                        screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
         with _understood():
             described = {"url": url} | monitor.describe()
     screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))
@@ -166,7 +166,7 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
 
 @contextlib.contextmanager
 def _understood() -> Iterator[None]:
-    """Turn what a message holds that ours never do into a LogError."""
+    """Turn errors of decoding a message that isn't ours into a LogError."""
     try:
         yield
     except (ValueError, LookupError, OverflowError, struct.error):
@@ -174,7 +174,7 @@ def _understood() -> Iterator[None]:
 
 
 def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
-    """Write the view for people; is_cut: a line for each event, cut to the terminal."""
+    """Format the view for people; is_cut: a line for each event, cut to the terminal."""
     if "state" not in described:
         return f"{described['messages']} messages, none of /scheme"
     fault = "" if described["fault"] == FaultReason.NONE.name else f" by {described['fault']}"

@@ -1,4 +1,4 @@
-"""`adacd-hil log`: logs at a glance, checked, recovered, cut, merged and exported, with the text printed of them."""
+"""`adacd-hil log`: info, check, recover, cut, merge and export of logs, and their output for people."""
 
 import json
 import sys
@@ -14,6 +14,8 @@ from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from adacd_hil.lab.logs.check.log_check import LogCheck
     from adacd_hil.lab.logs.recover import LogRecovery
     from adacd_hil.log.log_files import TimeWindow
@@ -39,7 +41,7 @@ def log() -> None:
 @json_option
 @explained
 def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
-    """Show what logs hold: topics, rates, attachments, the run, its contacts and faults.
+    """Show the contents of logs: topics, rates, attachments, the run, its contacts and faults.
 
     A folder stands for the logs in it.
     """
@@ -59,7 +61,7 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 @json_option
 @explained
 def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
-    """Check logs: the rules of `mcap doctor`, all CRCs, indexes against records, and what our own logs promise.
+    """Check logs: the rules of `mcap doctor`, all CRCs, indexes against records, and the rules of our own logs.
 
     A folder stands for the logs in it.
     """
@@ -76,7 +78,7 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 
 
 @log.command(
-    epilog="Exit status: 0 nothing was lost; 1 nothing to save, or the log can't be read; 2 wrong usage; 3 with loss."
+    epilog="Exit status: 0 without loss; 1 no data to save, or the log can't be read; 2 wrong usage; 3 with loss."
 )
 @_log_argument
 @_out_option
@@ -85,8 +87,8 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     """Save everything intact of a cut or damaged log, before and after the damage, to one whole file.
 
-    --out: default NAME.recovered.mcap. The log itself stays as it is. Of a log with CRCs no message is saved for which
-    none vouches; of one without all that can be read is, and counted.
+    --out: default NAME.recovered.mcap. The log itself stays as it is. A message of a log with CRCs is saved only if a
+    CRC covers it; of a log without, all readable messages are saved, and counted.
     """
     from adacd_hil.lab.logs.recover import recover as recover_log
 
@@ -96,7 +98,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     return ExitCode.PARTIAL if recovery.is_lossy else ExitCode.OK
 
 
-@log.command(epilog="Exit status: 0 done; 1 nothing there, or the log is damaged; 2 wrong usage.")
+@log.command(epilog="Exit status: 0 done; 1 no data there, or the log is damaged; 2 wrong usage.")
 @_log_argument
 @click.option("--contact", type=click.IntRange(min=1), help="Cut around this contact, numbered from 1.")
 @click.option(
@@ -127,7 +129,7 @@ def cut(
 
     if contact is not None:
         if not stretch.is_whole:
-            raise CommandError("--contact says where to cut: without --from and --until", ExitCode.USAGE)
+            raise CommandError("--contact excludes --from and --until", ExitCode.USAGE)
         stretch = find_contact(log, contact, around_s)
     done = cut_log(log, out or default_out(log), stretch, topics, _tell)
     result = {"out": str(done.out), **stretch.as_json(), "messages": done.messages}
@@ -147,20 +149,20 @@ def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) ->
 
     done = merge_logs(logs, out, has_prefix, _tell)
     if done.shared and not has_prefix:
-        _tell(f"topics of more than one log, told apart by their channels only: {', '.join(done.shared)}")
+        _tell(f"topics of more than one log; only their channels distinguish them: {', '.join(done.shared)}")
     result = {"out": str(done.out), "logs": list(done.names), "messages": done.messages, "shared": list(done.shared)}
     answer(as_json, result, in_line(f"{done.out}: {done.messages} messages"))
     return ExitCode.OK
 
 
 def info_as_json(info: "LogInfo") -> dict[str, Any]:
-    """Make a table of all that is known."""
+    """Return the information as a dictionary for JSON."""
     topics = [topic._asdict() for topic in info.topics]
     return {**vars(info), "path": str(info.path), "duration_s": info.duration_s, "topics": topics}
 
 
 def info_as_text(info: "LogInfo") -> str:
-    """Tell what a log holds, the gist first."""
+    """Format the contents of a log for people, the main facts first."""
     ending = f", {info.ending}" if info.ending else ", without an end" if info.problems else ""
     parts = f"{info.files} parts, " if info.files > 1 else ""
     lines = [
@@ -198,13 +200,13 @@ def _bytes(count: int | None) -> str:
 
 
 def check_as_json(check: "LogCheck") -> dict[str, Any]:
-    """Make a table of what was found."""
+    """Return the findings as a dictionary for JSON."""
     findings = [finding._asdict() for finding in check.findings]
     return {**check._asdict(), "path": str(check.path), "findings": findings}
 
 
 def check_as_text(check: "LogCheck") -> str:
-    """Tell what was found, and the sum of it."""
+    """Format the findings for people, and their number."""
     lines = []
     for finding in check.findings:
         where = f"{finding.file}, byte {finding.offset}" if finding.offset >= 0 else finding.file
@@ -218,7 +220,7 @@ def check_as_text(check: "LogCheck") -> str:
 
 
 def recovery_as_json(recovery: "LogRecovery") -> dict[str, Any]:
-    """Make a table of what was saved and lost."""
+    """Return saved and lost data as a dictionary for JSON."""
     losses = recovery.losses
     return {
         "path": str(recovery.path),
@@ -240,12 +242,12 @@ def recovery_as_json(recovery: "LogRecovery") -> dict[str, Any]:
 
 
 def recovery_as_text(recovery: "LogRecovery") -> str:
-    """Tell what was saved and lost."""
+    """Format saved and lost data for people."""
     saved = f"{recovery.messages} messages, {recovery.attachments} attachments"
     lost = recovery.describe_loss()
     lines = [f"{recovery.out}: {saved}", *(f"  {note}" for note in recovery.losses.notes)]
     if recovery.losses.unvouched:
-        lines.append(f"nothing vouches for {recovery.losses.unvouched} messages: {recovery.path.name} has no checksums")
+        lines.append(f"{recovery.losses.unvouched} messages are unchecked: {recovery.path.name} has no checksums")
     lines.append(f"lost: {lost}" if lost else "nothing was lost")
     return "\n".join(in_line(line) for line in lines)
 
@@ -254,7 +256,7 @@ TABLES = ("parquet", "csv")
 FRAMES = ("blf", "asc", "candump")
 _SUFFIXES = {"candump": ".log"}
 _TOLD_EACH = 1_000_000
-"""Rows or frames between two lines of progress."""
+"""Rows or frames between two progress lines."""
 
 
 class HexId(click.ParamType[int]):
@@ -263,7 +265,7 @@ class HexId(click.ParamType[int]):
     name = "hex"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Read it."""
+        """Parse the identifier."""
         try:
             number = int(str(value), 16)
         except ValueError:
@@ -279,7 +281,7 @@ only_option = click.option(
     type=click.Choice(["host", "devices", "both"]),
     default="both",
     show_default=True,
-    help="Whose frames: by the contract, else by their direction.",
+    help="Sender of the frames: by the contract, else by their direction.",
 )
 dbc_option = click.option(
     "--dbc", type=GivenPath(dir_okay=False), help="A DBC; default: the log's contract, else the arm's."
@@ -292,7 +294,7 @@ dbc_option = click.option(
     "usage or contract; 3 the recording is damaged, or a disk is full; 130 interrupted.",
 )
 @click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
-@click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Of the output.")
+@click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Format of the output.")
 @click.option("--out", type=WrittenPath(), help="Folder of the tables, or file of the frames; default: beside LOG.")
 @click.option(
     "--topic", "topics", multiple=True, metavar="TOPIC", help="For tables: a topic, or a pattern such as 'decoded/*'."
@@ -319,10 +321,10 @@ def export(
     dbc: Path | None,
     as_json: bool,
 ) -> ExitCode:
-    """Write what a recording holds as tables (Parquet, CSV) or its frames as BLF, ASC or candump log.
+    """Write a recording as tables (Parquet, CSV), or its frames as BLF, ASC or candump log.
 
-    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. What the target can't hold is counted on stderr. Tables
-    replace tables; a file of frames replaces none but the same.
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. Frames that the target format can't hold are counted on
+    stderr. Tables replace tables; a file of frames replaces only an identical one.
     """
     from adacd_hil.wire.dbc_decoder import DbcDecoder
 
@@ -346,7 +348,7 @@ def export(
 
 
 def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
-    """Read the DBC of a recording: the given one, else the one that is attached to the log, else the arm's."""
+    """Return the DBC of a recording: the given one, else the one attached to the log, else the arm's."""
     from adacd_hil.log.log_info import attachment
     from adacd_hil.wire.codec import read_dbc
 
@@ -359,7 +361,7 @@ def _export_tables(
 ) -> tuple[dict[str, Any], str]:
     from adacd_hil.lab.logs.signal_tables import export_tables
 
-    summary = export_tables(log, out, kind, topics, decoder, _Teller("rows"))
+    summary = export_tables(log, out, kind, topics, decoder, _progress_of("rows"))
     for note in summary.notes:
         _tell(f"{kind}: {note}")
     lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
@@ -381,7 +383,7 @@ def _export_frames(
     host_ids, device_ids = sides(decoder)
     choice = FrameChoice(only, host_ids, device_ids, frozenset(can_ids))
     source = open_frames(log)
-    summary = export_frames(source, choice.pieces(source), out, kind, _Teller("frames"), has_direction)
+    summary = export_frames(source, choice.pieces(source), out, kind, _progress_of("frames"), has_direction)
     for loss in summary.losses:
         print(in_line(f"{kind}: {loss}"), file=sys.stderr)
     described = {
@@ -393,15 +395,8 @@ def _export_frames(
     return described, source.problem
 
 
-class _Teller:
-    """Prints how far the work is."""
+def _progress_of(noun: str) -> "Callable[[int], None]":
+    """Return a function that prints a count of rows or frames every `_TOLD_EACH` of them."""
+    from adacd_hil.log.logged_run import Milestones
 
-    def __init__(self, what: str) -> None:
-        self._what = what
-        self._told = 0
-
-    def __call__(self, count: int) -> None:
-        """Print a line for every so many."""
-        if count - self._told >= _TOLD_EACH:
-            self._told = count
-            print(f"{count} {self._what}", file=sys.stderr, flush=True)
+    return Milestones(lambda count: _tell(f"{count} {noun}"), _TOLD_EACH).reach

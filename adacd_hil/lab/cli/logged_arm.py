@@ -1,4 +1,4 @@
-"""An arm's configuration written anew from the log of a run: what it had beyond the configuration it is based on."""
+"""An arm's configuration from the log of a run: its settings that differ from a built-in configuration."""
 
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ _NOT_TAKEN = {
     "realtime.sample_period": "",
     "safety.enable_timeout_s": "",
 }
-"""Keys that belong to the run and not to the arm, and what is said of them."""
+"""Keys that belong to the run and not to the arm, each with a warning."""
 
 
 def draft_from_log(
@@ -61,7 +61,7 @@ def draft_from_log(
 
 
 def _differences(settings: Settings, base: str, path: Path, warnings: list[str]) -> list[Entry]:
-    """List the settings of a run that its base doesn't have."""
+    """Return the settings of a run that differ from its base configuration."""
     based = load_settings(base, settings.arm.profile)
     entries = []
     if settings.arm.profile != load_settings(base).arm.profile:
@@ -85,7 +85,7 @@ def _is_unset(settings: Settings, key: str) -> bool:
 
 
 def _placed(entry: Entry, devices: Drafting, options: InitOptions) -> Entry:
-    """Name files of devices and contract from where the new configuration lies. Raises CommandError."""
+    """Make paths of devices and contract relative to the new configuration's folder. Raises CommandError."""
     kind = entry.key.removeprefix("devices.")
     if entry.key in ("devices.drive", "devices.sensor"):
         names = getattr(options, kind) or entry.value

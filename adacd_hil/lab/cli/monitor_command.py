@@ -1,4 +1,4 @@
-"""Monitor: a live table of what is on the bus. Listens only."""
+"""Monitor: a live table of the traffic on a bus. Listens only."""
 
 import json
 import shutil
@@ -20,15 +20,15 @@ from adacd_hil.wire.dbc_decoder import DbcDecoder
 from adacd_hil.wire.traffic import receive_until
 
 REDRAW_S = 0.2
-"""Of a terminal, 5 Hz: what the eye follows."""
+"""Interval of redrawing a terminal: the eye can follow 5 Hz."""
 PLAIN_S = 1.0
-"""Between tables where there is no terminal."""
+"""Interval between tables without a terminal."""
 _LINK_S = 1.0
 _HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 
 
 class Screen:
-    """Where tables go: redrawn in place on a terminal, one after the other elsewhere."""
+    """Output of tables: redrawn in place on a terminal, one after the other elsewhere."""
 
     def __init__(self, is_terminal: bool, write: Callable[[str], None]) -> None:
         self._is_terminal = is_terminal
@@ -36,7 +36,7 @@ class Screen:
 
     @property
     def is_redrawn(self) -> bool:
-        """Whether a table takes the place of the one before."""
+        """Whether a table replaces the previous one."""
         return self._is_terminal
 
     @property
@@ -44,8 +44,8 @@ class Screen:
         """Time between two tables."""
         return REDRAW_S if self._is_terminal else PLAIN_S
 
-    def draw(self, text: str) -> None:
-        """Show a table, cut to the terminal; a full one comes at the end."""
+    def draw_table(self, text: str) -> None:
+        """Show a table, cut to the terminal; `end` shows the whole one."""
         text = plain(text)
         if not self._is_terminal:
             self._write(text + "\n\n")
@@ -62,7 +62,7 @@ class Screen:
 
 
 class Monitor:
-    """Feeds a view from a bus and describes it."""
+    """Keeps a view of the traffic on a bus, and describes it."""
 
     def __init__(
         self, connection: Connection, codec: Codec | DbcDecoder, bus: Bus, clock: Clock, node_id: int | None
@@ -81,11 +81,11 @@ class Monitor:
         self.is_stopped = True
 
     def listen(self, duration_s: float) -> None:
-        """Take in what comes for a while. Raises BusError."""
+        """Read frames from the bus for a duration. Raises BusError."""
         end_ns = self._clock.now_ns() + round(duration_s * 1e9)
         while (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
             self._accept(frame)
-            while (waiting := self._bus.receive(0.0)) is not None:  # a batch, looking at the clock every so often
+            while (waiting := self._bus.receive(0.0)) is not None:  # a batch; the clock is read every 256 frames
                 self._accept(waiting)
                 if self._view.frames % 256 == 0:
                     break
@@ -99,7 +99,7 @@ class Monitor:
         self._view.accept(frame)
 
     def describe(self) -> dict[str, Any]:
-        """Put what has been seen into plain values."""
+        """Return the traffic so far as a dictionary for JSON."""
         now_ns = self._clock.now_ns()
         if self._link_name is not None and now_ns - self._state_ns >= _LINK_S * 1e9:
             link = read_link(self._link_name)
@@ -111,18 +111,18 @@ class Monitor:
         return None if self._link_name is None else carried_frames(self._link_name)
 
     def _count_missed(self) -> int | None:
-        """Count frames that the interface carried and this process has not seen: lost, or still waiting."""
+        """Count frames that the interface carried and this process has not read: lost, or still queued."""
         now = self._count_carried()
         return None if now is None or self._carried is None else max(0, now - self._carried - self._view.frames)
 
 
 def watch(connection: Connection, node_id: int | None, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
-    """Listen for `seconds` (None: until interrupted) and print; `is_live`: also on the way. Interrupted is OK.
+    """Listen for `seconds` (None: until interrupted) and print; `is_live`: also meanwhile. Interrupted is OK.
 
     Raises ConfigError, CodecError, BusMissingError, CommandError.
     """
     clock = MonotonicClock()
-    codec = connection.load_decoder()  # what is wrong with the configuration comes before what is wrong with the bus
+    codec = connection.load_decoder()  # errors of the configuration come before errors of the bus
     screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
     with connection.bus(clock, codec.is_fd) as bus:
         monitor = Monitor(connection, codec, bus, clock, node_id)
@@ -137,8 +137,8 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
                     if monitor.is_stopped or (end_ns is not None and clock.now_ns() >= end_ns):
                         break
                     if is_live and not as_json:
-                        screen.draw(as_text(monitor.describe(), is_cut=screen.is_redrawn))
-            finally:  # a bus that fails leaves its last table, too
+                        screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
+            finally:  # the last table is printed even if the bus fails
                 described = monitor.describe()
                 screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))
     return ExitCode.OK
@@ -173,7 +173,7 @@ def _describe_message(message: MessageView) -> dict[str, Any]:
 
 
 def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
-    """Write the table for people; is_cut: a line for each message, cut to the terminal."""
+    """Format the table for people; is_cut: a line for each message, cut to the terminal."""
     parts = [_head(described)]
     if described["nodes"]:
         rows = [

@@ -1,4 +1,4 @@
-"""`adacd-hil play`: the frames of a recording on a bus, at their times."""
+"""`adacd-hil play`: sends the frames of a recording on a bus at their times."""
 
 import queue
 import sys
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 _PIECES_AHEAD = 4
 _BLOCK = 256
-"""Frames that are made ready between two sends at most."""
+"""Most frames that are prepared between two sends."""
 _SWITCH_S = 50e-6
-"""How long the thread that reads ahead may keep the one that sends waiting."""
+"""Thread switch interval of Python: longest delay of the sending thread by the one that reads ahead."""
 
 
 @click.command("play", epilog=EPILOG)
@@ -49,7 +49,13 @@ _SWITCH_S = 50e-6
 )
 @click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")
 @click.option("--fd", "is_fd", is_flag=True, help="Open the bus for CAN FD; default: as the contract is.")
-@click.option("--speed", type=click.FloatRange(0.001, 1000.0), default=1.0, show_default=True, help="Of the times.")
+@click.option(
+    "--speed",
+    type=click.FloatRange(0.001, 1000.0),
+    default=1.0,
+    show_default=True,
+    help="Factor on the speed of the recording.",
+)
 @click.option("--start", "start_s", type=click.FloatRange(0.0), help="Begin so many s after the first frame.")
 @click.option("--end", "end_s", type=click.FloatRange(0.0), help="End so many s after the first frame.")
 @click.option(
@@ -57,7 +63,7 @@ _SWITCH_S = 50e-6
 )
 @click.option("--skip", "longest_pause_s", type=click.FloatRange(0.0), help="Cut longer pauses to so many s.")
 @click.option(
-    "--commands", is_flag=True, help="Also on a real bus, send what isn't the devices': it can move a real arm."
+    "--commands", is_flag=True, help="On a real bus, send frames of others than devices, too: they can move a real arm."
 )
 @only_option
 @id_option
@@ -81,10 +87,10 @@ def play(
     dbc: Path | None,
     as_json: bool,
 ) -> ExitCode:
-    """Send the frames of a recording at their times, and say how late they were.
+    """Send the frames of a recording at their times, and print how late they were.
 
-    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. On a real bus only frames that the contract says the devices
-    send are sent, unless --commands asks for the others: NMT, SDO and torque commands can move an arm.
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. On a real bus only frames that the contract assigns to devices
+    are sent, unless --commands asks for the others: NMT, SDO and torque commands can move an arm.
     """
     from adacd_hil.lab.logs.frame_export import FrameChoice, sides
     from adacd_hil.log.frames.frame_log import open_frames
@@ -99,7 +105,7 @@ def play(
         end_ns=None if end_s is None else round(end_s * 1e9),
     )
     playback = Playback(log, choice, is_harmless=may_move_an_arm(interface, channel) and not commands)
-    open_frames(log)  # what is wrong with the recording comes before what is wrong with the bus
+    open_frames(log)  # errors of the recording come before errors of the bus
     clock = MonotonicClock()
     from adacd_hil.wire.open_bus import open_bus
 
@@ -111,18 +117,18 @@ def play(
 
 @dataclass
 class Playback:
-    """What is played, and what was left out of it."""
+    """A recording to be played, the choice of its frames, and counts of frames left out."""
 
     log: Path
     choice: "FrameChoice"
     is_harmless: bool
-    """Only what the contract's devices send goes out."""
+    """Whether only frames of the contract's devices are sent."""
     unsendable: int = 0
     withheld: int = 0
     problem: str = ""
 
     def frames(self) -> "Iterator[PlayedFrame]":
-        """Give the frames, read ahead by a thread. Raises LogError."""
+        """Yield the frames, read ahead by a thread. Raises LogError."""
         from adacd_hil.wire.playback import PlayedFrame
 
         for piece in _ahead(self._pieces()):
@@ -197,7 +203,7 @@ def _run(
 
 
 def _as_text(described: dict[str, Any]) -> str:
-    """Describe it for people."""
+    """Format the result for people."""
     late = described["lateness_us"]
     lines = [
         f"{described['frames']} frames sent, late by p50 {late['p50']} µs, p99 {late['p99']} µs, max {late['max']} µs; "
@@ -215,12 +221,12 @@ def _as_text(described: dict[str, Any]) -> str:
 
 
 def may_move_an_arm(interface: str, channel: str) -> bool:
-    """Tell whether real drives may hear what is sent."""
+    """Tell whether real drives may receive the frames."""
     return not is_virtual(interface, channel)
 
 
 def _ahead(pieces: "Iterable[NDArray[Any]]") -> "Iterator[NDArray[Any]]":
-    """Give what a thread takes from an iterator some pieces ahead. Raises what that raises."""
+    """Yield the items of an iterator, read some pieces ahead by a thread. Raises its errors."""
     waiting: queue.Queue[NDArray[Any] | LogError | None] = queue.Queue(_PIECES_AHEAD)
     is_over = threading.Event()
 

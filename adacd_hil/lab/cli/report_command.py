@@ -1,4 +1,4 @@
-"""Reports of logs and of folders of runs: the command's work."""
+"""Reports of logs and of folders of runs, for the command `report`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,20 +17,20 @@ from adacd_hil.terminal import one_line
 
 
 class IndexEntry(NamedTuple):
-    """A run of the folder, and its report; None where it can't be reported."""
+    """A run of the folder, and its report; None if it can't be reported."""
 
     listed: ListedRun
     report: Report | None
 
 
 class Index(NamedTuple):
-    """What was reported of a folder of runs, and the page over it."""
+    """Reports of a folder of runs, and their index page."""
 
     path: Path
     entries: tuple[IndexEntry, ...]
 
     def as_text(self) -> str:
-        """Give a line for each run."""
+        """Return the index as text: a line for each run, with its verdict."""
         lines = [count_text([entry.listed.run for entry in self.entries]), ""]
         for listed, _ in self.entries:
             run = listed.run
@@ -42,10 +42,10 @@ Reported = Report | Index
 
 
 def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -> tuple[list[Reported], ExitCode]:
-    """Report each log, or a stretch of it, beside it or in `out`; of several logs in folders of `out`.
+    """Report each log, or a stretch of it, beside it or in `out`; several logs in subfolders of `out`.
 
-    A folder stands for the run log in it, or without one for the runs in its folders; of those one that can't be read
-    does not keep the others from being reported. Raises LogError, ConfigError, CommandError.
+    A folder stands for the run log in it, or without one for the runs in its folders; one of these that can't be read
+    doesn't stop the others. Raises LogError, ConfigError, CommandError.
     """
     places: dict[Path, tuple[Path, tuple[Path, ...]]] = {}  # by folder of the report
     for given in logs:
@@ -73,12 +73,12 @@ def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -
 
 
 def _runs_in(given: Path) -> tuple[Path, ...]:
-    """List the folders with a run below a folder that has none itself."""
+    """Return the folders with a run below a folder that has none itself."""
     return () if not given.is_dir() or (given / LOG_NAME).exists() else tuple(find_runs(given))
 
 
 def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWindow, progress: Progress) -> Index:
-    """Report the runs of a folder, and write the page over them."""
+    """Report the runs of a folder, and write their index page."""
     entries: list[IndexEntry] = []
     for number, run in enumerate(runs, start=1):
         name = run.relative_to(given).as_posix()
@@ -94,13 +94,13 @@ def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWind
             entries.append(IndexEntry(ListedRun(broken, None, problem), None))
     index = Index(out / INDEX_NAME, tuple(entries))
     with failing_as(f"{index.path} can't be written"):
-        out.mkdir(parents=True, exist_ok=True)  # as after no run could be reported
+        out.mkdir(parents=True, exist_ok=True)  # missing if no run could be reported
         replace_file(index.path, runs_page(out, [entry.listed for entry in entries]))
     return index
 
 
 def as_json(reported: Sequence[Reported]) -> list[dict[str, Any]]:
-    """Give the content of each report.json; of a run that could not be reported its folder and why."""
+    """Return the contents of each report.json; for a run that could not be reported its folder and the error."""
     tables = []
     for each in reported:
         if isinstance(each, Report):

@@ -1,4 +1,4 @@
-"""`adacd-hil runs` and `trend`: the runs of a folder, and what an arm's figures did from run to run."""
+"""`adacd-hil runs` and `trend`: the runs of a folder, and the changes of an arm's figures from run to run."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _STATUSES = ("good", "not good", "not judged", "broken", "running")
 _EPILOG = (
     "Exit status: 0 done; 1 no run there, or a file can't be written; 2 wrong usage; 3 the log of a run is broken, the "
-    "others are told of; 130 interrupted."
+    "others are listed; 130 interrupted."
 )
 _DATE_FORMS = "2026-11-25, 2026-11-25T14:22 or 2026-11-25T14:22:33"
 _DRAWN = (".svg", ".png", ".html")
@@ -41,7 +41,7 @@ class LocalDate(click.ParamType[datetime]):
         self._is_end = is_end
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> datetime:
-        """Read it."""
+        """Parse the date."""
         text = str(value)
         try:
             found = datetime.fromisoformat(text)
@@ -53,17 +53,23 @@ class LocalDate(click.ParamType[datetime]):
 
 
 _FILTER_OPTIONS = (  # last first: click lists them the other way round
-    click.option("--until", type=LocalDate(is_end=True), metavar="DATE", help="Begun until then, that day included."),
-    click.option("--since", type=LocalDate(), metavar="DATE", help="Begun since then."),
-    click.option("--scenario", "scenarios", multiple=True, metavar="NAME", help="Played this; repeatable."),
     click.option(
-        "--arm", "arms", multiple=True, metavar="NAME", help="Of this arm or configuration, or a pattern; repeatable."
+        "--until", type=LocalDate(is_end=True), metavar="DATE", help="Runs begun until then, that day included."
+    ),
+    click.option("--since", type=LocalDate(), metavar="DATE", help="Runs begun since then."),
+    click.option("--scenario", "scenarios", multiple=True, metavar="NAME", help="Runs of this scenario; repeatable."),
+    click.option(
+        "--arm",
+        "arms",
+        multiple=True,
+        metavar="NAME",
+        help="Runs of this arm or configuration, or a pattern; repeatable.",
     ),
 )
 
 
 def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
-    """Give a command the options that choose runs; it takes them as a `RunFilter`."""
+    """Give a command the options that choose runs; it receives them as a `RunFilter`."""
 
     @functools.wraps(command)
     def chosen(
@@ -93,11 +99,16 @@ _folder_argument = click.argument("folder", type=GivenPath(file_okay=False), def
 @click.command(epilog=_EPILOG)
 @_folder_argument
 @click.option(
-    "--verdict", "statuses", multiple=True, type=click.Choice(_STATUSES), help="With this verdict; repeatable."
+    "--verdict", "statuses", multiple=True, type=click.Choice(_STATUSES), help="Runs with this verdict; repeatable."
 )
 @click.option("--judge", "is_judging", is_flag=True, help="Read the whole log of each run without a report.")
 @click.option("--csv", "csv_path", type=WrittenPath(dir_okay=False), help="Write the table here.")
-@click.option("--parquet", "parquet_path", type=WrittenPath(dir_okay=False), help="The same, for DuckDB and others.")
+@click.option(
+    "--parquet",
+    "parquet_path",
+    type=WrittenPath(dir_okay=False),
+    help="Write the table here as Parquet, for DuckDB and others.",
+)
 @click.option("--html", "html_path", type=WrittenPath(dir_okay=False), help="Write a page that leads to the reports.")
 @json_option
 @_filtered
@@ -112,9 +123,9 @@ def runs(
 ) -> ExitCode:
     """List the runs in FOLDER, default `runs`: verdict, certificate, thresholds, margin, contacts; oldest first.
 
-    Figures are those of the report beside a log. A run without one is told by its events, and is not judged: `adacd-hil
-    report FOLDER` reports all, --judge reads their logs and keeps nothing. Links are left alone, and folders deeper
-    than four levels.
+    Figures come from the report beside a log. A run without one is described by its events, and not judged: `adacd-hil
+    report FOLDER` reports all, --judge reads their logs and stores nothing. Links, and folders deeper than four levels,
+    are skipped.
     """
     from adacd_hil.lab.runs import run_table
 
@@ -148,10 +159,10 @@ def runs(
 @json_option
 @_filtered
 def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "RunFilter") -> ExitCode:
-    """Say when thresholds, friction and torque offsets of an arm last changed over the runs in FOLDER; draw them.
+    """Find when thresholds, friction and torque offsets of an arm last changed over the runs in FOLDER; draw them.
 
-    Runs without a report are judged first, which reads their logs. A friction or an offset has changed where it differs
-    by more than four standard deviations of both certificates.
+    Runs without a report are judged first, which reads their logs. A friction or an offset has changed if it differs by
+    more than four standard deviations of both certificates.
     """
     from adacd_hil.lab.runs.run_trend import trends
 
@@ -170,7 +181,7 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
 
 
 def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progress) -> list["RunSummary"]:
-    """Find the runs of a folder that are asked for, in order. Raises LogError, CommandError."""
+    """Return the chosen runs of a folder, in order. Raises LogError, CommandError."""
     from adacd_hil.lab.runs import run_table
     from adacd_hil.lab.runs.run_summary import NOT_JUDGED, find_runs, judged, summarise
 
@@ -188,7 +199,7 @@ def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progre
             near = nearest_name(arm, [*known, *sorted({run.config for run in found if run.config})])
             hint = f"did you mean {near!r}?" if near else f"there are {', '.join(known) or 'none that is named'}"
             raise CommandError(f"no run of arm {arm!r} in {folder}; {hint}", ExitCode.USAGE)
-    # What judging may change is asked for afterwards.
+    # The verdict is filtered after judging, which may change it.
     taken = [run for run in found if dataclasses.replace(asked, statuses=()).takes(run)] if is_judging else found
     if is_judging:
         waiting = sum(run.status == NOT_JUDGED for run in taken)

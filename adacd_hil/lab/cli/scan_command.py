@@ -1,4 +1,4 @@
-"""Scan: who is on the bus, what they are and send, and whether that is the arm of the configuration."""
+"""Scan: the nodes on a bus, their frames, and whether they are the arm of the configuration."""
 
 import sys
 from typing import Any
@@ -14,7 +14,7 @@ from adacd_hil.wire.traffic import Talk
 
 
 def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], ExitCode]:
-    """Scan a bus. Exit code: OK when all expected nodes are there and right, else BUS_MISSING.
+    """Scan a bus. Exit status OK if all expected nodes are there and right, else BUS_MISSING.
 
     Raises ConfigError, CodecError, BusMissingError, CommandError.
     """
@@ -22,15 +22,15 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
     clock = MonotonicClock()
     with connection.bus(clock, codec.is_fd) as bus:
         expected = expected_nodes(Master(settings, codec, bus).slaves, codec)
-        told = {node.node_id for node in expected if node.layout_digest is not None}
-        found = survey(bus, clock, listen_s, lambda line: print(in_line(line), file=sys.stderr, flush=True), told)
+        reporting = {node.node_id for node in expected if node.layout_digest is not None}
+        found = survey(bus, clock, listen_s, lambda line: print(in_line(line), file=sys.stderr, flush=True), reporting)
     described = describe(found, compare(found, expected), codec)
     is_right = not any(row["verdict"] not in ("", "unexpected") for row in described["nodes"])
     return described, ExitCode.OK if is_right else ExitCode.BUS_MISSING
 
 
 def describe(found: Survey, verdicts: dict[int, str], codec: Codec) -> dict[str, Any]:
-    """Put a survey into plain values."""
+    """Return a survey as a dictionary for JSON."""
     nodes = {node.node_id: node for node in found.nodes}
     return {
         "duration_s": round(found.duration_s, 3),
@@ -83,7 +83,7 @@ def _describe_talk(talk: Talk, codec: Codec) -> dict[str, Any]:
 
 
 def as_text(described: dict[str, Any]) -> str:
-    """Write the result for people."""
+    """Format the result for people."""
     nodes = described["nodes"]
     parts = []
     if nodes:
@@ -135,14 +135,14 @@ def _talk_row(owner: str, talk: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _contract(described: dict[str, Any]) -> str:
-    """Say which contract is expected, and which nodes tell that it is theirs."""
+    """Describe the expected contract, and the nodes that report the same or another one."""
     contract = described["contract"]
-    told = [node for node in described["nodes"] if node.get("layout_digest") is not None]
-    same = [node["node"] for node in told if node["layout_digest"] == contract["layout_digest"]]
-    other = [f"node {node['node']}: {node['layout_digest']}" for node in told if node["node"] not in same]
+    reporting = [node for node in described["nodes"] if node.get("layout_digest") is not None]
+    same = [node["node"] for node in reporting if node["layout_digest"] == contract["layout_digest"]]
+    other = [f"node {node['node']}: {node['layout_digest']}" for node in reporting if node["node"] not in same]
     what = f"{contract['name']}: wire version {contract['wire_version']}, layout digest {contract['layout_digest']}"
     says = [f"same in node {', '.join(map(str, same))}"] * bool(same) + other
-    return f"{what}; {'; '.join(says) or 'no node tells its own'}"
+    return f"{what}; {'; '.join(says) or 'no node reports one'}"
 
 
 def _summary(described: dict[str, Any]) -> str:

@@ -22,12 +22,13 @@ if TYPE_CHECKING:
     from adacd_hil.lab.tune.sweep import Plan, SweepRow, Task, Values
 
 _SIMULATED_CONFIG = "certified"
-"""Of simulated runs where no --config is given."""
+"""Configuration of simulated runs without --config."""
 
 
 @click.command(
-    epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` says why; 1 the cluster is "
-    "lost, or the folder can't be written; 2 wrong usage or configuration; 130 interrupted: the same command goes on."
+    epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` has the reason; 1 the "
+    "cluster is lost, or the folder can't be written; 2 wrong usage or configuration; 130 interrupted: the same "
+    "command continues."
 )
 @click.argument("logs", nargs=-1, type=GivenPath(), shell_complete=complete_run)
 @click.option(
@@ -53,11 +54,11 @@ _SIMULATED_CONFIG = "certified"
     "--scheduler",
     default="",
     metavar="ADDRESS",
-    help="Dask scheduler to use instead: tls://host:8786. One at tcp:// runs what anybody sends who reaches it.",
+    help="Dask scheduler to use instead: tls://host:8786. At tcp:// it runs code of anybody who reaches it.",
 )
-@click.option("--tls-ca-file", type=GIVEN_FILE, help="Of tls://: who signs the cluster's certificates; PEM.")
-@click.option("--tls-cert", type=GIVEN_FILE, help="Of tls://: the certificate to show; PEM.")
-@click.option("--tls-key", type=GIVEN_FILE, help="Of tls://: its key, where the certificate's file lacks it; PEM.")
+@click.option("--tls-ca-file", type=GIVEN_FILE, help="For tls://: CA that signs the cluster's certificates; PEM.")
+@click.option("--tls-cert", type=GIVEN_FILE, help="For tls://: this client's certificate; PEM.")
+@click.option("--tls-key", type=GIVEN_FILE, help="For tls://: its key, unless the certificate's file has it; PEM.")
 @click.option("--out", required=True, type=WrittenPath(file_okay=False), help="Folder of the results.")
 @json_option
 @explained
@@ -78,7 +79,7 @@ def sweep(
 ) -> ExitCode:
     """Replay LOGS, or play scenarios, with every combination of settings; one table, OUT/sweep.parquet.
 
-    A folder stands for every run.mcap below it. Begun again with the same folder, a sweep computes what is missing.
+    A folder stands for every run.mcap below it. With the same folder again, a sweep computes only missing rows.
     """
     from adacd_hil.lab.tune.cluster import TLS, TlsFiles, connect
     from adacd_hil.lab.tune.sweep import SweepStore, replay_task, run_sweep
@@ -95,9 +96,7 @@ def sweep(
             f"{counted(len(plan.variants), 'setting')}"
         )
         if scheduler and not scheduler.startswith(TLS) and not any(tls):
-            progress(
-                f"{scheduler} is open: it runs whatever anybody sends who reaches it; tls:// asks for a certificate"
-            )
+            progress(f"{scheduler} is open: it runs code of anybody who reaches it; tls:// requires certificates")
         with connect(scheduler, workers or os.cpu_count() or 1, tls) as client:
             outcome = run_sweep(plan, work, store, client, progress)
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
@@ -137,7 +136,7 @@ def _plan(
 
     variants = parse_variations(vary)
     base = load_settings(config or "certified", profile or None)
-    for changes in variants:  # what no run could take is refused before the first one
+    for changes in variants:  # refuse invalid settings before the first run
         apply_settings(base, changes)
     version = f"{__version__} {program_digest()}"
     if logs:
@@ -161,7 +160,7 @@ def _files(logs: Sequence[Path]) -> list[Path]:
 
 
 def _seeds(text: str) -> range:
-    """Read `N` or `A:B`."""
+    """Parse `N` or `A:B`."""
     first, colon, last = text.partition(":")
     try:
         low, high = int(first), int(last if colon else first)
@@ -173,7 +172,7 @@ def _seeds(text: str) -> range:
 
 
 def simulate_task(task: "Task") -> "list[Values]":
-    """Play the scenario of a task with the settings of each row: in a folder of its own, replayed, and forgotten."""
+    """Play the scenario of a task with the settings of each row: in a temporary folder, replayed, then deleted."""
     return [_simulate(task, row) for row in task.rows]
 
 

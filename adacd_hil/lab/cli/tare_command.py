@@ -1,4 +1,4 @@
-"""A tare on a bus: opens it, lets a tare session measure, stores what it found."""
+"""A tare on a bus: opens it, runs a tare session, stores its result."""
 
 import dataclasses
 import signal
@@ -10,7 +10,7 @@ from typing import Any
 from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import VirtualClock
-from adacd_hil.control.arm_records import Tare, read_tare, write_tare
+from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import refuse_company
@@ -23,19 +23,19 @@ from adacd_hil.terminal import in_line
 
 @dataclass(frozen=True)
 class StoredTare:
-    """A tare and where it lies. `backup`: where the file lies that was there."""
+    """A tare and the path of its file. `backup`: path of the file that it replaced, None without one."""
 
     tare: Tare
     path: Path
     backup: Path | None
 
     def as_json(self) -> dict[str, Any]:
-        """Describe it for machines."""
+        """Return the tare as a dictionary for JSON."""
         backup = None if self.backup is None else str(self.backup)
         return {"file": str(self.path), "backup": backup, **dataclasses.asdict(self.tare)}
 
     def as_text(self) -> str:
-        """Describe it for people."""
+        """Format the tare for people."""
         tare = self.tare
         lines = [
             f"joint{joint}: offset {offset:+.4f} ± {error:.4f} Nm (was {old:+.4f}), spread of poses {spread:.4f} Nm, "
@@ -72,7 +72,7 @@ def tare_on_bus(
     check_clock(clock_name, interface, channel)
     settings = _with_options(connection.settings(), poses, seconds)
     check_shared(clock_name, settings)
-    # A file that is no tare isn't overwritten.
+    # A file that isn't a tare is not overwritten.
     old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
     codec = load_contract(settings)
     clock = make_clock(clock_name)
@@ -92,7 +92,7 @@ def tare_on_bus(
 
 
 def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
-    """Let the command's options outweigh the configuration."""
+    """Return the settings with the command's options."""
     tare = settings.tare
     tare = dataclasses.replace(tare, poses=poses or tare.poses, window_s=seconds or tare.window_s)
     return dataclasses.replace(settings, tare=tare)

@@ -1,4 +1,4 @@
-"""Thresholds from recorded motion: the command's work and its table."""
+"""Thresholds from recorded motion, for the command `thresholds`."""
 
 import dataclasses
 import json
@@ -14,7 +14,7 @@ from adacd_hil.progress_lines import Progress
 def find(
     logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: TimeWindow = WHOLE
 ) -> tuple[Thresholds, Comparison | None]:
-    """Find the thresholds, and compare the detectors where asked for. Raises LogError."""
+    """Find the thresholds, and compare the detectors if requested. Raises LogError."""
     paths = [log_in(given) for given in logs]
     with Progress() as progress:
         thresholds, statistics = thresholds_of_logs(paths, rate_per_h, stretch, progress)
@@ -22,7 +22,7 @@ def find(
 
 
 def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:
-    """Write both as JSON."""
+    """Return thresholds and comparison as JSON."""
     content = dataclasses.asdict(thresholds)
     if comparison is not None:
         content["comparison"] = comparison.as_json()
@@ -30,7 +30,7 @@ def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:
 
 
 def as_text(thresholds: Thresholds, comparison: Comparison | None) -> str:
-    """Write both as tables."""
+    """Format thresholds and comparison as tables."""
     lines = [
         f"{thresholds.rate_per_h:g} false alarms per hour, from {thresholds.hours:.2f} h of contact-free motion"
         + (", extrapolated" if thresholds.is_extrapolated else "")

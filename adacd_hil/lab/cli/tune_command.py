@@ -8,7 +8,17 @@ import click
 
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show, suggest, tell, tried
+from adacd_hil.cli.output import (
+    CommandError,
+    ExitCode,
+    checked_place,
+    explained,
+    format_table,
+    print_and_write,
+    quoted,
+    show,
+    suggest,
+)
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.progress_lines import Progress
@@ -59,16 +69,16 @@ def tune(
 
     paths = [log_in(given) for given in logs]
     if len(set(paths)) < len(paths):
-        raise CommandError("a log is given twice: what is chosen on it can't be checked on it", ExitCode.USAGE)
-    with tried(out):
+        raise CommandError("a log is given twice: a choice can't be checked on the log it was made on", ExitCode.USAGE)
+    with checked_place(out):
         base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
         with Progress() as progress:
             found = find(paths, rate_per_h, config, progress, stretch)
-        said = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
+        text = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
         if base is None or found.best is None:
-            print(said) if as_json else show(said, *_next(paths[0], found, None))
+            print(text) if as_json else show(text, *_next(paths[0], found, None))
         else:
-            tell(said, out, suggested_toml(found, found.best, *base), as_json)
+            print_and_write(text, out, suggested_toml(found, found.best, *base), as_json)
             if not as_json:
                 suggest(*_next(paths[0], found, out))
     if report is not None:
@@ -79,12 +89,12 @@ def tune(
 
 
 def _next(log_path: Path, found: "Tuning", out: Path | None) -> tuple[str, ...]:
-    """Name what may be typed after it: to write the configuration, then to try it on the log."""
+    """Return the commands to suggest: first write the configuration, then try it on the log."""
     if found.best is None:
         return ()
     if out is None:
         return (f"adacd-hil tune {quoted(log_path)} --out tuned.toml   # writes the suggestion as a configuration",)
-    return (f"adacd-hil replay {quoted(log_path)} --config {quoted(out)}   # what it would have changed",)
+    return (f"adacd-hil replay {quoted(log_path)} --config {quoted(out)}   # with these settings",)
 
 
 def _as_text(found: "Tuning") -> str:
@@ -92,7 +102,7 @@ def _as_text(found: "Tuning") -> str:
     from adacd_hil.lab.tune.tune_roc import LIMITS, free_hours
 
     hours = sum(map(free_hours, found.logs))
-    lines = [f"{found.rate_per_h:g} false alarms per hour wanted; {hours:.4f} h of motion that nobody touched", ""]
+    lines = [f"{found.rate_per_h:g} false alarms per hour wanted; {hours:.4f} h of contact-free motion", ""]
     if found.detectors:
         head = ("detector", "found", "95 %", "median ms", "p90 ms", "max ms", "alarms", "95 % bound, 1/h", "thresholds")
         rows = [
@@ -122,7 +132,7 @@ def _as_text(found: "Tuning") -> str:
 
 
 def _cells(checked: "Found") -> tuple[str, ...]:
-    """Say what thresholds come to in one half, a cell for each figure."""
+    """Format the result of thresholds in one half, a cell for each figure."""
     from adacd_hil.score.wording import delay_figures
 
     low, high = checked.share_bounds

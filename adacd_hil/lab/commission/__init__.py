@@ -1,1 +1,1 @@
-"""What is done with an arm before a run: tare, test of the connection, diagnosis. The drives carry no torque."""
+"""Work on an arm before a run: configuration draft, tare, communication test, diagnosis. The drives carry no torque."""

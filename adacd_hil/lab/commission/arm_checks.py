@@ -1,6 +1,6 @@
-"""Doctor's checks of the arm on its bus: who is there, whether they are as agreed, and what they measure at rest.
+"""Doctor's checks of the arm on its bus: nodes present, identity and contract, measurements at rest.
 
-The drives are never asked for more than Disable voltage. `ArmExamination.leave` puts the nodes back to pre-operational.
+The drives get no command beyond Disable voltage. `ArmExamination.leave` puts the nodes back to pre-operational.
 """
 
 import math
@@ -36,19 +36,19 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.traffic import Traffic, listen
 
 LISTEN_S = 0.5
-"""For other masters: five of the usual heartbeats of 100 ms."""
+"""Listening time for other masters: five of the usual heartbeats of 100 ms."""
 HIGH_LOAD_PERCENT = 80.0
-"""Above this the worst case (stuff bits, a status and an SDO frame) does not fit a period."""
+"""Bus load above which the worst case (stuff bits, a status and an SDO frame) does not fit a period."""
 _PDOS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
 
 
 @dataclass
 class ArmExamination:
-    """What is examined, and what the checks have learnt so far.
+    """The arm that doctor examines, and the results of the checks so far.
 
-    open_bus: opens the bus, receiving everything. read_link: the interface's present state. ask: None when nobody can
-    move the arm, with the reason in `no_move_reason`; else tells the user what to do.
-    cycle_s: how long the cycle runs. move_s: how long the user has to move a joint.
+    open_bus: opens the bus without a filter. read_link: returns the interface's present state. ask: prints an
+    instruction to the user; None if no user can move the arm, for the reason in `no_move_reason`. cycle_s: duration of
+    the cycles. move_s: time for the user to move a joint.
     """
 
     settings: Settings
@@ -70,7 +70,7 @@ class ArmExamination:
     traffic: Traffic = field(default_factory=Traffic)
 
     def connect(self) -> None:
-        """Open the bus and put arm and master on it. Raises BusMissingError."""
+        """Open the bus; make arm and master on it. Raises BusMissingError."""
         self._bus = self.open_bus()
         self._tap = Tap(self._bus, self.clock)
         self.arm = Arm(self.settings, self.codec, self._tap)
@@ -84,18 +84,18 @@ class ArmExamination:
 
     @property
     def loop(self) -> ZeroTorqueLoop:
-        """The loop of this examination; its cycles count on."""
+        """The zero-torque loop of this examination; later runs continue its cycle count."""
         if self._loop is None:
             self._loop = ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
         return self._loop
 
     def reset(self) -> None:
-        """Reset the nodes' communication; from here on they have to be left safe. Raises DeviceError, BusError."""
+        """Reset the nodes' communication; `leave` then has to stop them. Raises DeviceError, BusError."""
         self._has_reset = True
         self.master.reset()
 
     def leave(self) -> str:
-        """Put the nodes back to pre-operational and close the bus; returns what went wrong, "" when nothing did."""
+        """Put the nodes back to pre-operational and close the bus; return the error's text, "" without one."""
         trouble = ""
         if self._has_reset:
             try:
@@ -108,10 +108,10 @@ class ArmExamination:
         return trouble
 
     def communication(self) -> CommunicationReport:
-        """Judge the connection by the cycles so far."""
+        """Return the communication test's report on the cycles so far."""
         test = CommunicationTest(self.settings, self.arm, self.bitrate, self.data_bitrate)
         for cycle in self.cycles:
-            test.observe(cycle)
+            test.observe_cycle(cycle)
         return test.report()
 
     def joint_values(self, name: str) -> NDArray[np.float64]:
@@ -127,7 +127,7 @@ def check_bus(patient: ArmExamination) -> CheckOutcome:
 
 
 def check_other_masters(patient: ArmExamination) -> CheckOutcome:
-    """Check that nobody else plays the host."""
+    """Check that no other master is on the bus."""
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
     patient.tap.take()
@@ -161,7 +161,7 @@ def check_boot(patient: ArmExamination) -> CheckOutcome:
 
 
 def check_contract(patient: ArmExamination) -> CheckOutcome:
-    """Check that host and devices are made for the same contract."""
+    """Check that host and devices use the same contract."""
     codec = patient.codec
     lacking = []
     for name, node in patient.master.nodes.items():
@@ -182,26 +182,26 @@ def check_contract(patient: ArmExamination) -> CheckOutcome:
 
 
 def check_set_up(patient: ArmExamination) -> CheckOutcome:
-    """Check that the nodes take identity check and set-up as a run does them."""
+    """Run a run's identity check and set-up of the nodes."""
     patient.master.identify()
     patient.master.configure()
     return ok(f"SYNC period {patient.settings.bus.period_us} µs, heartbeat {patient.settings.bus.heartbeat_ms} ms")
 
 
 def check_pdo_map(patient: ArmExamination) -> CheckOutcome:
-    """Check that the PDOs that the devices have configured are those of the contract."""
+    """Check that the devices' PDO parameters and mappings are those of the contract."""
     lines = []
     for slave in patient.master.slaves:
         lines += contract_differences(slave.device, read_pdos(patient.master.nodes[slave.name]))
     if lines:
         return failed(
-            "; ".join(lines), "correct [[pdo]] of the devices' profiles, or map the devices' PDOs as these say"
+            "; ".join(lines), "correct [[pdo]] of the devices' profiles, or map the devices' PDOs accordingly"
         )
     return ok("read back, equal to the contract")
 
 
 def check_torque_scale(patient: ArmExamination) -> CheckOutcome:
-    """Say what the drives' rated torques are at the joints; the set-up has compared them."""
+    """Report the drives' rated torques at the joints; the set-up has compared them already."""
     slaves = patient.master.slaves[:JOINTS]
     pairs = zip(slaves, patient.settings.arm.rated_torque_Nm, strict=True)
     text = "; ".join(describe_torque_scale(slave, rated_Nm) for slave, rated_Nm in pairs)
@@ -226,14 +226,14 @@ def check_protection(patient: ArmExamination) -> CheckOutcome:
 
 
 def check_cycle(patient: ArmExamination) -> CheckOutcome:
-    """Run cycles at the period, drives not enabled."""
+    """Run cycles at the period with disabled drives."""
     patient.tap.take()
     patient.master.start()
     patient.loop.run(patient.cycle_s, patient.cycles.append)
     for cycle in patient.cycles:
         for is_sent, frame in cycle.frames:
             if not is_sent:
-                patient.traffic.accept(frame)
+                patient.traffic.count_frame(frame)
     return ok(f"{len(patient.cycles)} cycles, torque zero, drives not enabled")
 
 
@@ -249,7 +249,7 @@ def check_rate(patient: ArmExamination) -> CheckOutcome:
         f"{100.0 * report.share:.1f} % of the periods complete, {report.overruns} skipped"
     )
     remedy = (
-        "`adacd-hil commtest` shows what is late; see `scheduler` and `preemption`, or choose a longer bus.period_us"
+        "`adacd-hil commtest` shows the late part; see `scheduler` and `preemption`, or choose a longer bus.period_us"
     )
     if report.verdict is Verdict.NOT_SUFFICIENT:
         return failed(text, remedy)
@@ -257,16 +257,16 @@ def check_rate(patient: ArmExamination) -> CheckOutcome:
 
 
 def check_load(patient: ArmExamination) -> CheckOutcome:
-    """Check that the bus has room for what is not cyclic."""
+    """Check that the bus has room for frames that are not cyclic."""
     load = patient.communication().load_percent
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
     if load > HIGH_LOAD_PERCENT:
-        return warning(text, "choose a longer bus.period_us or CAN FD; `adacd-hil budget` shows what takes the time")
+        return warning(text, "choose a longer bus.period_us or CAN FD; `adacd-hil budget` shows the time of each frame")
     return ok(text)
 
 
 def check_heartbeats(patient: ArmExamination) -> CheckOutcome:
-    """Check that each node says that it lives and is operational."""
+    """Check that each node sends heartbeats in state Operational, often enough."""
     expected_Hz = 1e3 / patient.settings.bus.heartbeat_ms
     silent, odd, slow = [], [], []
     for name, node in patient.master.nodes.items():
@@ -289,7 +289,7 @@ def check_heartbeats(patient: ArmExamination) -> CheckOutcome:
 
 
 def check_devices(patient: ArmExamination) -> CheckOutcome:
-    """Check that no drive is in fault, no device reports an error."""
+    """Check that no drive is in fault and no device reports an error."""
     lines = [line for line in ArmReport(patient.arm).describe_faults() if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
     if lines or events:
@@ -299,11 +299,11 @@ def check_devices(patient: ArmExamination) -> CheckOutcome:
 
 def check_saturation(patient: ArmExamination) -> CheckOutcome:
     """Check that no sensor is saturated or invalid."""
-    told = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
-    text = ", ".join(f"{name} {status!r}" for name, status in told.items())
-    if any(status & SensorStatus.NOT_VALID for status in told.values()):
+    reported = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
+    text = ", ".join(f"{name} {status!r}" for name, status in reported.items())
+    if any(status & SensorStatus.NOT_VALID for status in reported.values()):
         return failed(text, "see the sensor's EMCY; check its cable to the strain gauge")
-    if told:
+    if reported:
         return failed(text, "take the load off the joint; the arm must hang free")
     return ok("within range")
 
@@ -338,7 +338,7 @@ def check_torque_zero(patient: ArmExamination) -> CheckOutcome:
 
 
 def check_noise(patient: ArmExamination) -> CheckOutcome:
-    """Check that the torque signal is alive and quiet."""
+    """Check that the torque signal changes, and that its noise is small."""
     tau_J = patient.joint_values("tau_J")
     if len(tau_J) < 2:
         return skipped("no complete cycles")
@@ -354,7 +354,7 @@ def check_noise(patient: ArmExamination) -> CheckOutcome:
 
 
 def check_bus_errors(patient: ArmExamination) -> CheckOutcome:
-    """Check that the bus stayed without errors while the cycle ran."""
+    """Check that no error frame came while the cycle ran."""
     link = patient.read_link()
     errors = patient.traffic.error_frames
     counters = ""
@@ -377,22 +377,22 @@ def _check_joint(joint: int) -> Callable[[ArmExamination], CheckOutcome]:
             f"move joint {joint + 1} by hand toward +q, at least {motion.WANTED_DEG:g} degrees, "
             f"within {patient.move_s:g} s"
         )
-        patient.loop.run(patient.move_s, motion.observe, lambda: motion.is_done)
+        patient.loop.run(patient.move_s, motion.observe_cycle, lambda: motion.is_done)
         return motion.judge()
 
     return check
 
 
 WORK_FLOOR_J = 1e-3
-"""Work that counts: 10 degrees against 6 mNm. Noise and zero error make less on a joint that turns freely."""
+"""Least work that shows a sign: 10 degrees against 6 mNm. Noise and zero error make less on a free joint."""
 _DOMINANCE = 2.0
-"""How much further than the other joint the moved one must have gone."""
+"""Least ratio of the moved joint's travel to the other joint's."""
 
 
 class HandMotion:
-    """Watches the cycles in which the user moves joint `joint` (0, 1) toward +q, its drive off, and judges its signs.
+    """Judges the signs of joint `joint` (0, 1) while the user moves it toward +q, its drive disabled.
 
-    The hand drives the arm and the arm's sensor drives the idle motor, so the torque that the sensor sees opposes the
+    The hand drives the arm, and the arm drives the idle motor through the sensor, so the sensed torque opposes the
     motion: the work ∫ tau_J dq must be negative. q, dq, tau_J (2,) are in joint coordinates. `zero_Nm` (2,): torque at
     rest.
     """
@@ -409,10 +409,10 @@ class HandMotion:
 
     @property
     def is_done(self) -> bool:
-        """Whether a joint has been moved far enough."""
+        """Whether any joint has moved far enough."""
         return bool(np.abs(self._way).max() >= math.radians(self.WANTED_DEG))
 
-    def observe(self, cycle: ZeroTorqueCycle) -> None:
+    def observe_cycle(self, cycle: ZeroTorqueCycle) -> None:
         """Take in one cycle."""
         state = cycle.state
         if not state.is_complete:
@@ -425,7 +425,7 @@ class HandMotion:
         self._way = state.q - self._start
 
     def judge(self) -> CheckOutcome:
-        """Say what the motion told."""
+        """Return the outcome for the motion so far."""
         joint, number = self._joint, self._joint + 1
         ways_deg = np.degrees(self._way)
         moved = int(np.argmax(np.abs(self._way)))

@@ -1,16 +1,16 @@
-"""The draft of an arm's configuration: what is known, what follows from it, and what is a guess, with a comment each.
+"""Draft of an arm's configuration: known values, derived values and guesses, each with a comment.
 
-Known are two rigid links as a description gives them: a URDF of two joints, or lengths and masses. Gains, motion and
-prior follow from the inertia in proportion to the emulated arm P, on which they were measured. Where the masses aren't
-known, the inertia is taken to be in proportion to the rated torque, as that arm's.
+Known are two rigid links from a description: a URDF of two joints, or lengths and masses. Gains, motion and prior
+follow from the inertia in proportion to the emulated arm P, on which they were measured. If the masses aren't known,
+the inertia is taken in proportion to the rated torque.
 
 The parameters are those of the host's model, in the order of `records.PARAMETER_NAMES`: with link i of mass m_i, its
 centre of mass c_i from joint i on the line of the link and the inertia I_i about it,
 
     a1 = I₁ + m₁ c₁² + m₂ l₁² + a3    a2 = m₂ l₁ c₂    a3 = I₂ + m₂ c₂²        kg m²
-    a4 = g' (m₁ c₁ + m₂ l₁)           a5 = g' m₂ c₂                            Nm, where the axes are not vertical
+    a4 = g' (m₁ c₁ + m₂ l₁)           a5 = g' m₂ c₂                            Nm, if the axes are not vertical
 
-g' = g sin(tilt) acts in the plane of motion; `arm.mounting_deg` has the tilt and the q1 at which link 1 hangs.
+g' = g sin(tilt) acts in the plane of motion; `arm.mounting_deg` has the tilt and the q1 at which link 1 hangs down.
 
 Friction is not known from a description; it is 0.
 """
@@ -32,22 +32,22 @@ from adacd_hil.terminal import one_line
 
 Pair = tuple[float, float]
 _PARALLEL = math.cos(math.radians(2.0))
-"""Least |cosine| between axes that count as parallel, and with the vertical for one that counts as vertical."""
+"""Least |cosine| of the angle between parallel axes, and of that between a vertical axis and the vertical."""
 _BENT_DEG = 5.0
-"""From here on the zero of joint 2 is not that of a stretched arm."""
+"""Angle from which the zero of joint 2 is not that of a stretched arm."""
 _LEAST_MOMENT_KG_M = 1e-6
-"""Of link 2 about its joint: less has no direction."""
+"""Least mass moment of link 2 about its joint; the direction of a smaller one is undefined."""
 LEVEL_DEG: Pair = (0.0, 0.0)
-"""Mounting of an arm on which gravity does not act."""
+"""Mounting of an arm with vertical axes, without gravity."""
 
 
 class PlanarArm(NamedTuple):
-    """What a description says of an arm with two parallel axes.
+    """Description of an arm with two parallel axes.
 
-    cad_theta: parameters, empty where the masses are not known. mounting_deg: as `arm.mounting_deg`. sign, zero_deg:
-    of drives that count as the description. The rest: None where nothing is said of it.
-    mass_kg, center_m, inertia_kg_m2: of each link, about its centre of mass; the last two of no rod.
-    doubts: what the model can't have as the description says, a line each.
+    cad_theta: parameters, empty if the masses are not known. mounting_deg: as `arm.mounting_deg`. sign, zero_deg: for
+    drives that count as the description. mass_kg, center_m, inertia_kg_m2: of each link, the inertia about its centre
+    of mass; the last two are None for rods. Other fields are None if the description lacks them. doubts: properties of
+    the description that the model can't represent, a line each.
     """
 
     link_length_m: Pair
@@ -85,9 +85,9 @@ def uniform_rods(link_length_m: Pair, mass_kg: Pair, mounting_deg: Pair) -> Plan
 
 
 def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float = 0.0) -> PlanarArm:
-    """Read an arm of two turning joints with parallel axes. Raises UrdfError for any other.
+    """Read an arm of two revolute joints with parallel axes. Raises UrdfError for any other.
 
-    pitch_deg: how far the URDF's root is turned about its y axis; 0: its z axis points up, 90: its x axis down.
+    pitch_deg: rotation of the URDF's root about its y axis; 0: its z axis points up, 90: its x axis down.
     """
     pitch_rad = math.radians(pitch_deg)
     gravity = GRAVITY_M_S2 * math.sin(pitch_rad), 0.0, -GRAVITY_M_S2 * math.cos(pitch_rad)
@@ -155,12 +155,12 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float
 
 
 def _angle_deg(start: Vector, end: Vector, axis: Vector) -> float:
-    """Return the angle about the axis from one direction to the other, deg."""
+    """Return the angle about `axis` from one direction to the other, deg."""
     return math.degrees(math.atan2(float(np.cross(start, end) @ axis), float(start @ end)))
 
 
 def _mounting(chain: Chain, along: Vector) -> Pair:
-    """Return tilt of the plane of motion, and the q1 at which link 1, `along` (3,) in its own frame, hangs; deg."""
+    """Return the tilt of the plane of motion, and the q1 at which link 1, `along` (3,), hangs down; deg."""
     axis, gravity = chain.axis[0], chain.rotation[0].T @ chain.gravity_m_s2
     downhill = gravity - (gravity @ axis) * axis
     tilt_deg = math.degrees(math.asin(min(float(np.linalg.norm(downhill)) / GRAVITY_M_S2, 1.0)))
@@ -171,7 +171,7 @@ def _mounting(chain: Chain, along: Vector) -> Pair:
 
 
 def _gravity_doubts(moment: Vector, along: Vector, axis: Vector, lever_kg_m: float) -> Iterator[str]:
-    """Say what of link 1's gravity the model can't have. moment (3,): of link 1, kg m."""
+    """Describe the part of link 1's gravity that the model can't represent. moment (3,): of link 1, kg m."""
     aside = abs(float(np.cross(axis, along) @ moment))
     if lever_kg_m <= 0.0:
         yield "link 1 has a counterweight heavier than link 2: the model has no gravity of that direction"
@@ -198,13 +198,13 @@ def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str])
 
 
 def _limit_about(arm: SerialArm, sign: int, bent_deg: float) -> float:
-    """Return the largest |q2| on both sides of the stretched arm within the limits of joint 2, deg; 0 or less: none."""
+    """Return the largest |q2| to both sides of the stretched arm within joint 2's limits, deg; 0 or less: none."""
     first, second = (math.degrees(sign * float(end[1])) + bent_deg for end in (arm.position_low, arm.position_high))
     return round(min(-min(first, second), max(first, second)), 2)
 
 
 def _mass_doubts(arm: SerialArm) -> list[str]:
-    """Say which link has no mass. Raises UrdfError where its inertia can't be any body's."""
+    """Name a link without mass. Raises UrdfError for an inertia that no body has."""
     doubts = []
     links = arm.theta_full.reshape(JOINTS, PER_LINK)
     for name, link, axis in zip(arm.link_names, links, arm.chain.axis, strict=True):
@@ -224,7 +224,7 @@ def _mass_doubts(arm: SerialArm) -> list[str]:
 
 
 def _body(arm: SerialArm, mass_kg: Pair, moment_kg_m: Pair, inertia: list[float]) -> dict[str, Pair]:
-    """Return masses, their centres and the inertia about them, and friction where the URDF has some."""
+    """Return masses, their centres and the inertia about them, and friction if the URDF has any."""
     center = [moment / mass for moment, mass in zip(moment_kg_m, mass_kg, strict=True)]
     own = [max(whole - mass * c * c, 0.0) for whole, mass, c in zip(inertia, mass_kg, center, strict=True)]
     named: dict[str, Sequence[float] | Vector] = {"mass_kg": mass_kg, "center_m": center, "inertia_kg_m2": own}
@@ -234,7 +234,7 @@ def _body(arm: SerialArm, mass_kg: Pair, moment_kg_m: Pair, inertia: list[float]
 
 
 def _reach(arm: SerialArm) -> float:
-    """Return how far the farthest frame on link 2 is from its axis, m."""
+    """Return the distance of the farthest frame on link 2 from its axis, m."""
     axis = arm.chain.axis[1]
     far = [0.0]
     for carrier, pose in arm.places.values():
@@ -250,7 +250,7 @@ def _about(link: Vector, axis: Vector) -> float:
 
 
 def _position_limits(arm: SerialArm) -> Vector:
-    """Return the largest |q| that is within the limits on both sides, deg; infinite where a joint has none."""
+    """Return the largest |q| that is within the limits on both sides, deg; infinite for a joint without limits."""
     largest = np.minimum(-arm.position_low, arm.position_high)
     if np.any(largest <= 0.0):
         joint = int(np.argmax(largest <= 0.0))
@@ -259,7 +259,7 @@ def _position_limits(arm: SerialArm) -> Vector:
 
 
 def _plausible(key: str, values: Vector, doubts: list[str]) -> Pair | None:
-    """Return limits; None where the URDF has none, and a doubt where it has one that `arm.KEY` can't have."""
+    """Return limits; None if the URDF has none, or, with a doubt, if `arm.KEY` doesn't accept them."""
     if not np.all(np.isfinite(values)):
         return None
     pair = float(values[0]), float(values[1])
@@ -280,7 +280,7 @@ def _rounded(values: list[float]) -> tuple[float, ...]:
 
 
 _MODEL_INERTIA = (0.1786065, 0.0189645)
-"""a1 and a3 of P's CAD model, kg m², for which the gains below are."""
+"""a1 and a3 of P's CAD model, kg m², for which the gains below were measured."""
 _KP, _KD = (250.0, 20.0), (12.5, 0.75)
 _MODEL_TORQUE_NM = (12.0, 6.0)
 _RATE_PER_NM = 1000.0 / 6.0
@@ -288,41 +288,41 @@ _RATE_PER_NM = 1000.0 / 6.0
 _AMPLITUDE_DEG, _HALF_PERIOD_S, _EXCITATION_S = (30.0, 60.0), (1.125, 4.5), 2.4
 _MOST_HALF_PERIOD_S = 60.0
 _MOST_SLOWER = _MOST_HALF_PERIOD_S / max(_HALF_PERIOD_S)
-"""Beyond it the motion gets shorter, by steps of this factor."""
+"""Largest slowdown of the motion; beyond it the amplitude shrinks, by steps of this factor."""
 _SHORTER = 0.95
 _UPRIGHT_DEG, _LEAST_UPRIGHT_DEG = (60.0, 60.0), 45.0
-"""Of an arm that is level at q1 = 0: amplitude, and that of joint 1 below which gravity looks like an offset."""
+"""For an arm that is level at q1 = 0: amplitude, and joint 1's amplitude below which gravity looks like an offset."""
 _LEVEL = math.sin(math.radians(45.0))
-"""From here on of |sin| of the q1 at which link 1 hangs, gravity hardly changes about q1 = 0, as an offset does not."""
+"""|sin| of the q1 at which link 1 hangs, from which gravity hardly changes about q1 = 0, as an offset does not."""
 _PEAK_DEG_S = (100.0, 120.0)
 """Peak speed of the certified scheme's excitation at those amplitudes and that period, and of a withdrawal."""
 _FULL_ACCELERATION = 1.02
-"""Its acceleration there is a withdrawal's limit; two percent are left for values that are rounded."""
+"""Factor on its peak acceleration for a withdrawal's limit; two percent allow for rounding."""
 _TRAVEL_SHARE, _SPEED_SHARE = 0.8, 0.8
-"""Part of the position and velocity limit that the motion has."""
+"""Share of the position and of the velocity limit that the motion uses."""
 _HEAVY = 2.0
-"""Inertia per torque, against P, up to which the motion is as fast: that of arm S, which runs it."""
+"""Inertia per torque, against P, up to which the motion needs no slowdown: that of arm S, which runs it."""
 _ALIKE = 2.0
-"""Factor of torques and inertia within which the scheme's numbers are those of arm P."""
+"""Factor of torques and inertia against P within which P's numbers of the scheme are used."""
 _HEAVY_INERTIA = 20.0
-"""Inertia, against P, up to which the evidence of a fit is as well conditioned; measured on 8 kg links."""
+"""Inertia, against P, up to which a fit is as well conditioned; measured on 8 kg links."""
 _OFFSET, _LAG = 4, 5
-"""Places of torque offsets, and of lags, whose numbers are no torques, among the kinds of parameters."""
+"""Index of torque offsets, and of lags (not torques), among the kinds of parameters."""
 _MOST_REST_NM = 100.0
 """Bound of `safety.rest_torque_Nm`."""
 _LEAST_TORQUE_SHARE = 0.3
-"""Part of the torque that gravity must leave."""
+"""Share of the torque that gravity must leave."""
 
 
 class Fact(NamedTuple):
-    """A pair of values. source: who says so; "" for a guess."""
+    """A pair of values. source: its origin; "" for a guess."""
 
     value: Any
     source: str = ""
 
 
 class ArmFacts(NamedTuple):
-    """What is known of an arm. The rest of its configuration follows."""
+    """Known facts of an arm. The rest of its configuration follows from them."""
 
     geometry: PlanarArm
     length_source: str
@@ -342,7 +342,7 @@ class ArmFacts(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """One line of the file. value: None where there is none to give; the key then stands in a comment."""
+    """One line of the file. value: None if unknown; the key is then written as a comment."""
 
     key: str
     value: Any
@@ -351,7 +351,7 @@ class Entry(NamedTuple):
 
 
 class ArmDraft(NamedTuple):
-    """A configuration in the making. warnings: what the arm may not be able to do, a line each."""
+    """The entries of a configuration. warnings: abilities that the arm may lack, a line each."""
 
     entries: tuple[Entry, ...]
     warnings: tuple[str, ...]
@@ -363,7 +363,7 @@ class ArmDraft(NamedTuple):
 
 
 def draft_arm(facts: ArmFacts) -> ArmDraft:
-    """Propose everything that an arm's configuration has to say."""
+    """Draft all settings of an arm's configuration from its facts."""
     warnings = list(facts.geometry.doubts)
     entries = [*_arm(facts), *_devices(facts), *_motion(facts, warnings)]
     return ArmDraft(tuple(entries), tuple(warnings))
@@ -378,15 +378,18 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
     yield Entry("arm.torque_rate_limit_Nm_s", rate, "in proportion to the rated torque")
     yield _stated("arm.position_limit_deg", facts.position_limit_deg, "largest |q|; beyond it the run faults")
     yield _stated("arm.velocity_limit_deg_s", facts.velocity_limit_deg_s, "largest |dq|; beyond it the run faults")
-    told = "+1 where the device counts as the joint"
+    comment = "+1 where the device counts as the joint"
     if geometry.sign != (1, 1):
-        told = "joint 2 of the URDF turns against joint 1, and the drives as the URDF"
-    yield Entry("arm.sign", geometry.sign, f"a guess: {told}; `doctor --move` tells", True)
+        comment = "joint 2 of the URDF turns against joint 1, and the drives as the URDF"
+    yield Entry("arm.sign", geometry.sign, f"a guess: {comment}; `doctor --move` checks it", True)
     if any(geometry.zero_deg):
-        told = "a guess: drives that read the URDF's positions; at q2 = 0 the arm is stretched"
-        yield Entry("arm.zero_deg", geometry.zero_deg, told, True)
+        comment = "a guess: drives that read the URDF's positions; at q2 = 0 the arm is stretched"
+        yield Entry("arm.zero_deg", geometry.zero_deg, comment, True)
     yield Entry(
-        "arm.holding_torque_Nm", None, "not known: what brakes, friction and cogging hold without power; 0: free", True
+        "arm.holding_torque_Nm",
+        None,
+        "not known: largest torque of brakes, friction and cogging without power; 0: free",
+        True,
     )
     theta = geometry.cad_theta
     if theta:
@@ -400,8 +403,8 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
     axes = "not vertical: gravity acts on them" if geometry.has_gravity else "vertical: gravity doesn't act on them"
     yield _stated("estimator.gravity", Fact(geometry.has_gravity, facts.gravity_source), f"joint axes {axes}")
     if geometry.has_gravity:
-        told = f"tilt of the plane of motion, and the q1 at which link 1 hangs; {draw_arm(geometry.mounting_deg)}"
-        yield _stated("arm.mounting_deg", Fact(geometry.mounting_deg, facts.gravity_source), told)
+        comment = f"tilt of the plane of motion, and the q1 at which link 1 hangs; {draw_arm(geometry.mounting_deg)}"
+        yield _stated("arm.mounting_deg", Fact(geometry.mounting_deg, facts.gravity_source), comment)
 
 
 def _devices(facts: ArmFacts) -> Iterator[Entry]:
@@ -421,9 +424,9 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
     limit, speed = facts.position_limit_deg.value, facts.velocity_limit_deg_s.value
     hangs_rad = math.radians(facts.geometry.mounting_deg[1])
     is_level = facts.geometry.has_gravity and abs(math.sin(hangs_rad)) > _LEVEL
-    wanted, told = _AMPLITUDE_DEG, f"±, within {_TRAVEL_SHARE:.0%} of the position limit"
+    wanted, comment = _AMPLITUDE_DEG, f"±, within {_TRAVEL_SHARE:.0%} of the position limit"
     if is_level:
-        wanted, told = _UPRIGHT_DEG, f"{told}; wide, to tell gravity from the sensors' offsets"
+        wanted, comment = _UPRIGHT_DEG, f"{comment}; wide, to tell gravity from the sensors' offsets"
     amplitude = tuple(_round(min(wanted[i], _TRAVEL_SHARE * limit[i])) for i in range(JOINTS))
     if is_level and amplitude[0] < _LEAST_UPRIGHT_DEG:
         warnings.append(
@@ -436,12 +439,12 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
         while slower > _MOST_SLOWER:
             amplitude = tuple(_round(_SHORTER * value) for value in amplitude)
             slower = _slowdown(facts, amplitude, [])
-        told += f"; {amplitude[0] / whole[0]:.2g} of it, for a half period of {_MOST_HALF_PERIOD_S:g} s at most"
+        comment += f"; {amplitude[0] / whole[0]:.2g} of it, for a half period of {_MOST_HALF_PERIOD_S:g} s at most"
         warnings.append(
             f"by its limits of speed and torque the arm moves by ±{amplitude[0]:g} and ±{amplitude[1]:g} deg only, in "
             f"{slower * max(_HALF_PERIOD_S):.3g} s: learning it takes minutes; are the limits and the gears right?"
         )
-    yield Entry("trajectory.amplitude_deg", amplitude, told)
+    yield Entry("trajectory.amplitude_deg", amplitude, comment)
     half_period = tuple(_round(slower * period_s) for period_s in _HALF_PERIOD_S)
     reason = "as of the emulated arm" if slower == 1.0 else f"{slower:.2f} times slower than the emulated arm"
     yield Entry("trajectory.half_period_s", half_period, reason)
@@ -453,26 +456,26 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
     has_masses = bool(facts.geometry.cad_theta)
     for name, model in (("Kp", _KP), ("Kd", _KD)):
         gain = tuple(_round(model[i] * inertia[i] / _MODEL_INERTIA[i]) for i in range(JOINTS))
-        told = "the inertia" if has_masses else "the rated torque, as the masses are not known"
-        yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {told}", not has_masses)
+        basis = "the inertia" if has_masses else "the rated torque, as the masses are not known"
+        yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {basis}", not has_masses)
     if facts.geometry.has_gravity:
         yield _rest_torque(facts)
     yield from _certified(facts)
 
 
 def _rest_torque(facts: ArmFacts) -> Entry:
-    """Allow gravity to load the sensors of an arm that its brakes hold."""
+    """Draft the torque at rest so that gravity may load the sensors of an arm that its brakes hold."""
     free = load_settings("certified").safety.rest_torque_Nm
     gravity = _gravity(facts, facts.position_limit_deg.value)[0]
-    load, told = 1.2 * gravity, f"gravity's {gravity:.3g} Nm on joint 1 and a fifth, which the arm's brakes hold"
+    load, comment = 1.2 * gravity, f"gravity's {gravity:.3g} Nm on joint 1 and a fifth, which the arm's brakes hold"
     if not gravity:
         load = max(facts.torque_limit_Nm.value)
-        told = "a guess: as much as the drives may give, for gravity loads the sensors and the masses are not known"
-    return Entry("safety.rest_torque_Nm", _round(min(free + load, _MOST_REST_NM)), told, not gravity)
+        comment = "a guess: as much as the drives may give, for gravity loads the sensors and the masses are not known"
+    return Entry("safety.rest_torque_Nm", _round(min(free + load, _MOST_REST_NM)), comment, not gravity)
 
 
 def _certified(facts: ArmFacts) -> Iterator[Entry]:
-    """Propose the scheme's numbers that are torques or follow from the inertia, where the arm is unlike P."""
+    """Draft the scheme's numbers that are torques or follow from the inertia, for an arm unlike P."""
     base = load_settings("certified")
     found, inertia, rated = base.certified, _inertia(facts), facts.rated_torque_Nm.value
     scale = _torque_scale(facts)
@@ -493,7 +496,7 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
             ("certified.enough_std", enough, found.enough_std, f"{reason}; lags stay"),
             ("certified.drift_std", _scaled(found.drift_std, scale), found.drift_std, f"{reason}; lags stay"),
         ]
-    reason = "what the arm may be; inertia and gravity: at least twice what the description says"
+    reason = "prior; inertia and gravity: at least twice the description's"
     entries.append(("certified.prior_std", prior, found.prior_std, reason))
     ratios = [inertia[i] / _MODEL_INERTIA[i] for i in range(JOINTS)]
     light, heavy = min(1.0, _ALIKE * min(ratios)), max(1.0, max(ratios) / _HEAVY_INERTIA)
@@ -512,7 +515,7 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
 
 
 def _torque_scale(facts: ArmFacts) -> float:
-    """Return torques over P's by the joint that is more like P's; 1 where one is about alike or one smaller."""
+    """Return the ratio of torques to P's, of the joint closer to P; 1 if one is alike or smaller."""
     ratios = [facts.rated_torque_Nm.value[i] / _MODEL_TORQUE_NM[i] for i in range(JOINTS)]
     if min(ratios) > _ALIKE:
         return float(min(ratios))
@@ -520,14 +523,14 @@ def _torque_scale(facts: ArmFacts) -> float:
 
 
 def _scaled(by_kind: Sequence[float], scale: float) -> list[float]:
-    """Scale numbers by kind of parameter but for lags, which are no torques."""
+    """Scale numbers by kind of parameter, except lags, which are not torques."""
     return [value if kind == _LAG else scale * value for kind, value in enumerate(by_kind)]
 
 
 def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) -> float:
-    """Return how much slower than on arm P the motion must be for speed, acceleration and torque to suffice; 1 or more.
+    """Return the factor, at least 1, by which the motion must be slower than P's to fit speed, acceleration, torque.
 
-    Raises ConfigError where a joint has no torque.
+    Raises ConfigError for a joint without torque.
     """
     limit_Nm, speed = facts.torque_limit_Nm.value, facts.velocity_limit_deg_s.value
     inertia, gravity, slower = _inertia(facts), _gravity(facts, amplitude), 1.0
@@ -558,7 +561,7 @@ def _inertia(facts: ArmFacts) -> Pair:
 
 
 def _gravity(facts: ArmFacts, within_deg: Sequence[float]) -> Pair:
-    """Return gravity's largest torque on each joint within ± these positions, Nm; 0: not known, or does not act."""
+    """Return gravity's largest torque on each joint within ± these positions, Nm; 0 if unknown or without gravity."""
     geometry = facts.geometry
     if not (geometry.has_gravity and geometry.cad_theta):
         return 0.0, 0.0
@@ -577,18 +580,18 @@ _POSES = {
     -90: "the arm is level and +q1 lifts it",
     90: "the arm is level and +q1 lowers it",
 }
-"""What an arm does at q = 0, by the q1 at which link 1 hangs, deg."""
+"""Pose or direction of an arm at q = 0, by the q1 at which link 1 hangs down, deg."""
 
 
 def draw_arm(mounting_deg: Pair) -> str:
-    """Draw an arm at q = 0 in a line, joint 1 on the left, with the direction of gravity in the plane of motion."""
+    """Draw an arm at q = 0 in one line, joint 1 on the left, with the direction of gravity in the plane of motion."""
     tilt_deg, hangs_deg = mounting_deg
     arm = "at q = 0: [1]====[2]===>, +q counter-clockwise"
     if tilt_deg <= SLIGHT_TILT_DEG:
         return f"{arm}, seen from above; gravity does not act on the joints"
-    told = _POSES.get(round(hangs_deg), f"link 1 hangs at q1 = {hangs_deg:g} deg")
+    pose = _POSES.get(round(hangs_deg), f"link 1 hangs at q1 = {hangs_deg:g} deg")
     tilt = "" if tilt_deg > 89.9 else f" (plane tilted by {tilt_deg:g} deg)"
-    return f"{arm}, gravity {_ARROWS[round(hangs_deg / 45.0) % 8]}{tilt}: {told}"
+    return f"{arm}, gravity {_ARROWS[round(hangs_deg / 45.0) % 8]}{tilt}: {pose}"
 
 
 def _stated(key: str, fact: Fact, what: str) -> Entry:
@@ -600,8 +603,8 @@ def _round(value: float) -> float:
 
 
 _HEAD = """# {title}
-# `adacd-hil config check {name}` checks this file, `adacd-hil config docs KEY` explains a key; what is not named here
-# is as in `{base}`. `adacd-hil run` needs offsets of the torque sensors: `adacd-hil tare`.
+# `adacd-hil config check {name}` checks this file, `adacd-hil config docs KEY` explains a key; other keys
+# are as in `{base}`. `adacd-hil run` needs offsets of the torque sensors: `adacd-hil tare`.
 
 extends = "{base}"
 """

@@ -1,4 +1,4 @@
-"""The communication test: whether every cycle brings complete fresh data, and how late each part of it is.
+"""The communication test: share of cycles with complete fresh data, and the lateness of each part of a cycle.
 
 Judged as libfranka's `examples/communication_test.cpp` does by its success rate: below 0.90 the connection isn't
 sufficient, below 0.95 it is poor. A period that was skipped counts as one without data.
@@ -33,7 +33,7 @@ from adacd_hil.wire.frame_time import LoadMeter
 
 
 class ZeroTorqueCycle(NamedTuple):
-    """One cycle: what the arm reported, how it went, and its frames, True for sent."""
+    """One cycle: the arm's state, the cycle's times, and its frames, with True for sent ones."""
 
     state: ArmState
     record: CycleRecord
@@ -41,7 +41,7 @@ class ZeroTorqueCycle(NamedTuple):
 
 
 class ZeroTorqueLoop:
-    """Cycles of an arm that has been started. `is_enabling`: the drives are asked to enable, with zero torque."""
+    """Runs cycles of an arm whose nodes are Operational. `is_enabling`: enable the drives, with zero torque."""
 
     def __init__(
         self, settings: Settings, bus: Tap, clock: Clock, arm: Arm, master: Master, is_enabling: bool = False
@@ -52,7 +52,7 @@ class ZeroTorqueLoop:
         self._bus = bus
         self._is_enabling = is_enabling
         self.is_interrupted = False
-        """Whether somebody asked for the end."""
+        """Whether the end was requested."""
         self._exchange = Exchange(settings, bus, arm, master, self.pacer, clock)
         self._max_age_cycles = settings.bus.max_age_cycles
 
@@ -66,7 +66,7 @@ class ZeroTorqueLoop:
         observe: Callable[[ZeroTorqueCycle], None],
         is_over: Callable[[], bool] = lambda: False,
     ) -> FaultReason:
-        """Cycle for a while, then disable the drives; returns what a device faulted with. Raises BusError."""
+        """Run cycles for a duration, then disable the drives; return the fault that ended them. Raises BusError."""
         last_ns = self._clock.now_ns() + round(duration_s * 1e9) - self._period_ns
         fault = FaultReason.NONE
         while self._clock.now_ns() < last_ns and not (self.is_interrupted or is_over() or fault):
@@ -77,7 +77,7 @@ class ZeroTorqueLoop:
         return fault
 
     def _fault(self, state: ArmState) -> FaultReason:
-        """Say what ends a test with enabled drives; without torque nothing has to."""
+        """Return the fault that ends a test with enabled drives; with disabled drives NONE."""
         if not self._is_enabling:
             return FaultReason.NONE
         if state.is_enabled and max(*state.age_q, *state.age_tau_J) > self._max_age_cycles:
@@ -85,12 +85,12 @@ class ZeroTorqueLoop:
         return state.fault
 
     def disable(self, quick_stop: bool = False) -> None:
-        """Take the drives out of operation. Raises BusError."""
+        """Disable the drives. Raises BusError."""
         for _ in range(DISABLE_CYCLES):
             self.step(quick_stop=quick_stop)
 
     def step(self, is_enabling: bool = False, quick_stop: bool = False) -> ZeroTorqueCycle:
-        """Do one cycle. Raises BusError, of it SilenceError in lockstep."""
+        """Do one cycle. Raises BusError, such as SilenceError in lockstep."""
         turn = self._exchange.turn()
         self._exchange.leave()
         record = self._exchange.end(turn, ArmCommand(np.zeros(JOINTS), is_enabling, quick_stop))
@@ -100,11 +100,11 @@ class ZeroTorqueLoop:
 SUFFICIENT_SHARE = 0.90
 GOOD_SHARE = 0.95
 _LOAD_CYCLES = 1000
-"""Cycles at the end of the test whose frames make the bus load."""
+"""Cycles at the end of the test from whose frames the bus load is computed."""
 
 
 class Verdict(Enum):
-    """What the share of complete cycles says."""
+    """Verdict on the share of complete cycles."""
 
     GOOD = "good"
     WARNING = "warning"
@@ -112,7 +112,7 @@ class Verdict(Enum):
 
 
 def judge(share: float) -> Verdict:
-    """Judge the share of cycles with complete fresh data, 0…1."""
+    """Return the verdict on a share of cycles with complete fresh data, 0…1."""
     if share < SUFFICIENT_SHARE:
         return Verdict.NOT_SUFFICIENT
     return Verdict.WARNING if share < GOOD_SHARE else Verdict.GOOD
@@ -120,9 +120,9 @@ def judge(share: float) -> Verdict:
 
 @dataclass(frozen=True)
 class DeviceReport:
-    """One device: share of periods with a fresh value, and how often each age occurred, in cycles.
+    """One device: share of periods with a fresh value, and number of cycles by age of the value.
 
-    checks: what its frames' checks found, by name. never: cycles before its first frame.
+    checks: number of frames by result of the end-to-end check. never: cycles before its first frame.
     """
 
     share: float
@@ -134,7 +134,7 @@ class DeviceReport:
 
 @dataclass(frozen=True)
 class CommunicationReport:
-    """What the test measured. columns: /cycle's; feedback_ns is -1 where a cycle was not complete. load: percent."""
+    """Results of the test. columns: /cycle's; feedback_ns is -1 for an incomplete cycle. load: percent."""
 
     cycles: int
     overruns: int
@@ -145,23 +145,23 @@ class CommunicationReport:
 
     @property
     def periods(self) -> int:
-        """Periods that passed, with those that were skipped."""
+        """Number of periods, skipped ones included."""
         return self.cycles + self.overruns
 
     @property
     def share(self) -> float:
-        """Share of the periods that brought complete fresh data; 0 when there was none."""
+        """Share of the periods with complete fresh data; 0 without periods."""
         return self.complete / self.periods if self.periods else 0.0
 
     @property
     def verdict(self) -> Verdict:
-        """What this share says."""
+        """Verdict on this share."""
         return judge(self.share)
 
 
 @dataclass
 class CommunicationTest:
-    """Collects the cycles of a test: give `observe` to the loop, then ask for the `report`."""
+    """Collects the cycles of a test: the loop calls `observe_cycle`; `report` returns the results."""
 
     settings: Settings
     arm: Arm
@@ -174,11 +174,11 @@ class CommunicationTest:
     _overruns: int = 0
     _complete: int = 0
 
-    def observe(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
-        """Take in one cycle; returns its record for the log."""
+    def observe_cycle(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
+        """Take in one cycle; return its record for the log."""
         state = cycle.state
         ages = (*state.age_q, *state.age_tau_J)
-        if self._ages:  # what is skipped before the first cycle isn't the test's
+        if self._ages:  # periods skipped before the first cycle don't count
             self._overruns += state.periods - 1
         self._complete += state.is_complete
         self._ages.append(ages)
@@ -189,7 +189,7 @@ class CommunicationTest:
         return record
 
     def report(self) -> CommunicationReport:
-        """Sum up what was observed."""
+        """Return the results of the observed cycles."""
         cycles = len(self._ages)
         ages = np.array(self._ages, dtype=np.int64).reshape(cycles, 2 * JOINTS)
         periods = cycles + self._overruns
@@ -223,7 +223,7 @@ class CommunicationTest:
         meter = LoadMeter(self.bitrate, self.data_bitrate, 0)
         for cycle in self._recent:
             for _, frame in cycle.frames:
-                with suppress(ValueError):  # a stranger's, of a length that the contract's bus can't carry
-                    meter.add(frame)
+                with suppress(ValueError):  # a foreign frame whose length the contract's bus can't have
+                    meter.count_frame(frame)
         periods = sum(cycle.state.periods for cycle in self._recent)
-        return meter.take(periods * self.settings.bus.period_ns).percent
+        return meter.take_load(periods * self.settings.bus.period_ns).percent

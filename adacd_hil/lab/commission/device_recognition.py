@@ -1,4 +1,4 @@
-"""Devices that a survey has found: which profile describes each, and the arm's ratings.
+"""Recognition of devices that a survey has found: the profile of each, and the arm's ratings.
 
 Sends SDO uploads only. Sources: CiA 301 (0x1000, 0x1018), CiA 402-2 (0x6072, 0x6076, 0x607D, 0x6080, 0x608F, 0x6091),
 CiA 404 (0x6131, 0x6132).
@@ -23,7 +23,7 @@ from adacd_hil.wire.codec import CodecError
 
 
 class RecognisedDevice(NamedTuple):
-    """A drive or a sensor on the bus. profiles: built-in ones with its vendor and product; none: another's device."""
+    """A drive or a sensor on the bus. profiles: built-in ones of its vendor and product; () for an unknown device."""
 
     node: Node
     kind: str
@@ -40,7 +40,7 @@ class RecognisedDevice(NamedTuple):
 
 
 def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int, str]) -> list[RecognisedDevice]:
-    """Tell the drives and sensors among the nodes of a survey, and read their ratings. Raises BusError.
+    """Pick drives and sensors out of a survey's nodes, and read their ratings. Raises BusError.
 
     `kinds`: drive or sensor by node id, for nodes whose 0x1000 names neither.
     """
@@ -58,7 +58,7 @@ def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int,
 
 
 def fitting_profiles(node: Node, kind: str) -> tuple[str, ...]:
-    """Name the built-in profiles whose EDS has this node's vendor, and its product where it gives one."""
+    """Return the built-in profiles whose EDS has this node's vendor, and its product if the EDS gives one."""
     names = []
     for name in profile_names():
         try:
@@ -92,7 +92,7 @@ _OF_DRIVES = (
 def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> int | None:
     try:
         data = read_object(remote, index, sub)
-    except DeviceError:  # it refuses, or tells it otherwise than by a number
+    except DeviceError:  # it refuses the upload, or answers with another type
         return None
     return None if not data or len(data) > 8 else int.from_bytes(data, "little", signed=is_signed)
 
@@ -107,9 +107,9 @@ def _read_ratings(remote: Any, kind: str) -> DeviceRatings:
 def choose_family(
     drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Choose the profiles of two drives and two sensors: those whose frames the devices say they have (0x2000).
+    """Choose the profiles of two drives and two sensors: those whose layout digest the devices report (0x2000).
 
-    Where none says so, the first that fits each; "" where none does.
+    If none reports one, the first profile that fits each; "" if none fits.
     """
     digests = {device.node.layout_digest for device in (*drives, *sensors)} - {None}
     combinations = itertools.product(drives[0].profiles or ("",), sensors[0].profiles or ("",))

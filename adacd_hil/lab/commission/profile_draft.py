@@ -1,8 +1,8 @@
-"""The draft of a device profile from an EDS: the frames that a cycle needs, as the device's mapping allows them.
+"""Draft of a device profile from an EDS: the frames that a cycle needs, as far as the device's mapping allows them.
 
-A value that the EDS leaves open, such as the worth of a count, comes from the user's answers, else from the device's
+A value that the EDS leaves open, such as the scale of a count, comes from the user's answers, else from the device's
 objects, else from a shipped profile of the same maker; else it is a guess. The EDS's value of a writable object is a
-factory setting: a guess, too, where the right value depends on the arm.
+factory setting, and a guess, too, if the right value depends on the arm.
 
 Sources: CiA 301 (0x1000, 0x1018; clause 7.5.2, PDO parameters), CiA 306 (EDS: PDOMapping, AccessType), CiA 402-2,
 CiA 404.
@@ -35,7 +35,7 @@ DRIVE, SENSOR = "drive", "sensor"
 KINDS = {402: DRIVE, 404: SENSOR}
 _DEG_S_PER_RPM = 6.0
 _LEAST_LIMIT_DEG, _MOST_LIMIT_DEG, _MOST_SPEED_DEG_S = 1.0, 360.0, 720.0
-"""Limits of a joint; others are a drive's factory values. A wrist of a UR3e turns by 360 deg/s."""
+"""Plausible limits of a joint; others are a drive's factory values. A wrist of a UR3e turns at 360 deg/s."""
 _Place = tuple[int, int]
 
 
@@ -47,7 +47,7 @@ class DeviceRatings(NamedTuple):
 
     @property
     def torque_share(self) -> float | None:
-        """0x6072, the largest torque over the rated one; None if unknown."""
+        """0x6072: the largest torque over the rated one; None if unknown."""
         permille = self.numbers.get((0x6072, 0))
         return permille * 1e-3 if permille else None
 
@@ -57,7 +57,7 @@ class DeviceRatings(NamedTuple):
         return counts * scale.joint_torque_Nm if counts else None
 
     def position_limit_deg(self, scale: ScaleSettings) -> float | None:
-        """Return 0x607D; None where it is no joint's limit, as the whole range of a counter."""
+        """Return 0x607D; None if it isn't a joint's limit, such as a counter's whole range."""
         low, high = self.numbers.get((0x607D, 1)), self.numbers.get((0x607D, 2))
         if low is None or high is None or min(-low, high) <= 0 or not scale.increments_per_joint_rev:
             return None
@@ -65,7 +65,7 @@ class DeviceRatings(NamedTuple):
         return degrees if _LEAST_LIMIT_DEG <= degrees <= _MOST_LIMIT_DEG else None
 
     def velocity_limit_deg_s(self, scale: ScaleSettings) -> float | None:
-        """Return 0x6080, rpm of the motor, at the joint; None where it is no joint's limit, as 50000 of a factory."""
+        """Return 0x6080, rpm of the motor, at the joint; None if it is no joint's limit, such as a factory's 50000."""
         rpm = self.numbers.get((0x6080, 0))
         gear = self.numbers.get((0x6091, 1), 0) / (self.numbers.get((0x6091, 2)) or 1) or scale.gear_ratio
         degrees_s = (rpm or 0) * _DEG_S_PER_RPM / gear
@@ -73,7 +73,7 @@ class DeviceRatings(NamedTuple):
 
 
 class Guess(NamedTuple):
-    """A guessed value of a draft. key: in the profile. text: the value, and why it is a guess."""
+    """A guessed value of a draft. key: in the profile. text: the value, and the reason of the guess."""
 
     key: str
     value: float
@@ -83,7 +83,7 @@ class Guess(NamedTuple):
 class ProfileDraft(NamedTuple):
     """The text of a profile. remarks: limits of the device, a line each.
 
-    rated_torque_Nm: at the joint, by 0x6076; None if unknown. is_rated_known: it contains no guess.
+    rated_torque_Nm: at the joint, by 0x6076; None if unknown. is_rated_known: no guess went into it.
     """
 
     kind: str
@@ -100,7 +100,7 @@ class ProfileDraft(NamedTuple):
 
     @property
     def settings(self) -> ProfileSettings:
-        """The draft as it will be read."""
+        """The draft, parsed as a profile."""
         return parse(ProfileSettings, parse_toml(self.text))
 
 
@@ -117,12 +117,12 @@ def identity_of(eds: Path) -> tuple[int | None, int | None]:
 
 
 def is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int | None]) -> bool:
-    """Whether an EDS of this vendor and product fits a node; a number that the EDS omits fits all."""
+    """Tell whether an EDS of this vendor and product fits a node; a number that the EDS omits fits all."""
     return all(expected in (None, found) for expected, found in zip(identity, node, strict=True))
 
 
 def kind_of(eds: Path) -> str:
-    """Tell whether an EDS is that of a drive or a sensor, by 0x1000; "" where it is of another profile, or of none.
+    """Return "drive" or "sensor" by 0x1000 of an EDS; "" for another profile, or none.
 
     Raises ConfigError.
     """
@@ -133,7 +133,7 @@ def kind_of(eds: Path) -> str:
 
 
 def describe_kind(eds: Path) -> str:
-    """Say which profile 0x1000 of an EDS names, where it is neither a drive's nor a sensor's. Raises ConfigError."""
+    """Describe 0x1000 of an EDS that is neither a drive's nor a sensor's. Raises ConfigError."""
     number = _profile_number(eds)
     profile = f"names CiA {number}" if number else "names no profile"
     return f"0x1000 of {eds.name} {profile}, neither a drive's (CiA 402) nor a sensor's (CiA 404)"
@@ -150,10 +150,10 @@ def draft_profile(
     kind: str = "",
     answers: Mapping[str, float] | None = None,
 ) -> ProfileDraft:
-    """Draft the profile of the device that an EDS describes. Raises ConfigError where it lacks what a cycle needs.
+    """Draft the profile of the device that an EDS describes. Raises ConfigError if it lacks an object of the cycle.
 
-    `kind`: drive or sensor, where 0x1000 doesn't tell. `answers`: values of `scale` that are given, by key;
-    `velocity_unit` is a code of 0x60A9.
+    `kind`: drive or sensor, if 0x1000 doesn't name either. `answers`: given values of `scale`, by key; `velocity_unit`
+    is a code of 0x60A9.
     """
     kind = kind or kind_of(eds)
     if not kind:
@@ -201,30 +201,30 @@ _PERMILLE = ("torque_actual", "torque_demand", "target_torque", "torque_offset",
 _STATUS_OBJECTS = ((0x6041, 0), (0x6061, 0), (0x6077, 0), (0x603F, 0))
 _EVENT_TYPE, _EVENT_MS = 255, 100
 _INHIBIT_100US = 50
-"""Of a status frame with the torque, which changes all the time: 5 ms leave two drives 4 % of a bus."""
+"""Inhibit time of a status frame with the torque, which changes all the time: 5 ms leave two drives 4 % of a bus."""
 _RECEIVED, _SENT = 0x1400, 0x1800
 _MOST_RECORDS = 64
-"""Records of PDO parameters that are looked at; CiA 301 has 512, devices have 4 to 8."""
+"""Most PDO parameter records that are read; CiA 301 allows 512, devices have 4 to 8."""
 _GUESSED_INCREMENTS = 1 << 20
 _GUESSED_TORQUE_NM = 1e-6, 2e-3
-"""Guessed worth of a count, for more than 16 bits and for 16: a range of ±2147 Nm and ±65 Nm."""
+"""Guessed torque of one count, for more than 16 bits and for 16: a range of ±2147 Nm and ±65 Nm."""
 _MOST_MOTOR_NM = 100.0
-"""A motor of more in an arm of this size is one whose 0x6076 counts µNm."""
+"""Largest plausible rated torque of a motor in an arm of this size; beyond it 0x6076 counts µNm."""
 _LEAST_JOINT_NM, _JOINT_NM = 3.0, 10.0
-"""A rated torque below the first is a motor's; the guessed gear brings it to the second."""
+"""A rated torque below the first is a motor's; the guessed gear raises it to the second."""
 _LIKELY_GEAR, _MOST_GEAR = 50.0, 160.0
 _RPM_UNITS = {prefix << 24 | 0x00B44700 for prefix in (0, *range(0xF7, 0x100))}
 """0x60A9: rpm, and decimal fractions of it."""
 _CST = 1 << 9  # of 0x6502
 TORQUE_KEYS = {"scale.gear_ratio", "scale.rated_torque_count_Nm"}
-"""Factors between 0x6076 and the torque at the joint, without the efficiency, which is within a third of 1."""
+"""Factors from 0x6076 to the torque at the joint, except the efficiency, which is within a third of 1."""
 _MOST_OPTION = 8  # of 0x605A
 
 
 class _Record(NamedTuple):
     """A PDO of a device. cob_id: without the node id. entries: the default mapping.
 
-    room: how many objects may be mapped; 0: the mapping is read-only. transmission, inhibit_100us, timer_ms: read-only
+    room: most objects of its mapping; 0: the mapping is read-only. transmission, inhibit_100us, timer_ms: read-only
     values; None and 0 if they can be written.
     """
 
@@ -238,11 +238,11 @@ class _Record(NamedTuple):
     timer_ms: int
 
     def carries(self, *places: _Place) -> bool:
-        """Whether it brings objects by itself."""
+        """Tell whether its default mapping has these objects."""
         return set(places) <= set(self.entries)
 
     def can_be(self, transmission: int) -> bool:
-        """Whether it can be sent or taken in this way."""
+        """Tell whether it can have this transmission type."""
         return self.transmission in (None, transmission)
 
 
@@ -279,7 +279,7 @@ class _ProfileWriter(ABC):
         return None if variable is None else variable.default
 
     def is_factory(self, index: int, sub: int) -> bool:
-        """Whether the known value of an object is a factory setting."""
+        """Tell whether the known value of an object is a factory setting."""
         return (index, sub) not in self.ratings.numbers and self.can_write(index, sub)
 
     def refuse(self, reason: str) -> ConfigError:
@@ -295,11 +295,11 @@ class _ProfileWriter(ABC):
 
     @property
     def is_fixed(self) -> bool:
-        """Whether no mapping can be written."""
+        """Tell whether no mapping can be written."""
         return not any(record.room for is_received in (False, True) for record in self.records(is_received))
 
     def records(self, is_received: bool) -> list[_Record]:
-        """List the PDOs that can be switched on."""
+        """Return the PDOs that can be switched on."""
         base = _RECEIVED if is_received else _SENT
         found = []
         for number in range(1, _MOST_RECORDS + 1):
@@ -321,7 +321,7 @@ class _ProfileWriter(ABC):
         return found
 
     def _cob_id(self, index: int, number: int, is_received: bool) -> int | None:
-        """Return the EDS's identifier of a PDO without the node id; None where it can't be used."""
+        """Return a PDO's identifier in the EDS without the node id; None if unusable."""
         by_eds = self.default(index, 1)
         if by_eds & NOT_VALID and not self.can_write(index, 1):
             return None
@@ -361,46 +361,46 @@ class _ProfileWriter(ABC):
         return "\n".join([*lines, *self.further(), *frames])
 
     def check(self) -> None:
-        """Raise ConfigError where the device can't do what a cycle needs."""
+        """Raise ConfigError if the device lacks a function that a cycle needs."""
 
     def allows(self, feature: str) -> bool:
-        """Whether a feature is one of this kind of device."""
+        """Tell whether devices of this kind can have a feature."""
         return self.kind == DRIVE or feature in ("heartbeat_consumer", "sync_counter")
 
     def watchdog(self) -> list[str]:
-        """Write where the deadline of commands is."""
+        """Return the profile's lines on the deadline of commands."""
         return []
 
     def options(self, can_write: bool) -> list[str]:  # noqa: ARG002 (of a drive)
-        """Write how it stops."""
+        """Return the profile's lines on the reactions of a stop."""
         return []
 
     def further(self) -> list[str]:
-        """Write the maker's facts beside scale and PDOs."""
+        """Return the maker's further lines, besides scale and PDOs."""
         return []
 
     @abstractmethod
     def scale(self) -> list[str]:
-        """Write what a count is worth."""
+        """Return the profile's lines on the scales of counts."""
 
     @abstractmethod
     def frames(self) -> list[str]:
-        """Write the PDOs."""
+        """Return the profile's lines on PDOs."""
 
     def fact(self, key: str) -> float | None:
-        """Return a value of `scale` that holds for all devices of this maker; None where none is known."""
+        """Return a value of `scale` that holds for all devices of this maker; None if unknown."""
         if self.facts is None or f"scale.{key}" in self.facts.assumed:
             return None
         value: float = getattr(self.facts.scale, key)
         return value or None
 
     def guess(self, key: str, value: float, text: str) -> str:
-        """Note a guess; return the comment above it."""
+        """Record a guess; return the comment above its line."""
         self.guessed.append(Guess(f"scale.{key}", value, text))
         return f"# A guess: {text}"
 
     def pdo(self, message: str, record: _Record, places: Sequence[_Place], transmission: int = 1) -> list[str]:
-        """Write one PDO; one whose mapping is fixed has what the EDS maps by default."""
+        """Return the lines of one PDO; a fixed mapping keeps the EDS's default objects."""
         rows = [
             f'    {{ object = "{ObjectName(*place)}", {self.signal(place)} }},'
             for place in (places if record.room else record.entries)
@@ -429,7 +429,7 @@ class _ProfileWriter(ABC):
         return f'signal = "{name or f"object_{index:04X}_{sub}"}"{unit}'
 
     def fill(self, places: Sequence[_Place], room: int) -> list[_Place]:
-        """Keep of some objects those that may be in a frame and fit into one of so much room, in order."""
+        """Return the objects, in order, that can be mapped and fit into one PDO of so much room."""
         kept: list[_Place] = []
         bits = 0
         for place in places:
@@ -518,9 +518,9 @@ class _DriveWriter(_ProfileWriter):
         return gear, text
 
     def _likely_gear(self, motor_Nm: float) -> float:
-        """Guess the gear: rather too large, which commands too little torque.
+        """Guess the gear ratio, rather too large, so that too little torque is commanded.
 
-        A rated torque of a joint means no gear; a weak motor, or a velocity in rpm, means one.
+        A rated torque in a joint's range means no gear; a weak motor, or a velocity in rpm, means one.
         """
         if self.facts is not None:
             return self.facts.scale.gear_ratio
@@ -554,7 +554,7 @@ class _DriveWriter(_ProfileWriter):
         return increments, [*lines, f"increments_per_joint_rev = {increments:.16g}"]
 
     def _numbers_with_gear(self) -> Any:
-        """Return the drive's numbers, without 0x6091 where it is the default 1 : 1 or overridden by an answer."""
+        """Return a reader of the drive's numbers, without a 0x6091 that is 1 : 1 by default or answered otherwise."""
         by_drive = read_drive_units(self.number).gear_ratio
         is_set = by_drive not in (None, 1.0) and "gear_ratio" not in self.answers
         return lambda index, sub: None if index == 0x6091 and not is_set else self.number(index, sub)
@@ -628,7 +628,7 @@ class _DriveWriter(_ProfileWriter):
             if status.transmission is None and not status.has_timer:
                 self.remarks.append(
                     f"its statusword comes on change only, as 0x{_SENT + status.number - 1:X}:5 (event timer) is not "
-                    "there: nobody notices one that is lost"
+                    "there: a lost one is not noticed"
                 )
         return [*lines, *self.pdo("Command", self._command(), ((0x6040, 0), (0x6071, 0)))]
 
@@ -651,7 +651,7 @@ class _SensorWriter(_ProfileWriter):
         ]
 
     def _by_eds(self) -> float | None:
-        """Return one count by read-only unit and digits; None if they are writable or missing."""
+        """Return the torque of one count by read-only unit and digits; None if they are writable or missing."""
         if self.is_factory(0x6131, 1) or self.is_factory(0x6132, 1):
             return None
         return count_of(self.number(0x6131, 1), self.number(0x6132, 1))
@@ -675,7 +675,7 @@ class _SensorWriter(_ProfileWriter):
 
 
 def count_of(unit: int | None, digits: int | None) -> float | None:
-    """Return one count of a sensor by 0x6131 and 0x6132, Nm; None if the unit is no torque."""
+    """Return the torque of one count of a sensor by 0x6131 and 0x6132, Nm; None if the unit is not a torque."""
     if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
         return None
     prefix = unit >> PREFIX_SHIFT

@@ -1,4 +1,4 @@
-"""The tare of the joint torque sensors: a window at rest judged, and the offsets solved from one or several poses.
+"""The tare of the joint torque sensors: checks of a window at rest, and offsets solved from one or several poses.
 
 At rest, drives off, pose k, joint i, the sensor reads gravity and its zero offset:
 
@@ -8,7 +8,7 @@ With vertical joint axes Y_g is zero and the offset is the mean over the poses. 
 the offsets by least squares, or taken from the CAD model. Y_g are the gravity columns of the scheme's regressor.
 
 Shapes: histories q, dq, tau_J (n, 2); per joint (2,); per pose (N, 2). Units: rad, rad/s, Nm. tau_J is in joint
-direction with nothing subtracted.
+direction, no offset subtracted.
 """
 
 import math
@@ -31,16 +31,16 @@ _GRAVITY = (A4, A5)
 
 
 class TareRefusedError(RuntimeError):
-    """The sensors can't be tared now; one line with quantity, value, bound and unit."""
+    """The tare is refused; the message is one line with quantity, value, bound and unit."""
 
 
 class ArmMovedError(TareRefusedError):
-    """The arm did not rest while it was measured."""
+    """The arm moved during the measurement."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """One pose that was measured at rest."""
+    """One pose, measured at rest."""
 
     q: Vector
     mean_Nm: Vector
@@ -53,7 +53,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class TareSolution:
-    """What the poses say. `gravity_Nm`: a4 and a5, zeros with vertical axes. `condition`: of the poses' equations."""
+    """Solution of the poses. `gravity_Nm`: a4, a5; zeros with vertical axes. `condition`: of the poses' equations."""
 
     offset_Nm: Vector
     standard_error_Nm: Vector
@@ -63,13 +63,13 @@ class TareSolution:
 
     @property
     def spread_Nm(self) -> Vector:
-        """Distance of the highest and the lowest residual of each joint, Nm (2,)."""
+        """Difference of the largest and the smallest residual of each joint, Nm (2,)."""
         spread: Vector = np.ptp(self.residual_Nm, axis=0)
         return spread
 
 
 def check_plan(settings: Settings) -> None:
-    """Raise ConfigError when these settings can't lead to a tare, whatever is measured."""
+    """Raise ConfigError if these settings allow no tare, whatever is measured."""
     tare = settings.tare
     if not settings.estimator.gravity:
         return
@@ -83,7 +83,7 @@ def check_plan(settings: Settings) -> None:
 
 
 def check_motion(q: Vector, dq: Vector, settings: Settings) -> None:
-    """Raise ArmMovedError when the arm moves or creeps. q, dq: (2,), or (n, 2) with n at least 1."""
+    """Raise ArmMovedError if the arm moves or creeps. q, dq: (2,), or (n, 2) with n at least 1."""
     q, dq = np.atleast_2d(q), np.atleast_2d(dq)
     speed = np.abs(dq).max(axis=0)
     bound_rad_s = settings.safety.rest_velocity_rad_s
@@ -103,7 +103,7 @@ def check_motion(q: Vector, dq: Vector, settings: Settings) -> None:
 
 
 def measure_pose(q: Vector, dq: Vector, tau_J: Vector, settings: Settings) -> Pose:
-    """Judge one window of samples at rest (n, 2 each) and reduce it to a pose. Raises TareRefusedError."""
+    """Check one window of samples at rest (n, 2 each) and reduce it to a pose. Raises TareRefusedError."""
     tare = settings.tare
     if len(tau_J) < 2 * _BLOCKS:
         raise TareRefusedError(f"{len(tau_J)} complete samples in a pose are below {2 * _BLOCKS}")
@@ -127,7 +127,7 @@ def measure_pose(q: Vector, dq: Vector, tau_J: Vector, settings: Settings) -> Po
 
 
 def _standard_error(tau_J: Vector) -> Vector:
-    """Estimate the standard error of the mean (2,), by samples and by blocks: the larger one, as noise has memory."""
+    """Estimate the standard error of the mean (2,), the larger of two: by samples, by blocks (for coloured noise)."""
     by_sample = tau_J.std(axis=0, ddof=1) / math.sqrt(len(tau_J))
     means = np.array([block.mean(axis=0) for block in np.array_split(tau_J, _BLOCKS)])
     larger: Vector = np.maximum(by_sample, means.std(axis=0, ddof=1) / math.sqrt(_BLOCKS))
@@ -135,7 +135,7 @@ def _standard_error(tau_J: Vector) -> Vector:
 
 
 def _bound(quantity: str, values: Vector, bound: float | Sequence[float], setting: str, remedy: str = "") -> None:
-    """Raise TareRefusedError when the size of a joint's value exceeds its bound; NaN does."""
+    """Raise TareRefusedError if the size of a joint's value exceeds its bound, or is NaN."""
     bounds = np.broadcast_to(bound, JOINTS)
     for joint, name in enumerate(JOINT_NAMES):
         if not abs(values[joint]) <= bounds[joint]:
@@ -160,7 +160,7 @@ def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
             remedy = "; something pushes on the arm there, or the mounting, arm.mounting_deg, is wrong"
             _bound(f"residual of pose {number}", residual, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
     else:
-        remedy = "; friction, a cable or somebody pushes on the arm in one of them"
+        remedy = "; friction, a cable or a hand pushes on the arm in one of them"
         _bound("spread between poses of tau_J", solution.spread_Nm, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
     mounting = "the mounting, arm.mounting_deg, is wrong"
     if not settings.estimator.gravity:
@@ -171,7 +171,7 @@ def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
 
 
 def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
-    """Solve by least squares, without a word on the result's plausibility."""
+    """Solve by least squares, without any check of the result."""
     is_estimated = settings.estimator.gravity and settings.tare.gravity_model == "estimated"
     gravity = np.zeros(len(_GRAVITY))
     if settings.estimator.gravity and not is_estimated:
@@ -199,9 +199,9 @@ def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
 
 
 def _errors_of_unknowns(matrix: NDArray[np.float64], poses: Sequence[Pose], residual: Vector) -> Vector:
-    """Give the standard errors of the unknowns.
+    """Return the standard errors of the unknowns.
 
-    An equation's error is the larger of two: the noise of its mean, and how far the poses disagree.
+    An equation's error is the larger of two: the noise of its mean, and the disagreement of the poses.
     """
     inverse = np.linalg.inv(matrix.T @ matrix)
     variance = np.array([pose.standard_error_Nm for pose in poses]) ** 2
@@ -220,7 +220,7 @@ def _check_condition(matrix: NDArray[np.float64], poses: Sequence[Pose], setting
     bound = settings.tare.condition_limit
     if condition <= bound:
         return condition
-    # What hardly shows is an a4 with the offset of joint 1, or an a5 with the offset of joint 2.
+    # The hardly determined combination is a4 with the offset of joint 1, or a5 with the offset of joint 2.
     hidden = directions[-1] ** 2
     q = np.array([pose.q for pose in poses])
     level = f" - {math.degrees(settings.level_rad):g} deg" * (settings.level_rad != 0.0)

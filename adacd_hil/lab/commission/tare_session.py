@@ -12,8 +12,8 @@ import numpy as np
 
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, format_date, wall_ns
-from adacd_hil.control.arm_records import TARE_FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
 from adacd_hil.control.session import git_commit
+from adacd_hil.control.tare_file import TARE_FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, explained
 from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Master
@@ -36,7 +36,7 @@ from adacd_hil.wire.codec import Codec
 
 AUTO_ZERO = (0x6125, 1)
 AUTO_ZERO_SIGNATURE = b"zero"
-"""0x6F72657A, CiA 404: what 0x6125 takes."""
+"""0x6F72657A, CiA 404: the signature that 0x6125 (auto-zero) requires."""
 AUTO_ZERO_CYCLES = 64
 """Samples that an emulated sensor averages for its zero."""
 _AUTO_ZERO_WAIT_CYCLES = 2 * AUTO_ZERO_CYCLES
@@ -72,7 +72,7 @@ class TareSession:
         self._period_s = self.settings.bus.period_s
 
     def interrupt(self) -> None:
-        """Ask for the end. Safe in a signal handler."""
+        """End the tare. Safe in a signal handler."""
         self._is_interrupted = True
 
     def run(self) -> Tare:
@@ -93,12 +93,12 @@ class TareSession:
                 self._auto_zero(nodes, sensors)
             poses = self._measure_poses()
         finally:
-            with contextlib.suppress(BusError):  # what broke the bus is on its way already
+            with contextlib.suppress(BusError):  # the error that broke the bus is being raised already
                 self._master.stop()
         return self._describe(poses, solve_tare(poses, self.settings), sensors, temperatures)
 
     def _read_temperature(self, node: Any, sensor: Identity) -> float | None:
-        """Read the sensor's temperature in °C; None when it doesn't give one."""
+        """Read the sensor's temperature in °C; None if it has none."""
         if sensor.vendor != _OWN_VENDOR:
             return None
         try:
@@ -117,7 +117,7 @@ class TareSession:
         return max(1, round(duration_s / self._period_s))
 
     def _await_data(self) -> None:
-        """Wait until all devices have answered for a while. Raises TareRefusedError when they don't."""
+        """Wait until all devices have answered for a while. Raises TareRefusedError after a timeout."""
         safety = self.settings.safety
         good, enough = 0, self._cycles(safety.commission_s)
         for _ in range(enough + self._cycles(safety.phase_timeout_s)):
@@ -145,7 +145,7 @@ class TareSession:
         return poses
 
     def _measure_next_pose(self, last: Pose, number: int) -> Pose:
-        """Wait until the arm has been moved and rests again, then measure it; begin again when it moves meanwhile."""
+        """Wait until the arm has been moved and rests again, then measure it; start again if it moves meanwhile."""
         tare = self.settings.tare
         self.progress(
             f"pose {number} of {tare.poses}: move a joint by hand by more than {tare.move_deg:g} deg, then let go"
@@ -159,7 +159,7 @@ class TareSession:
                 self.progress(f"pose {number} of {tare.poses}: {reason}; let go of it")
 
     def _await_rest(self, last: Pose, number: int, cycles_left: int) -> int:
-        """Wait for the arm to be away from the last pose and at rest for a while; return the cycles that are left."""
+        """Wait until the arm has left the last pose and rests for a while; return the remaining cycles."""
         tare = self.settings.tare
         settle_cycles = self._cycles(tare.settle_s)
         has_moved = False
@@ -211,7 +211,7 @@ class TareSession:
         return measure_pose(q, dq, tau_J, settings)
 
     def _check_data(self, state: ArmState) -> None:
-        """Raise TareRefusedError when a sensor calls its value bad, or a value is too old."""
+        """Raise TareRefusedError if a sensor marks its value as bad, or a value is too old."""
         for sensor in self._arm.sensors:
             if sensor.status:
                 flags = ", ".join(str(flag.name) for flag in sensor.status)
@@ -223,11 +223,11 @@ class TareSession:
                 raise TareRefusedError(f"{name} has sent nothing usable for {age} cycles, bus.max_age_cycles = {bound}")
 
     def _auto_zero(self, nodes: list[Any], sensors: tuple[Identity, ...]) -> None:
-        """Let the sensors set their own zero at rest, and check what is left. Raises TareRefusedError, DeviceError."""
+        """Let the sensors set their own zero at rest, and check the remainder. Raises TareRefusedError, DeviceError."""
         before = self._measure()
-        solve_tare([before], self.settings)  # an arm that somebody pushes on isn't zeroed
+        solve_tare([before], self.settings)  # refuse if the arm is pushed
         for node, sensor in zip(nodes, sensors, strict=True):
-            # Sensors of our own kind refuse it in Operational, where somebody relies on what they measure.
+            # adacd-sensors refuse it in Operational, where their values are in use.
             self._canopen.command(ENTER_PRE_OPERATIONAL, sensor.node_id)
             with explained(sensor.name, sensor.node_id, "auto-zero"):
                 node.sdo.download(*AUTO_ZERO, AUTO_ZERO_SIGNATURE)
@@ -315,7 +315,7 @@ def _describe_pose(pose: Pose) -> str:
 
 
 def _user() -> str:
-    """Name who runs this, empty when the system has no name."""
+    """Return the name of the user who runs this, "" if the system has none."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):

@@ -1,1 +1,1 @@
-"""What other programs import: a log as arrays, arrays through the scheme. `adacd_hil.api` names all of it."""
+"""Library for other programs: a log as arrays, arrays through the scheme. `adacd_hil.api` names its public parts."""

@@ -1,7 +1,7 @@
 """Arrays of any serial arm through the offline scheme: a model from free motion, its test, contacts in the rest.
 
-The steps and their equations: `adacd_hil.scheme.identify.offline`. Nothing has to be known of the arm but its geometry;
-masses, friction and the torque sensors' offsets are identified.
+The steps and their equations: `adacd_hil.scheme.identify.offline`. Only the arm's geometry must be known; masses,
+friction and the torque sensors' offsets are identified.
 """
 
 import math
@@ -44,7 +44,7 @@ from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 
 FIT_SHARE: Final = 0.4
-"""Of arrays of which nobody says what is free motion: the part from the beginning that is taken for it."""
+"""Share of the arrays, from the beginning, that is taken for free motion by default."""
 _REQUIRED: Final = ("t", "q", "tau_J")
 _OPTIONAL: Final = ("dq", "touched")
 _ALIASES: Final = {"t_s": "t", "time": "t", "qd": "dq", "tau": "tau_J"}
@@ -83,7 +83,7 @@ class OfflineArm:
 
     @classmethod
     def from_config(cls, config: str | Path, profile: str | None = None) -> Self:
-        """Take the two-joint arm of a configuration, a name or a TOML file. Raises ConfigError, a ValueError."""
+        """Make the two-joint arm of a configuration, a name or a TOML file. Raises ConfigError, a ValueError."""
         return cls(read_urdf(robot_description(load_settings(str(config), profile))))
 
     def __repr__(self) -> str:
@@ -102,7 +102,7 @@ class OfflineArm:
 
 
 class _GivenArrays(NamedTuple):
-    """Arrays as a recording, whose time begins with 0 at begin_s of `t`."""
+    """Arrays as a recording; its time 0 is begin_s of `t`."""
 
     recording: ForeignRecording
     begin_s: float
@@ -110,7 +110,7 @@ class _GivenArrays(NamedTuple):
 
 
 class ArrayContact(NamedTuple):
-    """A contact: when it was detected, in the time of the arrays; link from 1; sign of each joint's torque (n,)."""
+    """A contact: time of detection, on the arrays' time; link from 1; sign of each joint's torque (n,)."""
 
     t_s: float
     link: int
@@ -119,11 +119,11 @@ class ArrayContact(NamedTuple):
 
 @dataclass(frozen=True)
 class FittedModel:
-    """A model that was fitted to free motion, and tested on motion that it was not fitted to.
+    """A model fitted to free motion, and tested on other motion.
 
-    names, theta, std: parameters (p,), and how far they may be off. margin: smallest threshold over residual in the
+    names, theta, std: parameters (p,) and their standard deviations. margin: smallest threshold over residual in the
     test; below 1 the model lacks more than noise. explained: share (n,) of each joint's torque that it explains in the
-    test, nan where there is none. verdict: whether all of it is, why not, and what to do next.
+    test, nan without torque. verdict: whether the torque is explained, the reasons if not, the next step.
     """
 
     arm: OfflineArm
@@ -136,7 +136,7 @@ class FittedModel:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the torque is explained, with reasons, remarks and the next thing to do."""
+        """Verdict: whether the torque is explained, with reasons, remarks and the next step."""
         return self.identified.verdict
 
     def __repr__(self) -> str:
@@ -145,9 +145,9 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class ArrayDetection:
-    """The model, and of m samples at a fixed period: t_s (m,), tau_ext_hat and threshold (m, n) in Nm; the contacts.
+    """The model, and for m samples at a fixed period: t_s (m,), tau_ext_hat and threshold (m, n) in Nm; the contacts.
 
-    The samples are those of the arrays where these have a fixed period; gaps part them, and short rests are left out.
+    The samples are those of the arrays if these have a fixed period; gaps split them, and short rests are left out.
     """
 
     model: FittedModel
@@ -172,7 +172,7 @@ def fit(
 ) -> FittedModel:
     """Fit a model to the free motion in arrays and test it on the last 40 % of that; see `detect`.
 
-    `verdict` of the model says whether it explains the torque: look at it before anything else.
+    Look at the model's `verdict` first: it tells whether the model explains the torque.
     """
     return _fitted(_taken(arrays, arm, velocity_lag_s), arm, fit_s, scheme)
 
@@ -209,18 +209,18 @@ def detect(
     velocity_lag_s: float = 0.0,
     **scheme: Any,
 ) -> ArrayDetection:
-    """Run the offline scheme over recorded arrays: fit, test, then look for contacts in all of them.
+    """Run the offline scheme over recorded arrays: fit, test, then detect contacts in all of them.
 
-    arrays: `t` (k,) s, increasing; `q` (k, n) rad; `tau_J` (k, n) Nm, positive along the joint's axis; if there are
-    some `dq` (k, n) rad/s, else derived from q; `touched` (k,) bool, true while somebody touches the arm, left out of
-    the fit. `time`, `qd` and `tau` stand for `t`, `dq` and `tau_J`. All finite, below 1e6; gaps in time part them.
+    arrays: `t` (k,) s, increasing; `q` (k, n) rad; `tau_J` (k, n) Nm, positive along the joint's axis; optionally
+    `dq` (k, n) rad/s, else derived from q; `touched` (k,) bool, true while the arm is touched, left out of the fit.
+    `time`, `qd` and `tau` stand for `t`, `dq` and `tau_J`. All finite, below 1e6; gaps in time split them.
 
-    model: of `fit`, in place of fitting here. fit_s: from when to when, by `t`, the arm moves freely; default: the
-    first 40 %. A touch in it is learnt. velocity_lag_s: by how much dq is older than tau_J, as behind a tracking loop;
-    1.25e-3 of the emulated drives. scheme: `OfflineSettings` by name, such as detection_cutoff_rad_s=20.0,
-    deviations=6.0, noise_Nm=(0.02, 0.02); noise that isn't given is estimated from the arrays.
+    model: of `fit`, instead of a fit here. fit_s: span of `t` in which the arm moves freely; default: the first 40 %. A
+    touch in it is learnt. velocity_lag_s: time by which dq is older than tau_J, as behind a tracking loop; 1.25e-3 for
+    the emulated drives. scheme: `OfflineSettings` by name, such as detection_cutoff_rad_s=20.0, deviations=6.0,
+    noise_Nm=(0.02, 0.02); the default noise is estimated from the arrays.
 
-    Raises ArrayError, a ValueError, for what can't be used, in one line: quantity, value, bound.
+    Raises ArrayError, a ValueError, for unusable input, in one line: quantity, value, bound.
     """
     given = _taken(arrays, arm, velocity_lag_s)
     recording, begin_s = given.recording, given.begin_s
@@ -249,7 +249,7 @@ def detect(
 
 
 def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
-    """Give arrays by their own names. Raises ArrayError for one that is unknown, missing or given twice."""
+    """Return the arrays by their canonical names. Raises ArrayError for one that is unknown, missing or given twice."""
     named: dict[str, ArrayLike] = {}
     for given, values in arrays.items():
         name = _ALIASES.get(given, given)
@@ -307,7 +307,7 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
 
 
 def _numbers(name: str, given: ArrayLike) -> Vector:
-    """Take finite float64 values. Raises ArrayError."""
+    """Convert to finite float64 values. Raises ArrayError."""
     try:
         values = np.asarray(given)
         if values.dtype.kind not in "fiu":
@@ -325,7 +325,7 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
 
 
 def _span(given: _GivenArrays, fit_s: tuple[float, float] | None) -> tuple[float, float]:
-    """Give the stretch of free motion in the recording's time, from 0. Raises ArrayError."""
+    """Return the span of free motion in the recording's time, from 0. Raises ArrayError."""
     if fit_s is None:
         last = given.recording.stretches[-1]
         return 0.0, FIT_SHARE * (last.start_s + len(last.record.q) * given.recording.period_s)
@@ -339,7 +339,7 @@ def _span(given: _GivenArrays, fit_s: tuple[float, float] | None) -> tuple[float
 
 
 def _described(arm: OfflineArm, has_dq: bool, scheme: Mapping[str, Any]) -> RecordingMap:
-    """Describe arrays as a map does a file. Raises ArrayError for a setting of the scheme that can't be."""
+    """Return a map for arrays, as for a file. Raises ArrayError for an invalid setting of the scheme."""
     names = tuple(f"{place}" for place in range(1, arm.joints + 1))
     plain = {key: list(value) if isinstance(value, tuple | np.ndarray) else value for key, value in scheme.items()}
     try:

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from adacd_hil.scheme.identify.certificate import Certificate
 
 _TOPICS: Final = ("/scheme", "/control", "/cycle")
-"""Each has a record per cycle."""
+"""Topics with a record per cycle."""
 _READ: Final = (*_TOPICS, "/contact", "/events")
 
 
 class RunEvent(NamedTuple):
-    """An event: when, s since motion start; level: "info", "warning" or "error"."""
+    """An event: time, s since motion start; level: "info", "warning" or "error"."""
 
     t_s: float
     level: str
@@ -39,7 +39,7 @@ class RunEvent(NamedTuple):
 
 
 class RunContact(NamedTuple):
-    """A contact: when it was detected, s since motion start, and its last report."""
+    """A contact: time of detection, s since motion start, and its last report."""
 
     t_s: float
     report: ContactReport
@@ -52,12 +52,12 @@ class RunContact(NamedTuple):
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A run over its n cycles; in a cut log, those that all of its topics have.
+    """A run of n cycles; of a cut log, the cycles that all of its topics have.
 
-    arrays: read-only, by the names that `adacd-hil log info` and `records.py` give them, each (n,) or (n, columns):
-    `q`, `dq` (rad, rad/s), `tau_J`, `tau_ext_hat`, `threshold` (Nm), `theta_hat`, `tau_d`, `tau_c`, `state`,
-    `lateness_ns` and so on, and `t_s`. Times are s since motion start, the first cycle in ADAPT, else since the first
-    cycle. problem: what is missing of the log, "" for a whole one.
+    arrays: read-only, by the names of `adacd-hil log info` and `records.py`, each (n,) or (n, columns): `q`, `dq` (rad,
+    rad/s), `tau_J`, `tau_ext_hat`, `threshold` (Nm), `theta_hat`, `tau_d`, `tau_c`, `state`, `lateness_ns` and so on,
+    and `t_s`. Times are s since motion start, the first cycle in ADAPT, else since the first cycle. problem: defect of
+    the log, "" for a whole one.
     """
 
     path: Path
@@ -75,7 +75,7 @@ class LoadedRun:
         return f"<LoadedRun {self.path}: {', '.join(found)}, {certified}{'; ' + self.problem if self.problem else ''}>"
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Give an array by its name. Raises KeyError that names the nearest."""
+        """Return an array by its name. Raises KeyError that names the nearest."""
         if name not in self.arrays:
             near = nearest_name(name, self.arrays)
             hint = f"did you mean {near!r}?" if near else f"there are {', '.join(self.arrays)}"
@@ -100,26 +100,26 @@ class LoadedRun:
 
     @property
     def motion(self) -> dict[str, Vector]:
-        """What `detect` takes: `t` (n,) s, `q`, `dq`, `tau_J` (n, 2)."""
+        """Arrays for `detect`: `t` (n,) s, `q`, `dq`, `tau_J` (n, 2)."""
         return {"t": self.t_s, **{name: self.arrays[name] for name in ("q", "dq", "tau_J")}}
 
     @cached_property
     def certificates(self) -> "tuple[Certificate, ...]":
-        """The certificates that were not taken back, in order; none in a log that lacks its end."""
+        """Certificates that were not taken back, in order; () in a log without its end."""
         return tuple(certificates_in((event.name, event.message) for event in self.events))
 
     @property
     def certificate(self) -> "Certificate | None":
-        """The last certificate."""
+        """The last certificate; None without one."""
         return self.certificates[-1] if self.certificates else None
 
     @cached_property
     def settings(self) -> Settings:
-        """The settings that the run had. Raises LogError where the log lacks them."""
+        """Settings of the run. Raises LogError if the log lacks them."""
         return settings_of(self.path, self.attachments)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Give a column for each number of a cycle: `q_1`, `q_2`; `state` by name."""
+        """Return a column for each number of a cycle: `q_1`, `q_2`; `state` by name."""
         found: dict[str, NDArray[Any]] = {}
         for name, values in self.arrays.items():
             if values.ndim == 1:
@@ -130,7 +130,7 @@ class LoadedRun:
         return found
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """Make a data frame of `columns`, the index `t_s`. Raises ImportError that says how to install pandas."""
+        """Make a data frame of `columns`, the index `t_s`. Raises ImportError with the command that installs pandas."""
         try:
             import pandas
         except ImportError:
@@ -138,7 +138,7 @@ class LoadedRun:
         return pandas.DataFrame(self.columns()).set_index("t_s")
 
     def to_polars(self) -> "polars.DataFrame":
-        """Make a data frame of `columns`. Raises ImportError that says how to install polars."""
+        """Make a data frame of `columns`. Raises ImportError with the command that installs polars."""
         try:
             import polars
         except ImportError:
@@ -149,8 +149,8 @@ class LoadedRun:
 def load(run: str | Path) -> LoadedRun:
     """Read the log of a run: a folder with run.mcap, or the log's first part; all its parts as one.
 
-    A cut or damaged log is read as far as it is intact, see `problem`. Raises LogError, one line, where nothing can be
-    read or the log has no cycle.
+    A cut or damaged log is read as far as it is intact, see `problem`. Raises LogError, in one line, if it can't be
+    read or has no cycle.
     """
     path = log_in(run)
     log = read_log(path, _READ)
@@ -173,7 +173,7 @@ def load(run: str | Path) -> LoadedRun:
 
 
 def _arrays(log: RunLog) -> dict[str, NDArray[Any]]:
-    """Give the fields of all topics of a cycle, in rows of the cycles that all of them have."""
+    """Return the fields of all topics of a cycle, for the cycles that all topics have."""
     if not len(log.scheme):
         raise LogError(f"log {log.path} has no cycle" + (f": {log.problem}" if log.problem else ""))
     series = [log.topics[topic] for topic in _TOPICS if len(log.topics[topic])]
@@ -194,7 +194,7 @@ def _in_order(events: Iterable[LoggedEvent]) -> list[LoggedEvent]:
 
 
 def _contacts(contacts: Iterable[LoggedContact], zero_ns: int) -> Iterator[RunContact]:
-    """Give each contact once: when it was first reported, and its last report."""
+    """Yield each contact once: the time of its first report, and its last report."""
     found: dict[int, RunContact] = {}
     for t_ns, report in contacts:
         first = found.get(report.cycle)

@@ -18,10 +18,10 @@ from typing import NamedTuple
 from adacd_hil.lab.live.live_setup import LiveSetup
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""Two names of what is the same on the wire: of the viewers since 2025, and of the ones before."""
+"""Two names of one protocol on the wire: of viewers since 2025, and of earlier ones."""
 OPEN_TIMEOUT_S = 5.0
 SHOWN_DATA, SHOWN_HEAD = 1, struct.Struct("<BIQ")
-"""What a message to a viewer begins with: SHOWN_DATA, number of its subscription, log time in ns."""
+"""Head of a message to a viewer: SHOWN_DATA, number of its subscription, log time in ns."""
 VIEWER_ORIGINS = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "file://")
 """Foxglove's pages, and `file://`, which the desktop applications of Foxglove and Lichtblick send."""
 _OWN_PAGE = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d{1,5})?")
@@ -61,7 +61,7 @@ NOTICES = tuple(refusal.notice for refusal in (_ORIGIN, _HOST, _PROTOCOL, FULL))
 
 
 def normal_origin(origin: str) -> str:
-    """Return an origin as browsers write it. Raises ValueError for what is none."""
+    """Return an origin as browsers write it. Raises ValueError if it isn't one."""
     found = re.fullmatch(r"([a-z][a-z0-9+.-]*://[^/\s@]*)/?", origin.lower())
     if not found:
         raise ValueError(f"{origin!r} is no origin: scheme, host and port, such as https://view.lab.example")
@@ -72,7 +72,7 @@ class Admission:
     """The rules of one run."""
 
     def __init__(self, setup: LiveSetup) -> None:
-        """Take in what `setup` allows beside the viewers' own pages and this machine's own names."""
+        """Allow the origins and names of `setup`, besides the viewers' own pages and this machine's own names."""
         self._origins = {*VIEWER_ORIGINS, *map(normal_origin, setup.origins)}
         own = socket.gethostname().lower()
         short = own.partition(".")[0]

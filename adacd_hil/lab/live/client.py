@@ -1,4 +1,4 @@
-"""A client of the live view: subscribes to what it serves and takes in the messages.
+"""A client of the live view: subscribes to all advertised channels and receives their messages.
 
 Foxglove WebSocket protocol: the server advertises channels as JSON; a message is 1, the subscription's number (uint32),
 the log time in ns (uint64), then the payload, little endian. https://github.com/foxglove/ws-protocol
@@ -58,7 +58,7 @@ class LiveClient:
         self._wait()
 
     def _wait(self) -> None:
-        """Take in what comes until the subscriptions are in force."""
+        """Receive messages until the subscriptions are in force."""
         clock = MonotonicClock()
         end_ns = clock.now_ns() + round(OPEN_TIMEOUT_S * 1e9)
         while not self._waiting or self._waiting[-1].topic != DESCRIPTION_TOPIC:
@@ -91,7 +91,7 @@ class LiveClient:
         return None
 
     def _obey(self, word: dict[str, Any]) -> None:
-        """Subscribe to what is advertised; last to the description, which is the answer that all of it is in force."""
+        """Subscribe to the advertised channels, last to the description: its message shows that all are in force."""
         if word["op"] != "advertise":
             return
         last: dict[str, int] | None = None

@@ -114,7 +114,7 @@ class LiveFeed:
         try:
             self._ring = Ring(RING_BYTES)
             descriptors = (theirs.fileno(), self._ring.descriptor)
-            # Whatever its libraries might say of what a viewer sent stays away from the run's terminal.
+            # Its libraries may print text from viewers, which must not reach the run's terminal.
             notices = os.dup(2)
             try:
                 self.process = start_module(
@@ -147,11 +147,11 @@ class LiveFeed:
 
     @property
     def is_watched(self) -> bool:
-        """Whether somebody is there to see what is shown."""
+        """Whether a viewer is connected."""
         with contextlib.suppress(BlockingIOError, ConnectionResetError):
             while word := self._socket.recv(processes.MOST_BYTES):
                 self._is_watched = word == processes.WATCHED
-            self._is_watched = False  # nobody is left
+            self._is_watched = False  # the view's process has closed its socket
         return self._is_watched
 
     @property
@@ -169,7 +169,7 @@ class LiveFeed:
         """Hand over message records that follow each other, of which the other side shows some; see Batch."""
         if not len(ends) or not self.is_watched:
             return
-        if not self._ring.put(pack_batch(Batch(records, channels, log_ns, ends))):
+        if not self._ring.put_packet(pack_batch(Batch(records, channels, log_ns, ends))):
             self.hidden += 1
             return
         self._say(processes.WAKE)
@@ -179,7 +179,7 @@ class LiveFeed:
             self._socket.send(word)
 
     def close(self) -> None:
-        """Let it send what it has, and end, in its own time."""
+        """Ask the view's process to send the rest and end; don't wait for it."""
         self._say(processes.END)
         self._release()
 
@@ -221,7 +221,7 @@ class Decimator:
 
 _PUBLISH_TIME = slice(MESSAGE_HEAD - 8, MESSAGE_HEAD)
 _BODY = len(ENCAPSULATION) + 8
-"""Where a body begins in a payload, bytes: after the stamp."""
+"""Offset of a body in a payload, bytes: after the stamp."""
 
 
 class Shown(NamedTuple):
@@ -262,7 +262,7 @@ class LiveTopics:
         return Shown(self.robot, self.latest_ns, self._description)
 
     def choose(self, batch: Batch, wanted: Collection[int]) -> Iterator[Shown]:
-        """Give what is shown of a batch, in its order, on the channels that somebody wants."""
+        """Yield the records of a batch to show, in its order, on the channels that viewers have subscribed to."""
         if not len(batch.ends):
             return
         self.latest_ns = max(self.latest_ns, int(batch.log_ns.max()))

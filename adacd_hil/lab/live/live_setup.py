@@ -1,4 +1,4 @@
-"""What the live view serves, where, and to whom."""
+"""Setup of the live view: address, admitted viewers, the arm to draw."""
 
 from dataclasses import dataclass
 
@@ -7,10 +7,10 @@ from adacd_hil.log.log_files import MOST_VIEWERS
 
 @dataclass(frozen=True)
 class LiveSetup:
-    """Where the live view is served (port 0: any that is free), and the arm that it draws.
+    """Address of the live view (port 0: any free one), and the arm that it draws.
 
     robot_description: a URDF. tilt_rad: of the plane of motion. level_rad: the q1 at which link 1 is level. origins,
-    names: of web pages that may watch, and of this machine, beside those of lab/live/admission.py. most_viewers: at
+    names: of web pages that may watch, and of this machine, besides those of lab/live/admission.py. most_viewers: at
     a time.
     """
 

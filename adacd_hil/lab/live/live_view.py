@@ -21,7 +21,7 @@ class LiveView(LiveSetup):
 
 
 class LiveAddress(NamedTuple):
-    """Where the live view is served, and to whom; port 0: any that is free. The rest as in LiveSetup."""
+    """Address and admitted viewers of the live view; port 0: any free one. The rest as in LiveSetup."""
 
     host: str
     port: int

@@ -27,7 +27,7 @@ SCENE = foreign_type("foxglove_msgs/msg/SceneUpdate")
 
 
 class Transform(NamedTuple):
-    """Where the frame `child` is in the frame `parent`."""
+    """Pose of the frame `child` in the frame `parent`."""
 
     parent: str
     child: str
@@ -62,7 +62,7 @@ class Label(NamedTuple):
 
 
 class Entity(NamedTuple):
-    """What moves with one frame; it replaces the entity of the same name. `lifetime_ns` 0: until then."""
+    """Shapes that move with one frame; they replace the entity of the same name. `lifetime_ns` 0: until then."""
 
     name: str
     frame: str

@@ -57,14 +57,14 @@ OPENING = 64
 """Connections beyond the viewers, such as those that are still opening; further ones are dropped at once."""
 PING_S = 20.0
 LINGER_S = 1.0
-"""How long it outlives the log at most: for what it still has to send."""
+"""Longest time after the log's end in which the server sends the rest."""
 _MOST_REQUEST_BYTES = 64 * 1024
 _SUBSCRIPTIONS_PER_TOPIC = 4
 _AT_ONCE_BYTES = 256 * 1024
 _TIME = struct.Struct("<BQ")
 _TIME_DATA = 2
 _TIME_STEP_NS = 10_000_000
-"""Time is sent again after so much of it: viewers stamp what they receive with the latest."""
+"""Interval between time messages: viewers stamp received messages with the latest time."""
 _WARNING, _ERROR = 1, 2
 _POLICY_VIOLATION = 1008
 
@@ -72,7 +72,7 @@ Data = str | bytes
 
 
 class Viewer:
-    """A connection, what it has subscribed to, and what waits for it."""
+    """A connection, its subscriptions, and the messages waiting for it."""
 
     def __init__(self, connection: ServerConnection) -> None:
         self.subscriptions: dict[int, int] = {}
@@ -98,7 +98,7 @@ class Viewer:
             self.put(_message(number, shown))
 
     def warn_once(self, text: str) -> None:
-        """Say what it asks for in vain."""
+        """Send the viewer one warning about a request that isn't supported."""
         if not self._is_warned:
             self._is_warned = True
             self.put(_status(_WARNING, text))
@@ -109,7 +109,7 @@ class Viewer:
         return not self._waiting
 
     async def send_all(self) -> None:
-        """Send what waits, for ever."""
+        """Send waiting messages forever."""
         while True:
             await self._has_some.wait()
             self._has_some.clear()
@@ -140,7 +140,7 @@ class LiveServer:
         self._notices: int | None = None
 
     async def run(self, listening: socket.socket, notices: int | None = None) -> None:
-        """Serve until the writer says that it is over, or is gone. `notices`: descriptor of the run's terminal."""
+        """Serve until the writer ends or dies. `notices`: descriptor of the run's terminal."""
         self._notices = notices
         loop = asyncio.get_running_loop()
         server = await serve(
@@ -181,8 +181,8 @@ class LiveServer:
         self._show_some()
 
     def _show_some(self) -> None:
-        """Show a part of what waits in the ring; the rest after the viewers had their turn."""
-        data = self._ring.take(_AT_ONCE_BYTES)
+        """Show a part of the packets in the ring; the rest after the viewers had their turn."""
+        data = self._ring.take_packets(_AT_ONCE_BYTES)
         for start, size in zip(*(numbers.tolist() for numbers in split(data)), strict=True):
             self._show(data[start : start + size])
         if self._ring.waiting:
@@ -272,7 +272,7 @@ class LiveServer:
         }
 
     def _obey(self, viewer: Viewer, data: Data) -> bool:
-        """Do what a viewer asks; False when it asks for too much."""
+        """Carry out a viewer's request; False if it asks for too much."""
         try:
             word = json.loads(data) if isinstance(data, str) else {}
             op = word.get("op") if isinstance(word, dict) else None
@@ -312,7 +312,7 @@ class LiveServer:
         self._tell_writer()
 
     async def _end(self, server: Server) -> None:
-        """Listen no more; send what is left, for a moment, and part."""
+        """Stop listening; send the rest for a moment, then close."""
         for listening in server.sockets:  # before it closes: asyncio drops, unclosed, whom it accepts while it does
             asyncio.get_running_loop().remove_reader(listening)
         server.close(close_connections=False)
@@ -355,7 +355,7 @@ def _status(level: int, text: str) -> str:
 
 
 def _page(connection: ServerConnection, host: str) -> Response:
-    """Tell a browser what connects here; `host` is what it asked for, and was admitted."""
+    """Answer a browser with a page that names viewers for this address; `host`: requested and admitted."""
     page = Template(_PAGE.read_text(encoding="utf-8")).substitute(url=f"ws://{html.escape(host)}")
     response = connection.respond(HTTPStatus.OK, page)
     del response.headers["Content-Type"]  # headers may be there twice
@@ -372,7 +372,7 @@ _PAGE = Path(__file__).with_name("live_page.html")
 
 
 def _no_logger() -> logging.Logger:
-    """Return one that formats nothing: what strangers send can be much."""
+    """Return a logger that formats nothing, since strangers may send much."""
     logger = logging.getLogger("adacd_hil.live")
     logger.disabled = True
     return logger
@@ -403,7 +403,7 @@ async def _serve(
 
 
 def main(socket_descriptor: int, ring_descriptor: int, notices: int) -> None:
-    """Serve: say where, show what comes, end with the writer."""
+    """Serve the live view: report the address, show packets, end with the writer."""
     writer = socket.socket(fileno=socket_descriptor)
     told: ServerSetup = read_setup()
     with contextlib.suppress(OSError):

@@ -1,1 +1,1 @@
-"""Recordings of arms that others made."""
+"""Identification from recordings of other arms: import, map, fit, verdict."""

@@ -1,6 +1,6 @@
 """A recording in an MCAP file or a rosbag: sensor_msgs/JointState of any number of joints, found by their names.
 
-Messages of other joints, as of a gripper that publishes on the same topic, are passed over.
+Messages of other joints, as of a gripper that publishes on the same topic, are skipped.
 """
 
 import math
@@ -17,9 +17,9 @@ from adacd_hil.settings.schema import ConfigError
 
 
 def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
-    """Read positions, efforts and, where all messages have them, velocities.
+    """Read positions, efforts and, if all messages have them, velocities.
 
-    Raises LogError when the bag can't be read or has no efforts, ConfigError when it lacks a topic or a joint.
+    Raises LogError if the bag can't be read or has no efforts, ConfigError if it lacks a topic or a joint.
     """
     wanted = described.columns.q or described.urdf.joint_names
     with opened_bag(path) as bag:
@@ -41,7 +41,7 @@ def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
-    """Choose the topic. Raises ConfigError."""
+    """Return the topic to read: the wanted one, else the only one of JointState. Raises ConfigError."""
     found = joint_state_topics(topics)
     if wanted:
         if wanted in found:
@@ -53,12 +53,12 @@ def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
         there = ", ".join(f"{topic} ({kind})" for topic, kind in list(topics.items())[:6]) or "no topic at all"
         raise ConfigError(f"recording {path} has no topic of {TYPE}; it has {there}")
     if len(found) > 1 and JOINT_STATES not in found:
-        raise ConfigError(f"recording {path} has joint states on {', '.join(found)}: `bag.topic` says which")
+        raise ConfigError(f"recording {path} has joint states on {', '.join(found)}: choose one by `bag.topic`")
     return JOINT_STATES if JOINT_STATES in found else found[0]
 
 
 class _States:
-    """Finds the joints in each message, in whatever order it names them."""
+    """Finds the wanted joints in each message, whatever their order in it."""
 
     def __init__(self, path: Path, topic: str, wanted: tuple[str, ...]) -> None:
         self.has_velocities = True
@@ -70,7 +70,7 @@ class _States:
         self._lacks_effort: set[str] = set(wanted)
 
     def read(self, number: int, message: JointStateMessage, into: RecordedRows) -> list[float] | None:
-        """Return positions, efforts and velocities of the joints that are wanted; None where they aren't in it."""
+        """Return positions, efforts and velocities of the wanted joints; None if the message lacks them."""
         self._messages += 1
         places = self._places.setdefault(message.names, self._find(message.names))
         if places is None:
@@ -94,7 +94,7 @@ class _States:
         return row
 
     def check(self, is_stamped: bool) -> None:
-        """Refuse a topic without the joints, without efforts, or without stamps. Raises LogError, ConfigError."""
+        """Raise LogError or ConfigError if the topic lacks the joints, efforts or stamps."""
         if not self._messages:
             raise LogError(f"{self._where} has no messages")
         if all(places is None for places in self._places.values()):
@@ -110,7 +110,7 @@ class _States:
             raise ConfigError(f"{self._where} has no joint {lacking!r}; {known} (`columns.q` names them)")
         if self._taken and self._lacks_effort:
             names = ", ".join(name for name in self._wanted if name in self._lacks_effort)
-            raise LogError(f"{self._where} has no effort of {names}: without a torque nothing can be explained")
+            raise LogError(f"{self._where} has no effort of {names}: torques are needed")
         if is_stamped and self._taken and not self._has_stamps:
             raise ConfigError(f'{self._where}: all stamps are 0; `bag.time` = "received" takes when it was recorded')
 

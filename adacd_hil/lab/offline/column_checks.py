@@ -1,8 +1,8 @@
-"""What the columns of a recording show before anything is fitted: constant, stuck, clipped, in another unit.
+"""Checks of a recording's columns before any fit: constant, stuck, clipped, noise, wrong unit or sign.
 
-A sensor that is dead, or a column that was never filled in, reads always the same. One that is stuck reads the same for
-a while in which its joint moves. One that is clipped stays at its largest reading far longer than just below it.
-Velocities are compared with the slope of the positions, positions and torques with the limits of the URDF.
+A dead sensor, or a column that was never filled in, always has the same value. A stuck one has the same value for a
+while in which its joint moves. A clipped one stays at its largest value far longer than just below it. Velocities are
+compared with the slope of the positions, positions and torques with the limits of the URDF.
 """
 
 import math
@@ -20,48 +20,50 @@ from adacd_hil.score.wording import number_of
 
 _STUCK_S: Final = 0.5
 _STUCK_TRAVEL: Final = 0.2
-"""Of its whole travel, that a joint makes while a torque that is stuck reads the same."""
+"""Share of its whole travel that a joint makes during equal readings of a stuck torque."""
 _STUCK_TIMES: Final = 5.0
-"""Longer than 99 % of the other runs of equal readings: coarse sensors have long ones."""
+"""Factor on the 99 % quantile of the other runs of equal readings: coarse sensors have long ones."""
 _CLIPPED_SHARE, _CLIPPED_ROWS, _CLIPPED_RUN = 0.005, 10, 5
 _CLIPPED_BAND: Final = 0.05
-"""Of the span below the largest reading, which a clipped sensor passes in less time than it stays at the bound."""
+"""Band below the largest reading, share of the span: a clipped sensor spends less time in it than at the bound."""
 _PLATEAU_SIGMAS: Final = 3.5
 _PLATEAU_WIDTH: Final = 0.1
 _PLATEAU_SHARE, _PLATEAU_TIMES = 0.02, 4.0
 """A sine stays at its crest for 2.4 times as long as just below it."""
 _FEWEST_LEVELS, _FINE_LEVELS = 50, 200
-"""Of a sensor whose largest reading says anything, and of one that a sine leaves sooner, to half the time."""
+"""Fewest distinct readings of a sensor for the check, and readings from which half the time at a bound suffices."""
 STILL_RAD: Final = 0.01
-"""A joint that travels less is at rest."""
+"""Travel below which a joint is at rest."""
 _SPIKE_WINDOW, _SPIKE_SIGMAS, _SPIKE_SPAN, _SPIKES_SHARE = 5, 30.0, 1.0, 0.005
-"""Samples around one, its distance to their median by noise and by the usual span, and the most of all samples."""
+"""Samples around one; its least distance to their median, by noise and by the usual span; largest share of spikes."""
 _NOISE_STEP: Final = 0.5
-"""Mean square of the steps from sample to sample over twice the variance: 1 of white noise, 0.01 of a motion of 1 Hz at
-50 Hz."""
+"""Mean square of the steps from sample to sample over twice the variance: 1 for white noise, 0.01 for a motion of 1 Hz
+at 50 Hz."""
 _NOISE_PERIOD_S: Final = 0.02
-"""At longer periods a fast motion has such steps, too."""
+"""Longest period for that check: at longer ones a fast motion has such steps, too."""
 _TURNS_THOUGH_STILL_RAD: Final = 0.3
-"""Travel by the velocities, of a joint at rest, that neither their noise nor their offset makes."""
+"""Travel by the velocities, for a joint at rest by its positions, that velocity noise and offset can't explain."""
 _WELL_CORRELATED: Final = 0.8
 _SAME_SLOPE: Final = (0.8, 1.25)
 _BEYOND_LIMITS: Final = 3.0
-"""Times the limits of a joint: no arm goes there, but degrees taken for radians are 57 times."""
+"""Factor on the limits of a joint: no arm goes there, but degrees read as radians are 57 times too large."""
 _BEYOND_EFFORT: Final = 30.0
-"""Times the effort of the URDF: mNm taken for Nm are 1000 times."""
+"""Factor on the effort of the URDF: mNm read as Nm are 1000 times too large."""
 
 CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 
 
-class ColumnFinding(NamedTuple):
-    """What is wrong with columns, and the next thing to do.
+class RecordingFinding(NamedTuple):
+    """A finding on a recording, and the user's next step; "" if none is needed.
 
-    is_dead: no model can be made of it. is_wrong: no model of it is worth anything, if no other reading is found. What
-    is neither may be why nothing fits.
+    is_against: a reason why the torque isn't explained; else a remark. Of columns: is_dead: no model can be fitted.
+    is_wrong: a fitted model is worthless, unless another interpretation of the map is found. With neither, the defect
+    is a possible reason of a bad fit.
     """
 
     text: str
-    remedy: str
+    remedy: str = ""
+    is_against: bool = True
     is_dead: bool = False
     is_wrong: bool = False
 
@@ -78,8 +80,8 @@ class _Columns(NamedTuple):
 
 def find_faults(
     described: RecordingMap, fitted: Sequence[ForeignRecording], tested: ForeignRecording
-) -> tuple[ColumnFinding, ...]:
-    """List what the columns of what is fitted and tested show."""
+) -> tuple[RecordingFinding, ...]:
+    """Return the defects of the columns of the fitted and the tested recordings."""
     recordings = [*fitted, tested]
     stretches = [stretch for recording in recordings for stretch in recording.stretches]
     period_s = recordings[0].period_s
@@ -98,26 +100,26 @@ def find_faults(
 
 
 def joined_names(names: list[str], count: int) -> str:
-    """Join the names of some of so many joints."""
+    """Join the names of some joints; "all joints" if these are all of `count`."""
     if len(names) == count > 2:
         return "all joints"
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def column_name(described: RecordingMap, key: str, joint: int) -> str:
-    """Name a joint with its column."""
+    """Return a joint's name with its column."""
     name, columns = described.urdf.joint_names[joint], getattr(described.columns, key)
     return f"{name} ({columns[joint]})" if columns and columns[joint] != name else name
 
 
-def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     n = described.joints
     constant = [joint for joint in range(n) if np.ptp(columns.tau_J[:, joint]) == 0.0]
     if constant:
         names = joined_names([column_name(described, "tau_J", joint) for joint in constant], n)
         always = ", ".join(dict.fromkeys(f"{columns.tau_J[0, joint] + 0.0:g}" for joint in constant))
-        yield ColumnFinding(
-            f"the torque of {names} is always {always} Nm: a dead sensor, or a column that nobody filled in",
+        yield RecordingFinding(
+            f"the torque of {names} is always {always} Nm: a dead sensor, or an empty column",
             "check that sensor, and `columns.tau_J`",
             is_dead=True,
         )
@@ -126,13 +128,13 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFi
         run = _stuck_run(torque, columns.q, columns.period_s)
         if run is not None:
             seconds, start_s = (run[1] - run[0]) * columns.period_s, columns.time_s[run[0]]
-            yield ColumnFinding(
+            yield RecordingFinding(
                 f"the torque of {name} is stuck at {torque[run[0]]:g} Nm for {seconds:.2g} s, from {start_s:.4g} s on, "
                 "while the arm moves",
                 "leave that time out with --from and --until, and check the sensor",
             )
         if bounds := list(_clipped_at(torque)):
-            yield ColumnFinding(
+            yield RecordingFinding(
                 f"the torque of {name} is clipped at {' and '.join(f'{bound:g}' for bound in bounds)} Nm",
                 CLIPPED_REMEDY,
             )
@@ -140,18 +142,18 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFi
 
 
 def largest_torques(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
-    """Return the largest torque (n,) of each joint, but for outliers, and its effort (n,): inf where unknown."""
+    """Return the largest torque (n,) of each joint, without outliers, and its effort (n,), inf where unknown."""
     effort = np.where(np.isfinite(arm.torque_limit) & (arm.torque_limit > 0.0), arm.torque_limit, np.inf)
     return np.nanquantile(np.abs(tau_J), 0.99, axis=0), effort
 
 
-def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     largest, effort = largest_torques(columns.tau_J, described.urdf)
     is_over = largest > _BEYOND_EFFORT * effort
     if "A" in described.units.tau_J or not is_over.any():
         return
     joint = int(np.argmax(largest / effort))
-    yield ColumnFinding(
+    yield RecordingFinding(
         f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest[joint]:.3g} Nm, the URDF allows "
         f"{effort[joint]:g} Nm",
         f"if the torques are mNm: {_unit_or_scale(described, 'tau_J', 'mNm', 1e-3, is_over | np.isinf(effort))}",
@@ -160,7 +162,7 @@ def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[Colu
 
 
 def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, is_meant: NDArray[np.bool_]) -> str:
-    """Name the key that gives all joints another unit, or some of them."""
+    """Return the map's key that changes the unit of all joints, or the scale of some."""
     if is_meant.all():
         return f'`units.{key}` = "{unit}", which the map has as "{getattr(described.units, key)}"'
     scale = np.array(getattr(described.scale, key) or (1.0,) * described.joints)
@@ -168,17 +170,17 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
     return f"`scale.{key}` = [{', '.join(f'{value:.6g}' for value in values)}]"
 
 
-def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
+def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     n, urdf = described.joints, described.urdf
     travel = np.ptp(columns.q, axis=0)
     still = [joint for joint in range(n) if travel[joint] < STILL_RAD]
     if len(still) == n:
-        yield ColumnFinding("the arm does not move", "record motion of every joint, fast and slow", is_dead=True)
+        yield RecordingFinding("the arm does not move", "record motion of every joint, fast and slow", is_dead=True)
     at_rest: list[int] = []
     for joint in still if len(still) < n else ():
         turned = float(np.ptp(np.cumsum(columns.dq[:, joint]))) * columns.period_s
         if turned > _TURNS_THOUGH_STILL_RAD:
-            yield ColumnFinding(
+            yield RecordingFinding(
                 f"the position of {column_name(described, 'q', joint)} {_stays(columns.q[:, joint])}, though by its "
                 "velocity it turns: a dead encoder",
                 "check that encoder, and `columns.q`",
@@ -188,17 +190,17 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
             at_rest.append(joint)
     if at_rest:
         names = joined_names([column_name(described, "q", joint) for joint in at_rest], n)
-        said = f"the position of {names} {_stays(columns.q[:, at_rest[0]])}: a dead encoder, or a joint"
+        text = f"the position of {names} {_stays(columns.q[:, at_rest[0]])}: a dead encoder, or a joint"
         if len(at_rest) > 1:
-            said = f"the positions of {names} change by less than {STILL_RAD:g} rad: dead encoders, or joints"
-        yield ColumnFinding(
-            f"{said} at rest, of which neither friction nor inertia can be learnt",
+            text = f"the positions of {names} change by less than {STILL_RAD:g} rad: dead encoders, or joints"
+        yield RecordingFinding(
+            f"{text} at rest, of which neither friction nor inertia can be learnt",
             "move every joint, name one that never moves in `arm.locked`, and check `columns.q`",
         )
     noise = [joint for joint in range(n) if joint not in still and _is_noise(columns.q[:, joint], columns.period_s)]
     if noise:
         names = joined_names([column_name(described, "q", joint) for joint in noise], n)
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"the position of {names} is noise: from sample to sample it jumps as far as it goes at all",
             "check that encoder, and `columns.q`",
             is_dead=True,
@@ -213,7 +215,7 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Column
     for joint in np.flatnonzero(is_beyond)[:1].tolist():
         much = f"goes to {reach[joint]:.3g} rad" if goes_far[joint] else f"turns at {speed[joint]:.3g} rad/s"
         most = f"{bound[joint]:.3g} rad" if goes_far[joint] else f"{limit[joint]:g} rad/s"
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
             f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
         )
@@ -223,13 +225,13 @@ def _stays(column: Vector) -> str:
     return f"changes by less than {STILL_RAD:g} rad" if np.ptp(column) else f"is always {column[0]:g} rad"
 
 
-def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFinding]:
-    """Name single samples that are far from their neighbours, as of a frame that was read wrong."""
+def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
+    """Report single samples far from their neighbours, as of a corrupted frame."""
     for key, what, unit in (("tau_J", "torque", "Nm"), ("q", "position", "rad")):
         for joint, column in enumerate(getattr(columns, key).T):
             rows = _spikes(column)
             if len(rows):
-                yield ColumnFinding(
+                yield RecordingFinding(
                     f"the {what} of {column_name(described, key, joint)} jumps for single samples, "
                     f"{number_of(len(rows), 'time')}, first to {column[rows[0]]:.4g} {unit} at "
                     f"{columns.time_s[rows[0]]:.4g} s",
@@ -238,7 +240,7 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[ColumnFin
 
 
 def _spikes(column: Vector) -> NDArray[np.int64]:
-    """List the samples that are spikes, if they are few."""
+    """Return the rows of spikes, empty if there are too many to be spikes."""
     if len(column) < _SPIKE_WINDOW:
         return np.zeros(0, np.int64)
     windows = np.lib.stride_tricks.sliding_window_view(column, _SPIKE_WINDOW)
@@ -257,21 +259,21 @@ def _is_noise(column: Vector, period_s: float) -> bool:
 
 def _of_rest(
     described: RecordingMap, part: str, recordings: Sequence[ForeignRecording], still: NDArray[np.bool_]
-) -> Iterator[ColumnFinding]:
-    """Say which joints rest in the part that is fitted, or tested, though they move in the other one. still (n,)."""
+) -> Iterator[RecordingFinding]:
+    """Report joints that rest in the fitted, or the tested, part although they move in the other one. still (n,)."""
     q = np.concatenate([stretch.record.q for recording in recordings for stretch in recording.stretches])
     rests = np.ptp(q, axis=0) < STILL_RAD
     joints = np.flatnonzero(rests & ~still).tolist()
     if joints:
         names = "the arm" if rests.all() else joined_names([described.urdf.joint_names[i] for i in joints], len(rests))
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"{names} does not move in the part that is {'fitted' if part == 'fit' else 'tested'}",
             "choose what is fitted with --from and --until, and other motion for --test",
             is_dead=bool(rests.all()),
         )
 
 
-def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) -> Iterator[ColumnFinding]:
+def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) -> Iterator[RecordingFinding]:
     """Compare measured velocities with the slope of the positions."""
     n = described.joints
     products = np.zeros((n, n))
@@ -290,7 +292,7 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
     for joint in moving:
         other = int(np.argmax(np.abs(alike[joint])))
         if abs(alike[joint, joint]) < _WELL_CORRELATED < alike[joint, other]:
-            yield ColumnFinding(
+            yield RecordingFinding(
                 f"the velocity of {column_name(described, 'dq', joint)} is in the column of "
                 f"{column_name(described, 'dq', other)}",
                 "in the map: exchange them in `columns.dq`, or leave that key out: velocities are derived then",
@@ -303,7 +305,7 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
         name, factor = column_name(described, "dq", joint), float(slopes[joint])
         how = "has the other sign than" if factor < 0.0 else f"is {factor:.3g} times"
         keys = [f'`units.{key}` = "{unit}"' for key, unit in units_by_slope(described.units, abs(factor))]
-        yield ColumnFinding(
+        yield RecordingFinding(
             f"the velocity of {name} {how} its position's slope",
             f"in the map: {' or '.join([*keys, 'leave `columns.dq` out'])}: velocities are derived then",
             is_wrong=True,
@@ -312,17 +314,17 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
 
 
 def _runs(column: Vector) -> NDArray[np.int64]:
-    """List the runs of equal readings: first row, and the one after the last (r, 2)."""
+    """Return the runs of equal readings: first row, and the row after the last (r, 2)."""
     edges = np.flatnonzero(np.diff(column) != 0.0) + 1
     bounds = np.concatenate(([0], edges, [len(column)]))
     return np.column_stack([bounds[:-1], bounds[1:]])
 
 
 def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | None:
-    """Find the longest run of equal torques in which a joint moves, if it is too long for a coarse sensor. q (k, n)."""
+    """Return the longest run of equal torques in which a joint moves, if a coarse sensor can't explain it. q (k, n)."""
     runs = _runs(torque)
     lengths = runs[:, 1] - runs[:, 0]
-    lengths[np.isin(torque[runs[:, 0]], (torque.min(), torque.max()))] = 1  # of a sensor that is clipped
+    lengths[np.isin(torque[runs[:, 0]], (torque.min(), torque.max()))] = 1  # a clipped sensor, reported elsewhere
     place = int(np.argmax(lengths))
     first, last = runs[place].tolist()
     usual = float(np.quantile(np.delete(lengths, place), 0.99)) if len(lengths) > 1 else 0.0
@@ -332,10 +334,10 @@ def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | 
 
 
 def plateau(torque: Vector) -> tuple[float, float] | None:
-    """Find a bound at which a torque stays within its noise: the bound, and the share of the time; None: there is none.
+    """Return the bound at which a torque stays within its noise, and the share of time there; None without one.
 
-    The last stretch before its extreme reading, as wide as the noise, holds far more readings than the one before it.
-    A joint that overcomes nothing but friction is like that, too.
+    The last band below the extreme reading, as wide as the noise, holds far more readings than the band before it. A
+    joint that overcomes nothing but friction looks like this, too.
     """
     noise = float(MEDIAN_TO_SIGMA) * float(np.median(np.abs(np.diff(torque, 2))))
     width, span = 2.0 * _PLATEAU_SIGMAS * noise, float(np.ptp(torque))
@@ -352,7 +354,7 @@ def plateau(torque: Vector) -> tuple[float, float] | None:
 
 
 def _clipped_at(torque: Vector) -> Iterator[float]:
-    """List the bounds at which readings are cut off."""
+    """Yield the bounds at which readings are cut off."""
     levels = np.unique(torque)
     if len(levels) < _FEWEST_LEVELS:
         return

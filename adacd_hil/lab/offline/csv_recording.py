@@ -1,6 +1,6 @@
-"""A recording in a CSV file: its heads, its rows, and which key of the map a file asks for that can't be read.
+"""A recording in a CSV file: head, rows, and hints at the key of the map that would make a cell readable.
 
-A row is left out if it has fewer cells than the head, or a cell that is no number; an empty cell is a missing value. A
+A row is skipped if it has fewer cells than the head, or a cell that is no number; an empty cell is a missing value. A
 row of units below the head is compared with the map.
 """
 
@@ -42,14 +42,14 @@ _KINDS_OF_FILE: Final = (
 
 
 class CsvHead(NamedTuple):
-    """The first row: heads, none where the map says so, and the number of cells."""
+    """The first row: heads, empty if the map announces none, and the number of cells."""
 
     heads: list[str]
     cells: int
 
 
 class _Column(NamedTuple):
-    """A column that is wanted: how errors name it, its place from 0, how a cell is read, and its unit by the map."""
+    """A wanted column: name in errors, index from 0, the function that reads a cell, and its unit in the map."""
 
     name: str
     place: int
@@ -58,7 +58,7 @@ class _Column(NamedTuple):
 
 
 def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
-    """Read the columns of a map. Raises LogError when the file can't be read, ConfigError when it lacks a column."""
+    """Read the columns of a map. Raises LogError if the file can't be read, ConfigError if it lacks a column."""
     for key in ("q", "tau_J"):
         if not getattr(described.columns, key):
             raise ConfigError(f"missing key `columns.{key}`: which columns of {path}?")
@@ -80,7 +80,7 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _head(path: Path, first: list[str], described: RecordingMap) -> CsvHead:
-    while first and not first[-1].strip():  # as of a delimiter at the end of every row
+    while first and not first[-1].strip():  # a delimiter at the end of every row
         first = first[:-1]
     heads = [cell.strip() for cell in first]
     if heads:
@@ -93,7 +93,7 @@ def _head(path: Path, first: list[str], described: RecordingMap) -> CsvHead:
 
 
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
-    """List the rows with their numbers from 1; empty ones, and comments below the first, are passed over."""
+    """Yield the rows with their numbers from 1; empty ones, and comments below the first, are skipped."""
     form = described.csv
     with opened_text(path) as file:
         for _ in range(form.skip_rows):
@@ -106,7 +106,7 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
 
 @contextmanager
 def opened_text(path: Path) -> Iterator[TextIO]:
-    """Open a file of text. Raises LogError for what is of another kind, or can't be read."""
+    """Open a text file. Raises LogError if it is of another kind, or can't be read."""
     try:
         with _open_text(path) as file:
             yield file
@@ -153,15 +153,15 @@ def _columns(path: Path, head: CsvHead, described: RecordingMap) -> list[_Column
 
 
 def _time_column(path: Path, head: CsvHead, described: RecordingMap) -> _Column:
-    """Find the column of times, or one without a name where the map has a period in its place. Raises ConfigError."""
+    """Find the time column; without one, if the map gives a period, a nameless column. Raises ConfigError."""
     name, units = described.columns.time, described.units
-    read = _Times(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
+    read = _time_reader(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
     has_period = described.sampling.period_s > 0.0
     if name and not (has_period and name not in head.heads and nearest_name(name, head.heads) is None):
         try:
             return _Column(name, find_column(name, head, path), read, units.time)
         except ConfigError as error:
-            raise ConfigError(f"{error}; if it has no times, `sampling.period_s` says how far rows are apart") from None
+            raise ConfigError(f"{error}; without times, give their distance by `sampling.period_s`") from None
     if not has_period:
         raise ConfigError("missing key `columns.time`; where there are no times `sampling.period_s` is the period")
     return _Column("", 0, read, "")
@@ -189,7 +189,7 @@ class _RowReader:
         self._plain = [(column.place, column.read) for column in self._wanted]
 
     def read(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
-        """Return the numbers of a row, the time first; None, and count it, where it is left out."""
+        """Return the numbers of a row, the time first; None for a skipped row, which is counted."""
         self._rows += 1
         self._first = self._first or number
         if len(cells) < self._cells:
@@ -208,7 +208,7 @@ class _RowReader:
         return row if self._has_time else [(self._rows - 1) * self._described.sampling.period_s, *row]
 
     def _slowly(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
-        """Read a row of which a cell is no number: empty, of units, or spoilt."""
+        """Read a row with a cell that is no number: empty, a unit, or unreadable."""
         row, wrong = [], []
         for column in self._wanted:
             text = cells[column.place].strip()
@@ -228,7 +228,7 @@ class _RowReader:
         return None
 
     def _is_of_units(self, wrong: list[tuple[_Column, str]]) -> bool:
-        """Tell whether a row names units. Raises ConfigError where one is not that of the map."""
+        """Tell whether a row names units. Raises ConfigError if one differs from the map's."""
         for column, text in wrong:
             unit = unit_of(text)
             if unit and column.unit and unit != column.unit and not (column.unit == ISO):
@@ -239,7 +239,7 @@ class _RowReader:
         return not any(map(str.isdigit, "".join(text for _, text in wrong)))
 
     def _remedy(self, text: str, column: _Column) -> str:
-        """Name the key of the map with which a cell could be read."""
+        """Return a hint at the key of the map that would make a cell readable."""
         if self._described.csv.decimal == "." and text.count(",") == 1 and is_number(text, ","):
             return ', no number: `csv.decimal` = "," reads it'
         if column is self._columns[0] and is_iso_time(text):
@@ -248,36 +248,36 @@ class _RowReader:
 
 
 def read_number(text: str, decimal: str) -> float:
-    """Read a number. Raises ValueError."""
+    """Parse a number with this decimal sign. Raises ValueError."""
     return float(text.replace(",", ".") if decimal == "," else text)
 
 
-class _Times:
-    """Reads times since the first one: a count of ns since 1970 has more digits than a float."""
+def _time_reader(read: Callable[[str], Decimal], decimal: str) -> Callable[[str], float]:
+    """Return a reader of times relative to the first one: ns since 1970 have more digits than a float."""
+    first: Decimal | None = None
 
-    def __init__(self, read: Callable[[str], Decimal], decimal: str) -> None:
-        self._read, self._decimal = read, decimal
-        self._first: Decimal | None = None
-
-    def __call__(self, text: str) -> float:
+    def read_time(text: str) -> float:
+        nonlocal first
         try:
-            moment = self._read(text.strip().replace(self._decimal, "."))
+            moment = read(text.strip().replace(decimal, "."))
         except InvalidOperation:
             raise ValueError(text) from None
-        if self._first is None and moment.is_finite():
-            self._first = moment
-        return float(moment - (self._first or 0))
+        if first is None and moment.is_finite():
+            first = moment
+        return float(moment - (first or 0))
+
+    return read_time
 
 
 def _iso_seconds(text: str) -> Decimal:
-    """Read a date and time of ISO 8601, of UTC unless it says otherwise, as s since 1970."""
+    """Parse a date and time of ISO 8601, UTC unless it has an offset, as s since 1970."""
     moment = datetime.fromisoformat(text)
     since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - _EPOCH
     return since // timedelta(microseconds=1) * Decimal("1e-6")
 
 
 def is_number(text: str, decimal: str) -> bool:
-    """Tell whether a text is a number with such a sign before its decimals."""
+    """Tell whether a text is a number with this decimal sign."""
     try:
         read_number(text, decimal)
     except ValueError:

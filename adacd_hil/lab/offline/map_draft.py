@@ -1,6 +1,6 @@
-"""A map drafted from a recording and a URDF: columns by their heads or values, units by spans against the URDF.
+"""Draft of a map from a recording and a URDF: columns by their heads or values, units by spans against the URDF.
 
-What is guessed says so in the map, with the reason; `identify` names what is still wrong.
+The map marks each guess with its reason; `identify` reports wrong ones.
 """
 
 import os
@@ -25,13 +25,13 @@ from adacd_hil.settings.toml_files import toml_value
 _FINGERS: Final = re.compile(r"finger|gripper|claw|knuckle|jaw", re.IGNORECASE)
 _DEGREES: Final = 180.0 / np.pi
 _BEYOND: Final = 1.5
-"""Times the limits of the URDF, from which positions are degrees."""
+"""Factor on the limits of the URDF, from which positions are degrees."""
 _BEYOND_EFFORT: Final = 5.0
 _SEEN_MESSAGES: Final = 20_000
 
 
 class DraftedKey(NamedTuple):
-    """A key of the map, its value, and why; reason "": it is certain."""
+    """A key of the map, its value, and the reason of the guess; "" if it is certain."""
 
     section: str
     key: str
@@ -48,12 +48,12 @@ class MapDraft:
 
     @property
     def guesses(self) -> tuple[DraftedKey, ...]:
-        """The keys that are to be looked at."""
+        """The keys that the user should check."""
         return tuple(key for key in self.keys if key.reason)
 
     def text(self) -> str:
         """Write the map as TOML."""
-        lines = [f"# Drafted from {self.recording.name}: look at what is a guess."]
+        lines = [f"# Drafted from {self.recording.name}: check the guesses."]
         for section in dict.fromkeys(key.section for key in self.keys):
             lines += ["", f"[{section}]"]
             for key in (key for key in self.keys if key.section == section):
@@ -63,7 +63,7 @@ class MapDraft:
 
 
 def draft_map(recording: Path, urdf: Path, map_path: Path) -> MapDraft:
-    """Draft the map of a recording, which will stand at map_path. Raises ConfigError, LogError."""
+    """Draft the map of a recording, to be saved at map_path. Raises ConfigError, LogError."""
     arm, locked = _read_arm(urdf)
     where = Path(os.path.relpath(urdf.resolve(), map_path.resolve().parent)).as_posix()
     keys = [DraftedKey("arm", "urdf", where, "")]
@@ -74,7 +74,7 @@ def draft_map(recording: Path, urdf: Path, map_path: Path) -> MapDraft:
 
 
 def _read_arm(urdf: Path) -> tuple[SerialArm, tuple[str, ...]]:
-    """Read the arm; joints of a gripper are locked where it would branch. Raises ConfigError."""
+    """Read the arm; if it branches, lock the joints of a gripper. Raises ConfigError."""
     try:
         text = read_input(urdf)
         try:
@@ -150,7 +150,7 @@ def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _angle_unit(q: Vector, arm: SerialArm) -> str:
-    """Guess degrees where positions go beyond what the URDF allows in radians."""
+    """Return "deg" if positions go far beyond the URDF's limits in radians, else "rad"."""
     bound = _bounds(arm)
     reach = np.nanmax(np.abs(q), axis=0)
     is_revolute = arm.chain.is_prismatic == 0.0
@@ -169,7 +169,7 @@ def _span(q: Vector, arm: SerialArm) -> str:
 
 
 def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
-    """Guess the unit in which velocities are the slope of the positions."""
+    """Return the unit in which velocities equal the slope of the positions."""
     slope = np.gradient(guess.of("q"), axis=0) / step_s * (1.0 / _DEGREES if angle == "deg" else 1.0)
     square = np.nansum(slope**2)
     factor = abs(float(np.nansum(slope * guess.of("dq")) / square)) if square > 0.0 else 1.0
@@ -177,7 +177,7 @@ def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
 
 
 def _torque_unit(tau: Vector, arm: SerialArm) -> str:
-    """Guess mNm where torques reach beyond the effort of the URDF, and would not in mNm."""
+    """Return "mNm" if torques exceed the effort of the URDF, but wouldn't in mNm, else "Nm"."""
     largest, effort = largest_torques(tau, arm)
     return "mNm" if np.any(largest > _BEYOND_EFFORT * effort) else "Nm"
 
@@ -189,7 +189,7 @@ def _reach(tau: Vector, arm: SerialArm) -> str:
 
 
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
-    """Draft what a bag needs: nothing, where it has the URDF's names on one topic."""
+    """Draft the keys of a bag; none are needed if it has the URDF's names on one topic."""
     keys = []
     with opened_bag(recording) as bag:
         found = joint_state_topics(bag.topics)
@@ -224,7 +224,7 @@ def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _bag_names(recording: Path, names: list[str], arm: SerialArm) -> tuple[str, ...]:
-    """Find the arm's joints among a bag's. Raises ConfigError."""
+    """Return the arm's joints among a bag's. Raises ConfigError."""
     if set(arm.joint_names) <= set(names):
         return arm.joint_names
     chosen = []
@@ -243,6 +243,6 @@ def _bag_names(recording: Path, names: list[str], arm: SerialArm) -> tuple[str, 
 
 
 def _natural(name: str) -> list[tuple[bool, int, str]]:
-    """Order names by their numbers."""
+    """Return a sort key that orders names by their numbers."""
     parts = re.split(r"(\d+)", name)
     return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]

@@ -1,12 +1,11 @@
-"""Ways in which a recording may be meant other than its map says, and which of them the arm's own motion bears out.
+"""Finds mistakes in the map of a recording: other interpretations of its columns that fit the arm's motion better.
 
-A reading turns, exchanges, scales or couples columns: q = T q_recorded, tau = R tau_recorded. To each the arm's
-equation, linear in theta, is fitted behind the filter of the fit; a reading that explains the torque of the test where
-the map's does not, and of an inertia that an arm can have, is named with the key of the map. It is for n joints what
-`control/device_readings.py` is for the two on the bus.
-
-A turned or exchanged torque costs no new regressor: with A_i = sum w w' of joint i and b_ij = sum w tau_j the residual
-of any choice of signs and places is a quadratic form. Not told apart: an arm without gravity is its own mirror image.
+A reading is such an interpretation: it turns, exchanges, scales or couples columns, q = T q_recorded, tau = R
+tau_recorded. The arm's equation, linear in theta, is fitted to each, behind the filter of the fit. A reading is
+reported with the key of the map if it explains the torque of the test, with the inertia of a possible arm, and the
+map's does not. `control/device_readings.py` does the same for the two joints on the bus. A turned or exchanged torque
+needs no new regressor: with A_i = sum w w' of joint i and b_ij = sum w tau_j the residual of any choice of signs and
+places is a quadratic form. Indistinguishable: an arm without gravity and its mirror image.
 """
 
 import itertools
@@ -24,25 +23,25 @@ from adacd_hil.scheme.identify.offline import ArmModel, OfflineSettings, Record
 from adacd_hil.scheme.model.urdf import STANDARD_GRAVITY_M_S2
 
 _MOST_S: Final = 10.0
-"""Of fit and of test that is looked at."""
+"""Longest part of fit and of test that is used."""
 _PERIOD_S: Final = 1e-2
-"""Samples closer than this are left out: the filter of the fit is slower by far."""
+"""Shortest distance of used samples: the filter of the fit is much slower."""
 _MOST_SIGNS: Final = 7
-"""Joints of which all choices of signs are tried."""
+"""Most joints for which all choices of signs are tried."""
 EXPLAINED: Final = 0.9
-"""Least share of each joint's torque that a reading explains which is named."""
+"""Least share of each joint's torque that a reported reading explains."""
 _BETTER: Final = 0.2
-"""Its unexplained share over that of the map, at most; of a map's arm that there can't be any does."""
+"""Largest ratio of its unexplained share to the map's; any ratio will do if the map's arm is impossible."""
 _ALIKE: Final = 1.3
-"""Times the best one's unexplained share, within which a simpler reading is taken, and others are named beside it."""
+"""Factor on the best unexplained share within which a simpler reading is preferred, and others are reported, too."""
 _RIDGE: Final = 1e-8
 _IDLE_FRICTION: Final = 0.05
-"""Of the largest friction: power that a joint without any may seem to give."""
+"""Share of the largest friction: power that a joint without friction may seem to give."""
 UNITS: Final = {"deg": "degrees", "rad": "radians"}
 
 
 class Reading(NamedTuple):
-    """A reading that is borne out: what it is, the key of the map, and the least share of a joint."""
+    """A reading that fits: its description, the key of the map, and the least share of torque explained at a joint."""
 
     text: str
     remedy: str
@@ -50,21 +49,21 @@ class Reading(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """A reading of the motion. T (n, n), R (n, n) of the torques: see above; R None: as they are."""
+    """A reading of the motion. T (n, n), R (n, n) of the torques: see above; R None: unchanged."""
 
-    kind: str  # "told": as the map says
+    kind: str  # "map": unchanged
     T: Vector
     R: Vector | None = None
     joints: tuple[int, ...] = ()
     unit: str = ""
-    has_rotors: bool | None = None  # None: as the map says
-    gravity_m_s2: tuple[float, ...] | None = None  # None: as the map says
+    has_rotors: bool | None = None  # None: as in the map
+    gravity_m_s2: tuple[float, ...] | None = None  # None: as in the map
     is_of_velocities: bool = True
 
     @property
     def weight(self) -> int:
-        """How many things are other than the map says."""
-        return int(self.kind != "told")
+        """Number of differences from the map."""
+        return int(self.kind != "map")
 
 
 class _Torques(NamedTuple):
@@ -75,7 +74,7 @@ class _Torques(NamedTuple):
 
     @property
     def weight(self) -> int:
-        """How many things are other than the map says."""
+        """Number of differences from the map."""
         return min(self.signs.count(-1.0), 2) + (self.places != tuple(range(len(self.places))))
 
 
@@ -90,7 +89,7 @@ class _Equations(NamedTuple):
 
     @property
     def spread(self) -> Vector:
-        """The squares (n,) of each column of torques about its best constant."""
+        """Sum of squares (n,) of each torque column about its best constant."""
         return np.maximum(np.diag(self.S) - self.u**2 / np.maximum(self.U, 1e-18), 1e-18)
 
 
@@ -108,7 +107,7 @@ class _Judged(NamedTuple):
 def find_readings(
     described: RecordingMap, model: ArmModel, settings: OfflineSettings, fitted: list[Record], tested: list[Record]
 ) -> tuple[Reading, ...]:
-    """Return the readings that explain the test far better than the map's; the simplest of those that do so alike."""
+    """Return the readings that explain the test far better than the map's; the simplest of nearly equal ones first."""
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
     settings = replace(settings, period_s=step * settings.period_s, fit_every=max(1, round(settings.fit_every / step)))
@@ -119,10 +118,10 @@ def find_readings(
         if fit is not None and test is not None:
             for torques in _torques(model.joints, most_turned=1 if motion.weight else model.joints):
                 judged.append(_judge(other, fit, test, motion, torques, fitted))
-    told = next((each for each in judged if each.weight == 0), None)
-    if told is None:
+    of_map = next((each for each in judged if each.weight == 0), None)
+    if of_map is None:
         return ()
-    limit = min(1.0 - EXPLAINED, _BETTER * told.unexplained if told.is_possible else 1.0)
+    limit = min(1.0 - EXPLAINED, _BETTER * of_map.unexplained if of_map.is_possible else 1.0)
     right = [each for each in judged if each.weight and each.is_possible and each.unexplained <= limit]
     if not right:
         return ()
@@ -140,7 +139,7 @@ def _model_of(model: ArmModel, motion: _Motion) -> ArmModel:
 
 
 def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
-    """Tell whether an arm can have these parameters: every joint has an inertia, and friction takes power. q (k, n)."""
+    """Tell whether an arm can have these parameters: each joint has an inertia, and friction dissipates. q (k, n)."""
     F_v, F_c = theta[model.place_of("F_v")], theta[model.place_of("F_c")]
     speed, square = np.abs(dq).mean(axis=0), (dq**2).mean(axis=0)
     idle = _IDLE_FRICTION * (np.abs(F_c).max() + np.abs(F_v).max() * speed.mean()) * speed
@@ -157,7 +156,7 @@ def _step(settings: OfflineSettings) -> int:
 
 
 def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
-    """Leave out samples, and what is beyond the longest time that is looked at."""
+    """Thin the samples out and shorten the records to the longest time that is used."""
     step, room = _step(settings), round(_MOST_S / settings.period_s)
     kept = []
     for record in records:
@@ -169,7 +168,7 @@ def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
 
 
 def _equations(model: ArmModel, records: list[Record], settings: OfflineSettings, motion: _Motion) -> _Equations | None:
-    """Sum the normal equations of a reading of the motion; None where its numbers can't be reckoned with."""
+    """Sum the normal equations of a reading of the motion; None if its numbers overflow."""
     n, p = model.joints, len(model.parameter_names)
     found = _Equations(*(np.zeros(shape) for shape in ((n, p, p), (n, n, p), (n, n), (n,), (1,))))
     offset = model.place_of("offset").start
@@ -192,7 +191,7 @@ def _equations(model: ArmModel, records: list[Record], settings: OfflineSettings
 def _judge(
     model: ArmModel, fit: _Equations, test: _Equations, motion: _Motion, torques: _Torques, fitted: list[Record]
 ) -> _Judged:
-    """Fit one reading, and say what share of each joint's torque it leaves unexplained in the test."""
+    """Fit one reading; return the largest share of a joint's torque that it leaves unexplained in the test."""
     signs, places, joints = np.array(torques.signs), list(torques.places), range(model.joints)
     weight = 1.0 / fit.spread[places]
     A = np.tensordot(weight, fit.A, axes=1)
@@ -204,15 +203,15 @@ def _judge(
         for i in joints
     ]
     unexplained = float(np.max(np.maximum(left, 0.0) / test.spread[places]))
-    is_told = motion.weight + torques.weight == 0
-    if unexplained > 1.0 - EXPLAINED and not is_told:
+    is_of_map = motion.weight + torques.weight == 0
+    if unexplained > 1.0 - EXPLAINED and not is_of_map:
         return _Judged(motion, torques, unexplained, is_possible=False)
     q, dq = (np.concatenate([getattr(record, name) for record in fitted]) @ motion.T.T for name in ("q", "dq"))
     return _Judged(motion, torques, unexplained, is_possible(model, theta, q, dq))
 
 
 def _torques(n: int, most_turned: int) -> Iterator[_Torques]:
-    """List readings of torques: so many turned ones or all, two that are exchanged, all in the other order."""
+    """Yield readings of torques: some or all turned, two exchanged, all in reverse order."""
     straight, ones = tuple(range(n)), (1.0,) * n
     for signs in itertools.product((1.0, -1.0), repeat=min(n, _MOST_SIGNS)):
         turned = signs.count(-1.0)
@@ -225,9 +224,9 @@ def _torques(n: int, most_turned: int) -> Iterator[_Torques]:
 
 
 def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
-    """List readings of the motion, that of the map first."""
+    """Yield readings of the motion, the map's first."""
     n, straight = model.joints, np.eye(model.joints)
-    yield _Motion("told", straight)
+    yield _Motion("map", straight)
     for unit, factor in (("deg", math.pi / 180.0), ("rad", 180.0 / math.pi)):
         if unit != described.units.q:
             yield _Motion("unit", factor * straight, unit=unit)
@@ -241,7 +240,7 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
         yield _Motion("joints", swap, swap, joints=(i, j))
     if n > 3:
         yield _Motion("order", straight[::-1], straight[::-1])
-    # A column may count from the base, or along with the joint before, as behind belts: torques do the same power.
+    # A column may count from the base, or with the joint before, as behind belts: then torques do the same power.
     for i, sign in itertools.product(range(1, n), (-1.0, 1.0)):
         T = straight.copy()
         T[i, i - 1] = sign
@@ -252,10 +251,10 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
         for R in (None, np.linalg.inv(T).T.astype(np.float64)):
             yield _Motion("absolute", T, R)
     yield _Motion("rotors", straight, has_rotors=not model.has_rotors)
-    told = model.chain.gravity_m_s2
-    size = float(np.linalg.norm(told)) or float(np.linalg.norm(STANDARD_GRAVITY_M_S2))
+    gravity_of_map = model.chain.gravity_m_s2
+    size = float(np.linalg.norm(gravity_of_map)) or float(np.linalg.norm(STANDARD_GRAVITY_M_S2))
     for direction in (np.zeros(3), *np.eye(3), *-np.eye(3)):
-        if not np.allclose(size * direction, told):
+        if not np.allclose(size * direction, gravity_of_map):
             yield _Motion("gravity", straight, gravity_m_s2=tuple((size * direction + 0.0).tolist()))
 
 
@@ -266,7 +265,7 @@ def _exchanged(n: int, i: int, j: int) -> list[int]:
 
 
 def _texts(described: RecordingMap, judged: _Judged) -> tuple[str, str]:
-    """Say what a reading is, and what makes it the map's."""
+    """Return a reading's description, and the change of the map that adopts it."""
     motion, torques = judged.motion, judged.torques
     turned = [i for i, sign in enumerate(torques.signs) if sign < 0.0]
     if motion.kind == "turned" and turned == list(motion.joints):

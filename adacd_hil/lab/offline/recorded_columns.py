@@ -1,9 +1,9 @@
-"""The rows of a recording, from whatever file they come: put in order of time, in SI units, with what was dropped.
+"""Rows of a recording, of any file format, turned into columns: sorted by time, in SI units, bad rows dropped.
 
-A logger doubles rows, cuts the last one, writes a word where a number should be. Such a row is dropped and counted; the
-recording is refused only where they are many, with the first of them.
+Loggers repeat rows, cut the last one, write a word instead of a number. Such rows are dropped and counted; the
+recording is refused only if they are many, and the error shows the first of them.
 
-A recording is held in memory, at most `MOST_ROWS` rows of it: of a longer file only the span that is asked for.
+A recording is held in memory, at most `MOST_ROWS` rows of it: of a longer file only the requested span.
 """
 
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ from adacd_hil.records import Vector
 from adacd_hil.score.wording import number_of
 
 MOST_ROWS: Final = 4_000_000
-"""Rows of a file that are kept, and samples that they become: an hour at 1 kHz, with a little to spare."""
+"""Most rows of a file that are kept, and most samples made of them: an hour at 1 kHz, with a little to spare."""
 SHORTEST_SAMPLES: Final = 50
-"""A shorter stretch teaches nothing: the filters have not settled."""
+"""A shorter stretch can't be used: the filters have not settled."""
 LARGEST: Final = 1e6
-"""rad, rad/s or Nm: what is larger is no measurement, and its square would spoil all others."""
+"""Limit in rad, rad/s or Nm: a larger value isn't a measurement, and its square would spoil all others."""
 _BLOCK_ROWS = 50_000
 _SPARE_S = 1.0
-"""Kept before and after the span that is asked for: what a derived velocity and the grid of samples reach over."""
+"""Time kept before and after the requested span, for derived velocities and the grid of samples."""
 _FEW_ROWS, _FEW_SHARE = 3, 0.01
-"""So many rows, or such a share of all, may be spoilt: beyond it the file is not what the map says."""
+"""Rows, or share of all rows, that may be unusable; with more, the file doesn't match the map."""
 
 _DOUBLED = "with the time of the row before"
 
@@ -37,8 +37,8 @@ _DOUBLED = "with the time of the row before"
 class RecordedColumns:
     """Time (k,) s, increasing, that of the first row, and values (k, 2 n or 3 n) in SI units.
 
-    values: positions, torques and, if there are some, velocities side by side; what is missing is not finite. touched
-    (k,), if known. notes: what was dropped or taken for granted, a few words each.
+    values: positions, torques and, if present, velocities side by side; missing ones are not finite. touched (k,), if
+    known. notes: dropped rows and assumptions, a few words each.
     """
 
     time_s: Vector
@@ -50,17 +50,17 @@ class RecordedColumns:
 
 @dataclass
 class _Drop:
-    """Rows that are dropped for one reason, and the first of them in words."""
+    """Number of rows dropped for one reason, and a description of the first."""
 
     count: int
     first: str
 
 
 class RecordedRows:
-    """Takes the rows of a recording one by one, and makes columns of them."""
+    """Collects the rows of a recording one by one, and makes columns of them."""
 
     def __init__(self, path: Path, width: int, time_unit_s: float, span: TimeWindow | None) -> None:
-        """Begin. width: numbers of a row, the time first."""
+        """Start without rows. width: numbers of a row, the time first."""
         self.notes: list[str] = []
         self.count = 0
         """Rows so far."""
@@ -72,7 +72,7 @@ class RecordedRows:
         self._is_long = False  # only the span is kept
 
     def append(self, number: int, row: list[float]) -> None:
-        """Take a row; number: its place in the file, from 1. Raises LogError where there are too many."""
+        """Add a row; number: its place in the file, from 1. Raises LogError if there are too many."""
         self._block.append(number)
         self._block += row
         self.count += 1
@@ -80,17 +80,17 @@ class RecordedRows:
             self._flush()
 
     def drop(self, kind: str, first: str, count: int = 1) -> None:
-        """Count rows that are left out. kind: follows the word "row"; first: says what the first of them is like."""
+        """Count dropped rows. kind: text after the word "row"; first: description of the first of them."""
         if count:
             self._drops.setdefault(kind, _Drop(0, first)).count += count
 
     @property
     def is_past_span(self) -> bool:
-        """Whether what is asked for has been read of a file that is too long to be read whole."""
+        """Whether the requested span has been read, of a file that is too long to be read whole."""
         return self._is_long and self._span is not None and self._latest_s - self._begin_s > self._span.end_s + _SPARE_S
 
     def columns(self, described: RecordingMap, names: list[str], has_touches: bool = False) -> RecordedColumns:
-        """Make columns of all rows. names: of the values, for errors. Raises LogError."""
+        """Return columns of all rows. names: of the values, for errors. Raises LogError."""
         self._flush()
         table = np.concatenate(self._kept) if self._kept else np.empty((0, self._width))
         self._check_drops(len(table))
@@ -112,7 +112,7 @@ class RecordedRows:
         return RecordedColumns(time_s, self._begin_s, values, touched, notes)
 
     def _flush(self) -> None:
-        """Put the rows so far in order, and keep those that are asked for."""
+        """Sort out the latest block of rows, and keep those of the requested span."""
         if not self._block:
             return
         table = np.array(self._block).reshape(-1, self._width)
@@ -149,7 +149,7 @@ class RecordedRows:
         return [f"{number_of(drop.count, 'row')} {kind} left out ({drop.first})" for kind, drop in self._drops.items()]
 
     def _check_drops(self, kept: int) -> None:
-        """Refuse a recording of which more than a few rows are spoilt; doubled ones are no harm."""
+        """Raise LogError if more than a few rows are unusable; repeated ones don't count."""
         spoilt = {kind: drop for kind, drop in self._drops.items() if kind != _DOUBLED}
         count = sum(drop.count for drop in spoilt.values())
         if count > max(_FEW_ROWS, _FEW_SHARE * (kept + count)):

@@ -1,9 +1,9 @@
-"""A foreign recording through the scheme: parameters from free motion, their test on other motion, contacts in a third.
+"""Identification of a foreign recording: fit on free motion, test on other motion, contacts in further recordings.
 
-The fit learns whatever is in its recording, a touch too; where the map names a column of touches, those are left out.
-The figure shows the external torque of each joint against its threshold, and the contacts. The thresholds of the test
-are those of its margin: noise and what is known of the parameters. Those of other recordings are wider by what the
-test shows as lacking.
+A touch in the fitted recording is learnt, unless the map names a column of touches; touched samples are left out. The
+figure shows the external torque of each joint against its threshold, and the contacts. The thresholds of the test are
+those of its margin, from noise and the parameters' covariance. Thresholds of other recordings are wider by the model
+error that the test shows.
 """
 
 import math
@@ -27,39 +27,39 @@ from adacd_hil.scheme.identify.offline import ModelEstimate, OfflineCertificate,
 from adacd_hil.score.judge import explained_until, owners
 
 FIT_SHARE = 0.6
-"""Of a recording that is both fitted and tested: the part that is fitted."""
+"""Share of a recording that is fitted if the rest of it is the test."""
 
 
 class Spell(NamedTuple):
-    """A contact that was found: times from the recording's start, links counted from 1, signs of each joint (n,)."""
+    """A detected contact: times from the recording's start, link from 1, signs of each joint's torque (n,)."""
 
     start_s: float
     link: int
     direction: tuple[int, ...]
-    is_true: bool | None  # None where nobody knows
+    is_true: bool | None  # None if touches are unknown
 
 
 @dataclass(frozen=True)
 class Watched:
-    """The findings in a recording that the model has not seen."""
+    """Contacts in a recording that the model was not fitted to."""
 
     recording: ForeignRecording
     tau_ext_hat: tuple[Vector, ...]  # per stretch (k, n), Nm
     threshold: tuple[Vector, ...]
     contacts: tuple[Spell, ...]
-    touches: int | None  # None where nobody knows
+    touches: int | None  # None if unknown
     missed: int | None
-    delays_s: tuple[float, ...]  # of the touches that were found
+    delays_s: tuple[float, ...]  # of the detected touches
 
     @property
     def false_contacts(self) -> int | None:
-        """Contacts where nobody touched; None where nobody knows."""
+        """Number of contacts without a touch; None if touches are unknown."""
         return None if self.touches is None else sum(contact.is_true is False for contact in self.contacts)
 
 
 @dataclass(frozen=True)
 class Identified:
-    """Parameters (p,) and their deviations, and how much of the torque they explain on motion that was not fitted."""
+    """Parameters (p,) with standard deviations, and the share of torque that they explain in the test."""
 
     model: offline.ArmModel
     settings: OfflineSettings
@@ -71,7 +71,7 @@ class Identified:
     fit_s: float
     test: Watched
     watched: tuple[Watched, ...]
-    notes: dict[Path, tuple[str, ...]]  # what was left out of the recordings, or taken for granted
+    notes: dict[Path, tuple[str, ...]]  # dropped rows and assumptions, by recording
 
     def __repr__(self) -> str:
         return f"<Identified: {self.verdict.headline}>"
@@ -83,11 +83,11 @@ class Identified:
 
     @property
     def explained(self) -> Vector:
-        """The share (n,) of each joint's torque that the model explains in the test; nan where there is none."""
+        """Share (n,) of each joint's torque that the model explains in the test; nan without torque."""
         return np.array([joint.share for joint in self.verdict.joints])
 
     def as_json(self) -> dict[str, Any]:
-        """Describe it for machines."""
+        """Return the result as a dictionary for JSON."""
         names, certificate = self.model.parameter_names, self.certificate
         return {
             "parameters": {
@@ -131,20 +131,20 @@ def identify(
 ) -> Identified:
     """Fit recordings one after the other, test on another, and look for contacts in further ones.
 
-    tested: None takes the last part of the last recording that is to be fitted. Raises ConfigError, LogError.
+    tested: None takes the last part of the last fitted recording. Raises ConfigError, LogError.
     """
     recordings = [recording.free for recording in fitted]
     if tested is None:
         last = recordings[-1]
         if not last.stretches:
-            raise LogError(f"{last.path}: nothing is free of touches")
+            raise LogError(f"{last.path}: no part is free of touches")
         first, final = last.stretches[0], last.stretches[-1]
         end_s = final.start_s + len(final.record.q) * last.period_s
         split_s = first.start_s + FIT_SHARE * (end_s - first.start_s)
         recordings[-1], tested = last.between(-np.inf, split_s), last.between(split_s, np.inf)
     tested = tested.free
     if not tested.stretches or not any(recording.stretches for recording in recordings):
-        raise LogError("too little free motion: nothing is left to fit or to test")
+        raise LogError("too little free motion to fit or to test")
     source = recordings[-1]
     settings = described.settings(source.noise_Nm, source.period_s, source.velocity_noise_rad_s)
     model = offline.model_of(described.urdf.chain, described.arm.has_rotors)
@@ -178,7 +178,7 @@ def _finite(value: float) -> float | None:
 
 
 def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:
-    """Join the certificates of all stretches, each by its length."""
+    """Join the certificates of all stretches, weighted by length."""
     weights = np.array([len(stretch.record.q) for stretch in tested.stretches], np.float64)
     weights /= weights.sum()
     return OfflineCertificate(
@@ -197,7 +197,7 @@ def watch(
     lack_Nm: Vector,
     recording: ForeignRecording,
 ) -> Watched:
-    """Look for contacts in a recording, and compare them with its touches where these are known."""
+    """Detect contacts in a recording, and compare them with its touches if these are known."""
     detections = [offline.detect(model, part.record, estimate, settings, lack_Nm) for part in recording.stretches]
     spells: list[Spell] = []
     delays: list[float] = []
@@ -237,7 +237,7 @@ def _touches(stretch: RecordingStretch) -> NDArray[np.int64]:
 def _owners(
     stretch: RecordingStretch, samples: NDArray[np.int64], recording: ForeignRecording, settings: OfflineSettings
 ) -> NDArray[np.int64]:
-    """Return which touch each contact is about, -1 for none, as far as the touches' times are known."""
+    """Return the touch that each contact belongs to, -1 for none, as far as the touches' times are known."""
     firsts, lasts = _touches(stretch).T
     onsets = firsts - round(recording.blur_s / recording.period_s)
     return owners(samples, onsets, explained_until(onsets, lasts + round(settings.isolation_s / settings.period_s)))

@@ -1,7 +1,7 @@
-"""A recording of an arm that others made: a file and its map become samples at a fixed period, in SI units.
+"""Import of a foreign recording: a file and its map become samples at a fixed period, in SI units.
 
-A gap in time, a value that is missing or not finite, and where a touch begins or ends, part a recording in stretches;
-the model is carried over, the filters begin anew. Values between two samples are interpolated.
+A gap in time, a missing or infinite value, and the beginning or end of a touch split a recording into stretches; the
+model is carried over, the filters restart. Values between two samples are interpolated.
 """
 
 from dataclasses import dataclass, replace
@@ -25,9 +25,9 @@ from adacd_hil.score.wording import number_of
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.1
 _LEAST_NOISE_NM = 1e-4
 _MOST_BESIDE_JUMP_RAD = 0.8
-"""Motion in the time of a jump, 8 rad/s in the longest period."""
+"""Most motion in the time of a position jump: 8 rad/s in the longest period."""
 _JITTER = 0.25
-"""Of a period, by which the times between rows vary: a derived velocity is off by as much."""
+"""Share of a period by which the intervals of rows may vary: a derived velocity is wrong by as much."""
 _DEGREE = 3  # of the polynomial whose slope is a derived velocity
 MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white noise
 _STEP_TO_SIGMA = 1.0 / np.sqrt(12.0)  # of the rounding to a step
@@ -35,7 +35,7 @@ _STEP_TO_SIGMA = 1.0 / np.sqrt(12.0)  # of the rounding to a step
 
 @dataclass(frozen=True)
 class RecordingStretch:
-    """Samples without a gap: when the first was, and, if known, whether somebody touched the arm at each (k,)."""
+    """Samples without a gap: time of the first, and, if known, for each whether the arm was touched (k,)."""
 
     start_s: float
     record: Record
@@ -44,10 +44,10 @@ class RecordingStretch:
 
 @dataclass(frozen=True)
 class ForeignRecording:
-    """A recording, time-first. `noise_Nm` (n,), `velocity_noise_rad_s`: rms of what looks like white noise in it.
+    """A recording, time-first. `noise_Nm` (n,), `velocity_noise_rad_s`: estimated rms of its white noise.
 
-    `blur_s`: how far a derived velocity looks ahead and back. `columns`: what the file had. `notes`: what was left out
-    or taken for granted, a few words each.
+    `blur_s`: half the window of a derived velocity. `columns`: as read from the file. `notes`: dropped rows and
+    assumptions, a few words each.
     """
 
     path: Path
@@ -61,27 +61,27 @@ class ForeignRecording:
 
     @property
     def has_velocities(self) -> bool:
-        """Whether velocities were measured, and not derived from the positions."""
+        """Whether velocities were measured, not derived from the positions."""
         return self.blur_s == 0.0
 
     @property
     def duration_s(self) -> float:
-        """Sum of the stretches."""
+        """Sum of the stretches' durations, s."""
         return sum(len(stretch.record.q) for stretch in self.stretches) * self.period_s
 
     def between(self, start_s: float, end_s: float) -> "ForeignRecording":
-        """Return what lies in a span of the recording's time, which begins with 0."""
+        """Return the part within a span of the recording's time, which begins with 0."""
         parts = [_cut(stretch, self.period_s, start_s, end_s) for stretch in self.stretches]
         kept = tuple(part for part in parts if len(part.record.q) >= SHORTEST_SAMPLES)
         return replace(self, stretches=kept)
 
     @property
     def free(self) -> "ForeignRecording":
-        """What nobody touched, as far as that is known."""
+        """Return the part without touches, as far as they are known."""
         return replace(self, stretches=tuple(part for stretch in self.stretches for part in self._untouched(stretch)))
 
     def _untouched(self, stretch: RecordingStretch) -> list[RecordingStretch]:
-        """Split a stretch at its touches, with what is blurred around them."""
+        """Split a stretch at its touches, without samples whose derived velocity reaches into a touch."""
         if stretch.is_touched is None:
             return [stretch]
         width = 2 * round(self.blur_s / self.period_s) + 1
@@ -96,10 +96,10 @@ class ForeignRecording:
 def read_recording(
     path: Path, described: RecordingMap, period_s: float = 0.0, span: TimeWindow | None = None
 ) -> ForeignRecording:
-    """Read a CSV file, an MCAP file or a rosbag. period_s: of the samples, where neither map nor recording is to say.
+    """Read a CSV file, an MCAP file or a rosbag. period_s: of the samples, if neither map nor recording determines it.
 
-    span: what has to be read of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError when
-    it can't be read or is too long, ConfigError when it lacks a column of the map.
+    span: the part to read of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError if it
+    can't be read or is too long, ConfigError if it lacks a column of the map.
     """
     read = read_bag if is_bag(path) else read_csv
     return recording_of(path, described, read(path, described, span), period_s)
@@ -163,7 +163,7 @@ def recording_of(
 
 
 def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
-    """Return the recording's own period. Raises LogError where no arm is recorded like that, with the likely unit."""
+    """Return the recording's own period. Raises LogError if it is implausible, with the likely unit."""
     period_s = float(np.median(np.diff(time_s)))
     if SHORTEST_PERIOD_S <= period_s <= LONGEST_PERIOD_S:
         return period_s
@@ -176,7 +176,7 @@ def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
 
 
 def _jitter(time_s: Vector, period_s: float) -> str:
-    """Say by how much rows are apart where that varies; "" where it hardly does."""
+    """Describe the variation of the intervals between rows; "" if it is small."""
     short_s, long_s = np.quantile(np.diff(time_s), (0.05, 0.95)).tolist()
     if long_s - short_s < _JITTER * period_s:
         return ""
@@ -191,7 +191,7 @@ def _even_period_s(time_s: Vector) -> float:
 
 
 def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
-    """Drop velocities, as some drivers leave them empty, where one never changes though its joint moves."""
+    """Drop velocities, which some drivers leave empty, if one never changes though its joint moves."""
     n = described.joints
     idle = np.ptp(values[:, 2 * n :], axis=0) == 0.0
     moved = np.ptp(values[:, :n], axis=0) > 0.0
@@ -204,7 +204,7 @@ def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[V
 
 
 def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
-    """Let positions go on where they jump by a turn, as those of joints without end do from +180 to -180 degrees."""
+    """Remove jumps of a whole turn, as at +180 degrees of a joint without end stops."""
     notes = []
     values = values.copy()
     for joint in np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist():
@@ -218,7 +218,7 @@ def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, lis
 
 
 def derivative_window(described: RecordingMap, period_s: float) -> int:
-    """Return over how many samples velocities are derived."""
+    """Return the number of samples in the window of a derived velocity."""
     return max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
 
 
@@ -228,9 +228,9 @@ def derive(q: Vector, period_s: float, window: int) -> Vector:
 
 
 def _noise(parts: list[Vector], given: Vector) -> Vector:
-    """Estimate the rms of white noise (n,), by the median of the second difference, which motion hardly shows in.
+    """Estimate the rms of white noise (n,) by the median of the second difference, which motion hardly changes.
 
-    given (k, n): the values as they were recorded; noise is at least that of their rounding.
+    given (k, n): the values as recorded; the noise is at least that of their rounding.
     """
     seconds = np.concatenate([np.abs(np.diff(part, 2, axis=0)) for part in parts])
     rounding = _STEP_TO_SIGMA * np.array([_step(column) for column in given.T])

@@ -1,4 +1,4 @@
-"""The map of a recording: what each of its columns means and in which unit, and which arm it is of.
+"""The map of a recording: meaning and unit of each column, and the arm that was recorded.
 
 One TOML file. Scales turn the recorded values, after their unit, into rad, rad/s and Nm, positive along the URDF's
 joint axes: -1.0 turns a sign, a drive's gain in Nm/A makes torques of currents.
@@ -35,7 +35,7 @@ def unit_of(text: str) -> str:
 
 
 def time_unit_of(step: float) -> str:
-    """Return the unit in which a time between two rows is one at which arms are recorded; "" if there is none."""
+    """Return the unit in which a step between two rows is a plausible period of a recording; "" if none is."""
     low_s, high_s = _USUAL_PERIOD_S
     return next((unit for unit in ("s", "ms", "us", "ns") if low_s <= step * TIME_S[unit] <= high_s), "")
 
@@ -54,7 +54,7 @@ class ArmSection:
 
 @dataclass(frozen=True)
 class ColumnsSection:
-    """Heads or numbers of the columns, or a bag's names of the joints; of the joints from the base outward."""
+    """Heads or numbers of the columns, or a bag's names of the joints; in the order of the joints from the base."""
 
     time: str = setting("", meaning="of the sample; none: a row every sampling.period_s")
     q: tuple[str, ...] = setting((), meaning="joint positions; of a bag names of its joints, else those of the URDF")
@@ -95,7 +95,7 @@ class CsvSection:
 
 @dataclass(frozen=True)
 class BagSection:
-    """Where an MCAP file or a rosbag has the joints' states."""
+    """Topic and stamp of the joints' states in an MCAP file or a rosbag."""
 
     topic: str = setting("", meaning="of sensor_msgs/JointState; none: the only one, or /joint_states")
     time: str = setting(
@@ -105,7 +105,7 @@ class BagSection:
 
 @dataclass(frozen=True)
 class SamplingSection:
-    """How the recording becomes samples at a fixed period."""
+    """Period and gaps of the samples."""
 
     period_s: float = setting(
         0.0,
@@ -121,7 +121,7 @@ class SamplingSection:
 
 
 def units_by_slope(units: UnitsSection, factor: float) -> list[tuple[str, str]]:
-    """List keys and units with which velocities, so many times the slope of the positions, would be that slope."""
+    """Return keys and units with which velocities, now `factor` times the slope of the positions, would equal it."""
     found = [("dq", unit) for unit, value in _SPEED.items() if _is_near(factor * value / _SPEED[units.dq], 1.0)]
     found += [("q", unit) for unit, value in _ANGLE.items() if _is_near(factor * _ANGLE[units.q] / value, 1.0)]
     return [(key, unit) for key, unit in found if getattr(units, key) != unit]
@@ -142,7 +142,7 @@ class RecordingMap:
     csv: CsvSection
     bag: BagSection
     sampling: SamplingSection
-    scheme: dict[str, Any]  # keys of OfflineSettings that outweigh its defaults and what the recording shows
+    scheme: dict[str, Any]  # keys of OfflineSettings, which override its defaults and the recording's estimates
     urdf: SerialArm
 
     @property
@@ -152,29 +152,29 @@ class RecordingMap:
 
     @property
     def time_s(self) -> float:
-        """One unit of the time, s."""
+        """One unit of time in s."""
         return TIME_S[self.units.time]
 
     @property
     def q_rad(self) -> tuple[float, ...]:
-        """One unit of each position, rad."""
+        """One unit of each position in rad."""
         return tuple(_ANGLE[self.units.q] * factor for factor in self._factors(self.scale.q))
 
     @property
     def dq_rad_s(self) -> tuple[float, ...]:
-        """One unit of each velocity, rad/s."""
+        """One unit of each velocity in rad/s."""
         return tuple(_SPEED[self.units.dq] * factor for factor in self._factors(self.scale.q))
 
     @property
     def tau_J_Nm(self) -> tuple[float, ...]:
-        """One unit of each torque, Nm."""
+        """One unit of each torque in Nm."""
         return tuple(_TORQUE[self.units.tau_J] * factor for factor in self._factors(self.scale.tau_J))
 
     def _factors(self, given: tuple[float, ...]) -> tuple[float, ...]:
         return given or (1.0,) * self.joints
 
     def settings(self, noise_Nm: tuple[float, ...], period_s: float, velocity_noise_rad_s: float) -> OfflineSettings:
-        """Join what the recording shows with what the map says of the scheme. Raises ConfigError."""
+        """Return the scheme's settings: the recording's estimates, overridden by the map's keys. Raises ConfigError."""
         shown = {"noise_Nm": list(noise_Nm), "period_s": period_s, "velocity_noise_rad_s": velocity_noise_rad_s}
         return parse(OfflineSettings, shown | self.scheme, "scheme.")
 

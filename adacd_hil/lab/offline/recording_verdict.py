@@ -1,18 +1,18 @@
-"""The verdict on a recording: whether its torque is explained, why not, and what to do next.
+"""The verdict on a recording: whether the model explains its torque, the reasons if not, the user's next step.
 
 **Share.** Of each joint's torque, the part that the frozen model explains in the test:
 
     share = 1 - sum (tau_f - W_f theta)² / sum (tau_f - c u_f)²
 
-with the filter of the fit on both, u_f what it leaves of a constant and c the best one: what the filter takes away is
-no one's merit, nor is an offset. A torque that is noise has a share of 0.
+with the filter of the fit on both; u_f is the filtered constant and c its best factor, so that neither the filter's
+effect nor an offset counts as explained. A torque that is noise has a share of 0.
 
-**Margin.** The smallest threshold over the residual in the test, of thresholds that noise and the parameters' P make.
+**Margin.** The smallest ratio of threshold to residual in the test, with thresholds from noise and the parameters' P.
 
 A joint is explained if its share is at least `WHOLE`, or if the residual stays below its threshold and the share is at
-least `HALF`: of a torque that is mostly noise no model explains more. The test is explained if all joints are, no
-column is dead, both parts are long enough and an arm can have the parameters. Beyond a margin of 1 the model lacks more
-than noise, which the verdict says with the smallest contact that shows beside it.
+least `HALF`: no model explains more of a torque that is mostly noise. The test is explained if all joints are, no
+column is dead, both parts are long enough and an arm can have the parameters. With a margin below 1 the model lacks
+more than noise; the verdict then names the smallest contact that still shows.
 """
 
 import math
@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.lab.offline.column_checks import CLIPPED_REMEDY, ColumnFinding, find_faults, joined_names, plateau
+from adacd_hil.lab.offline.column_checks import CLIPPED_REMEDY, RecordingFinding, find_faults, joined_names, plateau
 from adacd_hil.lab.offline.other_readings import UNITS, find_readings
 from adacd_hil.lab.offline.recording_import import ForeignRecording
 from adacd_hil.lab.offline.recording_map import RecordingMap
@@ -33,28 +33,28 @@ from adacd_hil.scheme.identify.offline import ArmModel, ModelEstimate, OfflineCe
 WHOLE: Final = 0.99
 HALF: Final = 0.5
 NOTHING: Final = 0.1
-"""Largest share of a torque in which nothing of the motion is."""
+"""Largest share of a torque that is unrelated to the motion."""
 _NOISE_TIMES: Final = 1.5
-"""Times the filtered noise, up to which a torque is called noise."""
+"""Factor on the filtered noise, up to which a torque is called noise."""
 _SHORTEST_FIT_S, _SHORTEST_TEST_S = 2.0, 1.0
 _SIGMAS: Final = 3.0
 _UNKNOWN: Final = 0.3
-"""Of the deviation before any motion: a parameter of which more is left was not excited."""
+"""Share of its initial deviation: a parameter that keeps more of it was not excited."""
 _MILLI: Final = (300.0, 3000.0)
-"""Times the masses of the URDF that torques ask for if they are mNm."""
+"""Range of the factor on the URDF's masses that the torques need if they are mNm."""
 _ODD_SCALE: Final = 2.0
 _ODD_MASSES: Final = 0.3
-"""Share by which the parameters of a URDF may be off."""
+"""Relative error that the parameters of a URDF may have."""
 _HEAVIEST_KG, _LIGHTEST_KG = 300.0, 0.01
-"""Inertia over the square of the reach: what no arm of a lab has."""
+"""Inertia over the square of the reach; beyond this no arm of a lab has it."""
 _HEAVY_KG, _LIGHT_KG = 30.0, 0.1
-"""What few have."""
+"""The same; beyond this few arms have it."""
 _MOSTLY: Final = 0.8
-"""Share of the torque that is explained where the scale of the parameters says anything."""
+"""Share of the torque that must be explained before the scale of the parameters is judged."""
 
 
 class JointShare(NamedTuple):
-    """What the test says of a joint. share: nan where there is no torque."""
+    """Result of the test for a joint. share: nan without torque."""
 
     name: str
     share: float
@@ -65,20 +65,20 @@ class JointShare(NamedTuple):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the torque is explained. reasons: why not, and remarks: what else is to be known, a sentence each."""
+    """Whether the torque is explained. reasons: why not, remarks: further facts, a sentence each."""
 
     is_explained: bool
     headline: str
     joints: tuple[JointShare, ...]
     reasons: tuple[str, ...]
     remarks: tuple[str, ...]
-    remedy: str  # the next thing to do; "" where nothing has to be mended
+    remedy: str  # the user's next step; "" if none is needed
 
     def __repr__(self) -> str:
         return f"<Verdict: {self.headline}>"
 
     def as_json(self) -> dict[str, Any]:
-        """Describe it for machines."""
+        """Return the verdict as a dictionary for JSON."""
         return {
             "is_explained": self.is_explained,
             "headline": self.headline,
@@ -89,7 +89,7 @@ class Verdict:
 
 
 class Fitted(NamedTuple):
-    """What is judged. before: the estimate that the fit began with."""
+    """A fit with its recordings and its test, to be judged. before: the estimate that the fit began with."""
 
     described: RecordingMap
     model: ArmModel
@@ -102,17 +102,11 @@ class Fitted(NamedTuple):
     tested: ForeignRecording
 
 
-class _Finding(NamedTuple):
-    text: str
-    remedy: str
-    is_against: bool
-
-
 def judge_fit(fit: Fitted) -> Verdict:
     """Judge a fit by its test."""
     joints = _shares(fit)
     columns = find_faults(fit.described, fit.fitted, fit.tested)
-    plain = [_against(found) for found in columns if found.is_dead] or list(_of_length(fit))
+    plain = [found for found in columns if found.is_dead] or list(_of_length(fit))
     findings = plain or _of_model(fit, joints, columns)
     findings += [] if plain else _of_friction(fit)
     is_explained = all(joint.is_explained for joint in joints) and not any(found.is_against for found in findings)
@@ -129,21 +123,17 @@ def judge_fit(fit: Fitted) -> Verdict:
     )
 
 
-def _against(found: ColumnFinding) -> _Finding:
-    return _Finding(found.text, found.remedy, is_against=True)
+def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[RecordingFinding]) -> list[RecordingFinding]:
+    """Return the likeliest cause of an unexplained torque, or of parameters that no arm has.
 
-
-def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[ColumnFinding]) -> list[_Finding]:
-    """Say why the torque is not explained, or not by an arm that there can be: the likeliest cause alone.
-
-    columns: what may be a cause; remarks where the torque is explained.
+    columns: defects of columns as possible causes; remarks if the torque is explained.
     """
-    remarks = [_Finding(found.text, found.remedy, is_against=False) for found in columns]
+    remarks = [found._replace(is_against=False) for found in columns]
     scale = list(_of_scale(fit, joints))
     if any(found.is_against for found in scale):
         return [*scale, *remarks]
     inertia = list(_of_inertia(fit))
-    wrong = [_against(found) for found in columns if found.is_wrong]
+    wrong = [found for found in columns if found.is_wrong]
     is_good = not inertia and not wrong and all(joint.is_explained for joint in joints)
     if is_good and fit.certificate.margin >= 1.0:
         return [*scale, *remarks]
@@ -152,20 +142,20 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Colum
     if is_good:
         return [*scale, *remarks]
     lack = list(_of_lack(fit, joints))
-    causes = wrong or [*map(_against, columns)]
+    causes = wrong or list(columns)
     if causes:
         return [*causes, *scale, *(found._replace(is_against=False) for found in lack)]
     return [*(list(_of_noise(fit, joints)) or inertia or lack), *scale]
 
 
 def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
-    """Tell of each torque whether it is no more than the sensor's noise behind the filter of the fit."""
+    """Tell for each torque whether it is no more than the sensor's noise behind the filter of the fit."""
     noise = offline.filtered_noise_Nm(fit.settings)
     return [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
 
 
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
-    """Measure each joint's share and margin."""
+    """Compute each joint's share and margin."""
     parts = [
         offline.filtered(fit.model, stretch.record, fit.estimate, fit.settings) for stretch in fit.tested.stretches
     ]
@@ -190,7 +180,7 @@ def _shares(fit: Fitted) -> tuple[JointShare, ...]:
 
 
 def percent(share: float) -> str:
-    """Write a share; what is explained less than not at all is nothing."""
+    """Format a share as a percentage; a negative one is 0."""
     if math.isnan(share):
         return "-"
     digits = 1 if share < 0.9995 else 2
@@ -211,36 +201,34 @@ def _headline(fit: Fitted, joints: Sequence[JointShare], is_explained: bool) -> 
     return f"NOT explained: {least}{where}; {margin}"
 
 
-def _of_length(fit: Fitted) -> Iterator[_Finding]:
-    """Say what is too short."""
+def _of_length(fit: Fitted) -> Iterator[RecordingFinding]:
+    """Report parts that are too short."""
     fit_s, test_s = sum(recording.duration_s for recording in fit.fitted), fit.tested.duration_s
     if fit_s < _SHORTEST_FIT_S or test_s < _SHORTEST_TEST_S:
-        yield _Finding(
+        yield RecordingFinding(
             f"too short: {fit_s:.2g} s fitted and {test_s:.2g} s tested, {_SHORTEST_FIT_S:g} and {_SHORTEST_TEST_S:g} "
             "s are the least, 10 s a good beginning",
             "record more, in which every joint turns fast and slow, both ways",
-            is_against=True,
         )
 
 
-def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[_Finding]:
-    """Name the mistake of the map that explains at least such a share of the torque."""
+def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[RecordingFinding]:
+    """Report the mistake of the map that explains at least this share of the torque."""
     fitted = [stretch.record for recording in fit.fitted for stretch in recording.stretches]
     tested = [stretch.record for stretch in fit.tested.stretches]
     readings = find_readings(fit.described, fit.model, fit.settings, fitted, tested)
     if not readings or readings[0].share < least:
         return
     text = ", or ".join(reading.text for reading in readings[:3])
-    told, where = percent(min(joint.share for joint in joints)), " at the worst joint" if len(joints) > 1 else ""
-    yield _Finding(
-        f"{text}: so {percent(readings[0].share)} of the torque is explained{where}, {told} as the map has it",
+    by_map, where = percent(min(joint.share for joint in joints)), " at the worst joint" if len(joints) > 1 else ""
+    yield RecordingFinding(
+        f"{text}: so {percent(readings[0].share)} of the torque is explained{where}, {by_map} as the map has it",
         f"in the map: {', or '.join(dict.fromkeys(reading.remedy for reading in readings[:3]))}",
-        is_against=True,
     )
 
 
-def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
-    """Name torques in which nothing of the motion is, or little."""
+def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
+    """Report torques that are unrelated to the motion, or nearly so."""
     related, is_noise = _related_to_motion(fit), _is_noise(fit, joints)
     empty = [
         i for i, joint in enumerate(joints) if not joint.share >= NOTHING and (is_noise[i] or related[i] < NOTHING)
@@ -254,42 +242,41 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
     for chosen, text in (
         (
             passive,
-            "the torque of {names} is noise, and by the model of the others there is hardly any: a passive joint, or "
-            "what drives it is less than the noise",
+            "the torque of {names} is noise, and by the model of the others it is tiny: a passive joint, or "
+            "its torque is less than the noise",
         ),
         (
             [i for i in empty if is_noise[i] and i not in passive],
-            "the torque of {names} is noise: nothing of the motion is in it. The sensor is dead, the column is another "
-            "one's, or nothing drives the joint",
+            "the torque of {names} is noise, unrelated to the motion: the sensor is dead, the column is another "
+            "joint's, or the joint isn't driven",
         ),
         (
             [i for i in empty if not is_noise[i] and i not in passive],
-            "nothing of the torque of {names} is explained: the sensor is dead, the column is another one's, nothing "
-            "drives the joint, or it moves in the test as it never did in the fit",
+            "the torque of {names} is unexplained: the sensor is dead, the column is another joint's, the joint isn't "
+            "driven, or it moves in the test unlike in the fit",
         ),
     ):
         if chosen:
             names = joined_names([joints[i].name for i in chosen], len(joints))
             remedy = f"check the sensor of {names}, and {_column(fit.described, 'tau_J', chosen)}"
-            yield _Finding(text.format(names=names), remedy, is_against=True)
+            yield RecordingFinding(text.format(names=names), remedy)
     weak = [
         joint.name
         for i, joint in enumerate(joints)
         if i not in (*empty, *passive) and not joint.is_explained and joint.margin >= 1.0
     ]
     if weak:
-        yield _Finding(
-            f"the torque of {joined_names(weak, len(joints))} is mostly noise: what the motion makes of it is smaller",
+        yield RecordingFinding(
+            f"the torque of {joined_names(weak, len(joints))} is mostly noise: the part due to motion is smaller",
             "move faster and farther",
-            is_against=True,
         )
 
 
 def _related_to_motion(fit: Fitted) -> Vector:
-    """Return the share (n,) of each torque that plain terms of the joint's own motion explain, whatever the model is.
+    """Return the share (n,) of each torque that simple terms of the joint's own motion explain, whatever the model.
 
-    By least squares on fit or test, told by the other one, whichever does better: filtered position, its sine and
-    cosine, velocity, its sign, and acceleration.
+    By least squares on fit or test, evaluated on the other, the better of the two; terms: filtered position, its sine
+    and cosine, velocity, its sign, and acceleration.
     """
     n = fit.model.joints
     period_s, cutoff = fit.settings.period_s, fit.settings.fit_cutoff_rad_s
@@ -310,13 +297,13 @@ def _related_to_motion(fit: Fitted) -> Vector:
                 rate = cutoff * (_low_pass(terms[:, 4:5], decay) - smooth[:, 4:5])
                 rows.append(np.hstack([smooth[:, :6], rate, smooth[:, 6:]]))
             tables.append(np.concatenate(rows))
-        shares[i] = max(_told_share(*tables), _told_share(*tables[::-1]))
+        shares[i] = max(_predicted_share(*tables), _predicted_share(*tables[::-1]))
     return shares
 
 
-def _told_share(told: Vector, tested: Vector) -> float:
-    """Return the share of the last column of a table that a fit of the others to another table explains."""
-    coefficients = np.linalg.lstsq(told[:, :-1], told[:, -1], rcond=1e-6)[0]
+def _predicted_share(fitted: Vector, tested: Vector) -> float:
+    """Return the share of a table's last column that a fit of the others to another table explains."""
+    coefficients = np.linalg.lstsq(fitted[:, :-1], fitted[:, -1], rcond=1e-6)[0]
     unit, torque = tested[:, 0], tested[:, -1]
     spread = torque - unit * (unit @ torque) / max(float(unit @ unit), 1e-18)
     left = torque - tested[:, :-1] @ coefficients
@@ -329,7 +316,7 @@ def _low_pass(values: Vector, decay: float) -> Vector:
     return np.asarray(lfilter([1.0 - decay], [1.0, -decay], values, axis=0))
 
 
-def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
+def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
     """Compare the torques with the masses of the URDF, and the inertia with that of any arm of this reach."""
     scale, sigma = _scale_of_urdf(fit)
     mass_kg = _mass_at_reach(fit)
@@ -340,28 +327,27 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
         turns = {"rad": 180.0 / math.pi, "deg": math.pi / 180.0}
         angle = [unit for unit, factor in turns.items() if unit != units.q and 0.8 < abs(scale) / factor < 1.25]
         if meant:
-            yield _Finding(f"{text}: they are {meant}", f'in the map: `units.tau_J` = "{meant}"', is_against=True)
+            yield RecordingFinding(f"{text}: they are {meant}", f'in the map: `units.tau_J` = "{meant}"')
             return
         if angle and least >= WHOLE:
             remedy = f'in the map: `units.q` = "{angle[0]}"'
-            yield _Finding(f"{text}: the positions are {UNITS[angle[0]]}", remedy, is_against=True)
+            yield RecordingFinding(f"{text}: the positions are {UNITS[angle[0]]}", remedy)
             return
         if not 1.0 / _ODD_SCALE <= abs(scale) <= _ODD_SCALE:
-            yield _Finding(
-                f"{text}: a unit, a gear or a gain is wrong, or the masses of the URDF are", "", is_against=False
+            yield RecordingFinding(
+                f"{text}: a unit, a gear or a gain is wrong, or the masses of the URDF are", is_against=False
             )
     if mass_kg is not None and least >= HALF and not _LIGHTEST_KG <= mass_kg <= _HEAVIEST_KG:
-        yield _Finding(
+        yield RecordingFinding(
             f"the inertia about {joints[0].name} is that of {mass_kg:.2g} kg at the arm's reach",
             "correct `units` and `scale` of positions and torques",
-            is_against=True,
         )
 
 
 def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
     """Return the unit that torques are meant in if they are off by 1000; "" if they aren't.
 
-    Some URDFs have masses of a thousandth to please a simulator: an inertia that an arm can have is none of mNm.
+    Some URDFs have masses of a thousandth for the sake of a simulator: with a plausible inertia, torques are not mNm.
     """
     low, high = _MILLI
     if low <= scale <= high and unit in ("Nm", "A") and (mass_kg is None or mass_kg > _HEAVY_KG):
@@ -372,21 +358,21 @@ def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
 
 
 def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
-    """Return by what the URDF's masses have to be multiplied, with its deviation; None where it has none."""
+    """Return the factor that the URDF's masses need, with its deviation; None if the URDF has no masses."""
     theta_full = fit.described.urdf.theta_full
     base = fit.model.place_of("base")
-    told = fit.model.base.map @ theta_full
-    if not np.any(told):
+    expected = fit.model.base.map @ theta_full
+    if not np.any(expected):
         return None, 0.0
     P = fit.estimate.P[base, base]
-    spread = _ODD_MASSES * np.maximum(np.abs(told), 0.1 * np.abs(told).max())
-    weighed = np.linalg.solve(P + np.diag(spread**2), told)
-    along = float(weighed @ told)
+    spread = _ODD_MASSES * np.maximum(np.abs(expected), 0.1 * np.abs(expected).max())
+    weighed = np.linalg.solve(P + np.diag(spread**2), expected)
+    along = float(weighed @ expected)
     return float(weighed @ fit.estimate.theta[base]) / along, math.sqrt(float(weighed @ P @ weighed)) / along
 
 
 def _mass_at_reach(fit: Fitted) -> float | None:
-    """Return the mass that the inertia about the first joint is of, at the distance of the outermost joint."""
+    """Return the mass at the distance of the outermost joint that has the inertia about the first joint."""
     arm = fit.described.urdf.chain
     reach_m = float(np.sum(np.linalg.norm(arm.translation[1:], axis=1)))
     if reach_m <= 0.0 or np.any(arm.is_prismatic):
@@ -398,8 +384,8 @@ def _mass_at_reach(fit: Fitted) -> float | None:
     return inertia / reach_m**2 if inertia > 0.0 else None
 
 
-def _of_inertia(fit: Fitted) -> Iterator[_Finding]:
-    """Say where no masses make the inertia that was found: kinetic energy would be negative."""
+def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
+    """Report an inertia that no masses have: kinetic energy would be negative."""
     names = fit.described.urdf.joint_names
     n = fit.model.joints
     record = fit.tested.stretches[0].record
@@ -413,15 +399,14 @@ def _of_inertia(fit: Fitted) -> Iterator[_Finding]:
     if worst is not None:
         _, joint, inertia, sigma = worst
         unit_text = "kg" if fit.described.urdf.chain.is_prismatic[joint] else "kg m²"
-        yield _Finding(
+        yield RecordingFinding(
             f"the inertia about {names[joint]} is negative, {inertia:.3g} ± {sigma:.1g} {unit_text}: no masses make it",
             "check signs and order of the columns, and the URDF",
-            is_against=True,
         )
 
 
-def _of_friction(fit: Fitted) -> Iterator[_Finding]:
-    """Say where friction drives a joint on, or one of its two terms is negative."""
+def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
+    """Report friction that drives a joint on, or whose viscous or Coulomb term is negative."""
     record = np.concatenate([stretch.record.dq for stretch in fit.tested.stretches])
     speed = np.abs(record)
     theta, deviation = fit.estimate.theta, fit.deviation
@@ -430,39 +415,37 @@ def _of_friction(fit: Fitted) -> Iterator[_Finding]:
         power = theta[F_c] * speed[:, joint].mean() + theta[F_v] * (speed[:, joint] ** 2).mean()
         sigma = math.hypot(deviation[F_c] * speed[:, joint].mean(), deviation[F_v] * (speed[:, joint] ** 2).mean())
         if power < -_SIGMAS * sigma:
-            yield _Finding(
+            yield RecordingFinding(
                 f"friction drives {name} on: F_v {theta[F_v]:.3g} ± {deviation[F_v]:.1g} Nm s/rad, F_c "
                 f"{theta[F_c]:.3g} ± {deviation[F_c]:.1g} Nm",
-                "",
                 is_against=False,
             )
         for place, unit in ((F_v, "Nm s/rad"), (F_c, "Nm")):
             if power >= -_SIGMAS * sigma and theta[place] < -_SIGMAS * deviation[place]:
-                yield _Finding(
+                yield RecordingFinding(
                     f"{fit.model.parameter_names[place]} of {name} is negative, {theta[place]:.3g} ± "
                     f"{deviation[place]:.1g} {unit}: the friction's curve is not a straight line",
-                    "",
                     is_against=False,
                 )
 
 
-def _of_excitation(fit: Fitted) -> Iterator[_Finding]:
-    """Name parameters that the motion tells little of, as noisy as the residual is."""
+def _of_excitation(fit: Fitted) -> Iterator[RecordingFinding]:
+    """Report parameters that the motion hardly determines, given the noise of the residual."""
     before, after = (np.sqrt(np.diag(estimate.P)) for estimate in (fit.before, fit.estimate))
     noise = np.maximum(fit.certificate.threshold_Nm / fit.settings.deviations, 1e-12)
     worse = max(1.0, float(np.max(fit.certificate.residual_rms_Nm / noise)))
     unknown = np.array(fit.model.parameter_names)[worse * after > _UNKNOWN * before].tolist()
     if unknown:
         some = ", ".join(unknown[:6]) + (f" and {len(unknown) - 6} more" if len(unknown) > 6 else "")
-        yield _Finding(
-            f"too little excitation: the motion tells next to nothing of {some}",
+        yield RecordingFinding(
+            f"too little excitation: the motion hardly determines {some}",
             "record motion of every joint, fast and slow, both ways",
             is_against=False,
         )
 
 
-def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
-    """Say which joints are not explained where nothing says why."""
+def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
+    """Report unexplained joints if no cause was found."""
     for i, joint in enumerate(joints):
         if joint.is_explained or math.isnan(joint.share):
             continue
@@ -471,7 +454,7 @@ def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
         )
         bound = plateau(torque)
         largest, rms = fit.certificate.residual_max_Nm[i], fit.certificate.residual_rms_Nm[i]
-        yield _Finding(
+        yield RecordingFinding(
             f"{joint.name}: {percent(joint.share)} is explained, {100.0 * WHOLE:.0f} % are needed; the residual "
             f"reaches {largest:.3g} Nm ({rms:.2g} rms), {_times_threshold(joint.margin)}"
             + (
@@ -480,7 +463,6 @@ def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
                 else ""
             ),
             CLIPPED_REMEDY if bound else _lack_remedy(fit),
-            is_against=True,
         )
 
 
@@ -488,7 +470,7 @@ def _lack_remedy(fit: Fitted) -> str:
     if fit.described.units.tau_J in ("A", "mA") and not fit.described.arm.has_rotors:
         return "torques of motors turn the rotors, too: `arm.has_rotors` = true"
     return (
-        "look at the picture of --out where the residual is large: reversals say friction, fast motion says lengths, "
+        "look at the picture of --out where the residual is large: at reversals: friction; in fast motion: lengths, "
         "elasticity or late velocities"
     )
 
@@ -499,31 +481,30 @@ def _times_threshold(margin: float) -> str:
     return f"{1.0 / margin:.2g} times its threshold" if margin > 0.0 else "far beyond its threshold"
 
 
-def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[_Finding]:
-    """Say what contacts show where the model lacks more than noise, or noise is more than the torque."""
+def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
+    """Report the smallest contacts that show, if the model lacks more than noise, or noise exceeds the torque."""
     certificate = fit.certificate
     contact_Nm = np.hypot(certificate.threshold_Nm, fit.settings.deviations * certificate.lack_Nm)
     over = [i for i, joint in enumerate(joints) if joint.margin < 1.0]
     loud = [i for i, joint in enumerate(joints) if i not in over and certificate.threshold_Nm[i] > joint.torque_Nm]
     if over:
         each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in over)
-        yield _Finding(
-            f"what the model lacks is more than noise: contacts show from about {each} on", "", is_against=False
+        yield RecordingFinding(
+            f"the model error exceeds the noise: contacts show from about {each} on", is_against=False
         )
     if loud:
         each = ", ".join(f"{joints[i].name} {contact_Nm[i]:.2g} Nm" for i in loud)
         noise = fit.settings.velocity_noise_rad_s
         source = f" of the velocities, {noise:.2g} rad/s," if noise and fit.described.columns.dq else ""
         remedy = "; without `columns.dq` they are derived from the positions" if source else ""
-        yield _Finding(
+        yield RecordingFinding(
             f"noise{source} hides contacts smaller than the torque itself: they show from about {each} on{remedy}",
-            "",
             is_against=False,
         )
 
 
 def _column(described: RecordingMap, key: str, joints: Sequence[int]) -> str:
-    """Name a key of the map with the columns of some joints."""
+    """Return a key of the map with the columns of some joints."""
     columns = getattr(described.columns, key)
     named = f" ({', '.join(columns[i] for i in joints)})" if columns else ""
     return f"`columns.{key}`{named}"

@@ -1,9 +1,8 @@
-"""What a CSV file seems to be: its delimiter, head and decimals, and what its columns are, by heads and by values.
+"""Guesses the form of a CSV file, delimiter, head and decimals, and the role of its columns, by heads and by values.
 
-A head is taken apart into words, a number and a unit: `pos_meas_2`, `j1_deg`, `actual_qd_0`, `effort [mNm]`. Columns
-with the same words and other numbers, or the arm's joints, are a group; a group of as many as the arm has joints is
-positions, velocities or torques by one of its words. Where a file has no heads, positions are the columns whose slope
-others are.
+A head is split into words, a number and a unit: `pos_meas_2`, `j1_deg`, `actual_qd_0`, `effort [mNm]`. Columns with the
+same words and other numbers, or the arm's joints, are a group; a group of as many as the arm has joints is positions,
+velocities or torques by one of its words. Without heads, columns whose slope other columns are, are positions.
 """
 
 import math
@@ -30,9 +29,9 @@ from adacd_hil.records import Vector
 
 _SEEN_ROWS: Final = 20_000
 _HEAD_ROWS: Final = 60
-"""Rows in which the head is looked for."""
+"""Rows in which the head is searched."""
 _FULL_ROWS: Final = 4
-"""Rows of numbers in a row that are the beginning of the data."""
+"""Consecutive rows of numbers that mark the beginning of the data."""
 _ROLES: Final = {
     "time": ("t", "time", "timestamp", "stamp", "sec", "secs", "seconds", "clock"),
     "dq": ("dq", "qd", "vel", "velocity", "velocities", "qdot", "speed", "omega", "rate"),
@@ -42,7 +41,7 @@ _ROLES: Final = {
     "contact": ("contact", "touched", "touch", "collision"),
 }
 _OTHERS: Final = ("ddq", "qdd", "acc", "acceleration", "temp", "temperature", "voltage", "error", "err")
-"""Words of columns that are none of these, whatever else their heads say."""
+"""Words of columns with another role, whatever else their heads contain."""
 _NOT_MEASURED: Final = ("des", "desired", "cmd", "command", "commanded", "con", "ref", "target", "goal", "set", "fric",
                         "friction", "filt", "filtered", "ff", "ext", "external", "model")  # fmt: skip
 _UNIT_ROLES: Final = {
@@ -56,7 +55,7 @@ _ALIKE: Final = 0.9
 
 
 class TableForm(NamedTuple):
-    """How a file is written, as `[csv]` of a map has it; units: of a row below the head, "" where there are none."""
+    """Form of a file, as in `[csv]` of a map; units: of a row below the head, "" without one."""
 
     delimiter: str
     decimal: str
@@ -68,10 +67,10 @@ class TableForm(NamedTuple):
 
 @dataclass
 class TableGuess:
-    """What a file seems to be. columns, units: by role, as heads say them. reasons: why, of guesses."""
+    """The guess. columns, units: by role, from the heads. reasons: of guesses."""
 
     form: TableForm
-    values: Vector  # (k, columns) as far as they are looked at; what is no number is nan
+    values: Vector  # (k, columns) of the rows that were read; nan for cells that are no numbers
     is_iso: bool = False
     columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
@@ -83,16 +82,16 @@ class TableGuess:
 
 
 class _Head(NamedTuple):
-    """A head taken apart."""
+    """A column's head, split into words, joint number or index, and unit."""
 
     place: int
     words: tuple[str, ...]
-    order: float  # number or place of the joint; nan where it has none
+    order: float  # number or index of the joint; nan without one
     unit: str
 
 
 def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
-    """Look at a CSV file of an arm with such joints. Raises LogError."""
+    """Guess form and columns of a CSV file for an arm with these joints. Raises LogError."""
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
     form, first = _form(path, lines)
@@ -110,14 +109,14 @@ def _split(path: Path, lines: list[str], delimiter: str) -> list[list[str]]:
 
 
 def _is_full(cells: list[str], decimal: str) -> bool:
-    """Tell whether a row has numbers, the first perhaps a date."""
+    """Tell whether a row has numbers only, except perhaps a date in the first cell."""
     return all(is_number(cell, decimal) for cell in cells[1:]) and (
         is_number(cells[0], decimal) or is_iso_time(cells[0])
     )
 
 
 def _form(path: Path, lines: list[str]) -> tuple[TableForm, int]:
-    """Find the form with the most columns, and the line in which the data begin. Raises LogError."""
+    """Find the form with the most columns, and the line where the data begin. Raises LogError."""
     best: tuple[int, TableForm, int] | None = None
     for delimiter in DELIMITERS:
         for decimal in (".", ",") if delimiter != "," else (".",):
@@ -143,7 +142,7 @@ def _begins(rows: list[list[str]], decimal: str) -> bool:
 
 
 def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) -> TableForm:
-    """Describe a file whose data begin at a row: the head is above, and perhaps a row of units between."""
+    """Return the form of a file whose data begin at a row: the head is above, perhaps with a row of units between."""
     count = len(rows[first])
     above = [k for k in range(first) if len(rows[k]) == count and rows[k][0].removeprefix("#").strip()]
     units: tuple[str, ...] = ("",) * count
@@ -157,7 +156,7 @@ def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) ->
 
 
 def _values(rows: list[list[str]], form: TableForm) -> tuple[Vector, bool]:
-    """Read the data; whether the first column has dates, which are left as nan."""
+    """Read the data; tell whether the first column has dates, which are read as nan."""
     count = len(form.heads)
     table: list[list[float]] = []
     is_iso = False
@@ -211,7 +210,7 @@ def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
 
 
 def _taken_apart(place: int, text: str, joint_names: Sequence[str]) -> _Head:
-    """Take a head apart."""
+    """Split a head into words, number and unit."""
     unit, order = "", math.nan
     if match := re.search(r"[\[(]([^\])]*[^\])\d][^\])]*)[\])]", text):
         unit = unit_of(match[1])
@@ -231,7 +230,7 @@ def _taken_apart(place: int, text: str, joint_names: Sequence[str]) -> _Head:
 
 
 def _role(words: tuple[str, ...], unit: str) -> str:
-    """Return what a column with such words is; "" where nothing says it."""
+    """Return the role of a column with these words; "" if unknown."""
     if any(word in _OTHERS for word in words):
         return ""
     found = (role for role, known in _ROLES.items() if any(word in known for word in words))
@@ -242,7 +241,7 @@ def _role(words: tuple[str, ...], unit: str) -> str:
 
 
 def _by_values(guess: TableGuess, n: int) -> None:
-    """Take the first column that grows for the time; positions are the n columns whose slope the n behind them are."""
+    """Take the first column that grows for the time; positions are n columns whose slope the next n are."""
     values, heads = guess.values, guess.form.heads
     grows = [place for place in range(values.shape[1]) if np.all(np.diff(values[:, place]) > 0.0)]
     first = 0
@@ -271,7 +270,7 @@ def _take(guess: TableGuess, role: str, block: tuple[int, ...], reason: str) -> 
 
 
 def _is_slope(time: Vector, q: Vector, dq: Vector) -> bool:
-    """Tell whether columns are the slope of others, in whatever unit."""
+    """Tell whether columns are the slope of others, in any unit."""
     slope = np.gradient(q, axis=0) / np.gradient(time)[:, None]
     moving = np.ptp(q, axis=0) > 0.0
     if not moving.any() or np.any(np.ptp(dq[:, moving], axis=0) == 0.0):

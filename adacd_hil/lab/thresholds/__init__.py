@@ -1,1 +1,1 @@
-"""Thresholds for a wanted rate of false alarms, from recorded motion that nobody touched."""
+"""Thresholds for a wanted rate of false alarms, from recorded contact-free motion."""

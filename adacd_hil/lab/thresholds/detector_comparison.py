@@ -1,11 +1,11 @@
 """Detectors compared on one stream: delay against the size of a step, at equal predicted rates of false alarms.
 
-The stream is recorded contact-free motion; a step of external torque is added to it at many instants, as a velocity
-that lags makes of it: 1 - (1 + x) e^-x with x = 2 t / lag, a critically damped tracking loop. Everything here is linear
-up to the statistics, so the sum is the recording that a push would have given, but for the motion that it causes.
+The stream is recorded contact-free motion; a step of external torque is added to it at many instants, shaped by the lag
+of the velocity: 1 - (1 + x) e^-x with x = 2 t / lag, a critically damped tracking loop. Everything here is linear up to
+the statistics, so the sum equals the recording of a push, except for the motion that a push causes.
 
-A delay is from the onset to the sample with which the detector is over, in ms; one bus cycle until the host has that
-sample is not in it. A step that is not found within `HORIZON_S` has a delay of more than that.
+A delay is from the onset to the sample at which the detector exceeds its threshold, in ms; the bus cycle until the host
+has that sample is not included. A step that is not found within `HORIZON_S` has a delay of more than that.
 """
 
 import math
@@ -27,8 +27,8 @@ ROC_STEP_NM: Final = 0.1
 ROC_WITHIN_S: Final = 0.03
 HORIZON_S: Final = 0.1
 LOOP_LAG_S: Final = 1.6e-3
-"""Of a 200 Hz tracking loop, with which the step reaches the measured velocity."""
-WARM_UP_S: Final = 0.6  # until the slowest filter knows nothing of what was before
+"""Lag of a 200 Hz tracking loop, with which the step reaches the measured velocity."""
+WARM_UP_S: Final = 0.6  # until the slowest filter has forgotten earlier samples
 _ONSETS: Final = 200
 _ROC_RATES_PER_H: Final = tuple(10.0 ** (0.25 * k) for k in range(-12, 9))
 NAME: Final = "detectors"
@@ -48,18 +48,18 @@ class DelayRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All detectors at one rate of false alarms. The first of `ranking` is the one that wins."""
+    """All detectors at one rate of false alarms. The first of `ranking` is the best."""
 
     rate_per_h: float
     hours: float
     rates_per_h: tuple[float, ...]
     rows: tuple[DelayRow, ...]
     missing: tuple[str, ...]
-    """Detectors whose tail the motion can't tell."""
+    """Detectors whose tail can't be fitted from this motion."""
 
     @property
     def ranking(self) -> tuple[str, ...]:
-        """Detectors by the geometric mean of their median delays over steps and joints; never is ten horizons."""
+        """Detectors by the geometric mean of their median delays over steps and joints; not found: ten horizons."""
         scores: dict[str, list[float]] = {}
         for row in self.rows:
             delays = np.minimum(np.maximum(row.delay_ms, 0.1), 1e4 * HORIZON_S)
@@ -67,7 +67,7 @@ class Comparison:
         return tuple(sorted(scores, key=lambda name: sum(scores[name]) / len(scores[name])))
 
     def as_json(self) -> dict[str, Any]:
-        """Give the table; a delay that is never is null."""
+        """Return the table as a dictionary for JSON; an infinite delay is null."""
         return {
             "rate_per_h": self.rate_per_h,
             "hours": self.hours,
@@ -90,7 +90,7 @@ class Comparison:
         }
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-        """Give head and rows for a terminal, best detector first; a dash where fewer than half are found."""
+        """Return head and rows for a terminal, best detector first; a dash if fewer than half are found."""
         head = ("detector", "joint", *(f"{torque:g} Nm" for torque in STEPS_NM), f"found at {STEPS_NM[0]:g} Nm")
         order = {name: place for place, name in enumerate(self.ranking)}
         rows = [
@@ -106,7 +106,7 @@ class Comparison:
 
 
 def step_shape(samples: int, onset_s: float, lag_s: float, period_s: float) -> Vector:
-    """Give a unit step of external torque as the stream shows it (samples,), its onset `onset_s` after sample 0.
+    """Return a unit step of external torque as it appears in the stream (samples,), `onset_s` after sample 0.
 
     The stream is the mean over the interval that ends with the sample.
     """
@@ -118,7 +118,7 @@ def step_shape(samples: int, onset_s: float, lag_s: float, period_s: float) -> V
 
 
 def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _ONSETS, seed: int = 0) -> Comparison:
-    """Calibrate all detectors for one rate and add steps to the stream.
+    """Calibrate all detectors for one rate and measure their delays to steps added to the stream.
 
     Raises TooLittleMotionError if no detector can be calibrated or no stretch of motion is long enough.
     """
@@ -158,7 +158,7 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
 
 
 def calibrate_all(statistics: Statistics, rate_per_h: float) -> tuple[dict[str, DetectorCalibration], tuple[str, ...]]:
-    """Calibrate each detector; name those whose tail can't be told. Raises TooLittleMotionError when that is all."""
+    """Calibrate each detector; also return those whose tail can't be fitted. Raises TooLittleMotionError: none can."""
     found: dict[str, DetectorCalibration] = {}
     missing: list[str] = []
     for name, places in statistics.settings.detectors.items():
@@ -181,7 +181,7 @@ def _ratios(
     before: int,
     after: int,
 ) -> Vector:
-    """Give the largest ratio of statistic to threshold since the onset (detectors, onsets, after, n)."""
+    """Return the largest ratio of statistic to threshold since the onset (detectors, onsets, after, n)."""
     period_s = statistics.motion.period_s
     largest = np.zeros((len(found), len(starts), after, JOINTS))
     for k, (start, phase_s) in enumerate(zip(starts.tolist(), phases_s.tolist(), strict=True)):
@@ -248,5 +248,5 @@ def draw_comparison(comparison: Comparison) -> Drawing:
 
 
 def write_comparison(comparison: Comparison, out_dir: Path) -> tuple[Path, ...]:
-    """Write detectors.json, .png and .svg into a folder. Raises LogError when they can't be written."""
+    """Write detectors.json, .png and .svg into a folder. Raises LogError if they can't be written."""
     return write_figures(out_dir, NAME, comparison.as_json(), [draw_comparison(comparison)])

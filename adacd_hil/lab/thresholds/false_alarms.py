@@ -1,4 +1,4 @@
-"""The false-alarm budget: which threshold gives which rate of false alarms, from motion that nobody touched.
+"""The false-alarm budget: the threshold for a rate of false alarms, from contact-free motion.
 
 A detector's statistic is kept as its largest value per block of time. Values above a level u that are less than
 `CLUSTER_S` apart are one alarm, of which the largest value counts. A generalised Pareto tail describes the values above
@@ -6,8 +6,8 @@ u (peaks over threshold), by probability-weighted moments:
 
     rate(h) = rate(u) (1 + xi (h - u) / sigma)^(-1 / xi),          exponential at xi = 0
 
-Below u the alarms are counted. Confidence bounds come from resampled clusters and a Poisson number of them; they say
-how well the recorded motion determines the tail, and nothing about motion that was not recorded.
+Below u the alarms are counted. Confidence bounds come from resampled clusters and a Poisson number of them; they cover
+the uncertainty of the tail in the recorded motion, not motion that was not recorded.
 
 A detector of several channels and joints is calibrated in two steps: each channel and joint for an equal share of the
 wanted rate, then all together by one factor, from the tail of the largest ratio of statistic to threshold. So channels
@@ -29,9 +29,9 @@ from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 
 CLUSTER_S: Final = 0.5
-"""Values above a threshold that are nearer than this are one alarm."""
+"""Values above a threshold that are closer in time than this are one alarm."""
 FITTED_CLUSTERS: Final = (25, 400)
-"""Fewest and most clusters that a tail is fitted to; more lie too deep in the body, fewer say too little."""
+"""Fewest and most clusters that a tail is fitted to; more lie too deep in the body, fewer are too uncertain."""
 _SHAPES: Final = (-0.5, 0.25)
 """Bounds of xi. Encoder counts and friction are bounded, so most tails end; a heavier tail than the upper bound has not
 been seen on contact-free motion and would make every extrapolation infinite."""
@@ -41,11 +41,11 @@ _S_PER_H: Final = 3600.0
 
 
 class TooLittleMotionError(LogError):
-    """The recorded motion can't give the asked figure; the message says what is missing."""
+    """The recorded motion is too short for the figure; the message names the missing amount."""
 
 
 def clusters(peaks: Vector, level: float, block_s: float) -> Vector:
-    """Give the largest value of each alarm above `level` (m,), of block maxima (B,); NaN blocks don't count."""
+    """Return the largest value of each alarm above `level` (m,), of block maxima (B,); NaN blocks don't count."""
     above = np.flatnonzero(np.nan_to_num(peaks, nan=-np.inf) > level)
     if above.size == 0:
         return np.zeros(0)
@@ -63,10 +63,10 @@ class Tail:
     rate_per_h: float  # of alarms above u
     hours: float
     count: int  # clusters above u
-    largest: float  # value that was seen
+    largest: float  # value observed
 
     def rate_at(self, threshold: float) -> float:
-        """Give the predicted alarms per hour at a threshold of at least the level."""
+        """Return the predicted alarms per hour at a threshold not below the level."""
         x = max(threshold - self.level, 0.0) / self.scale
         if abs(self.shape) < 1e-9:
             return self.rate_per_h * math.exp(-x)
@@ -74,7 +74,7 @@ class Tail:
         return self.rate_per_h * math.pow(inner, -1.0 / self.shape) if inner > 0.0 else 0.0
 
     def threshold_at(self, rate_per_h: float) -> float:
-        """Give the threshold of a rate of at most that at the level."""
+        """Return the threshold of a rate not above that of the level."""
         ratio = self.rate_per_h / rate_per_h
         if ratio <= 1.0:
             return self.level
@@ -96,7 +96,7 @@ def _moments_fit(excesses: Vector) -> tuple[Vector, Vector]:
 
 
 def counted_hours(peaks: Vector, block_s: float) -> float:
-    """Give the time that the block maxima (B,) stand for, without the NaN blocks, h."""
+    """Return the time of the block maxima (B,), without the NaN blocks, h."""
     return float(np.count_nonzero(~np.isnan(peaks))) * block_s / _S_PER_H
 
 
@@ -121,7 +121,7 @@ def fit_tail(peaks: Vector, block_s: float) -> Tail:
             f"{hours * _S_PER_H:.0f} s of contact-free motion are too few for a tail, "
             f"at least {4.0 * least * CLUSTER_S:.0f} s that move are needed"
         )
-    # one alarm in twenty intervals of CLUSTER_S: with more of them, they touch and are no longer alarms of their own
+    # one alarm in twenty intervals of CLUSTER_S: with more, clusters merge
     wanted = min(most, max(least, int(0.05 * hours * _S_PER_H / CLUSTER_S)))
     levels = np.sort(peaks[~np.isnan(peaks)])[::-1]
     level, found = math.inf, np.zeros(0)
@@ -130,7 +130,7 @@ def fit_tail(peaks: Vector, block_s: float) -> Tail:
         if found.size < deeper.size <= wanted:
             level, found = float(levels[place]), deeper
     if found.size < least // 2:
-        raise TooLittleMotionError(f"only {found.size} peaks stand apart in {hours:.2f} h: the tail can't be told")
+        raise TooLittleMotionError(f"only {found.size} peaks stand apart in {hours:.2f} h: the tail can't be fitted")
     scale, shape = _moments_fit(np.sort(found - level))
     return Tail(level, float(scale), float(shape), found.size / hours, hours, found.size, float(found.max()))
 
@@ -180,25 +180,25 @@ def calibrate(
 
 @dataclass(frozen=True)
 class DetectorCalibration:
-    """The thresholds of a detector: per channel and joint, and what all of them together do."""
+    """The thresholds of a detector per channel and joint, and the calibration of all of them together."""
 
     thresholds: Vector  # (channels, n)
     calibration: TailCalibration  # of the largest ratio of statistic to threshold; `threshold` is 1
 
     def ratio(self, peaks: Vector) -> Vector:
-        """Give the largest ratio of statistic to threshold per block (B,), of block maxima (B, channels, n)."""
+        """Return the largest ratio of statistic to threshold per block (B,), of block maxima (B, channels, n)."""
         return largest_ratio(peaks, self.thresholds)
 
 
 def largest_ratio(peaks: Vector, thresholds: Vector) -> Vector:
-    """Divide block maxima (B, channels, n) by thresholds (channels, n) and take the largest of each block (B,)."""
+    """Divide block maxima (B, channels, n) by thresholds (channels, n); return the largest of each block (B,)."""
     return np.asarray((peaks / thresholds).max(axis=(1, 2)))
 
 
 def calibrate_detector(
     peaks: Vector, block_s: float, rate_per_h: float, confidence: float = 0.95
 ) -> DetectorCalibration:
-    """Find the thresholds of a detector, an alarm being an alarm of any channel and joint; peaks (B, channels, n).
+    """Find the thresholds of a detector, which alarms on any channel and joint; peaks (B, channels, n).
 
     Raises TooLittleMotionError.
     """
@@ -216,7 +216,7 @@ def calibrate_detector(
 
 @dataclass(frozen=True)
 class Prediction:
-    """A predicted rate and the rate of held-out motion."""
+    """A predicted rate, and the rate counted in held-out motion."""
 
     predicted_per_h: float
     counted: int
@@ -224,23 +224,23 @@ class Prediction:
 
     @property
     def measured_per_h(self) -> float:
-        """Alarms per hour."""
+        """Counted alarms per hour."""
         return self.counted / self.hours
 
 
 @dataclass(frozen=True)
 class ThresholdSource:
-    """One thing that keeps a threshold up."""
+    """One cause of a threshold's height."""
 
     name: str
-    peak_Nm: float  # what it alone would need
+    peak_Nm: float  # threshold that this cause alone would need
 
     def __str__(self) -> str:
         return f"{self.name} {self.peak_Nm:.4f} Nm"
 
 
 def resolution(values: Vector) -> float:
-    """Find the step of a quantised series (n,): the smallest difference of two of its values, 0 if it never changes."""
+    """Return the step of a quantised series (n,): its smallest difference of two values, 0 if it never changes."""
     steps = np.diff(np.unique(values))
     steps = steps[steps > 1e-9 * max(float(np.abs(values).max()), 1e-300)]
     return float(steps.min()) if steps.size else 0.0
@@ -253,7 +253,7 @@ def white_noise(values: Vector) -> float:
 
 
 def impulse_response(poles_rad_s: Sequence[float], period_s: float) -> Vector:
-    """Give the response (L,) of low-passes in a row to one sample of 1, until it has died away."""
+    """Return the response (L,) of cascaded low-passes to one sample of 1, until it has decayed."""
     length = int(12.0 / min(poles_rad_s, default=math.inf) / period_s) + 2
     response = np.zeros(length)
     response[0] = 1.0
@@ -267,9 +267,9 @@ def impulse_response(poles_rad_s: Sequence[float], period_s: float) -> Vector:
 
 
 def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[float, float]:
-    """Give what white noise of 1 per sample becomes behind the filter: of the torque, Nm per Nm, and of the momentum.
+    """Return the gains of the filter for white noise of 1 per sample: of the torque, Nm per Nm, and of the momentum.
 
-    The second is in Nm per kg m² rad/s. The stream takes the mean of two torques less lag times their slope.
+    The second is in Nm per kg m² rad/s. The stream takes the mean of two torques minus lag times their slope.
     """
     h = np.r_[impulse_response(poles_rad_s, period_s), 0.0]
     before = np.r_[0.0, h[:-1]]
@@ -278,33 +278,33 @@ def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[
 
 
 def peak_factor(rate_per_h: float, bandwidth_rad_s: float) -> float:
-    """Give how many standard deviations Gaussian noise of that bandwidth exceeds so often, by Rice's formula."""
+    """Return the number of standard deviations that Gaussian noise of a bandwidth exceeds so often (Rice's formula)."""
     crossings_per_h = 2.0 * bandwidth_rad_s / (2.0 * math.pi) * _S_PER_H
     return math.sqrt(2.0 * math.log(max(crossings_per_h / rate_per_h, math.e)))
 
 
 @dataclass(frozen=True)
 class Limits:
-    """The sources that keep up the threshold of one low-pass channel and joint, largest first, for a wanted rate."""
+    """Causes of the threshold of one low-pass channel and joint, largest first, for a wanted rate."""
 
     sources: tuple[ThresholdSource, ...]
     achievable_Nm: float
-    """All noise and resolution together: what is left if the model, the lag and the friction were exact."""
+    """Threshold with an exact model, lag and friction: all noise and resolution together."""
 
     @property
     def limit(self) -> str:
-        """Name the largest source."""
+        """Name of the largest cause."""
         return self.sources[0].name
 
 
 @dataclass(frozen=True)
 class Sensing:
-    """The properties of one joint's measurements that a threshold depends on."""
+    """Measurement properties of one joint that determine a threshold."""
 
     torque_noise_Nm: float
     torque_LSB_Nm: float
     velocity_LSB_rad_s: float
-    mass_row_kg_m2: float  # norm of the joint's row of M(q) where that is largest
+    mass_row_kg_m2: float  # largest norm of the joint's row of M(q)
     momentum_noise_Nms: float  # per sample, of the velocity's noise beyond its resolution
     lag_error_s: float
     friction_error_Nm: float
@@ -320,11 +320,11 @@ def find_limits(
     lag_s: float,
     rate_per_h: float,
 ) -> Limits:
-    """Split the threshold of a low-pass channel of one joint by its sources, from contact-free motion (N,).
+    """Split the threshold of a low-pass channel of one joint by its causes, from contact-free motion (N,).
 
-    Random sources are taken at the height that Gaussian noise exceeds at the wanted rate. What the stream has beyond
-    them while the joint moves is an error of the model. An error of the lag counts with the steepest torque, one of the
-    friction as it is; what friction holds at standstill raises the threshold there and is no part of it.
+    Random causes count with the height that Gaussian noise exceeds at the wanted rate. The rest of the stream while the
+    joint moves is model error. An error of the lag counts with the steepest torque, one of the friction as it is;
+    torque held by friction at standstill raises the threshold there and is not included.
     """
     torque, momentum = gains(poles_rad_s, period_s, lag_s)
     factor = peak_factor(rate_per_h, min(poles_rad_s))
@@ -351,13 +351,13 @@ def find_limits(
 
 
 def mean_square(x: Vector) -> float:
-    """Give the mean square of a series (n,), 0 of an empty one."""
+    """Return the mean square of a series (n,), 0 for an empty one."""
     return float(x @ x) / max(x.size, 1)
 
 
 def low_pass(u: Vector, poles_rad_s: Sequence[float], period_s: float) -> Vector:
-    """Take a series (n,) through low-passes in a row that were at rest before."""
-    from scipy.signal import lfilter  # half a second to load, which the watch below can spare
+    """Filter a series (n,) by cascaded low-passes that start at rest."""
+    from scipy.signal import lfilter  # takes half a second to load, and only this function needs it
 
     for pole in poles_rad_s:
         decay = math.exp(-pole * period_s)

@@ -1,12 +1,12 @@
-"""Recorded motion: the samples of logs, and which of them nobody touched, piece by piece, in bounded memory.
+"""Contact-free motion in logs: which samples are free of contact, read piece by piece, in bounded memory.
 
-The samples of a log count that lie in MONITOR at least `APART_S` after its beginning, after a gap and after a contact,
-and at least as long before one. A touch that no detector flagged counts as motion.
+Samples count if they lie in MONITOR, at least `APART_S` after its beginning, after a gap and after a contact, and at
+least as long before a contact. A touch that no detector found counts as free motion.
 
-Of each of N samples one byte is kept: whether it is free. All other data is read again from the log when it is needed.
+Per sample one byte is kept: whether it is free. All other data are read from the log again when needed.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -23,15 +23,15 @@ from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
 from adacd_hil.scheme.detect import detectors
 
 APART_S: Final = 0.6
-"""Six time constants of the slowest filter."""
+"""Distance from contacts and gaps: six time constants of the slowest filter."""
 MOST_SAMPLES: Final = 1_000_000
-"""Samples that are looked at together; of more motion, some windows."""
+"""Most samples that are processed together; of more motion, windows are taken."""
 WINDOW: Final = 10_000
 """Samples of such a window."""
 TOPICS: Final = ("/scheme",)
 _NEAR: Final = (0.5, 1.5)  # shares of the period: the shortest and longest interval of samples that follow each other
 _PERIODS: Final = 1_000_000
-"""Intervals of which the median is the period."""
+"""Number of intervals whose median is the period."""
 
 Mask = NDArray[np.bool_]
 Watch = Callable[[Series], None]
@@ -39,7 +39,7 @@ Watch = Callable[[Series], None]
 
 @dataclass(frozen=True)
 class Motion:
-    """A recording of n samples; `is_free` (n,) where nobody touched the arm and the model was frozen."""
+    """A recording of n samples; `is_free` (n,): the arm was not touched and the model was frozen."""
 
     q: Vector  # q1 from the level
     dq: Vector
@@ -57,7 +57,7 @@ _COLUMNS: Final = ("q", "dq", "tau_J", "theta", "interval_s")
 class LoggedMotion:
     """The motion in a log, or in a stretch of it: N samples at `period_s`, with p parameters; is_free (N,).
 
-    level_rad: q1 at which link 1 is level; 0 where gravity does not act.
+    level_rad: q1 at which link 1 is level; 0 without gravity.
     """
 
     path: Path
@@ -86,7 +86,7 @@ class LoggedMotion:
 
 
 def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
-    """Read /scheme of a log, or what of it lies between two times, in pieces that are not empty. Raises LogError."""
+    """Yield /scheme of a log, or its part between two times, in pieces that are not empty. Raises LogError."""
     stream = LogStream(path, TOPICS)
     for piece in stream:
         scheme = piece.series["/scheme"]
@@ -102,9 +102,9 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 def read_motion(
     path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, watch: Watch = lambda _: None
 ) -> LoggedMotion:
-    """Find the contact-free motion in a log, or in a stretch of it. Raises LogError when there is none.
+    """Find the contact-free motion in a log, or in a stretch of it. Raises LogError if there is none.
 
-    watch: is shown all of its /scheme, piece by piece.
+    watch: called with each piece of its /scheme.
     """
     bounds_ns = None
     where = ""
@@ -114,7 +114,7 @@ def read_motion(
     parts: list[Mask] = []
     before: int | None = None
     parameters = count = 0
-    milestones = Milestones(lambda at: progress(f"{path}: looking for motion that nobody touched, {at} cycles"))
+    milestones = Milestones(lambda at: progress(f"{path}: looking for contact-free motion, {at} cycles"))
     for scheme in schemes(path, bounds_ns):
         watch(scheme)
         cycle = scheme["cycle"].astype(np.int64).reshape(-1)
@@ -138,7 +138,7 @@ def _level_rad(path: Path) -> float:
 
 
 def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:
-    """Give the median of the measured periods, of a long log those of its beginning."""
+    """Return the median of the measured periods; of a long log those at its beginning."""
     measured: list[Vector] = []
     rows = 0
     for scheme in schemes(path, bounds_ns):
@@ -155,7 +155,7 @@ def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:
 
 
 def _intervals(scheme: Any, cycle: NDArray[np.int64], before: int | None, period_s: float) -> Vector:
-    """Give the time since the sample before (n,), s; 0 where that is not the cycle before."""
+    """Return the time since the previous sample (n,), s; 0 if that is not of the previous cycle."""
     interval_s: Vector = scheme["period_s"].reshape(-1).copy()
     is_near = (interval_s >= _NEAR[0] * period_s) & (interval_s <= _NEAR[1] * period_s)
     interval_s[~is_near | (np.diff(cycle, prepend=cycle[0] - 2 if before is None else before) != 1)] = 0.0
@@ -163,13 +163,13 @@ def _intervals(scheme: Any, cycle: NDArray[np.int64], before: int | None, period
 
 
 def _spread(is_bad: Mask, samples: int) -> Mask:
-    """Tell which samples have a bad one within so many samples."""
+    """Mark the samples that have a bad one within so many samples."""
     spread = maximum_filter1d(is_bad.view(np.uint8), 2 * samples + 1, mode="constant", cval=0)
     return np.asarray(spread.view(np.bool_))
 
 
 def check_together(logs: Sequence[LoggedMotion]) -> None:
-    """Raise LogError unless periods and parameters of the logs fit together."""
+    """Raise LogError unless all logs have the same period and parameters."""
     first = logs[0]
     for other in logs[1:]:
         if abs(other.period_s - first.period_s) > 0.02 * first.period_s:
@@ -179,9 +179,9 @@ def check_together(logs: Sequence[LoggedMotion]) -> None:
 
 
 def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
-    """Give all motion of the logs, one after the other, or of more than `MOST_SAMPLES` some windows with free motion.
+    """Return all motion of the logs, one after the other; of more than `MOST_SAMPLES` windows with free motion.
 
-    The windows are spread evenly over those that have some. Raises LogError.
+    The windows are spread evenly. Raises LogError.
     """
     check_together(logs)
     chosen = _windows(logs)
@@ -216,7 +216,7 @@ def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
 
 
 def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
-    """Take some samples; one whose predecessor is not taken follows a gap, and is not free."""
+    """Take some samples; a sample whose predecessor is not taken follows a gap, and is not free."""
     if rows.all() and was_chosen:
         return motion
     is_first = rows & ~np.concatenate(([was_chosen], rows[:-1]))
@@ -224,21 +224,20 @@ def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
     return replace(part, **{name: getattr(part, name)[rows] for name in (*_COLUMNS, "is_free")})
 
 
-class TorqueStream:
-    """Gives the stream of `scheme.detectors` of motion that comes piece by piece."""
+def torque_streams(
+    pieces: Iterable[Motion], lag_s: float, standstill_rad_s: float
+) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:
+    """Yield each piece of a motion with its stream of `scheme.detect.detectors`.
 
-    def __init__(self, lag_s: float, standstill_rad_s: float) -> None:
-        self._lag_s = lag_s
-        self._standstill_rad_s = standstill_rad_s
-        self._last: list[Vector] | None = None  # sample of the piece before
-
-    def add(self, motion: Motion) -> tuple[Vector, Vector]:
-        """Take in the next piece; give its z and the friction that may hold, (n, 2) each, Nm."""
+    The stream: z, and the torque that friction may hold, (n, 2) each, Nm.
+    """
+    last: list[Vector] | None = None  # last sample of the previous piece
+    for motion in pieces:
         columns = [getattr(motion, name) for name in _COLUMNS]
-        last, self._last = self._last, [column[-1:].copy() for column in columns]
-        if last is not None:
-            columns = [np.concatenate(pair) for pair in zip(last, columns, strict=True)]
+        before, last = last, [column[-1:].copy() for column in columns]
+        if before is not None:
+            columns = [np.concatenate(pair) for pair in zip(before, columns, strict=True)]
         q, dq, tau_J, theta, interval_s = columns
-        z, held_Nm = detectors.make_stream(q, dq, tau_J, theta, interval_s, self._lag_s, self._standstill_rad_s)
-        skipped = int(last is not None)
-        return z[skipped:], held_Nm[skipped:]
+        z, held_Nm = detectors.make_stream(q, dq, tau_J, theta, interval_s, lag_s, standstill_rad_s)
+        skipped = int(before is not None)
+        yield motion, (z[skipped:], held_Nm[skipped:])

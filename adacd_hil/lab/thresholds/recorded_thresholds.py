@@ -1,10 +1,9 @@
-"""Thresholds from logs: recorded motion that nobody touched, each detector's statistics on it, and the thresholds.
+"""Thresholds from logs: contact-free motion, each detector's statistics on it, and the thresholds.
 
-`free_motion` defines the motion that counts. A touch that no detector flagged counts, and raises thresholds.
-
-The detectors run over all of this motion, and thresholds come from all of their statistics. The velocity's lag (what
-the filtered slope of the torque explains of the stream), the stream's covariance and the sources of a threshold are
-found from the same motion, of more than `MOST_SAMPLES` from some windows.
+`free_motion` defines the motion that counts. A touch that no detector found counts, too, and raises thresholds. The
+detectors run over all of this motion, and thresholds come from all of their statistics. The velocity's lag (by
+regression of the stream on the filtered slope of the torque), the stream's covariance and the causes of a threshold
+come from the same motion, of more than `MOST_SAMPLES` from windows of it.
 """
 
 from collections.abc import Sequence
@@ -29,7 +28,7 @@ from adacd_hil.lab.thresholds.false_alarms import (
     resolution,
     white_noise,
 )
-from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, TorqueStream, read_motion, sample_of
+from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, read_motion, sample_of, torque_streams
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import Milestones, Progress
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
@@ -40,14 +39,14 @@ from adacd_hil.settings.schema import setting
 BLOCK_S: Final = 0.1
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
-"""Below this the model's errors stand out of the noise."""
-_CHECKED_ALARMS: Final = 20.0  # of the held-out half: so many are counted well enough to compare with the prediction
+"""Corner frequency below which the model's errors exceed the noise."""
+_CHECKED_ALARMS: Final = 20.0  # alarms in the held-out half that are enough to compare with the prediction
 
 
 def find_lag(motion: Motion) -> tuple[float, Vector]:
     """Identify the velocity's lag behind the torque, s: of both joints together, and of each (n,); from 0 to 5 ms.
 
-    Where the torque never changes, the lag is the usual one.
+    If the torque never changes, the default lag is returned.
     """
     z, _ = detectors.make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
     moving = motion.is_free & (np.abs(motion.dq) > 0.02).all(axis=1)
@@ -59,7 +58,7 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
             low_pass(series * motion.is_free, (_MODEL_RAD_S,), motion.period_s)[moving] for series in (z[:, i], slope)
         )
         top[i] = -float(explained @ by)
-        # the noise of the torque has a slope too, of which the stream knows nothing
+        # the noise of the torque has a slope, too, which is not in the stream
         bottom[i] = float(by @ by) - by.size * (slope_gain * white_noise(motion.tau_J[:, i])) ** 2
     if not (bottom > 0.0).any():
         return detectors.VELOCITY_LAG_S, np.full(JOINTS, detectors.VELOCITY_LAG_S)
@@ -95,7 +94,7 @@ def run_detectors(
     """Run every detector over the motion of logs. Raises LogError, TooLittleMotionError."""
     motion = sample_of(logs)
     lag_s, lag_of_joint_s = find_lag(motion)
-    z, held_Nm = TorqueStream(lag_s, settings.standstill_rad_s).add(motion)
+    _, (z, held_Nm) = next(torque_streams([motion], lag_s, settings.standstill_rad_s))
     free = motion.is_free
     z[~free] = 0.0
     held_Nm[~free] = 0.0
@@ -123,9 +122,7 @@ def _peaks(
     place = 0
     milestones = Milestones(lambda count: progress(f"{log.path}: running the detectors, {count} of {len(free)} cycles"))
     for log in logs:
-        stream = TorqueStream(lag_s, settings.standstill_rad_s)
-        for motion in log.pieces():
-            new = stream.add(motion)
+        for motion, new in torque_streams(log.pieces(), lag_s, settings.standstill_rad_s):
             for column in new:
                 column[~motion.is_free] = 0.0
             z, held_Nm = (np.concatenate(pair) for pair in zip(rest, new, strict=True))
@@ -146,7 +143,7 @@ class ChannelRow:
     detector: str = setting(meaning="name of the detector")
     channel: str = setting(meaning="name of the channel")
     threshold: tuple[float, ...] = setting(low=0.0, meaning="per joint; Nm, but sigmas of likelihood and Nm s of cusum")
-    limit: tuple[str, ...] = setting(meaning="what keeps it up, per joint; empty where it can't be split")
+    limit: tuple[str, ...] = setting(meaning="largest cause of its height, per joint; empty where it can't be split")
     achievable_Nm: tuple[float, ...] = setting(
         unit="Nm", low=0.0, meaning="per joint, with an exact model; empty where it can't be split"
     )
@@ -154,7 +151,7 @@ class ChannelRow:
 
 @dataclass(frozen=True)
 class DetectorRow:
-    """The joint effect of all thresholds of a detector, a row of the thresholds file."""
+    """Rates of a detector with all of its thresholds together, a row of the thresholds file."""
 
     name: str = setting(meaning="name of the detector")
     rate_bound_per_h: float = setting(unit="1/h", low=0.0, meaning="upper 95 % bound of the rate of false alarms")
@@ -167,14 +164,14 @@ class DetectorRow:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds for a wanted rate of false alarms, and how sure they are."""
+    """Thresholds for a wanted rate of false alarms, with confidence bounds."""
 
     rate_per_h: float = setting(unit="1/h", low=1e-6, high=1e4, meaning="wanted false alarms per hour of a detector")
     hours: float = setting(unit="h", low=0.0, meaning="contact-free motion that they come from")
     is_extrapolated: bool = setting(meaning="less than one alarm is expected in that motion")
     lag_s: float = setting(unit="s", low=0.0, high=1.0, meaning="lag of the velocity, identified")
-    logs: tuple[str, ...] = setting(meaning="where the motion is from")
-    missing: tuple[str, ...] = setting(meaning="detectors whose tail this motion can't tell")
+    logs: tuple[str, ...] = setting(meaning="logs of the motion")
+    missing: tuple[str, ...] = setting(meaning="detectors whose tail can't be fitted from this motion")
     detectors: tuple[DetectorRow, ...] = setting(meaning="the detectors")
     channels: tuple[ChannelRow, ...] = setting(meaning="their channels")
 
@@ -230,9 +227,9 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
 
 
 def check_prediction(peaks: Vector) -> Prediction | None:
-    """Calibrate a detector on every other tenth of the motion for a rate that the rest can count; count it there.
+    """Calibrate a detector on every other tenth of the motion, and count its alarms in the rest.
 
-    None if half of the motion is too little.
+    The rate is such that the rest has enough alarms. None if half of the motion is too short.
     """
     tenth = -(-len(peaks) // 10)
     is_first = np.arange(len(peaks)) // tenth % 2 == 0
@@ -249,7 +246,7 @@ def check_prediction(peaks: Vector) -> Prediction | None:
 
 
 def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple[Limits, ...]]:
-    """Split the thresholds of the low-pass channels by their sources; per channel a tuple over the joints."""
+    """Split the thresholds of the low-pass channels by their causes; per channel a tuple over the joints."""
     settings, motion, free = statistics.settings, statistics.motion, statistics.is_free
     places = np.flatnonzero(free)
     masses = np.array([mass_matrix(motion.q[k], motion.theta[k]) for k in places[:: max(1, places.size // 200)]])
@@ -261,7 +258,7 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
         x = low_pass(statistics.z[free, i], (_MODEL_RAD_S,), motion.period_s)[moves]
         direction = low_pass(np.sign(motion.dq[free, i]), (_MODEL_RAD_S,), motion.period_s)[moves]
         velocity_LSB = resolution(motion.dq[free, i])
-        # the slope of the velocity's noise rules in single samples: nothing else is as fast
+        # the slope of the velocity's noise dominates single samples: nothing else is as fast
         torque_gain, momentum_gain = gains((), motion.period_s, statistics.lag_s)
         noise = white_noise(motion.tau_J[free, i])
         fast = mean_square(statistics.z[free, i][moves]) - (torque_gain * noise) ** 2
@@ -301,9 +298,9 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
 def thresholds_of_logs(
     paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None
 ) -> tuple[Thresholds, Statistics]:
-    """Read logs, or a stretch of each, and calibrate all detectors on what nobody touched.
+    """Read logs, or a stretch of each, and calibrate all detectors on their contact-free motion.
 
-    Raises LogError for a log that can't be used, TooLittleMotionError when all together are too short.
+    Raises LogError for a log that can't be used, TooLittleMotionError if all together are too short.
     """
     logs = []
     for path in paths:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.lab.thresholds.detector_comparison import WARM_UP_S
-from adacd_hil.lab.thresholds.free_motion import TorqueStream
+from adacd_hil.lab.thresholds.free_motion import torque_streams
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, run_detectors
 from adacd_hil.lab.tune.tune_roc import Changes, Observed, Touched, TunedLog, Window, rising
 from adacd_hil.log.logged_run import Progress
@@ -232,11 +232,11 @@ def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:
     if not waiting:
         return
     before = round(WARM_UP_S / log.motion.period_s)
-    stream = TorqueStream(statistics.lag_s, statistics.settings.standstill_rad_s)
     held = tuple(np.empty((0, statistics.z.shape[1])) for _ in range(2))  # what may still be needed of the stream
     end = 0
-    for motion in log.motion.pieces():
-        held = tuple(np.concatenate(pair) for pair in zip(held, stream.add(motion), strict=True))
+    streams = torque_streams(log.motion.pieces(), statistics.lag_s, statistics.settings.standstill_rad_s)
+    for motion, new in streams:
+        held = tuple(np.concatenate(pair) for pair in zip(held, new, strict=True))
         end += len(motion.q)
         begin = end - len(held[0])
         for window in [window for window in waiting if window.last < end]:

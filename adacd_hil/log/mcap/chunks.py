@@ -44,7 +44,7 @@ MOST_BYTES = 32 << 20
 MOST_RATIO = 200
 """How many times its size in the file all that has been opened of it may have."""
 FREE_BYTES = 64 << 20
-"""What may be opened of a file whatever its size."""
+"""Bytes that may be decompressed from a file of any size."""
 _PIECE_BYTES = 1 << 20
 _KINDS = ("", "zstd", "lz4")
 AnyBytes = TypeVar("AnyBytes", bytes, memoryview)
@@ -55,7 +55,7 @@ class ChunkError(ValueError):
 
 
 class Opening:
-    """Counts what has been opened of a file. One for each reading of it."""
+    """Counts the decompressed bytes of a file. One for each reading of it."""
 
     def __init__(self) -> None:
         self._packed = self._opened = 0
@@ -70,20 +70,20 @@ class Opening:
             raise ChunkError(f"opens to more than {MOST_RATIO} times the file before it")
 
     def open(self, chunk: Chunk) -> bytes:
-        """Return what a chunk holds, as long as it is. Raises ChunkError when that can't be had."""
+        """Return the decompressed contents of a chunk. Raises ChunkError if they are too large or damaged."""
         data = decompress(chunk.compression, chunk.data)
         self.allow(len(chunk.data), len(data))
         return data
 
     def open_checked(self, chunk: Chunk) -> bytes:
-        """Return what a chunk holds. Raises ChunkError when it isn't what was put in, as far as that can be told."""
+        """Return the decompressed contents of a chunk. Raises ChunkError if their size or CRC differs."""
         return _checked(chunk, self.open(chunk), is_size_certain=bool(chunk.uncompressed_crc))
 
 
 def open_into(chunk: Chunk, memory: memoryview, decompressor: zstandard.ZstdDecompressor) -> None:
-    """Write what a chunk holds, whose size has been allowed, to `memory`, which has room for one byte more.
+    """Decompress a chunk, whose size has been allowed, into `memory`, which has room for one byte more.
 
-    Raises ChunkError when that isn't as it says.
+    Raises ChunkError if its size or CRC differs.
     """
     size = chunk.uncompressed_size
     try:
@@ -169,28 +169,28 @@ Data: TypeAlias = bytes | bytearray
 
 @dataclass
 class Contents:
-    """The records of chunks. Messages as columns (n,), which are read once they are asked for."""
+    """The records of chunks. Messages as columns (n,), which are read at their first use."""
 
     data: Data
     starts: NDArray[np.int64]
     definitions: list[RawRecord] = field(default_factory=list)  # schemas and channels; `offset`: where in the data
     strangers: list[int] = field(default_factory=list)
-    """Opcodes of what has no place in a chunk; Message: one that is too short to be one."""
-    breaks: list[int] = field(default_factory=list)  # where what follows is no record, up to the end of the chunk
+    """Opcodes of records that may not be in a chunk; Message: one that is too short."""
+    breaks: list[int] = field(default_factory=list)  # where invalid bytes begin, to the end of their chunk
 
     @cached_property
     def heads(self) -> NDArray[Any]:
-        """What each message begins with (n,): opcode, length, channel, times."""
+        """Head of each message (n,): opcode, length, channel, times."""
         return _windows(self.data, MESSAGE_HEAD)[self.starts].view(_MESSAGE)
 
     @cached_property
     def ends(self) -> NDArray[np.int64]:
-        """Where the messages end."""
+        """Ends of the messages in `data`."""
         return np.asarray(self.starts + self.heads["length"] + HEAD.size)
 
     @cached_property
     def channels(self) -> NDArray[np.uint16]:
-        """The numbers of their channels."""
+        """Channel ids of the messages."""
         return self.heads["channel"].copy()
 
     @cached_property
@@ -205,7 +205,7 @@ class Contents:
 
     @property
     def entries(self) -> NDArray[Any]:
-        """What the message indexes must say of the messages."""
+        """Message index entries that these messages must have."""
         entries = np.empty(len(self.starts), INDEX_ENTRY)
         entries["log_time"] = self.log_times
         entries["offset"] = self.starts
@@ -304,7 +304,7 @@ class Block(NamedTuple):
     """Records of chunks, one chunk after the other; a message or a definition outside chunks is one by itself."""
 
     contents: Contents
-    memory: bytearray  # of the contents, used again after the next item is asked for
+    memory: bytearray  # of the contents; reused after the next item is requested
     position: int  # in the file, of the first of them
     problem: str  # why chunks are missing, "" if none is
 
@@ -322,10 +322,10 @@ class _Packed(NamedTuple):
 
 
 def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES, is_ahead: bool = True) -> Iterator[Item]:
-    """Read a file from front to end: blocks, attachments and metadata, and what is missing.
+    """Read a file from front to end: blocks, attachments and metadata, and problems.
 
-    block_bytes: of the chunks that make a block; 1: each chunk is one. is_ahead: a thread opens chunks before they are
-    asked for. Raises LogError when it isn't MCAP.
+    block_bytes: of the chunks that make a block; 1: each chunk is one. is_ahead: a thread decompresses chunks in
+    advance. Raises LogError if it isn't MCAP.
     """
     if not is_ahead:
         yield from _open_each(_pack(file, name, block_bytes))
@@ -349,7 +349,7 @@ def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES, is_a
 
 
 def _open_each(items: Iterator[list[_Packed] | RawRecord | Problem]) -> Iterator[Item]:
-    """Open chunks when they are asked for."""
+    """Decompress chunks when they are requested."""
     memory = bytearray()
     for item in items:
         if isinstance(item, list):
@@ -361,7 +361,7 @@ def _open_each(items: Iterator[list[_Packed] | RawRecord | Problem]) -> Iterator
 
 
 def _finished(item: Future[Block] | RawRecord | Problem, free: list[bytearray]) -> Iterator[Item]:
-    """Give an item; take back its memory afterwards: pages that are new cost more than what is done with them."""
+    """Yield an item; take back its memory afterwards, since new pages cost more time than the work on them."""
     if not isinstance(item, Future):
         yield item
         return

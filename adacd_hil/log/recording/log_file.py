@@ -1,10 +1,10 @@
-"""The MCAP file of a run, and the thread that writes it: a slow disk doesn't stop the writer from taking packets.
+"""The MCAP file of a run, and the thread that writes it, so that a slow disk doesn't block the writer process.
 
 The file: header, attachments and metadata first, then chunks, then the summary. Attachments and metadata come before
 the first chunk, so that they survive when the file is cut.
 
-The thread: the amount of data that waits for the disk is bounded. Above the bound `is_behind` is true until half of it
-is written, and a caller that must lose nothing lets `write` wait. The first failure (disk full) ends a file at the last
+The thread: the amount of data waiting for the disk is bounded. Above the bound `is_behind` is true until half of it is
+written; a caller that must not lose packets makes `write` wait. The first error (disk full) ends a file at the last
 whole write; the thread drops later data and counts its packets, until another file is begun.
 """
 
@@ -25,7 +25,7 @@ from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
 from adacd_hil.log.types.topics import LogChannel
 
 WAITING_BYTES = 32 * 1024 * 1024
-"""What may wait for the disk: about 45 s of a run at 1 kHz, compressed."""
+"""Most bytes waiting for the disk: about 45 s of a run at 1 kHz, compressed."""
 
 
 class _Write(NamedTuple):
@@ -44,21 +44,21 @@ class Sink:
         most_waiting: int = WAITING_BYTES,
         on_written: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Write to `descriptor`, which is of the file `path`.
+        """Write to `descriptor`, which belongs to the file `path`.
 
-        waits: `write` waits rather than let more than `most_waiting` bytes wait. on_written: is told, by the thread,
-        how many packets each write has brought to the disk.
+        waits: `write` blocks while more than `most_waiting` bytes wait. on_written: called by the thread with the
+        number of packets that each write has brought to the disk.
         """
         self.error = ""
-        """Why the file in progress ended early."""
+        """Error that ended the present file early."""
         self.first_error = ""
-        """Why the first of all files that did ended early."""
+        """Error that ended any file early; the first one."""
         self.written = 0
-        """Bytes of the file in progress that are on the disk."""
+        """Bytes of the present file that are on the disk."""
         self.path = path
-        """The file in progress; None when it could not be created."""
+        """The present file; None if it could not be created."""
         self.say: Callable[[str], None] = lambda _: None
-        """Is told, by the thread, in a line each, when a file fails and when one is written again."""
+        """Called by the thread with one line when a file fails and when one is written again."""
         self._has_told = False
         self._descriptor = descriptor
         self._name = ""  # of a later file
@@ -76,7 +76,7 @@ class Sink:
         self._thread.start()
 
     def write(self, data: bytes, packets: int = 0) -> int:
-        """Queue `data`, which completes so many packets."""
+        """Queue `data` for the disk; packets: number of packets that end with it. Return the length of the data."""
         self._position += len(data)
         if data:
             with self._changed:
@@ -86,41 +86,41 @@ class Sink:
                 self._changed.notify_all()
         return len(data)
 
-    def begin(self, path: Path) -> None:
-        """Go on with a new file, or with the one in progress from its start, once all before is written or failed."""
+    def begin_file(self, path: Path) -> None:
+        """Switch to a new file, or restart the present one, once all earlier data are written or have failed."""
         self._position = 0
         with self._changed:
             self._tasks.append(path)
             self._changed.notify_all()
 
     def tell(self) -> int:
-        """Return how many bytes of the file have been handed over."""
+        """Return the number of bytes of the file that have been handed over."""
         return self._position
 
     @property
     def waiting(self) -> int:
-        """Bytes that wait for the disk."""
+        """Bytes waiting for the disk."""
         return self._waiting
 
     @property
     def is_behind(self) -> bool:
-        """Whether so much waits for the disk that nothing should be added."""
+        """Whether so many bytes wait for the disk that no more should be added."""
         self._is_behind = self._waiting > (self._most_waiting // 2 if self._is_behind else self._most_waiting)
         return self._is_behind
 
     def take_lost(self) -> int:
-        """Count the packets that were swallowed since this was last asked."""
+        """Return the number of packets dropped since the last call."""
         with self._changed:
             lost, self._lost = self._lost, 0
         return lost
 
     def settle(self) -> None:
-        """Wait until everything handed over is written or has failed."""
+        """Wait until all data handed over are written or have failed."""
         with self._changed:
             self._changed.wait_for(lambda: self._is_idle and not self._tasks)
 
     def close(self) -> None:
-        """Write what is waiting, then close the file."""
+        """Write the waiting data, then close the file."""
         with self._changed:
             self._tasks.append(None)
             self._changed.notify_all()
@@ -153,7 +153,7 @@ class Sink:
                     self.say(f"log {self.path} is written again; packets are missing before it")
             except OSError as error:
                 self._fail(error)
-                with contextlib.suppress(OSError):  # not everything that can be written can be cut
+                with contextlib.suppress(OSError):  # a pipe or device can't be truncated
                     os.ftruncate(self._descriptor, self.written)
         with self._changed:
             self._waiting -= len(task.data)
@@ -210,9 +210,9 @@ class McapFile(ChunkedFile):
     ) -> None:
         super().__init__(sink, LIBRARY, ROS_PROFILE)
         self.ids: dict[int, int] = {}
-        """The file's number of each channel, by ours."""
+        """The file's channel ids, by our channel ids."""
         self.types = {channel.id: channel.type for channel in channels}
-        """Of each channel, by our number."""
+        """Message types, by our channel ids."""
         for name, data in attachments.items():
             media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "text/plain")
             self.attach(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
@@ -222,7 +222,7 @@ class McapFile(ChunkedFile):
         """Bytes before the first chunk."""
 
     def _define(self, channels: tuple[LogChannel, ...]) -> None:
-        """Give schemas and channels numbers from 1; the first chunk begins with them."""
+        """Assign ids from 1 to schemas and channels; the first chunk begins with them."""
         schema_ids: dict[str, int] = {}
         for number, channel in enumerate(channels, start=1):
             name, text = channel.type.name, channel.type.text
@@ -240,7 +240,7 @@ class McapFile(ChunkedFile):
             self.ids[channel.id] = number
 
     def finish(self, summary: dict[str, str]) -> None:
-        """End the file, with what is to be said of it."""
+        """Write the summary as metadata, then end the file."""
         self.flush()
         self.add_metadata(SUMMARY_METADATA, summary)
         self.complete()

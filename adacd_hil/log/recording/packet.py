@@ -1,9 +1,8 @@
 """Packets from the control process to the writer: one per cycle and one per event; they go through ring.py.
 
 A cycle's packet: kind, count of messages, count of frames, packets dropped so far, t_ns; then per frame identifier,
-count of data bytes, flags, the first 8 of them, t_ns; then per message channel and size; then the bodies; then what FD
-frames have beyond 8 bytes. So a cycle of classic frames pays nothing for the others.
-
+count of data bytes, flags, its first 8 data bytes, t_ns; then per message channel and size; then the bodies; then the
+data of FD frames beyond 8 bytes. So a cycle of classic frames has no overhead for FD frames.
 The control process packs one packet at a time; the writer unpacks hundreds at once, into arrays.
 """
 
@@ -45,22 +44,22 @@ FRAME_DTYPE = np.dtype(
         "itemsize": 24,
     }
 )
-"""A frame of a packet: `flags` of IS_TX and IS_ERROR; of `data`, `length` bytes count, all when there are more."""
+"""A frame of a packet: `flags` of IS_TX and IS_ERROR; `data`: the first 8 of `length` bytes."""
 MESSAGE_DTYPE = np.dtype([("channel", "<u2"), ("size", "<u2")])
 ROOM = MAX_DATA
-"""Bytes that `unpack` may look at behind the last packet."""
+"""Bytes behind the last packet that `unpack` may read."""
 
 
 @functools.cache
 def _table(frame_count: int, message_count: int) -> struct.Struct:
-    """Make the packer of everything but the bodies: one call per cycle."""
+    """Return the struct of a packet without its bodies, which packs them in one call per cycle."""
     return struct.Struct("<" + _HEAD_FORMAT + _FRAME_FORMAT * frame_count + _MESSAGE_FORMAT * message_count)
 
 
 def pack_cycle(
     t_ns: int, dropped: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]]
 ) -> bytes:
-    """Pack a cycle."""
+    """Return the packet of a cycle: its messages (channel, body) and its frames, True for sent ones."""
     values: list[int | bytes] = [CYCLE, len(messages), len(frames), dropped, t_ns]
     rests = []
     for is_tx, (can_id, data, frame_t_ns, is_error) in frames:
@@ -77,7 +76,7 @@ def pack_cycle(
 
 
 def pack_event(t_ns: int, dropped: int, event: Event) -> bytes:
-    """Pack an event; longer texts are cut at 4 KiB."""
+    """Return the packet of an event; longer texts are cut at 4 KiB."""
     texts = [text.encode("utf-8", "replace")[:_MAX_TEXT] for text in event]
     return _EVENT.pack(EVENT, dropped, t_ns, *map(len, texts)) + b"".join(texts)
 
@@ -98,7 +97,7 @@ class Columns(NamedTuple):
 
 
 def is_whole(data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Say which packets have a whole head of a known kind (n,); `data` has ROOM bytes after the last packet."""
+    """Tell which packets have a whole head of a known kind (n,); `data` has ROOM bytes after the last packet."""
     kinds = data[starts]
     return np.asarray((sizes >= HEAD.size) & ((kinds == CYCLE) | (kinds == EVENT)))
 
@@ -110,7 +109,7 @@ def times_ns(data: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.i
 
 
 def unpack(data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> Columns:
-    """Unpack the packets of cycles and events that begin at `starts`; those whose parts don't fit are left out.
+    """Unpack the packets of cycles and events that begin at `starts`; packets with inconsistent sizes are left out.
 
     `data` has ROOM bytes after the last packet.
     """
@@ -121,7 +120,7 @@ def unpack(data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np
 def _unpack(
     data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]
 ) -> tuple[Columns, NDArray[np.bool_]]:
-    """Unpack those whose tables lie within them, and say which of these are as long as their parts."""
+    """Unpack packets whose tables lie within them; also tell which of these are exactly as long as their parts."""
     heads: NDArray[Any] = gather(data, starts, HEAD.size).view(HEAD_DTYPE)
     is_cycle = heads["kind"] == CYCLE
     frame_counts: NDArray[np.int64] = np.where(is_cycle, heads["frames"], 0).astype(np.int64)
@@ -156,7 +155,7 @@ def _unpack(
 
 
 def unpack_event(columns: Columns, index: int) -> Event:
-    """Unpack the event of packet `index`, which is one."""
+    """Return the event in packet `index`, which must be an event's."""
     start = int(columns.starts[index])
     packet = columns.data[start : start + int(columns.sizes[index])].tobytes()
     _, _, _, *sizes = _EVENT.unpack_from(packet)
@@ -168,7 +167,7 @@ def unpack_event(columns: Columns, index: int) -> Event:
 
 
 def long_data(columns: Columns, frames: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Return the data of FD frames by their numbers (k, 64), anything beyond their length."""
+    """Return the data of FD frames by their numbers (k, 64); bytes beyond a frame's length are arbitrary."""
     data = np.empty((len(frames), MAX_DATA), np.uint8)
     data[:, :CLASSIC_BYTES] = columns.frames["data"][frames]
     rest_bytes = MAX_DATA - CLASSIC_BYTES
@@ -178,7 +177,7 @@ def long_data(columns: Columns, frames: NDArray[np.int64]) -> NDArray[np.uint8]:
 
 
 def windows(data: NDArray[np.uint8], size: int) -> NDArray[np.void]:
-    """View `data` as what lies in each window of `size` bytes: numpy copies such a row whole."""
+    """View `data` as its windows of `size` bytes, one per offset: numpy copies such a row whole."""
     return np.ndarray((len(data) - size + 1,), f"V{size}", data, strides=(1,))
 
 
@@ -188,7 +187,7 @@ def gather(data: NDArray[np.uint8], starts: NDArray[np.int64], size: int) -> NDA
 
 
 def sums_within(values: NDArray[Any], counts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sum consecutive groups of `counts` values: for each value what comes before it in its group, and the totals."""
+    """Sum consecutive groups of `counts` values; return each value's sum before it in its group, and the totals."""
     running: NDArray[np.int64] = np.zeros(len(values) + 1, np.int64)
     np.cumsum(values, out=running[1:])
     ends = np.cumsum(counts)
@@ -197,5 +196,5 @@ def sums_within(values: NDArray[Any], counts: NDArray[np.int64]) -> tuple[NDArra
 
 
 def _numbers(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Count the members of consecutive groups, each from 0."""
+    """Return each member's number within its group, for consecutive groups, from 0."""
     return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)

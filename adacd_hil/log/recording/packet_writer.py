@@ -1,9 +1,9 @@
-"""Packets to message records, hundreds of packets at a time.
+"""Conversion of packets to MCAP message records, hundreds of packets at a time.
 
 Python costs about 6 µs per message, numpy about 2 µs per array operation, however long the array: so the frames, the
 decoded messages and the bodies of a quarter of a second are each turned into records of one size as a whole, from a
-template, and then laid down in the order of the packets. A third of what remains is compression and checksums. It is
-not compiled: numba takes as long to import as 20 s of a run take to write, and 60 MB.
+template, and then placed in the order of the packets. A third of the remaining time is compression and checksums. It is
+not compiled: importing numba takes as long as writing 20 s of a run, and 60 MB.
 
 A record: opcode, length, channel, sequence 0, log time, publish time, then the payload; MCAP specification, Message.
 The order: cycle after cycle, each frame followed by its decoded message, then the bodies, /joint_states after /scheme.
@@ -54,7 +54,7 @@ _HEAD = struct.Struct("<BQHIQQ")
 _CHANNEL = slice(9, 11)
 _TIMES = slice(15, MESSAGE_HEAD)
 _BODY = MESSAGE_HEAD + len(ENCAPSULATION) + 8
-"""Where a body begins in a record, bytes: after the stamp, which all types begin with."""
+"""Offset of a body in a record, bytes: after the stamp, with which all types begin."""
 _STAMP = slice(_BODY - 8, _BODY)
 _NO_STAMP = bytes(8)
 _CAN_FRAME_RECORD = record_dtype(CAN_FRAME_DTYPE)
@@ -63,11 +63,11 @@ _JOINT_STATE_RECORD = record_dtype(JOINT_STATE_DTYPE)
 Numbers = NDArray[np.int64]
 Rows = NDArray[np.uint8]
 Watch = Callable[[Rows, NDArray[np.uint16], Numbers, Numbers], None]
-"""Takes records that follow each other, the file's numbers of their channels, their log times, and where each ends."""
+"""Takes consecutive records, the file's ids of their channels, their log times, and the end of each."""
 
 
 class _Group(NamedTuple):
-    """Records of one size: (n, size) bytes that lack channel, times and stamp."""
+    """Records of one size: (n, size) bytes, still without channel, times and stamp."""
 
     rows: Rows
     slots: Numbers  # (n,) which records of the batch they are
@@ -86,10 +86,10 @@ class PacketWriter:
         epoch_ns: int,
         watch: Watch | None = None,
     ) -> None:
-        """Write to `file`; `watch` is given every batch of records, too."""
+        """Write to `file`; `watch`, if given, gets every batch of records, too."""
         self.frames = 0
         self.dropped = 0  # packets that didn't reach the writer
-        self._lost = 0  # packets that did, and whose loss is to be said
+        self._lost = 0  # packets that reached it and were lost; the next packet's event reports them
         self._file = file
         self._watch = watch
         self._epoch_ns = epoch_ns
@@ -106,16 +106,16 @@ class PacketWriter:
         self._joint_slices = {name: slice(start, start + 8 * JOINTS) for name, start in starts.items()}
         self._least_scheme = max((place.stop for place in self._joint_slices.values()), default=_BODY) - _BODY
 
-    def begin(self, file: McapFile) -> None:
-        """Go on with another file of the same topics."""
+    def begin_file(self, file: McapFile) -> None:
+        """Continue with another file of the same topics."""
         self._file = file
 
     def lose(self, count: int) -> None:
-        """Take notice of packets that can't be written: the next one says so."""
+        """Count packets that can't be written; an event before the next packet reports them."""
         self._lost += count
 
-    def write(self, data: Rows, starts: Numbers, sizes: Numbers) -> int:
-        """Write what the packets of `data` hold; return how many of them make no sense, of which nothing is written.
+    def write_packets(self, data: Rows, starts: Numbers, sizes: Numbers) -> int:
+        """Write the contents of the packets in `data`; return the number of invalid packets, which are skipped.
 
         data: bytes (b,), with packet.ROOM behind the last packet; starts, sizes: of the packets (n,).
         """
@@ -128,7 +128,7 @@ class PacketWriter:
         return len(starts) - len(packets.heads)
 
     def _is_right(self, packets: Columns) -> NDArray[np.bool_]:
-        """Say of each packet whether the file can hold all of it."""
+        """Tell for each packet whether the file can hold all of it."""
         messages, frames = packets.messages, packets.frames
         is_short = (messages["channel"] == ChannelId.SCHEME) & (messages["size"] < self._least_scheme)
         is_wrong_message = is_short | ~self._is_known[messages["channel"]]
@@ -140,12 +140,12 @@ class PacketWriter:
         return np.asarray(self._has_stamp(packets.heads["t_ns"]) & (wrong == 0))
 
     def _has_stamp(self, t_ns: Numbers) -> NDArray[np.bool_]:
-        """Say which times, in ns of the run's clock, a stamp can hold."""
+        """Tell which times, in ns of the run's clock, fit into a stamp."""
         time_ns = t_ns + self._epoch_ns
         return np.asarray((time_ns >= 0) & (time_ns < END_OF_TIME_NS))
 
     def _write(self, packets: Columns) -> None:
-        """Give every record its slot, make the records in groups of one size, and lay them down."""
+        """Give every record its slot, make the records in groups of one size, and place them."""
         heads, frames, messages = packets.heads, packets.frames, packets.messages
         dropped = heads["dropped"].astype(np.int64)
         missing = np.diff(dropped, prepend=self.dropped)
@@ -181,7 +181,7 @@ class PacketWriter:
         self._lay_down(groups, int(slot_counts.sum()), firsts + slot_counts)
 
     def _decoders_of(self, frames: NDArray[Any]) -> Numbers:
-        """Find the number of the decoder of each frame (f,); -1 where there is none."""
+        """Return the index of each frame's decoder (f,); -1 for frames without one."""
         if not len(self._can_ids):
             return np.full(len(frames), -1)
         can_ids = frames["can_id"].astype(np.int64)
@@ -190,7 +190,7 @@ class PacketWriter:
         return np.where(fits & (frames["flags"] & IS_ERROR == 0), found, -1)
 
     def _frame_groups(self, packets: Columns, slots: Numbers, publish_ns: Numbers) -> Iterator[_Group]:
-        """Make the records of the frames: those of up to 8 bytes all at once, longer ones by their length."""
+        """Make the records of the frames: those of up to 8 bytes together, longer ones by length."""
         frames = packets.frames
         is_long = frames["length"] > CLASSIC_BYTES
         places = np.flatnonzero(~is_long)
@@ -218,7 +218,7 @@ class PacketWriter:
         slots: Numbers,
         publish_ns: Numbers,
     ) -> _Group:
-        """Fill in what all frames have; `records` views `rows`; `ids` are the topics of sent and received."""
+        """Fill the fields that all frames have; `records` views `rows`; `ids`: channels of sent and received ones."""
         records["can_id"] = frames["can_id"]
         records["is_extended"] = frames["can_id"] > MAX_STANDARD_ID
         records["is_error"] = frames["flags"] & IS_ERROR != 0
@@ -241,7 +241,7 @@ class PacketWriter:
             yield _Group(rows, slots[places], self._decoded_ids[number], t_ns, publish_ns[places])
 
     def _body_groups(self, packets: Columns, slots: Numbers, time_ns: Numbers) -> Iterator[_Group]:
-        """Make the records of our own topics, which come as bodies, and the joint states that /scheme holds."""
+        """Make the records of our own topics, which come as bodies, and the joint states contained in /scheme."""
         messages = packets.messages
         kinds = messages.view(np.uint32)
         for kind in np.unique(kinds):
@@ -267,7 +267,7 @@ class PacketWriter:
         return _Group(rows, np.array([slot]), self._file.ids[ChannelId.EVENTS], times_ns, times_ns)
 
     def _lay_down(self, groups: list[_Group], count: int, packet_ends: Numbers) -> None:
-        """Complete the `count` records of the groups and hand them to the file in the order of their slots.
+        """Complete the `count` records of the groups and write them in the order of their slots.
 
         packet_ends: the slot behind the last one of each packet.
         """
@@ -295,7 +295,7 @@ class PacketWriter:
             self._watch(records, channels, log_ns, ends)
 
     def _move_up(self, log_ns: Numbers, channels: NDArray[np.uint16]) -> None:
-        """Move log times up where they would run backwards in their topic, which readers don't expect."""
+        """Raise log times that would run backwards in their topic, which readers don't expect."""
         order = np.argsort(channels, kind="stable")
         for places in np.split(order, np.flatnonzero(np.diff(channels[order])) + 1):
             if not len(places):
@@ -316,7 +316,7 @@ def _rows(payload: bytes, count: int) -> Rows:
 
 @functools.cache
 def _fd_frame_record(length: int) -> "np.dtype[Any]":
-    """Describe the record of an FD frame of `length` bytes, where it differs from the template."""
+    """Return the record type of an FD frame of `length` bytes, as far as it differs from the template."""
     fields: Any = record_dtype(FD_FRAME_DTYPE).fields
     names = ("can_id", "is_extended", "is_error", "data")
     return np.dtype(

@@ -1,8 +1,7 @@
-"""The processes of a log: how the control process starts the others, the setup of each, and the words between them.
+"""Processes of a log: their start by the control process, their setup, and the messages between them.
 
-At its start a process reads its setup, pickled, from its standard input, which its parent alone writes. It has the
-messages of the DBC, as far as frames are decoded by them: to read a DBC takes longer than all else that the writer does
-before it is ready.
+A process reads its setup, pickled, from its standard input, to which only its parent writes. The setup contains the
+messages of the DBC whose frames are decoded, since reading a DBC takes longer than the rest of the writer's start.
 """
 
 import contextlib
@@ -23,7 +22,7 @@ from adacd_hil.wire.codec_columns import MessageTable
 
 
 class LiveFeed(Protocol):
-    """A live view of what is logged, open. `url`: where it is served; is_watched: whether somebody looks."""
+    """An open live view of the log. `url`: its address; is_watched: whether a viewer is connected."""
 
     url: str
 
@@ -37,25 +36,25 @@ class LiveFeed(Protocol):
         log_ns: NDArray[np.int64],
         ends: NDArray[np.int64],
     ) -> None:
-        """Take message records (b,) that follow each other; channels, log_ns, ends (n,), a record each."""
+        """Show consecutive message records (b,); channels, log_ns, ends (n,): one entry per record."""
 
     def close(self) -> None:
-        """End it, and wait for nobody."""
+        """Close the view without waiting for viewers."""
 
 
 class LiveService(Protocol):
-    """A live view to be opened by the writer, in whose process it arrives pickled."""
+    """A live view that the writer process opens; it is sent there pickled."""
 
     def open(self, setup: "WriterSetup", ids: dict[int, int], start_ns: int) -> LiveFeed:
-        """Serve. ids: the file's number of each channel; start_ns: before the first record. Raises LogError."""
+        """Open the view. ids: the file's id of each channel; start_ns: before the first record. Raises LogError."""
 
 
 @dataclass(frozen=True)
 class WriterSetup:
-    """`channels`: of the file; `messages`: of the DBC, whose frames are decoded.
+    """Setup of the writer. `channels`: of the file; `messages`: of the DBC, whose frames are decoded.
 
-    `path`: absolute, of the first part. A part ends after `part_bytes` before compression or `part_ns` of log time,
-    never where these are 0. `live`: served, unless None.
+    `path`: absolute, of the first part. A part ends after `part_bytes` before compression or `part_ns` of log time;
+    0: no limit. `live`: the view to open, or None.
     """
 
     path: Path
@@ -71,12 +70,12 @@ class WriterSetup:
 
 
 def start_module(
-    module: str, descriptors: Sequence[int], told: object, stderr: int | None = None
+    module: str, descriptors: Sequence[int], setup: object, stderr: int | None = None
 ) -> "subprocess.Popen[bytes]":
-    """Run a module of ours with descriptors as its arguments and `told` pickled on its standard input. Raises OSError.
+    """Run a module of ours with descriptors as arguments and `setup` pickled on its standard input. Raises OSError.
 
-    It is in a session of its own: Ctrl-C is for the control process. No folder but ours is searched for modules.
-    stderr: as of subprocess; None: the one of this process.
+    It runs in a session of its own, so that Ctrl-C reaches only the control process, and finds modules only in this
+    package's folder. stderr: as in subprocess; None: this process's.
     """
     process = subprocess.Popen(
         [sys.executable, "-P", "-m", module, *map(str, descriptors)],
@@ -88,31 +87,31 @@ def start_module(
         env={**os.environ, "PYTHONPATH": _module_path()},
     )
     assert process.stdin is not None
-    with contextlib.suppress(BrokenPipeError), process.stdin:  # one that died says so to who waits for its word
-        pickle.dump(told, process.stdin)
+    with contextlib.suppress(BrokenPipeError), process.stdin:  # a dead process is noticed where its answer is awaited
+        pickle.dump(setup, process.stdin)
     return process
 
 
 def read_setup() -> Any:
-    """Return what `start_module` was told, in the process that it started."""
+    """Return the setup that `start_module` has sent to this process."""
     return pickle.load(sys.stdin.buffer)
 
 
 def _module_path() -> str:
-    """Name the folder that this package was imported from, before what the environment names."""
+    """Return a PYTHONPATH with this package's folder before the environment's."""
     own = str(Path(__file__).resolve().parents[3])
     return os.pathsep.join(filter(None, (own, os.environ.get("PYTHONPATH", ""))))
 
 
 WAKE = b"wake"
-"""Take what waits in the ring."""
+"""Take the packets waiting in the ring."""
 ROOM = b"room"
-"""Take some of it and answer the same: there is more room."""
+"""Take some packets, then answer the same: there is more room."""
 END = b"end"
-"""Take it and end the log."""
+"""Take all packets and end the log."""
 NOTHING = b""
-"""What is received once the other side is dead."""
+"""Received when the other side is dead."""
 WATCHED = b"watched"
 ALONE = b"alone"
-"""Whether somebody watches: from the process of the live view to the writer."""
+"""Sent by the live view's process to the writer: whether a viewer is connected."""
 MOST_BYTES = 65536

@@ -1,8 +1,9 @@
-"""The control side of the log: hands each cycle to the writer process in one packet, and never waits in real time.
+"""The control process's side of the log: passes each cycle to the writer process, without waiting in real time.
 
-In real time a packet costs no system call: it goes into memory that the writer looks into by itself. A full ring (the
-writer is behind, stopped or dead) costs packets, never time and never an exception: `dropped` counts. In lockstep
-(`blocking`) the recorder wakes the writer now and then, waits while the ring is full, and loses nothing.
+In real time a packet costs no system call: it goes into shared memory that the writer polls. If the ring is full (the
+writer is behind, stopped or dead) packets are lost and counted in `dropped`; the cycle neither waits nor gets an
+exception. In lockstep (`blocking`) the recorder wakes the writer now and then, waits while the ring is full, and loses
+no packet.
 """
 
 import contextlib
@@ -31,16 +32,16 @@ from adacd_hil.wire.codec_columns import MessageTable, plain_tables
 START_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 60.0
 DEATH_TIMEOUT_S = 1.0
-"""Longest from the end of the writer's socket to the end of its process."""
+"""Longest time from the end of the writer's socket to the end of its process."""
 WAKE_BYTES = 64 * 1024
-"""So many bytes, about 100 cycles, go to the writer together in lockstep: the system calls of each are then cheap."""
+"""Bytes, about 100 cycles, that go to the writer together in lockstep, so that system calls are cheap per cycle."""
 _MIB = 1024 * 1024
 _MINUTE_NS = 60_000_000_000
 _FORMAT_VERSION = "1"
 
 
 class LogSummary(NamedTuple):
-    """How a log ended. `frames` and `messages` are 0 when the writer died; `error` says what went wrong."""
+    """Result of a log. `frames` and `messages` are 0 if the writer died; `error`: in one line, or empty."""
 
     path: Path  # of the first part
     frames: int
@@ -53,7 +54,7 @@ class LogSummary(NamedTuple):
 
 
 class Recorder:
-    """Writes one log. Start it before the process pins itself to a processor: the writer inherits that."""
+    """Writes one log. Start it before the process pins itself to a processor, since the writer inherits that."""
 
     def __init__(
         self,
@@ -72,11 +73,11 @@ class Recorder:
         robot: bytes = b"",
         live: LiveService | None = None,
     ) -> None:
-        """Create the file, which must not be there (see run_folder.py), and start the writer.
+        """Create the file, which must not exist (see run_folder.py), and start the writer.
 
-        messages: of the DBC, default those of the one that comes with the package. epoch_ns: added to t_ns for the
-        log's times; 0 in lockstep. is_truth: the emulator's own log, /truth and /events only. robot: the arm's URDF,
-        for viewers. live: serve what is logged. Raises LogExistsError, LogError.
+        messages: of the DBC, by default the package's. epoch_ns: added to t_ns for the log's times; 0 in lockstep.
+        is_truth: the emulator's own log, /truth and /events only. robot: the arm's URDF, for viewers. live: live view
+        to open. Raises LogExistsError, LogError.
         """
         settings = settings or LogSettings()
         own = {
@@ -90,10 +91,10 @@ class Recorder:
         self.path = path
         self.dropped = 0
         self.live_url = ""
-        """Where the live view is, if there is one."""
+        """Address of the live view; "" without one."""
         self._summary: LogSummary | None = None
         self._is_blocking = blocking
-        self._unannounced = 0  # bytes in the ring that the writer was not woken for
+        self._unannounced = 0  # bytes in the ring since the writer was last woken
         told = () if is_truth else plain_tables(_own_messages() if messages is None else messages)
         try:
             run = (parameter_count, told, further_count, channel_count)
@@ -148,7 +149,7 @@ class Recorder:
 
     @property
     def waiting_bytes(self) -> int:
-        """Bytes that wait for the writer; 0 in lockstep, where they say nothing of the run. Costs no system call."""
+        """Bytes waiting for the writer; 0 in lockstep, where they depend on chance. Costs no system call."""
         return 0 if self._is_blocking else self._ring.waiting
 
     def cycle(
@@ -162,13 +163,13 @@ class Recorder:
         self._put(packet.pack_event(t_ns, self.dropped, event))
 
     def flush(self) -> None:
-        """Wake the writer for what waits in the ring."""
+        """Wake the writer to take the packets in the ring."""
         self._unannounced = 0
-        with contextlib.suppress(OSError):  # words that it hasn't heard yet will do, and the dead hear nothing
+        with contextlib.suppress(OSError):  # its socket is full, so it will wake anyway, or it is dead
             self._socket.send(processes.WAKE, socket.MSG_DONTWAIT)
 
     def _put(self, data: bytes) -> None:
-        if not self._ring.put(data) and not (self._is_blocking and self._put_patiently(data)):
+        if not self._ring.put_packet(data) and not (self._is_blocking and self._put_patiently(data)):
             self.dropped += 1
             self._ring.count_dropped(self.dropped)
         elif self._is_blocking:
@@ -177,18 +178,18 @@ class Recorder:
                 self.flush()
 
     def _put_patiently(self, data: bytes) -> bool:
-        """Add a packet once the writer has made room; False when it is dead, or the packet larger than the ring."""
+        """Add a packet once the writer has made room; False if it is dead, or the packet larger than the ring."""
         is_put = False
-        with contextlib.suppress(OSError):  # nobody there
+        with contextlib.suppress(OSError):  # the writer is dead
             while not is_put and room_of(len(data)) <= self._ring.capacity:
                 self._socket.send(processes.ROOM)
                 if self._socket.recv(processes.MOST_BYTES) == processes.NOTHING:
                     break
-                is_put = self._ring.put(data)
+                is_put = self._ring.put_packet(data)
         return is_put
 
     def close(self) -> LogSummary:
-        """End the log and say how it went; never raises, twice is once."""
+        """End the log and return its summary; never raises; a second call returns the same summary."""
         if self._summary is None:
             self._socket.settimeout(END_TIMEOUT_S)
             with contextlib.suppress(OSError):
@@ -202,7 +203,7 @@ class Recorder:
         self._ring.close()
 
     def _summarise(self, word: dict[str, str] | None) -> LogSummary:
-        """Tell how it went, by the writer's last word if there is one, and wait for the end of the writer."""
+        """Return the summary, by the writer's last message if there is one, after the end of its process."""
         error = ""
         if word is None:
             error = self._end_writer()
@@ -217,7 +218,7 @@ class Recorder:
         return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
 
     def _end_writer(self) -> str:
-        """End a writer that says nothing; return what was wrong with it."""
+        """End a writer that doesn't answer; return the error."""
         try:
             return f"the writer died (exit status {self._process.wait(DEATH_TIMEOUT_S)})"
         except subprocess.TimeoutExpired:
@@ -225,7 +226,7 @@ class Recorder:
             return f"the writer did not end within {END_TIMEOUT_S:g} s"
 
     def _hear(self, timeout_s: float) -> dict[str, str] | None:
-        """Receive the writer's word; None when it died or stays silent."""
+        """Receive the writer's message; None if it died or stays silent."""
         self._socket.settimeout(timeout_s)
         try:
             received = self._socket.recv(processes.MOST_BYTES)
@@ -249,14 +250,14 @@ def _create(path: Path, is_truth: bool) -> int:
         make_room(path)
     try:
         return create_file(path)
-    except FileExistsError:  # since it was looked at
+    except FileExistsError:  # created since `check_free`
         raise LogExistsError(f"{path} is being written by another run; choose another folder with --out") from None
     except OSError as error:
         raise LogError(f"log {path} can't be created: {error.strerror}") from None
 
 
 def _own_messages() -> Iterable[MessageTable]:
-    # Takes 0.2 s, which whoever has a codec can spare.
+    # Takes 0.2 s; callers with a codec pass its messages instead.
     from adacd_hil.wire.codec import load_codec
 
     return load_codec().messages.values()

@@ -1,13 +1,13 @@
-"""Packets on their way to the writer, in memory that both processes share: one side puts, the other takes.
+"""Ring of packets in memory that control process and writer share: one side puts, the other takes.
 
-Neither side calls the system for it, and neither waits for the other. The memory begins with a page of counts, each an
-aligned uint64 that one side alone writes: HEAD, bytes ever put; TAIL, bytes ever taken; DROPPED, packets that were not
+Neither side needs a system call, and neither waits for the other. The memory begins with a page of counts, each an
+aligned uint64 that only one side writes: HEAD, bytes ever put; TAIL, bytes ever taken; DROPPED, packets that were not
 put; PEAK, most bytes that were found waiting; WRITTEN, packets that are on the disk. Then the ring: a packet is its
-size in 4 bytes, its bytes, and what fills up to 8; one that reaches the end goes on at the beginning.
+size in 4 bytes, its bytes, and padding to a multiple of 8; a packet that reaches the end continues at the beginning.
 
-HEAD moves last: a process that is killed in between leaves whole packets only. Whether the other side sees the bytes
-before it sees HEAD depends on the processor: x86-64 keeps the order of its writes. Elsewhere some 10 ns pass in which
-the processor may not; a packet that the reader takes too early makes no sense, and is counted as such.
+HEAD moves last: if a process is killed in between, only whole packets remain. Whether the other side sees the bytes
+before HEAD depends on the processor: x86-64 keeps the order of its writes. Elsewhere some 10 ns pass in which the order
+may be wrong; a packet taken too early is invalid, and is counted as such.
 """
 
 import mmap
@@ -21,17 +21,17 @@ _HEAD, _TAIL, _DROPPED, _PEAK, _WRITTEN = range(5)
 _COUNTS_BYTES = mmap.PAGESIZE
 _SIZE = struct.Struct("<I")
 _GRAIN = 8
-"""Packets begin at multiples of this, so that no size is split by the end of the ring."""
+"""Packets begin at multiples of this, so that the end of the ring never splits a size."""
 LEAST_BYTES = mmap.PAGESIZE
 
 
 def room_of(size: int) -> int:
-    """Count what a packet of `size` bytes takes up."""
+    """Return the bytes that a packet of `size` bytes takes in the ring."""
     return (_SIZE.size + size + _GRAIN - 1) & -_GRAIN
 
 
 class _SharedRing:
-    """Both sides' view."""
+    """Common part of the ring's writing and reading side: the shared memory and its counts."""
 
     def __init__(self, descriptor: int) -> None:
         self._memory = mmap.mmap(descriptor, os.fstat(descriptor).st_size)
@@ -54,13 +54,13 @@ class _SharedRing:
         return data if len(data) == size else data + self._memory[_COUNTS_BYTES : _COUNTS_BYTES + size - len(data)]
 
     def close(self) -> None:
-        """Release the memory."""
+        """Unmap the shared memory."""
         self._counts.release()
         self._memory.close()
 
 
 class Ring(_SharedRing):
-    """The side that puts."""
+    """The ring's writing side: puts packets."""
 
     def __init__(self, capacity: int) -> None:
         """Make a ring of `capacity` bytes, at least LEAST_BYTES. Raises OSError, as when that much can't be locked."""
@@ -72,16 +72,16 @@ class Ring(_SharedRing):
         except OSError:
             os.close(self.descriptor)
             raise
-        # Each page once, so that the cycle meets none for the first time.
+        # Touch each page once, so that the cycle has no page fault.
         for place in range(0, len(self._memory), mmap.PAGESIZE):
             self._memory[place] = 0
         self.packets = 0
-        """Packets that were put."""
+        """Number of packets that were put."""
         self._head = 0
-        self._room_until = self.capacity  # HEAD can go so far by the TAIL that was last looked at
+        self._room_until = self.capacity  # limit of HEAD by the last TAIL that was read
 
-    def put(self, packet: bytes) -> bool:
-        """Add a packet; False when there is no room for it."""
+    def put_packet(self, packet: bytes) -> bool:
+        """Add a packet; False if there is no room for it."""
         size = len(packet)
         head = self._head
         end = head + room_of(size)
@@ -103,16 +103,16 @@ class Ring(_SharedRing):
         return True
 
     def count_dropped(self, dropped: int) -> None:
-        """Say how many packets were not put."""
+        """Set the number of packets that were not put."""
         self._counts[_DROPPED] = dropped
 
     @property
     def written(self) -> int:
-        """Packets that are on the disk."""
+        """Number of packets on the disk."""
         return self._counts[_WRITTEN]
 
     def close(self) -> None:
-        """Release the memory; from then on there is no room."""
+        """Release the memory; later puts return False."""
         super().close()
         os.close(self.descriptor)
         self._counts = memoryview(bytearray(_COUNTS_BYTES)).cast("Q")
@@ -120,19 +120,19 @@ class Ring(_SharedRing):
 
 
 class RingReader(_SharedRing):
-    """The side that takes."""
+    """The ring's reading side: takes packets."""
 
     @property
     def dropped(self) -> int:
-        """Packets that were not put."""
+        """Number of packets that were not put."""
         return self._counts[_DROPPED]
 
     def count_written(self, packets: int) -> None:
-        """Say that so many more packets are on the disk."""
+        """Add to the number of packets on the disk."""
         self._counts[_WRITTEN] += packets
 
-    def take(self, most: int) -> bytes:
-        """Take whole packets of up to `most` bytes in all, or a longer one by itself; b"" when none is waiting."""
+    def take_packets(self, most: int) -> bytes:
+        """Take whole packets of up to `most` bytes in all, or a longer one alone; b"" if the ring is empty."""
         tail = self._counts[_TAIL]
         waiting = self._counts[_HEAD] - tail
         self._counts[_PEAK] = max(self._counts[_PEAK], waiting)
@@ -147,7 +147,7 @@ class RingReader(_SharedRing):
 
 
 def split(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find where the packets of taken data begin, and their sizes (n,)."""
+    """Return where the packets of taken data begin, and their sizes (n,)."""
     starts, sizes = [], []
     place = 0
     while place < len(data):
@@ -159,7 +159,7 @@ def split(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _whole_bytes(data: bytes) -> int:
-    """Count the bytes of the whole packets that data begins with."""
+    """Return the length of the whole packets at the beginning of the data."""
     place = 0
     while place + _SIZE.size <= len(data):
         end = place + room_of(_SIZE.unpack_from(data, place)[0])

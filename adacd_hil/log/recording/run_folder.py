@@ -1,6 +1,6 @@
-"""The place of a new log: it replaces no other log, but for one of a start that failed before the first cycle.
+"""Check and preparation of the folder of a new log: it replaces no log but that of a start that failed.
 
-The log of such a start is moved aside, so that the user can give the same command again once the cause is mended.
+The log of a start that failed before the first cycle is moved aside, so that the user can repeat the command.
 """
 
 import itertools
@@ -13,7 +13,7 @@ _FAILED_NAME = "failed-start-{}.mcap"
 
 
 def check_free(path: Path) -> None:
-    """Raise LogExistsError where `path` can't be the first part of a new log, LogError where that can't be told."""
+    """Raise LogExistsError if `path` can't be the first part of a new log, LogError if it can't be examined."""
     if is_taken(path) and not _is_failed_start(path):
         raise _refusal(path)
 
@@ -30,22 +30,22 @@ def make_room(path: Path) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """Tell whether anything, a dangling link included, is where a log or one of its parts would be.
+    """Tell whether any file, a dangling link included, has the name of a log or one of its parts.
 
-    Raises LogExistsError when a folder on the way to it is none, LogError.
+    Raises LogExistsError if a folder of the path is a file, LogError.
     """
     try:
         return is_there(path) or bool(find_parts(path))
     except FileNotFoundError:
         return False
-    except NotADirectoryError:  # something else is where its folder would be
+    except NotADirectoryError:  # a file has the name of its folder
         raise LogExistsError(f"log {path} can't be created: Not a directory") from None
     except OSError as error:
         raise LogError(f"log {path} can't be created: {error.strerror}") from None
 
 
 def is_there(path: Path) -> bool:
-    """Tell whether there is anything of that name, a dangling link included."""
+    """Tell whether any file of that name exists, a dangling link included."""
     return path.is_symlink() or path.exists()
 
 
@@ -56,9 +56,9 @@ def _refusal(path: Path) -> LogExistsError:
 
 
 def _is_failed_start(path: Path) -> bool:
-    """Tell whether a log has nothing, or, ended as it should, no cycle.
+    """Tell whether a log is empty, or has ended properly without a cycle.
 
-    Raises LogExistsError for one that is being written.
+    Raises LogExistsError if it is being written.
     """
     try:
         check_unused(path)
@@ -66,7 +66,7 @@ def _is_failed_start(path: Path) -> bool:
         raise LogExistsError(f"{error}; choose another folder with --out") from None
     if path.is_symlink() or not path.is_file() or list(find_parts(path)) != [0]:
         return False
-    from adacd_hil.log.log_info import read_info  # only where there is something to look at
+    from adacd_hil.log.log_info import read_info  # only needed for an existing log
 
     try:
         info = read_info(path)

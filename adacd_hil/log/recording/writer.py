@@ -1,16 +1,15 @@
-"""The writer process: packets from a ring in, the files of one log out. Run by `Recorder`, never by hand.
+"""The writer process: takes packets from a ring and writes the files of one log. Started by `Recorder` only.
 
-It shares nothing with the control process but the ring and a socket for words: neither its CAN sockets nor its
-scheduling, nor its session, so that Ctrl-C reaches only the control process. It ends the log when it is told to or when
-the control process dies, after it has taken the packets that the control process left in the ring.
+It shares only the ring and a message socket with the control process: not its CAN sockets, its scheduling or its
+session, so that Ctrl-C reaches only the control process. It ends the log on the control process's message or death,
+after it has taken all packets left in the ring.
 
 The writer gathers packets and writes many at a time, at the latest when a chunk has to end: see packet_writer.py. It
-writes more often while somebody watches the live view.
+writes more often while the live view has a viewer.
 
-In lockstep the files depend on the packets only, bit for bit; so chunks end by log time there, and nothing is lost but
-to a full disk. Otherwise they end by the clock, so that silence doesn't keep data from the disk; and a disk that is too
-slow or full costs packets, which are counted, while the ring is emptied as ever. A full disk is tried again with
-another part.
+In lockstep the files depend on the packets only, bit for bit; so chunks end by log time, and packets are lost only to a
+full disk. In real time chunks end by the clock, so that data reach the disk during silence, too; if the disk is too
+slow or full, packets are dropped and counted, and the ring is still emptied. After a full disk, another part is tried.
 """
 
 import contextlib
@@ -34,19 +33,19 @@ from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.terminal import in_line
 
 POLL_PERIOD_US = 25_000
-"""How often the ring is looked into in real time. To be woken would cost the control process more than the packet does;
-to look costs the writer as much as to write two cycles."""
+"""Polling interval of the ring in real time. A wake-up would cost the control process more than the packet; a poll
+costs the writer as much as writing two cycles."""
 RETRY_PERIOD_NS = 5_000_000_000
-"""How long a disk that failed is left alone."""
+"""Time before a disk that failed is tried again."""
 SHOW_PERIOD_NS = 45_000_000
-"""How often packets are written while somebody watches in real time: at every second look into the ring. At every one
-the writer would take 10 % of a processor instead of 6 %."""
+"""Interval of writing in real time while the live view has a viewer: every second poll of the ring. At every poll the
+writer would take 10 % of a processor instead of 6 %."""
 BATCH_BYTES = 256 * 1024
-"""Packets that are gathered at most, about 400 cycles: more would be no cheaper, each."""
+"""Most bytes of packets that are gathered, about 400 cycles: more would be no cheaper per cycle."""
 
 
 class WriterProcess:
-    """The loop around a PacketWriter."""
+    """The writer process's loop: takes packets, writes them, ends chunks and parts, reports the end."""
 
     def __init__(
         self, connection: socket.socket, ring: RingReader, sink: Sink, setup: WriterSetup, clock: Clock | None = None
@@ -66,10 +65,10 @@ class WriterProcess:
         self._gathered_bytes = 0
         self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
         self._shown_ns = self._flushed_ns
-        self._failed_ns: int | None = None  # when the disk was seen to fail, or was last tried
+        self._failed_ns: int | None = None  # time at which the disk failed, or was last tried
         self._part_ns: tuple[int, int] | None = None  # t_ns of the first and the last packet of the part
         self._lost = 0  # packets that were taken but are in no file
-        self._frames = self._messages = self._dropped = 0  # of the parts before
+        self._frames = self._messages = self._dropped = 0  # of earlier parts
         if not setup.is_blocking:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, POLL_PERIOD_US))
 
@@ -78,12 +77,12 @@ class WriterProcess:
         return live.open(self._setup, self._file.ids, start_ns)
 
     def run(self) -> None:
-        """Write until the end, then answer with the last word."""
+        """Write until the end, then answer with the summary."""
         while True:
             word = self._hear()
             if word == processes.ROOM:
                 self._take_some()
-                _send(self._connection, processes.ROOM)  # before the rest, so that both sides work at once
+                _send(self._connection, processes.ROOM)  # before taking the rest, so that both sides work at once
             self._take()
             if word in (processes.END, processes.NOTHING):
                 break
@@ -91,7 +90,7 @@ class WriterProcess:
         self._end(self._finish("closed" if word == processes.END else "control process died"))
 
     def _end(self, summary: dict[str, str]) -> None:
-        """Close the last file and say how it went."""
+        """Close the last file and send the summary."""
         self._sink.close()
         path = part_path(self._setup.path, self._part)
         if self._part and self._sink.error and self._sink.path == path and not self._has_chunks:
@@ -104,7 +103,7 @@ class WriterProcess:
             self.live.close()
 
     def _hear(self) -> bytes | None:
-        """Receive a word, NOTHING when the control process is dead; None when there is none for a while."""
+        """Receive a message; NOTHING if the control process is dead; None after a timeout."""
         try:
             return self._connection.recv(processes.MOST_BYTES)
         except BlockingIOError:
@@ -113,7 +112,7 @@ class WriterProcess:
             return processes.NOTHING
 
     def _take(self) -> None:
-        """Take all that waits in the ring; in real time, flush by the clock."""
+        """Take all packets waiting in the ring; in real time, flush by the clock."""
         while True:
             self._take_some()
             if self._gathered_bytes >= BATCH_BYTES or (self._setup.is_blocking and self._is_watched):
@@ -124,12 +123,12 @@ class WriterProcess:
                 return
 
     def _take_some(self) -> None:
-        if data := self._ring.take(BATCH_BYTES):
+        if data := self._ring.take_packets(BATCH_BYTES):
             self._gathered.append(data)
             self._gathered_bytes += len(data)
 
     def _look_at_clock(self) -> None:
-        """Flush or show if it is time, and see to a disk that has failed."""
+        """Flush or show if it is time, and retry a disk that has failed."""
         now_ns = self._clock.now_ns()
         if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
             self._write()
@@ -144,7 +143,7 @@ class WriterProcess:
         return self.live is not None and self.live.is_watched
 
     def _look_at_disk(self, now_ns: int) -> None:
-        """Begin another part where the disk has failed some time ago."""
+        """Begin another part if the disk failed long enough ago."""
         if not self._sink.error:
             self._failed_ns = None
         elif self._failed_ns is None:
@@ -159,7 +158,7 @@ class WriterProcess:
         return self._sink.written > self._file.head_bytes
 
     def _flush(self, now_ns: int) -> None:
-        """End the chunk in progress, and the part where it is time."""
+        """End the chunk in progress, and the part if it is due."""
         self._file.flush()
         self._flushed_ns = now_ns
         if self._is_part_full() and not self._sink.error and not self._sink.is_behind:
@@ -174,7 +173,7 @@ class WriterProcess:
         return 0 < part_bytes <= self._file.record_bytes or 0 < part_ns <= last_ns - first_ns
 
     def _begin_part(self, is_next: bool) -> None:
-        """Begin the next part, or the present one again; names that somebody else has taken are passed over."""
+        """Begin the next part, or the present one again; skip names that other files have taken meanwhile."""
         self._part += is_next
         self._parts += is_next
         while self._sink.path != (path := part_path(self._setup.path, self._part)) and is_there(path):
@@ -183,9 +182,9 @@ class WriterProcess:
         self._messages += self._file.messages
         self._packets.frames = 0
         self._part_ns = None
-        self._sink.begin(path)
+        self._sink.begin_file(path)
         self._file = self._begin_file()
-        self._packets.begin(self._file)
+        self._packets.begin_file(self._file)
 
     def _begin_file(self) -> McapFile:
         setup = self._setup
@@ -211,7 +210,7 @@ class WriterProcess:
         }
 
     def _write(self) -> None:
-        """Write what has been gathered, in lockstep with an end of the chunk where its log time says so."""
+        """Write the gathered packets; in lockstep end chunks by log time."""
         data = b"".join(self._gathered)
         starts, sizes = split(data)
         self._gathered = []
@@ -248,10 +247,10 @@ class WriterProcess:
             return
         first_ns = int(times_ns[0]) if self._part_ns is None else self._part_ns[0]
         self._part_ns = first_ns, int(times_ns[-1])
-        self._lost += self._packets.write(block, starts, sizes)
+        self._lost += self._packets.write_packets(block, starts, sizes)
 
     def _note_lost(self) -> None:
-        """Take in what the sink has swallowed."""
+        """Count the packets that the sink has dropped."""
         self._lose(self._sink.take_lost())
 
     def _lose(self, count: int) -> None:
@@ -260,25 +259,25 @@ class WriterProcess:
 
 
 def _send(connection: socket.socket, word: bytes) -> None:
-    with contextlib.suppress(OSError):  # nobody is left to hear it
+    with contextlib.suppress(OSError):  # the receiver is dead
         connection.send(word)
 
 
 def _say(line: str) -> None:
-    """Tell the user of the run at once: a full disk leaves the control process in peace, who would learn at the end."""
-    with contextlib.suppress(OSError, ValueError):  # nobody is left to read it
+    """Print a line for the user at once: the control process reports a full disk only at the end."""
+    with contextlib.suppress(OSError, ValueError):  # standard error is closed
         sys.stderr.write(f"{PRODUCT}: {in_line(line)}\n")
         sys.stderr.flush()
 
 
 def _schedule_plainly() -> None:
-    """Leave the real-time class that the control process may have passed on."""
+    """Leave the real-time scheduling class inherited from the control process."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> None:
-    """Write a log: say when ready, take packets until the end, say how it went."""
+    """Write a log: report readiness, take packets until the end, send the summary."""
     _schedule_plainly()
     connection = socket.socket(fileno=socket_descriptor)
     error = url = ""
@@ -289,7 +288,7 @@ def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> 
         sink = Sink(file_descriptor, setup.path, waits=setup.is_blocking, on_written=ring.count_written)
         process = WriterProcess(connection, ring, sink, setup)
         sink.settle()
-        error = sink.error  # the control process tells the first one
+        error = sink.error  # the control process prints the first one
         sink.say = _say
         url = process.live.url if process.live else ""
     except (LogError, OSError, ValueError) as reason:

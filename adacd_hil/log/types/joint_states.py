@@ -53,8 +53,8 @@ def is_joint_state(payload: bytes) -> bool:
 def joint_state_columns(payloads: Iterable[bytes]) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
     """Make tables of messages of ROS 2, one for each choice of joints: (their names, columns).
 
-    Columns: `t_ns` of the stamp, and `position_NAME`, `velocity_NAME`, `effort_NAME`; nan where a message has none, or
-    not one of each joint. What is no message is left out.
+    Columns: `t_ns` of the stamp, and `position_NAME`, `velocity_NAME`, `effort_NAME`; nan if a message has none, or not
+    one of each joint. Payloads that are no messages are left out.
     """
     groups: dict[tuple[str, ...], list[JointStateMessage]] = {}
     for payload in payloads:

@@ -74,7 +74,7 @@ class Member(NamedTuple):
         return tuple((f"{self.prefix or self.name.upper()}_{value.name}", int(value)) for value in self.values or ())
 
     def value_of(self, number: Any) -> Any:
-        """Make a value of what a record holds. Raises ValueError, OverflowError for one that the field can't take."""
+        """Convert a record's number to the field's value. Raises ValueError, OverflowError if it doesn't fit."""
         if self.size > 1:
             return tuple(number)
         if self.values is not None:
@@ -133,7 +133,7 @@ def number_type(name: str, members: Iterable[Member]) -> MessageType:
 
 
 def body_struct(members: Iterable[Member], has_block: bool = False) -> struct.Struct:
-    """Make the packer of what follows the stamp; with `has_block` it ends where a float64 block may begin."""
+    """Return the packer of the members behind the stamp; with `has_block` it ends where a float64 block may begin."""
     pattern = "<"
     position = _STAMP_END
     for member in members:
@@ -251,7 +251,7 @@ def pack_fd_frame(stamp: bytes, can_id: int, data: bytes, is_error: bool, is_ext
 
 
 def _joint_state_parts() -> tuple[bytes, bytes]:
-    """Return what lies between stamp and position, and what lies before velocity and before effort."""
+    """Return the constant bytes between stamp and position, and those before velocity and before effort."""
     names = struct.pack("<I", JOINTS)
     for name in JOINT_NAMES:
         text = name.encode() + b"\0"

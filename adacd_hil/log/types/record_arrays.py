@@ -1,8 +1,8 @@
-"""Message records and bus frames as numpy arrays: what a log gives, and what recordings of other programs give.
+"""Message records and bus frames as numpy arrays, of our logs and of other programs' recordings.
 
-The fields of `LONG_FRAME_DTYPE` come first in `RECORDED_FRAME_DTYPE` and mean the same; what is beyond them is what our
-own bus never has: remote frames, 29-bit identifiers below 0x800, FD frames without bit rate switch, several channels.
-
+The fields of `LONG_FRAME_DTYPE` come first in `RECORDED_FRAME_DTYPE` and mean the same; its other fields are for frames
+that our own bus never has: remote frames, 29-bit identifiers below 0x800, FD frames without bit rate switch, several
+channels.
 Messages are gathered by topic, piece by piece. A piece ends before the first message whose publish time, which is its
 cycle's, is higher than any before.
 """
@@ -124,7 +124,7 @@ def is_of_frames(topic: Topic) -> bool:
 
 
 def frames_of(records: NDArray[Any], topic: Topic, epoch_ns: int) -> NDArray[Any]:
-    """Make frames of the records of a topic of frames; epoch_ns: what their times are less than those of the file."""
+    """Make frames of the records of a topic of frames; epoch_ns: subtracted from the file's times."""
     kind = FRAME_TOPICS[topic.name]
     frames = np.empty(len(records), LONG_FRAME_DTYPE if kind.is_long else FRAME_DTYPE)
     frames["t_ns"] = records["sec"].astype(np.int64) * 1_000_000_000 + records["nanosec"] - epoch_ns
@@ -190,8 +190,8 @@ class FrameLog(NamedTuple):
 
     channels: tuple[str, ...]  # "" where the recording names none
     frames: NDArray[Any]  # (n,) of RECORDED_FRAME_DTYPE
-    epoch_ns: int = 0  # what was added to t_ns for the times in the file
-    problem: str = ""  # what is missing, one line; "" for a whole recording
+    epoch_ns: int = 0  # offset from t_ns to the times in the file
+    problem: str = ""  # defect, one line; "" for a whole recording
 
 
 def is_plain(frames: NDArray[Any]) -> NDArray[np.bool_]:
@@ -207,7 +207,7 @@ def is_sendable(frames: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def as_logged(frames: NDArray[Any]) -> NDArray[Any]:
-    """Return what a bus end of ours would have received and sent of them, (k,) of LONG_FRAME_DTYPE."""
+    """Return the frames that a bus end of ours would have received or sent, (k,) of LONG_FRAME_DTYPE."""
     chosen = frames[is_plain(frames)]
     logged = np.zeros(len(chosen), LONG_FRAME_DTYPE)
     for name in LONG_FRAME_DTYPE.names or ():
@@ -219,9 +219,9 @@ Numbers = NDArray[np.int64]
 
 
 class RawPiece(NamedTuple):
-    """What a piece of a log holds, by topic."""
+    """Contents of a piece of a log, by topic."""
 
-    records: dict[str, NDArray[np.uint8]]  # (n, size of a record): numpy would not copy what no field covers
+    records: dict[str, NDArray[np.uint8]]  # (n, size of a record): numpy would not copy bytes outside of fields
     frames: NDArray[Any]  # (n,) of FRAME_DTYPE, or of LONG_FRAME_DTYPE where a frame is FD
     payloads: dict[str, list[bytes]]
 
@@ -311,7 +311,7 @@ class PieceBuilder:
         self._cycles = int(cycles[-1])
 
     def end(self) -> RawPiece:
-        """Return what has been gathered, and begin anew."""
+        """Return the gathered records and payloads, and start a new piece."""
         records, payloads = {}, {}
         for topic, rows, texts in zip(self.topics, self._rows, self._payloads, strict=True):
             if topic.dtype is None:

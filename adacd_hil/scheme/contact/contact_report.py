@@ -19,9 +19,9 @@ A hand that grasps a moving arm stops it and then guides it; it is called by wha
 body that is clamped is a hit where it springs back, a push where it stays under load: transient and quasi-static
 contact of ISO/TS 15066.
 
-**The paper's scheme** (`Isolation`). Link 2 if joint 2 is over its threshold at any time until the isolation window
-ends, else link 1. At the alarm the answer is often too early: joint 1 has the longer arm and crosses first. The report
-is given at once and becomes final when the window ends.
+**The paper's scheme** (`IntegratedContact`). Link 2 if joint 2 is over its threshold at any time until the isolation
+window ends, else link 1. At the alarm the answer is often too early: joint 1 has the longer arm and crosses first. The
+report is given at once and becomes final when the window ends.
 """
 
 from abc import ABC, abstractmethod

@@ -4,7 +4,7 @@ The steps, each a function over a `Record`:
 
 - `identify`: recursive least squares of all parameters that the torque can tell: base parameters of the links, F_v and
   F_c of each joint, an offset of each torque sensor, and, where torques are those of motors, the inertia of each rotor
-  as the joint feels it through the gear. It starts from what is known before, with honest uncertainty (`Prior`), and
+  as the joint feels it through the gear. It starts from what is known before, with honest uncertainty (`prior`), and
   ends with the uncertainty P that is left.
 - `certify`: the same parameters, frozen, on motion that was not used. It says how large the residual is, and how much
   larger than noise and P explain: what the model lacks.

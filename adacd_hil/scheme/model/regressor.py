@@ -172,7 +172,7 @@ def fill_terms(
 ) -> None:
     """Fill the columns of the optional terms, numbers as in `FRICTION_TERMS`, from `first_column` on.
 
-    speeds: still, width w and v_s, rad/s. bent (2, n): of the bristles, see `bend`.
+    speeds: still, width w and v_s, rad/s. bent (2, n): of the bristles, see `bend_bristles`.
     """
     count = dq.shape[0]
     still_rad_s, width_rad_s, stribeck_rad_s = speeds
