@@ -45,9 +45,11 @@ class CommandGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list."""
-        commands = [(name, self.commands[name]) for name in self.list_commands(ctx)]
+        named = [(name, self.commands[name]) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
-            formatter.write_dl([(name, command.get_short_help_str(_LONGEST)) for name, command in commands])
+            formatter.write_dl(
+                [(name, command.get_short_help_str(_LONGEST)) for name, command in named if not command.hidden]
+            )
 
 
 _LONGEST = 1000

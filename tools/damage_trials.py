@@ -21,7 +21,7 @@ import recorded_run
 
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import PART_KEY, LogError
 
 KINDS = ("cut", "flip", "flips", "zeros", "cut and flip")
 CYCLES = 400
@@ -155,9 +155,9 @@ def run_trial(whole: Undamaged, seed: int, folder: Path) -> DamageResult:
         if is_intact(whole.chunks[0], places):
             violations.append("nothing is saved though the first chunk is intact")
     else:
-        status = 3 if recovery.is_lossy else 0
+        status = 3 if recovery.losses.is_any else 0
         saved = recovery.messages
-        violations += judge(whole, recovery.out, places, recovery.is_lossy)
+        violations += judge(whole, recovery.out, places, recovery.losses.is_any)
         checked = check_log(recovery.out)
         if checked.errors:
             violations.append(f"the recovered log fails its check: {checked.findings[0].text}")
@@ -191,7 +191,8 @@ def judge(whole: Undamaged, out: Path, places: list[Place], is_lossy: bool) -> l
     if not is_lossy:
         if len(found) != len(whole.messages):
             violations.append(f"{len(whole.messages) - len(found)} messages are missing, and it says that nothing is")
-        if attachments != whole.attachments or metadata.get("run") != whole.metadata["run"]:
+        run = {key: text for key, text in whole.metadata["run"].items() if key != PART_KEY}
+        if attachments != whole.attachments or metadata.get("run") != run:
             violations.append("attachments or metadata are not what they were, and it says that nothing is lost")
     return violations
 

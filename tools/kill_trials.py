@@ -159,6 +159,6 @@ def _judge(seed: int, victim: str, path: Path, last_ns: int) -> KillResult:
     lost_s = max(0, last_ns - int(log.cycle.t_ns[-1])) * 1e-9
     if lost_s > LOSS_BOUND_S:
         violations.append(f"lost {lost_s:.3f} s, more than {LOSS_BOUND_S:g} s")
-    if victim != "control" and not recovery.is_lossy:
+    if victim != "control" and not recovery.losses.is_any:
         violations.append("recover says that nothing was lost")
-    return KillResult(seed, victim, len(cycle), lost_s, 3 if recovery.is_lossy else 0, violations)
+    return KillResult(seed, victim, len(cycle), lost_s, 3 if recovery.losses.is_any else 0, violations)

@@ -67,9 +67,7 @@ class Kind:
 
 NO_BUS = "-i socketcan -c none"
 FRAMES = (
-    Command("adacd-hil log export FILE --format candump --out OUT/x.log", (0, 1, 2, 3)),
     Command("adacd-hil log export FILE --format csv --out OUT", (0, 1, 2, 3)),
-    Command("adacd-hil log export FILE --format asc --out OUT/x.asc --id 181", (0, 1, 2, 3)),
     Command("adacd-hil play FILE -i virtual -c x --speed 1000 --skip 0.001 --end 1", (0, 1, 2, 3, 5)),
     Command(f"firmware-sim play FILE {NO_BUS}", (1, 2, 5)),
     Command("adacd-hil replay FILE --config paper", (0, 1, 2, 3), is_heavy=True),
@@ -117,9 +115,7 @@ KINDS = {
             Command("adacd-hil log recover FILE --out OUT/x.mcap", (0, 1, 3)),
             Command("adacd-hil log cut FILE --from 0.05 --until 0.1 --out OUT/x.mcap", (0, 1)),
             Command("adacd-hil log cut FILE --contact 1 --out OUT/x.mcap", (0, 1)),
-            Command("adacd-hil log merge FILE SHORT_MCAP --out OUT/x.mcap", (0, 1)),
             Command("adacd-hil log export FILE --format parquet --out OUT", (0, 1, 2, 3)),
-            Command("adacd-hil log export FILE --format blf --out OUT/x.blf", (0, 1, 2, 3)),
             *FRAMES,
             Command("adacd-hil replay FILE --set detector.threshold_Nm=0.1", (0, 1, 2, 3), is_heavy=True),
             Command("adacd-hil compare FILE SHORT_MCAP", (0, 1, 2, 3), is_heavy=True),

@@ -15,7 +15,7 @@ from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.given_path import GivenPath
-from adacd_hil.lab.cli.log_command import dbc_option, find_dbc, id_option, only_option
+from adacd_hil.lab.cli.log_command import dbc_option, find_dbc
 from adacd_hil.log.log_files import LogError
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.terminal import in_line
@@ -25,7 +25,7 @@ from adacd_hil.wire.can_interface import is_virtual
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from adacd_hil.lab.logs.frame_export import FrameChoice
+    from adacd_hil.lab.logs.frame_choice import FrameChoice
     from adacd_hil.wire.playback import PlayedFrame
 
 _PIECES_AHEAD = 4
@@ -33,6 +33,22 @@ _BLOCK = 256
 """Frames that are made ready between two sends at most."""
 _SWITCH_S = 50e-6
 """How long the thread that reads ahead may keep the one that sends waiting."""
+
+
+class HexId(click.ParamType[int]):
+    """A CAN identifier in hexadecimal."""
+
+    name = "hex"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Read it."""
+        try:
+            number = int(str(value), 16)
+        except ValueError:
+            self.fail(f"{value} is not a hexadecimal identifier", param, ctx)
+        if not 0 <= number < 1 << 29:
+            self.fail(f"{value} has more than 29 bits", param, ctx)
+        return number
 
 
 @click.command("play", epilog=EPILOG)
@@ -59,8 +75,14 @@ _SWITCH_S = 50e-6
 @click.option(
     "--commands", is_flag=True, help="Also on a real bus, send what isn't the devices': it can move a real arm."
 )
-@only_option
-@id_option
+@click.option(
+    "--only",
+    type=click.Choice(["host", "devices", "both"]),
+    default="both",
+    show_default=True,
+    help="Whose frames: by the contract, else by their direction.",
+)
+@click.option("--id", "can_ids", type=HexId(), multiple=True, metavar="HEX", help="Only these identifiers.")
 @dbc_option
 @json_option
 @explained
@@ -86,7 +108,7 @@ def play(
     Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. On a real bus only frames that the contract says the devices
     send are sent, unless --commands asks for the others: NMT, SDO and torque commands can move an arm.
     """
-    from adacd_hil.lab.logs.frame_export import FrameChoice, sides
+    from adacd_hil.lab.logs.frame_choice import FrameChoice, sides
     from adacd_hil.log.frames.frame_log import open_frames
     from adacd_hil.wire.codec import parse_codec
 

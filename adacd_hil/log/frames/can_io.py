@@ -26,7 +26,6 @@ from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
-from adacd_hil.log.frames.frame_log import ERROR_FLAG
 from adacd_hil.log.frames.mcap_frames import FrameWriter, McapFrames, RecordedFrame
 from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import MOST_BYTES
@@ -224,6 +223,10 @@ def _asc_lines(lines: Iterable[str], is_relative: bool) -> Iterator[str]:
         yield line
 
 
+_ERROR_FLAG = 0x20000000
+"""Of a candump log's identifiers: CAN_ERR_FLAG of the kernel."""
+
+
 class _CandumpReader(can.CanutilsLogReader):
     """python-can's, but a line that is no frame ends nothing, and error frames keep their class.
 
@@ -255,7 +258,7 @@ class _CandumpReader(can.CanutilsLogReader):
             self._number += 1
             error = re.search(r" ([23][0-9A-Fa-f]{7})#", self._line)
             self._is_error = error is not None
-            line = self._line.replace(error[0], f" {int(error[1], 16) & ~ERROR_FLAG:08X}#") if error else self._line
+            line = self._line.replace(error[0], f" {int(error[1], 16) & ~_ERROR_FLAG:08X}#") if error else self._line
             yield re.sub(r"(#[0-9A-Fa-f]{16})_[0-9A-Fa-f]", r"\1", line)  # a raw DLC, which means 8
 
 

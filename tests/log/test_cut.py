@@ -1,13 +1,12 @@
-"""Stretches of logs, and several logs as one: the same messages, whole cycles, nothing out of order."""
+"""Stretches of logs: the same messages, whole cycles, nothing out of order."""
 
-import numpy as np
 import pytest
 from made_log import ATTACHMENTS, MILLISECOND, RUN, SUMMARY, kinds, make_log, put_together, take_apart
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from adacd_hil.lab.logs.check.log_check import check_log
-from adacd_hil.lab.logs.cut_and_merge import TimeWindow, contacts_begun, cut, find_contact, log_names, merge
+from adacd_hil.lab.logs.cut import TimeWindow, contacts_begun, cut, find_contact
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedContact, read_log
 from adacd_hil.records import ContactReport
@@ -131,36 +130,33 @@ def without_crc(data):
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (lambda data: data[:-1], "is cut, it has no end"),
-        (lambda data: data[: len(data) // 2], "is cut, it has no end"),
-        (lambda data: data.replace("Prüfung".encode(), "Trüfung".encode()), "is damaged, it fails its CRC"),
-        (lambda data: spoil_chunk(without_crc(data)), r"is damaged at byte \d+"),
-        (lambda data: without_crc(data).replace(b"x = 1", b"x = 2"), r"is damaged at byte \d+"),
-        (lambda data: without_crc(data)[:100] + bytes(20) + without_crc(data)[120:], r"is damaged at byte \d+"),
+        (lambda data: data[: len(data) // 2], r"byte \d+, \d+ bytes: no record"),
+        (lambda data: data.replace("Prüfung".encode(), "Trüfung".encode()), "fails the CRC of the whole"),
+        (lambda data: spoil_chunk(without_crc(data)), r"byte \d+, \d+ bytes: "),
+        (lambda data: without_crc(data).replace(b"x = 1", b"x = 2"), r"byte \d+, \d+ bytes: attachment fails its CRC"),
     ],
 )
 def test_a_damaged_log_is_recovered_first(spoil, reason, log_path, tmp_path):
     log_path.write_bytes(spoil(log_path.read_bytes()))
-    for work in (
-        lambda out: cut(log_path, out, TimeWindow(-INFINITE, INFINITE)),
-        lambda out: merge([log_path], out),
-    ):
-        with pytest.raises(LogError, match=f"^{log_path} {reason}: recover it first$"):
-            work(tmp_path / "out.mcap")
-        assert list(tmp_path.iterdir()) == [log_path]
+    with pytest.raises(LogError, match=rf"^run\.mcap: {reason}.*: recover the log first$"):
+        cut(log_path, tmp_path / "out.mcap", TimeWindow(-INFINITE, INFINITE))
+    assert list(tmp_path.iterdir()) == [log_path]
+
+
+def test_a_log_that_lacks_only_what_is_made_anew_is_cut(log_path, tmp_path):
+    log_path.write_bytes(log_path.read_bytes()[:-1])
+    assert cut(log_path, tmp_path / "out.mcap", TimeWindow(-INFINITE, INFINITE)).messages == 2 * CYCLES
 
 
 def test_a_strangers_log_without_crcs_is_taken_as_it_is(log_path, tmp_path):
     log_path.write_bytes(without_crc(log_path.read_bytes()))
-    assert merge([log_path], tmp_path / "out.mcap").messages == 2 * CYCLES
+    assert cut(log_path, tmp_path / "out.mcap", TimeWindow(-INFINITE, INFINITE)).messages == 2 * CYCLES
 
 
 def test_a_log_is_not_overwritten_by_what_is_made_of_it(log_path):
     before = log_path.read_bytes()
     with pytest.raises(LogError, match="is the log itself"):
         cut(log_path, log_path, TimeWindow(-INFINITE, INFINITE))
-    with pytest.raises(LogError, match="is one of the logs"):
-        merge([log_path], log_path)
     assert log_path.read_bytes() == before
 
 
@@ -185,59 +181,6 @@ def test_an_unknown_contact_is_an_error(log_path):
         find_contact(log_path, 1, 1.0)
 
 
-def test_logs_are_merged_by_time_and_keep_their_own_order(tmp_path):
-    first = write(tmp_path / "a.mcap", topics=("/a", "/x"), times=frame_times)
-    second = write(
-        tmp_path / "b.mcap",
-        topics=("/b", "/x"),
-        chunks=((0, 3), (3, 4), (4, 10)),
-        times=lambda number: (number * MILLISECOND + LATE_NS + 1000, number),
-    )
-    out = tmp_path / "out.mcap"
-    done = merge([first, second], out)
-    messages = read(out)[0]
-    assert done.messages == len(messages) == 40
-    assert done.shared == ("/x",)
-    assert [message[1] for message in messages] == sorted(message[1] for message in messages)
-    for path in (first, second):
-        own = read(path)[0]
-        assert [message for message in messages if message in own] == own
-    assert check_log(out).findings == []
-
-
-def test_a_log_that_runs_backwards_between_topics_keeps_its_order(tmp_path):
-    path = tmp_path / "a.mcap"
-    data = make_log(times=lambda number: (10**9 + number * MILLISECOND, 0))
-    parts = take_apart(data)
-    path.write_bytes(put_together(parts))
-    other = write(tmp_path / "b.mcap", topics=("/c",), times=lambda number: (10**9 + number * MILLISECOND // 2, 0))
-    out = tmp_path / "out.mcap"
-    merge([path, other], out)
-    assert [message for message in read(out)[0] if message[0] != "/c"] == read(path)[0]
-
-
-def test_what_logs_say_of_themselves_is_kept_apart(tmp_path):
-    first = write(tmp_path / "a" / "run.mcap", summary={**SUMMARY, "dropped": "1"})
-    second = write(
-        tmp_path / "b" / "run.mcap",
-        run={**RUN, "name": "other"},
-        attachments={"config.toml": b"x = 2\n", "arm.dbc": ATTACHMENTS["arm.dbc"]},
-    )
-    out = tmp_path / "out.mcap"
-    done = merge([first, second], out, has_prefix=True)
-    messages, attachments, metadata = read(out)
-    assert done.names == ("a_run", "b_run")
-    assert {topic for topic, *_ in messages} == {"/a_run/a", "/a_run/b", "/b_run/a", "/b_run/b"}
-    assert attachments == {**ATTACHMENTS, "b_run/config.toml": b"x = 2\n"}
-    assert (metadata["run"], metadata["run:b_run"]["name"]) == (RUN, "other")
-    assert (metadata["summary"]["dropped"], metadata["summary"]["ending"]) == ("1", "merged")
-
-
-def test_logs_of_one_name_are_told_apart(tmp_path):
-    assert log_names([tmp_path / "a.mcap", tmp_path / "b.mcap"]) == ("a", "b")
-    assert log_names([tmp_path / "a.mcap", tmp_path / "a.mcap"])[0].endswith("_a_1")
-
-
 def write_parts(folder):
     for number, ending in enumerate(("continued", "closed")):
         name = f"run_{number:03d}.mcap" if number else "run.mcap"
@@ -250,42 +193,20 @@ def write_parts(folder):
 def test_parts_are_one_log(tmp_path):
     path = write_parts(tmp_path)
     whole = read(path)[0] + read(tmp_path / "run_001.mcap")[0]
-    merge([path, tmp_path / "run_001.mcap"], tmp_path / "merged.mcap")
-    cut(path, tmp_path / "cut.mcap", TimeWindow(-INFINITE, INFINITE))
-    for out in (tmp_path / "merged.mcap", tmp_path / "cut.mcap"):
-        messages, attachments, metadata = read(out)
-        assert (messages, attachments, metadata["run"]) == (whole, ATTACHMENTS, RUN)
-        assert check_log(out).findings == []
-        assert read_log(out).problem == ""
+    out = tmp_path / "cut.mcap"
+    cut(path, out, TimeWindow(-INFINITE, INFINITE))
+    messages, attachments, metadata = read(out)
+    assert (messages, attachments, metadata["run"]) == (whole, ATTACHMENTS, RUN)
+    assert check_log(out).findings == []
+    assert read_log(out).problem == ""
 
 
 def test_parts_that_are_missing_or_of_another_run_are_an_error(tmp_path):
     path = write_parts(tmp_path)
     (tmp_path / "run_001.mcap").rename(tmp_path / "run_002.mcap")
-    with pytest.raises(LogError, match=r"run_001\.mcap is missing: recover the log first$"):
-        merge([path], tmp_path / "out.mcap")
+    with pytest.raises(LogError, match=r"run\.mcap lacks run_001\.mcap: recover the log first$"):
+        cut(path, tmp_path / "out.mcap", TimeWindow(-INFINITE, INFINITE))
     (tmp_path / "run_002.mcap").unlink()
     write(tmp_path / "run_001.mcap", run={**RUN, "name": "other"})
-    with pytest.raises(LogError, match=r"its parts are of different runs$"):
-        merge([path], tmp_path / "out.mcap")
-
-
-def test_many_logs_of_random_times_are_merged_as_a_sort_would(tmp_path):
-    generator = np.random.default_rng(3)
-    paths = []
-    for number in range(4):
-        times = np.sort(generator.integers(0, 60, 40)).tolist()
-        chunks = tuple((start, start + 8) for start in range(0, 40, 8))
-        paths.append(
-            write(
-                tmp_path / f"{number}.mcap",
-                topics=(f"/{number}",),
-                chunks=chunks,
-                times=lambda place, times=times: (times[place], 0),
-            )
-        )
-    merge(paths, tmp_path / "out.mcap")
-    merged = read(tmp_path / "out.mcap")[0]
-    assert [message[1] for message in merged] == sorted(message[1] for message in merged)
-    for number, path in enumerate(paths):
-        assert [message for message in merged if message[0] == f"/{number}"] == read(path)[0]
+    with pytest.raises(LogError, match=r"run\.mcap lacks run_001\.mcap \(of another run\): recover the log first$"):
+        cut(path, tmp_path / "out.mcap", TimeWindow(-INFINITE, INFINITE))
