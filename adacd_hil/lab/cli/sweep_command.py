@@ -80,8 +80,8 @@ def sweep(
 
     A folder stands for every run.mcap below it. Begun again with the same folder, a sweep computes what is missing.
     """
-    from adacd_hil.lab.tune.cluster import TLS, TlsFiles, connect
     from adacd_hil.lab.tune.sweep import SweepStore, replay_task, run_sweep
+    from adacd_hil.lab.tune.workers import TLS, TlsFiles, connect
 
     if bool(logs) == bool(scenarios):
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
@@ -98,8 +98,9 @@ def sweep(
             progress(
                 f"{scheduler} is open: it runs whatever anybody sends who reaches it; tls:// asks for a certificate"
             )
-        with connect(scheduler, workers or os.cpu_count() or 1, tls) as client:
-            outcome = run_sweep(plan, work, store, client, progress)
+        count = workers or len(os.sched_getaffinity(0))
+        with connect(scheduler, min(count, plan.size), tls, (work.__module__, "adacd_hil.replay.replay")) as pool:
+            outcome = run_sweep(plan, work, store, pool, progress)
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
         table = store.join(plan.row_keys(), about)
     result = {
