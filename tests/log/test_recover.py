@@ -1,9 +1,7 @@
 """Recovered logs: everything intact is in them, nothing else is, and they say what was lost."""
 
-import sys
-from pathlib import Path
-
 import pytest
+from damage_trials import make_undamaged, run_trial
 from made_log import (
     ATTACHMENTS,
     RUN,
@@ -25,10 +23,6 @@ from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from damage_trials import make_undamaged, run_trial
 
 CHUNKS = tuple((start, start + 3) for start in range(0, 12, 3))
 COUNT = 24

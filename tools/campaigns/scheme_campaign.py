@@ -1,8 +1,8 @@
 """Plays both schemes against a thousand arms, a day of motion and two thousand touches, and prints the figures.
 
-    python tools/scheme_campaign.py --quick                 a few minutes' worth
-    python tools/scheme_campaign.py --json campaign.json    everything; an hour or so on two CPUs
-    python tools/scheme_campaign.py --only steps --schemes paper
+    python tools/campaigns/scheme_campaign.py --quick                 a few minutes' worth
+    python tools/campaigns/scheme_campaign.py --json campaign.json    everything; an hour or so on two CPUs
+    python tools/campaigns/scheme_campaign.py --only steps --schemes paper
 
 No bus: recordings of the emulated arm (`lab`), the schemes' compiled steps on them (`campaign_schemes`). Every run has
 its seed. Tables go to stdout, progress to stderr. Exit status: 0 the last scheme has all figures within their bounds,

@@ -1,4 +1,4 @@
-"""Logs damaged at random, for tools/damage_campaign.py: what check and recover must make of each.
+"""Logs damaged at random, for damage_campaign.py: what check and recover must make of each.
 
 Judged by code that is not ours: mcap's own reader lists the messages of the undamaged and of the recovered log.
 """
@@ -15,7 +15,7 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Chunk, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "log"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "log"))
 
 import recorded_run
 

@@ -1,8 +1,8 @@
 """Measures which lines of the code that runs on an arm, and replays it, the reference runs and five faults reach.
 
-    python tools/reached_lines.py -j 2             the share, by package, and the files with the most lines not reached
-    python tools/reached_lines.py --functions      and every function that no run enters
-    python tools/reached_lines.py paper-quick lose-feedback     these runs alone
+    python tools/campaigns/reached_lines.py -j 2  the share, by package, and the files with the most lines not reached
+    python tools/campaigns/reached_lines.py --functions      and every function that no run enters
+    python tools/campaigns/reached_lines.py paper-quick lose-feedback     these runs alone
 
 Plays each run of `tests/reference` and five scenarios of the emulator without compilation, the log's writer included,
 then replays each log and the stored one. A line counts once it was executed; importing a module reaches the lines that
@@ -32,7 +32,7 @@ from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.cli.output import format_table
 from adacd_hil.log.log_files import LOG_NAME
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "reference")]
 
 import reference_runs  # noqa: E402 (it is the tests')
@@ -138,7 +138,7 @@ def _environment(folder: Path) -> dict[str, str]:
         "disable_warnings = no-data-collected,module-not-measured,module-not-imported\n",
         encoding="utf-8",
     )
-    paths = [packages, ROOT, ROOT / "tools", ROOT / "tests", ROOT / "tests" / "reference"]
+    paths = [packages, ROOT, ROOT / "tools" / "campaigns", ROOT / "tests", ROOT / "tests" / "reference"]
     return {
         **os.environ,
         "NUMBA_DISABLE_JIT": "1",

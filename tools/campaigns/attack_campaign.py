@@ -1,11 +1,11 @@
-"""Plays the attacks of tools/attacks.py on a running arm: what the host noticed, and how the arm came to rest.
+"""Plays the attacks of attacks.py on a running arm: what the host noticed, and how the arm came to rest.
 
-    python tools/attack_campaign.py -j 2                  virtual time: the table on stdout
-    python tools/attack_campaign.py command sync          attacks whose names have one of these words
-    python tools/attack_campaign.py --json
-    tools/with-vcan -- .venv/bin/python tools/attack_campaign.py --vcan --keep runs/attacks     processes on a vcan
+    python tools/campaigns/attack_campaign.py -j 2                  virtual time: the table on stdout
+    python tools/campaigns/attack_campaign.py command sync          attacks whose names have one of these words
+    python tools/campaigns/attack_campaign.py --json
+    tools/with-vcan -- .venv/bin/python tools/campaigns/attack_campaign.py --vcan --keep runs/attacks  on a vcan
 
-In virtual time host and devices run by the clock at 1 kHz, and the figures are exact (tools/attacked_run.py). With
+In virtual time host and devices run by the clock at 1 kHz, and the figures are exact (attacked_run.py). With
 `--vcan` emulator, host and attacker are processes on one interface, at `--period-us`, and a second host, the commands
 that look at an arm, and a host that is killed come on top; figures are then of the host's rules and of this machine.
 
@@ -26,6 +26,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # instruments that campaigns stand on
 
 import attack_vcan
 from attacked_run import Finding, play_attack

@@ -1,7 +1,7 @@
 """Plays arms with errors that the model lacks: time to the certificate, false alarms, thresholds, missed pushes.
 
-    python tools/error_campaign.py --minutes 40 --only clean
-    python tools/error_campaign.py --profiles P --only 'lugre*,load*,cable*' -j 2
+    python tools/campaigns/error_campaign.py --minutes 40 --only clean
+    python tools/campaigns/error_campaign.py --profiles P --only 'lugre*,load*,cable*' -j 2
 
 Each arm learns on the excitation and then moves at random, in `lab`'s closed loop; with --kg also once that payload has
 been announced. Steps of torque begin every 20 ms, both signs, as each channel answers them (no bus, no tracking loop);
@@ -21,7 +21,7 @@ from itertools import product
 
 import numpy as np
 from campaign_certified import CertifiedScheme
-from campaign_loop import add_jobs, play_trials
+from campaign_loop import add_jobs, add_seeds, play_trials
 from lab import PERIOD_S, Motion, cut, join, profile_arm, random_motion, record, still
 from numpy.typing import NDArray
 from played_record import play_record
@@ -272,7 +272,7 @@ def main() -> int:
     parser.add_argument("--profiles", default="P,S,M", metavar="NAMES")
     parser.add_argument("--only", default="*", metavar="PATTERNS", help=f"of {', '.join(ERRORS)}".replace("%", "%%"))
     parser.add_argument("--kg", default="0", metavar="MASSES", help="0, or a payload that is announced")
-    parser.add_argument("--seeds", default="1", metavar="NUMBERS")
+    add_seeds(parser, 1)
     parser.add_argument("--minutes", type=float, default=3.0, help="of random motion; default 3")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting; repeatable")
     add_jobs(parser)
@@ -282,8 +282,8 @@ def main() -> int:
     errors = [error for error in ERRORS if any(fnmatch.fnmatch(error, pattern) for pattern in patterns)]
     if not errors:
         parser.error(f"--only {options.only!r} fits none of {', '.join(ERRORS)}")
-    lists = options.profiles.split(","), errors, options.kg.split(","), options.seeds.split(",")
-    cases = [Case(profile, error, float(kg), int(seed)) for profile, error, kg, seed in product(*lists)]
+    lists = options.profiles.split(","), errors, options.kg.split(","), options.seeds
+    cases = [Case(profile, error, float(kg), seed) for profile, error, kg, seed in product(*lists)]
     one = partial(play, minutes=options.minutes, changes=parse_changes(options.set))
     rows = list(play_trials(one, cases, options.jobs, lambda played: f"{played.case.profile} {played.case.error}"))
     print(json.dumps([asdict(row) for row in rows]) if options.json else format_table(HEAD, map(row_of, rows)))

@@ -271,7 +271,7 @@ def push_links(case: Case) -> list[Row]:
     recording = prelude.record(motion, case.seed, contacts=contacts)
     outcome = scheme_of(case.scheme).run(recording, prelude.begins)
     bound = profile_bound(case.profile, case.is_loaded)
-    return [case.labels() | _judge(contact, recording, outcome, bound) for contact in contacts]
+    return [case.labels() | judge_contact(contact, recording, outcome, bound) for contact in contacts]
 
 
 @cache
@@ -295,7 +295,7 @@ def _lever(contact: ContactSettings, recording: Recording, outcome: Outcome) -> 
     return {"lever_error_m": lever_m - contact.point_m, "force_ratio": float(np.abs(force_N).max() / contact.force_N)}
 
 
-def _judge(contact: ContactSettings, recording: Recording, outcome: Outcome, bound: Bound) -> Row:
+def judge_contact(contact: ContactSettings, recording: Recording, outcome: Outcome, bound: Bound) -> Row:
     """Compare what was made of a contact with what it was."""
     first = int(np.ceil(contact.at_s / PERIOD_S))
     last = int((contact.at_s + contact.duration_s) / PERIOD_S) + 100

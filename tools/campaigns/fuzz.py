@@ -1,7 +1,7 @@
 """Sends random and damaged frames to everything that takes frames, and stops at the first violation.
 
-    python tools/fuzz.py --frames 1000000 --seed 1     every frame into codec, end-to-end check, host and devices
-    python tools/fuzz.py --cangen 60                   a real bus: runs for 60 s under cangen at full rate, on vcan
+    python tools/campaigns/fuzz.py --frames 1000000 --seed 1  every frame into codec, end-to-end check, host and devices
+    python tools/campaigns/fuzz.py --cangen 60  a real bus: runs for 60 s under cangen at full rate, on vcan
 
 What is promised, and what can't be: tests/fuzz/fuzz_receivers.py and tests/vcan/test_cangen_fuzz.py.
 Exit status: 0 nothing was violated; 1 something was; the frame is printed.
@@ -19,7 +19,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "fuzz")]
 
 from fuzz_frames import CanFrame, damaged, fuzz, record_legal_traffic  # noqa: E402 (they are the tests')

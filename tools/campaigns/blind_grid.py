@@ -1,14 +1,14 @@
 """Delays each cyclic frame by many amounts in many shares of the cycles, pushes the arm, and lists missed pushes.
 
-    python tools/blind_grid.py -j 2                      the whole grid, some 3,300 runs of 7 s: hours
-    python tools/blind_grid.py --every 20 -j 2           one row in twenty
-    python tools/blind_grid.py --scheme certified --contract arm --frame torque --delay 550 --share 1.0
-    python tools/blind_grid.py --first                   the one scenario that began it, by its own times
+    python tools/campaigns/blind_grid.py -j 2                      the whole grid, some 3,300 runs of 7 s: hours
+    python tools/campaigns/blind_grid.py --every 20 -j 2           one row in twenty
+    python tools/campaigns/blind_grid.py --scheme certified --contract arm --frame torque --delay 550 --share 1.0
+    python tools/campaigns/blind_grid.py --first                   the one scenario that began it, by its own times
 
 Profile P from its start corner. From 3 s on frames of one kind and node are late, in a share of the cycles that is
 drawn for each frame or lies at the beginning of each push; link 1 is pushed with 8 N for 0.5 s at 4 s, link 2 with 3 N
 at 5.8 s. A row is bad when a push was missed although nothing had been named and the arm had not stopped, when the
-arm reacted to nothing without a named reason, or when the armed model stood still. Judged by tools/run_rules.py.
+arm reacted to nothing without a named reason, or when the armed model stood still. Judged by run_rules.py.
 
 Exit status: 0 no bad row, 1 a bad one, 2 wrong usage.
 """

@@ -1,7 +1,7 @@
 """Plays arms whose wiring the host knows wrongly, from the first motion on, and counts the causes that the host names.
 
-    python tools/cause_campaign.py -j 2
-    python tools/cause_campaign.py --arms upright --only 'sensors*' --seeds 7 --list
+    python tools/campaigns/cause_campaign.py -j 2
+    python tools/campaigns/cause_campaign.py --arms upright --only 'sensors*' --seeds 7 --list
 
 `init` makes the arms, upright and flat. Each seed has masses, friction, sensor offsets, noise and a start of its own,
 and of the right arms some carry a payload. Virtual time, no bus. By wrong statement: `certain`, the right cause named

@@ -1,7 +1,7 @@
 """Computes the smallest hand that one run can tell from the arm, by the motion on which it is asked.
 
-    python tools/studies/hand_bounds.py
-    python tools/studies/hand_bounds.py --profiles P
+    python tools/campaigns/hand_bounds.py
+    python tools/campaigns/hand_bounds.py --profiles P
 
 Of the certified scheme's regressor on recorded motion, and the columns of some hands behind the same filter. What of a
 hand is outside the columns of the arm, as far as the prior leaves them open, is found when it comes to SIGMAS
@@ -12,9 +12,6 @@ is the rest between, not the motion. Table on stdout. Exit status: 0 printed, 2 
 
 import argparse
 import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from campaign_certified import CertifiedScheme

@@ -1,10 +1,10 @@
 """Plays scenarios with host and arm in one process each, and compares the outcomes with the expectations.
 
-    python tools/campaign.py                    all that come with the package
-    python tools/campaign.py --only 'clamp*'    those whose name or group fits a pattern
-    python tools/campaign.py my.toml -j 2       files, two runs at a time
-    python tools/campaign.py --seed 2           with other noise and other chance: expectations have to bear it
-    python tools/campaign.py --config paper     with this host only; can be repeated
+    python tools/campaigns/campaign.py                    all that come with the package
+    python tools/campaigns/campaign.py --only 'clamp*'    those whose name or group fits a pattern
+    python tools/campaigns/campaign.py my.toml -j 2       files, two runs at a time
+    python tools/campaigns/campaign.py --seed 2  with other noise and other chance: expectations have to bear it
+    python tools/campaigns/campaign.py --config paper     with this host only; can be repeated
 
 Lockstep. Without --config each is played with `paper` and with `certified`: what the one does is the measure of what
 the other does, and an expectation that nobody plays does not stay true. The table goes to stdout, progress to stderr.

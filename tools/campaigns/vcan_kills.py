@@ -1,4 +1,4 @@
-"""Kills host, logger or emulated arm on a vcan, one process each, for tools/damage_campaign.py.
+"""Kills host, logger or emulated arm on a vcan, one process each, for damage_campaign.py.
 
 host            its logger ends the log; the drives' watchdogs stop the arm
 logger          the cycle goes on; what is in the file is saved by recover

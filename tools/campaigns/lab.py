@@ -114,7 +114,7 @@ def _limit(tau_d: Vector, limit_Nm: Vector, step_Nm: Vector, quantum_Nm: Vector,
 
 
 @compiled
-def _play(
+def play_loop(
     state_vector: Vector,
     number_vector: Vector,
     mechanics: Structured | None,
@@ -234,7 +234,7 @@ def record(
     noise = np.random.default_rng(seed).standard_normal((count, JOINTS)) * arm.sensors.torque_noise_Nm
     drift = arm.drift(seed, count)
     q, dq, tau_J, tau_c, tau_ext = (np.zeros((count, JOINTS)) for _ in range(5))
-    _play(
+    play_loop(
         *parts, _push_table(pushes), drift, arm.asymmetry, noise, motion.q_d, motion.dq_d, motion.ddq_d,
         np.array(arm.Kp), np.array(arm.Kd),
         np.stack((rated_Nm, rate_share * rated_Nm * PERIOD_S, 1e-3 * rated_Nm)),

@@ -1,11 +1,11 @@
 """Plays random runs in lockstep and judges each from the wire and the truth, by rules that every run must keep.
 
-    python tools/property_campaign.py --seeds 0:1000 -j 2     a line for each violated run, then the table
-    python tools/property_campaign.py --seeds 17 --keep runs/seed17
-    python tools/property_campaign.py --seeds 0:1000 --json   figures of each run
+    python tools/campaigns/property_campaign.py --seeds 0:1000 -j 2     a line for each violated run, then the table
+    python tools/campaigns/property_campaign.py --seeds 17 --keep runs/seed17
+    python tools/campaigns/property_campaign.py --seeds 0:1000 --json   figures of each run
 
 A seed draws profile, scheme, contract, period, the host's latency and stalls, faults, contacts, bodies, hands, payload
-and what the user asks (tools/random_run.py). tools/run_rules.py has the rules, tools/wire_record.py a decoder of its
+and what the user asks (random_run.py). run_rules.py has the rules, wire_record.py a decoder of its
 own. One run in `--replay-every` is replayed with `adacd-hil replay`, which must give the same decisions.
 
 Exit status: 0 nothing violated and at least 80 % of the runs reached MONITOR, 1 otherwise, 2 wrong usage.
@@ -32,7 +32,7 @@ from witnessed_run import Played, play_witnessed
 from adacd_hil.cli.output import format_table
 from adacd_hil.records import SchemeState
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 LEAST_ARMED = 0.8
 """Share of the runs that must reach MONITOR; with fewer, the rules about it say little."""
 REPLAY_S = 300.0
@@ -140,7 +140,8 @@ def as_dict(result: Result) -> dict[str, object]:
     return {**asdict(result), "violations": [violation._asdict() for violation in result.violations]}
 
 
-def _run(job: tuple[int, Path | None, bool]) -> Result:
+def play_seed(job: tuple[int, Path | None, bool]) -> Result:
+    """Play a seed, keep its files in a folder if one is given, and replay it if asked to."""
     seed, keep, is_replayed = job
     try:
         return run_seed(seed, keep, is_replayed)
@@ -156,7 +157,7 @@ def play_all(seeds: Sequence[int], jobs: int, keep: Path | None, replay_every: i
         (seed, None if keep is None else keep / f"seed{seed}", bool(replay_every) and index % replay_every == 0)
         for index, seed in enumerate(seeds)
     ]
-    yield from play_trials(_run, work, jobs)
+    yield from play_trials(play_seed, work, jobs)
 
 
 def summary(results: Sequence[Result]) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""A run in real time, prepared for the rules of tools/run_rules.py: raw frames of its log, and the arm's truth.
+"""A run in real time, prepared for the rules of run_rules.py: raw frames of its log, and the arm's truth.
 
 The log has the frames in the order in which the host sent and read them; here they are decoded anew.
 """

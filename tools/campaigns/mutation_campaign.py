@@ -1,10 +1,10 @@
 """Feeds mutated files of every kind to the commands that read them, and counts violations.
 
-    python tools/mutation_campaign.py                            1000 mutations of each kind
-    python tools/mutation_campaign.py --kinds mcap blf --count 50 --seed 7
-    python tools/mutation_campaign.py --case mcap:113            one again, as it goes
-    python tools/mutation_campaign.py --light                    without the commands that take seconds
-    python tools/mutation_campaign.py --commands 1               each file through one of its kind's commands, drawn
+    python tools/campaigns/mutation_campaign.py                            1000 mutations of each kind
+    python tools/campaigns/mutation_campaign.py --kinds mcap blf --count 50 --seed 7
+    python tools/campaigns/mutation_campaign.py --case mcap:113            one again, as it goes
+    python tools/campaigns/mutation_campaign.py --light                    without the commands that take seconds
+    python tools/campaigns/mutation_campaign.py --commands 1  each file through one of its kind's commands, drawn
 
 What is counted: tracebacks, exit statuses that a command doesn't document, more than one line of complaint, control
 characters in the output, commands that take longer than a minute, and the peak of memory beyond the program's own.
@@ -30,8 +30,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
 
 from mutation_seeds import Seeds, make_seeds  # noqa: E402
 from mutations import Mutation, mutate_blf, mutate_bytes, mutate_history, mutate_mcap, mutate_text  # noqa: E402

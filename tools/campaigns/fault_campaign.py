@@ -1,9 +1,9 @@
 """Plays every fault of the emulator's campaign by both clocks and compares the host's reaction with its row.
 
-    python tools/fault_campaign.py -j 4               all of tests/fault_table.py: table on stdout, progress on stderr
-    python tools/fault_campaign.py torque SYNC        cases whose names have one of these words
-    python tools/fault_campaign.py --markdown         the table of docs/emulator/faults.md
-    python tools/fault_campaign.py --json             one object for each run
+    python tools/campaigns/fault_campaign.py -j 4  all of tests/fault_table.py: table on stdout, progress on stderr
+    python tools/campaigns/fault_campaign.py torque SYNC        cases whose names have one of these words
+    python tools/campaigns/fault_campaign.py --markdown         the table of docs/emulator/faults.md
+    python tools/campaigns/fault_campaign.py --json             one object for each run
 
 Exit status: 0 when every run is as its row says, 1 when one isn't, 2 for wrong usage. Runs in virtual time, about one
 second each, after compiling.
@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from campaign_loop import add_jobs, play_trials  # noqa: E402

@@ -1,11 +1,11 @@
 """The long measurements of the cycle over vcan, each one command: JSON and a table in a folder, progress on stderr.
 
-    python tools/timing_campaign.py cycle --minutes 10       1 kHz beside the C yardstick, in turn
-    python tools/timing_campaign.py rates --minutes 2        2 kHz: classic frames, and CAN FD
-    python tools/timing_campaign.py hour --minutes 60        contacts, memory, every part of the log
-    python tools/timing_campaign.py disk --seconds 20        slow disk, full disk, logger killed, logger stopped
-    python tools/timing_campaign.py hogs --minutes 10        beside processes that take processor and disk
-    python tools/timing_campaign.py clock --seconds 10       the wall clock is set forward and back
+    python tools/campaigns/timing_campaign.py cycle --minutes 10       1 kHz beside the C yardstick, in turn
+    python tools/campaigns/timing_campaign.py rates --minutes 2        2 kHz: classic frames, and CAN FD
+    python tools/campaigns/timing_campaign.py hour --minutes 60        contacts, memory, every part of the log
+    python tools/campaigns/timing_campaign.py disk --seconds 20  slow disk, full disk, logger killed, logger stopped
+    python tools/campaigns/timing_campaign.py hogs --minutes 10        beside processes that take processor and disk
+    python tools/campaigns/timing_campaign.py clock --seconds 10       the wall clock is set forward and back
 
 All run through tools/with-vcan: emulator and host are two processes on one vcan interface. `--settings` adds TOML to
 the configuration of the host, such as its [log] and [realtime] sections. docs/timing.md says how to read the results.
@@ -24,6 +24,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # instruments that campaigns stand on
 
 import yardstick
 from side_by_side import (

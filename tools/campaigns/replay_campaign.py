@@ -1,8 +1,8 @@
 """Plays the emulator's scenarios in this process and replays each log: the decisions must be the same to the bit.
 
-    python tools/replay_campaign.py --config paper                    every scenario that `firmware-sim list` names
-    python tools/replay_campaign.py --config certified push-link1 idle
-    python tools/replay_campaign.py --logs runs/*/run.mcap -j 2       replay logs that are there
+    python tools/campaigns/replay_campaign.py --config paper  every scenario that `firmware-sim list` names
+    python tools/campaigns/replay_campaign.py --config certified push-link1 idle
+    python tools/campaigns/replay_campaign.py --logs runs/*/run.mcap -j 2       replay logs that are there
 
 A scenario that doesn't get so far that the scheme decides anything counts as refused. Lines go to stdout as they come.
 Exit status: 0 all are identical, 1 one is not, 2 wrong usage.

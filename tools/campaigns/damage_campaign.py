@@ -1,16 +1,16 @@
 """Damages logs and kills runs, and checks what `log check` and `log recover` do with them.
 
-    python tools/damage_campaign.py                      1000 damaged logs, 20 killed runs
-    python tools/damage_campaign.py --logs 1000 --kills 0
-    python tools/damage_campaign.py --kills 200 --logs 0 --seed 7 --json
-    python tools/damage_campaign.py --kills 0 --logs 0 --vcan-kills 200     host, logger, emulated arm, or two of them
+    python tools/campaigns/damage_campaign.py                      1000 damaged logs, 20 killed runs
+    python tools/campaigns/damage_campaign.py --logs 1000 --kills 0
+    python tools/campaigns/damage_campaign.py --kills 200 --logs 0 --seed 7 --json
+    python tools/campaigns/damage_campaign.py --kills 0 --logs 0 --vcan-kills 200  host, logger, arm, or two of them
 
 A log of random numbers is cut, has bits flipped or stretches zeroed, at places that the seed chooses: check must find
 it, and recover must save every intact chunk and no message that the log never had. A run of the experiment in real time
 loses its writer, its control process or both by SIGKILL at moments that the seed chooses: recover must save all but the
 last 0.3 s, cycle for cycle. With `--vcan-kills` host, logger and emulated arm are processes on a vcan, made by
 tools/with-vcan where there is none: whoever is left must come to its documented end, the arm to rest
-(tools/vcan_kills.py).
+(vcan_kills.py).
 
 Exit status: 0 all as it must be, 1 something isn't, 2 wrong usage.
 """
@@ -27,13 +27,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # instruments that campaigns stand on
+
 from campaign_loop import add_jobs, play_trials
 from damage_trials import DamageResult, Undamaged, make_undamaged, run_trial
 from kill_trials import LOSS_BOUND_S, KillResult, kill_trial
 from side_by_side import CHANNEL
 from vcan_kills import VcanKill, kill_on_vcan
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 ResultT = TypeVar("ResultT", DamageResult, KillResult, VcanKill)
 
 

@@ -1,4 +1,4 @@
-"""Touches of an arm that learns, for tools/touch_campaign.py: the arm of the scheme's tests, in closed loop, by seed.
+"""Touches of an arm that learns, for touch_campaign.py: the arm of the scheme's tests, in closed loop, by seed.
 
 Arm and noise are those of tests/scheme (no emulator, no bus); pipeline, desired motion and controller are the
 product's. The motors are free and said to be, so the reading at rest is an anchor.
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "scheme"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "scheme"))
 
 from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop
 from lab_motion import paper_motion

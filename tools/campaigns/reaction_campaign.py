@@ -1,8 +1,8 @@
 """Measures peak force and impulse on each body region of ISO/TS 15066 for each reaction: a table and a picture.
 
-    python tools/reaction_campaign.py                       all regions, 3 places each, free and clamped
-    python tools/reaction_campaign.py --region chest -n 10  one region, 10 places
-    python tools/reaction_campaign.py --out runs/reactions  where picture and table go as well
+    python tools/campaigns/reaction_campaign.py                       all regions, 3 places each, free and clamped
+    python tools/campaigns/reaction_campaign.py --region chest -n 10  one region, 10 places
+    python tools/campaigns/reaction_campaign.py --out runs/reactions  where picture and table go as well
 
 Profile P on its trajectory, the model known, no bus. A body stands in link 2's way at a random place, free to be
 pushed away or clamped against a wall; each reaction meets the same bodies. Force and impulse are the emulator's, from

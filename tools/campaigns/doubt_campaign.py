@@ -1,9 +1,9 @@
 """Plays what happens to an arm that monitors: payloads, certificates that become wrong, touches, slow pushes.
 
-    python tools/doubt_campaign.py payload --seeds 0:60 -j 2
-    python tools/doubt_campaign.py wrong --seeds 0:60
-    python tools/doubt_campaign.py touches --seeds 0:60
-    python tools/doubt_campaign.py slow --seeds 0:200 [--mujoco]
+    python tools/campaigns/doubt_campaign.py payload --seeds 0:60 -j 2
+    python tools/campaigns/doubt_campaign.py wrong --seeds 0:60
+    python tools/campaigns/doubt_campaign.py touches --seeds 0:60
+    python tools/campaigns/doubt_campaign.py slow --seeds 0:200 [--mujoco]
 
 By seed an arm of `touch_trials` is certified and monitors for 1 to 5 s. payload: SIZES_KG are picked up by turns.
 wrong: a joint's friction or its sensor's zero changes. touches: TOUCHES pushes at random times. slow: an arm of profile

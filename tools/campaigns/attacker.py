@@ -1,6 +1,6 @@
-"""Plays one attack of tools/attacks.py on a SocketCAN interface, with a raw socket of its own.
+"""Plays one attack of attacks.py on a SocketCAN interface, with a raw socket of its own.
 
-    python tools/attacker.py command-both vcan0 --seconds 1.5
+    python tools/campaigns/attacker.py command-both vcan0 --seconds 1.5
 
 Prints "ready", then waits for a line on stdin and begins; at the end prints JSON: wall-clock time of the beginning and
 of the first forged frame in ns, and how many frames were forged. Exit status: 0 done, 2 wrong usage, 5 no such bus.
@@ -17,8 +17,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
 
 from attacks import ATTACKS, Attack, Forged, Forger, find_attack  # noqa: E402
 

@@ -1,9 +1,9 @@
 """Plays hands on an arm that learns: the certificates' errors, and the time until the arm monitors again.
 
-    python tools/touch_campaign.py --seeds 0:200 -j 2
-    python tools/touch_campaign.py --kind help --seeds 0:200
-    python tools/touch_campaign.py --untouched --seeds 0:200
-    python tools/touch_campaign.py --mujoco --seeds 0:200
+    python tools/campaigns/touch_campaign.py --seeds 0:200 -j 2
+    python tools/campaigns/touch_campaign.py --kind help --seeds 0:200
+    python tools/campaigns/touch_campaign.py --untouched --seeds 0:200
+    python tools/campaigns/touch_campaign.py --mujoco --seeds 0:200
 
 Arms and touches by seed (`touch_trials`). Tables go to stdout, progress to stderr. Exit status: 0 all figures are
 within their bounds, 1 one is not, 2 wrong usage.

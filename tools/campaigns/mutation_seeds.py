@@ -18,7 +18,7 @@ from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.codec import contract_folder
 from firmware_sim.scenario.scenario import builtin_scenarios
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "docs" / "examples" / "foreign"
 PROFILES = ROOT / "adacd_hil" / "device_profiles"
 _FRAMES = 400

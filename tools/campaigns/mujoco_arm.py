@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "scheme"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "scheme"))
 
 from planar_arm import ENCODER_LSB_RAD, TRACKING_RAD_S
 

@@ -1,7 +1,7 @@
-"""Plays attacks on a real vcan interface, for tools/attack_campaign.py: emulator, host and attacker, each a process.
+"""Plays attacks on a real vcan interface, for attack_campaign.py: emulator, host and attacker, each a process.
 
 Emulator and host run in real time. A run that ends by itself before the attack begins, as one does on a machine that
-stalls, is played again. Besides the attacks of tools/attacks.py: what a second user does, and a host that is killed.
+stalls, is played again. Besides the attacks of attacks.py: what a second user does, and a host that is killed.
 """
 
 import contextlib
@@ -221,14 +221,21 @@ def _attacker(name: str, channel: str, seconds: float) -> Iterator["subprocess.P
     if name not in {case.name for case in ATTACKS}:
         yield None
         return
-    command = [sys.executable, ROOT / "tools" / "attacker.py", name, channel, "--seconds", str(seconds)]
+    command = [sys.executable, ROOT / "tools" / "campaigns" / "attacker.py", name, channel, "--seconds", str(seconds)]
     with _waiting(command) as process:
         yield process
 
 
 @contextlib.contextmanager
 def _heartbeats(channel: str) -> Iterator["subprocess.Popen[str]"]:
-    command = [sys.executable, ROOT / "tools" / "attacker.py", "heartbeat-of-host", channel, "--seconds", "1.5"]
+    command = [
+        sys.executable,
+        ROOT / "tools" / "campaigns" / "attacker.py",
+        "heartbeat-of-host",
+        channel,
+        "--seconds",
+        "1.5",
+    ]
     with _waiting(command) as process:
         yield process
 

@@ -1,7 +1,7 @@
 """Attacks on a running arm, each an object that hears the bus and says what to send: no sockets, no clock.
 
 The attacker knows the contract: identifiers, data ids, counters. End-to-end protection is against accidents; it keeps
-nobody out who has the DBC. `ATTACKS` is the table; tools/attacked_run.py plays it in virtual time, tools/attacker.py on
+nobody out who has the DBC. `ATTACKS` is the table; attacked_run.py plays it in virtual time, attacker.py on
 a socket.
 """
 

@@ -1,4 +1,4 @@
-"""Runs of the experiment in real time that are killed, for tools/damage_campaign.py: what recover must save of each.
+"""Runs of the experiment in real time that are killed, for damage_campaign.py: what recover must save of each.
 
 The host and the emulated arm are one process, the writer of the log is another. The emulator has a log and a writer of
 its own, which nobody kills: it tells which cycle was the last.
@@ -30,7 +30,7 @@ START_S = 600.0
 """Longest until then: everything is compiled before, the first time for minutes on a busy machine."""
 ATTEMPTS = 3
 """A run that ends by itself before its moment, as one does that finds no time to compute, is played again."""
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 _DEMO = "from adacd_hil.cli.main import main; main()"
 
 
