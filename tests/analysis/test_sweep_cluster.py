@@ -121,7 +121,7 @@ def test_certificates_that_cant_be_used_are_one_line_and_status_2(
 
 
 def test_an_open_scheduler_is_called_open(tmp_path: Path, log: Path, monkeypatch) -> None:
-    monkeypatch.setattr("adacd_hil.lab.tune.workers._TIMEOUT_S", 0.1)
+    monkeypatch.setattr("adacd_hil.lab.tune.workers.TIMEOUT_S", 0.1)
     words = ["sweep", str(log), "--scheduler", "tcp://127.0.0.1:1", "--out", str(tmp_path / "out")]
     refused = CliRunner().invoke(cli, words)
     assert refused.exit_code == 1

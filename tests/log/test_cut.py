@@ -90,8 +90,7 @@ def test_only_the_asked_topics_are_taken(log_path, tmp_path):
     out = tmp_path / "out.mcap"
     cut(log_path, out, TimeWindow(0.0, 0.1), topics=("/b",))
     assert {topic for topic, *_ in read(out)[0]} == {"/b"}
-    with make_reader(out.open("rb"))._stream as file:
-        file.seek(0)
+    with out.open("rb") as file:
         assert [channel.topic for channel in make_reader(file).get_summary().channels.values()] == ["/b"]
 
 

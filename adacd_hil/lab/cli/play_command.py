@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from adacd_hil.lab.logs.frame_choice import FrameChoice
-    from adacd_hil.wire.playback import PlayedFrame
+    from adacd_hil.lab.logs.playback import PlayedFrame
 
 _PIECES_AHEAD = 4
 _BLOCK = 256
@@ -145,7 +145,7 @@ class Playback:
 
     def frames(self) -> "Iterator[PlayedFrame]":
         """Give the frames, read ahead by a thread. Raises LogError."""
-        from adacd_hil.wire.playback import PlayedFrame
+        from adacd_hil.lab.logs.playback import PlayedFrame
 
         for piece in _ahead(self._pieces()):
             for start in range(0, len(piece), _BLOCK):
@@ -177,8 +177,8 @@ def _run(
 ) -> tuple[dict[str, Any], ExitCode]:
     """Play onto a bus until the recording ends or the user interrupts. Raises LogError, CommandError."""
     from adacd_hil.cli.connection import on_interrupt
-    from adacd_hil.wire.playback import play as play_frames
-    from adacd_hil.wire.playback import repeat
+    from adacd_hil.lab.logs.playback import play as play_frames
+    from adacd_hil.lab.logs.playback import repeat
 
     interrupted = threading.Event()
     for refusal in request_realtime().missing:

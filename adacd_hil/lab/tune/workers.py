@@ -26,7 +26,7 @@ from adacd_hil.remedies import install_command
 from adacd_hil.settings.schema import ConfigError
 
 TLS = "tls://"
-_TIMEOUT_S = 10
+TIMEOUT_S = 10
 _IN_FLIGHT = 4
 """Tasks per worker of a cluster, so that none waits for the client."""
 _PATIENCE_S = 2.0
@@ -80,7 +80,7 @@ def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what happens to workers shows in the rows
     security = _security_of(scheduler, tls)
     try:
-        client = Client(scheduler, timeout=_TIMEOUT_S, set_as_default=False, security=security)
+        client = Client(scheduler, timeout=TIMEOUT_S, set_as_default=False, security=security)
     except (OSError, TimeoutError, ValueError) as error:
         raise LogError(f"no Dask scheduler at {scheduler}: {' '.join(str(error).split())}") from None
     with client:
