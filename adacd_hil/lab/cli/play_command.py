@@ -1,9 +1,9 @@
 """`adacd-hil play`: the frames of a recording on a bus, at their times."""
 
-import queue
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,6 @@ from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explain
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.given_path import GivenPath
 from adacd_hil.lab.cli.log_command import dbc_option, find_dbc
-from adacd_hil.log.log_files import LogError
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import Bus, BusError
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from adacd_hil.lab.logs.frame_choice import FrameChoice
     from adacd_hil.lab.logs.playback import PlayedFrame
 
-_PIECES_AHEAD = 4
 _BLOCK = 256
 """Frames that are made ready between two sends at most."""
 _SWITCH_S = 50e-6
@@ -241,37 +239,10 @@ def may_move_an_arm(interface: str, channel: str) -> bool:
     return not is_virtual(interface, channel)
 
 
-def _ahead(pieces: "Iterable[NDArray[Any]]") -> "Iterator[NDArray[Any]]":
-    """Give what a thread takes from an iterator some pieces ahead. Raises what that raises."""
-    waiting: queue.Queue[NDArray[Any] | LogError | None] = queue.Queue(_PIECES_AHEAD)
-    is_over = threading.Event()
-
-    def put(item: "NDArray[Any] | LogError | None") -> bool:
-        while not is_over.is_set():
-            try:
-                waiting.put(item, timeout=0.1)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    def read() -> None:
-        try:
-            for piece in pieces:
-                if not put(piece):
-                    return
-        except LogError as error:
-            put(error)
-        else:
-            put(None)
-
-    thread = threading.Thread(target=read, name="playback reader", daemon=True)
-    thread.start()
-    try:
-        while (item := waiting.get()) is not None:
-            if isinstance(item, LogError):
-                raise item
-            yield item
-    finally:
-        is_over.set()
-        thread.join()
+def _ahead(pieces: "Iterator[NDArray[Any]]") -> "Iterator[NDArray[Any]]":
+    """Give the pieces; a thread reads the next one meanwhile. Raises what reading raises."""
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(next, pieces, None)
+        while (piece := following.result()) is not None:
+            following = reader.submit(next, pieces, None)
+            yield piece
