@@ -147,6 +147,13 @@ def test_logconvert_to_text_keeps_data_frames_both_ways_to_the_microsecond(suffi
     assert sum(message.is_error_frame for message in read) == sum(message.is_error_frame for message in sent)
 
 
+def test_logconvert_of_a_cut_log_says_what_is_missing(path, tools, tmp_path, caplog):
+    (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:-100])
+    tools(tmp_path / "cut.mcap", tmp_path / "cut.blf")
+    (said,) = [record for record in caplog.records if record.name.startswith("adacd_hil.")]
+    assert (said.levelname, "cut" in said.getMessage()) == ("WARNING", True)
+
+
 def test_logconvert_from_mcap_to_mcap_keeps_nanoseconds(messages, path, tools, tmp_path):
     read = list(McapReader(tools(path, tmp_path / "copy.mcap")))
     assert [message.t_ns for message in read] == [message.t_ns for message in messages]

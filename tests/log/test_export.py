@@ -183,6 +183,7 @@ def test_a_dbc_that_knows_no_frame_is_named(tmp_path):
     "options",
     [
         ("--format", "blf", "--out", "x.blf"),
+        ("--format", "BLF"),
         ("--format", "candump", "--only", "devices", "--id", "181"),
         ("--format", "asc", "--direction", "--json"),
         ("--id", "181"),

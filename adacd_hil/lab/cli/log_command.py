@@ -259,7 +259,7 @@ class TableFormat(click.Choice[str]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Check it."""
-        if value in _FRAMES:
+        if str(value).lower() in _FRAMES:
             self.fail(_CONVERTED, param, ctx)
         return super().convert(value, param, ctx)
 

@@ -31,13 +31,14 @@ from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import MOST_BYTES
 from adacd_hil.log.types.message_types import MAX_DATA
 from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE
+from adacd_hil.terminal import in_line
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 
 class McapReader(BinaryIOMessageReader):
     """The messages of an MCAP file, in its order; of a log of ours all parts.
 
-    `problem` names afterwards the missing data, "" for a whole file.
+    `problem` names afterwards the missing data, "" for a whole file. It is also logged as a warning.
     """
 
     def __init__(self, file: Any, **_: Any) -> None:
@@ -58,6 +59,8 @@ class McapReader(BinaryIOMessageReader):
     def __iter__(self) -> Generator[can.Message, None, None]:
         for frames in self._frames:
             yield from to_messages(frames, self._frames.channels, self._frames.epoch_ns)
+        if self.problem:  # for the terminal of python-can's tools, which know no `problem`
+            logging.getLogger(__name__).warning("%s", in_line(self.problem))
         self.stop()
 
 
