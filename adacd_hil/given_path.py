@@ -44,10 +44,12 @@ class CommandGroup(click.Group):
     """A group of commands that lists whole summaries, folded; click cuts them to one line."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list of commands with their summaries."""
-        commands = [(name, self.commands[name]) for name in self.list_commands(ctx)]
+        """Write the list."""
+        named = [(name, self.commands[name]) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
-            formatter.write_dl([(name, command.get_short_help_str(_LONGEST)) for name, command in commands])
+            formatter.write_dl(
+                [(name, command.get_short_help_str(_LONGEST)) for name, command in named if not command.hidden]
+            )
 
 
 _LONGEST = 1000

@@ -45,7 +45,7 @@ OTHERS = {
 """Programs that aren't ours: known to be meant, their arguments are not looked at."""
 PREFIXES = {"chrt": 3, "nice": 3}
 """Programs that run another one, with the words before it."""
-TOOL = re.compile(r"tools/(studies/)?[\w-]+(\.py|\.sh)?|tests/[\w/-]+\.py")
+TOOL = re.compile(r"tools/(campaigns/)?[\w-]+(\.py|\.sh)?|tests/[\w/-]+\.py")
 PLACEHOLDER = re.compile(r"[A-Z][A-Z0-9_]*(=[A-Z,.…]+)?|\.\.\.|…")
 PACKAGES = ("", "adacd_hil", "firmware_sim", "dbc", "docs", "tests")
 """Folders that paths in documents count from."""
@@ -318,7 +318,7 @@ def environment_names() -> frozenset[str]:
 
 def tools() -> list[Path]:
     """List the instruments."""
-    found = (*(ROOT / "tools").iterdir(), *(ROOT / "tools" / "studies").iterdir())
+    found = (*(ROOT / "tools").iterdir(), *(ROOT / "tools" / "campaigns").iterdir())
     return [path for path in sorted(found) if path.suffix in (".py", "") and path.is_file()]
 
 
@@ -340,9 +340,8 @@ def flags(tool: Path) -> frozenset[str]:
 
 def _shared_options(imported: ast.ImportFrom) -> Iterator[ast.AST]:
     """Give what is in the functions that a tool imports from another: some add options that several tools have."""
-    source = ROOT / "tools" / f"{imported.module}.py"
     names = {alias.name for alias in imported.names}
-    if source.is_file():
+    for source in (tool for tool in tools() if tool.stem == imported.module):
         for node in ast.parse(source.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.FunctionDef) and node.name in names:
                 yield from ast.walk(node)

@@ -3,15 +3,12 @@
 import copy
 import json
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from documents import ROOT
 from experiment_runs import Played, adacd_hil
-
-sys.path.insert(0, str(ROOT / "tools"))
 from notebook import pictures, printed, run_notebook
 
 pytestmark = pytest.mark.slow

@@ -1,6 +1,6 @@
 """Each kind of fault against its row: on the wire, in the host's reaction and in the emulator's ground truth.
 
-`tools/fault_campaign.py` plays all rows.
+`tools/campaigns/fault_campaign.py` plays all rows.
 """
 
 from pathlib import Path

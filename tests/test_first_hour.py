@@ -9,11 +9,9 @@ import re
 import sys
 from pathlib import Path
 
+import first_hour
 import pytest
 from documents import ROOT
-
-sys.path.insert(0, str(ROOT / "tools"))
-import first_hour
 from first_hour import Played, Step, Way, concepts, judge, logical_lines, play, read_way
 from long_cases import long_but
 

@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from mcap.records import Attachment
 
-from adacd_hil.lab.logs.cut_and_merge import IntactLog
+from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import (
     CONTINUED,
     DROPPED_KEY,
@@ -91,7 +91,7 @@ class LongLog:
         """Read the log. Raises LogError when it is damaged."""
         self.blocks: list[Block] = []
         self.attachments: dict[str, bytes] = {}
-        log = IntactLog(path)
+        log = SalvagedLog(path)
         for item in log:
             if isinstance(item, Attachment):
                 self.attachments[item.name] = item.data
@@ -105,6 +105,8 @@ class LongLog:
                 for number, channel in log.definitions.channels.items()
             }
             self._add(item, types)
+        if lost := log.losses.describe():
+            raise LogError(f"{path} lacks {lost}")
         self.channels = [
             LogChannel(number, channel.topic, types[number])
             for number, channel in sorted(log.definitions.channels.items())

@@ -5,7 +5,8 @@
 LOG: of a run, 10 ms periods are realistic in user-mode Linux. CONFIG: of the host. PLAYER: canplayer, can_player or
 adacd-hil. FILE: what it plays, the cyclic frames of LOG's devices only:
 
-    adacd-hil log export LOG --format candump --only devices --id 181 --id 182 --id 183 --id 184 --out cyclic.log
+    can_logconvert LOG all.log
+    grep -E ' 18[1-4]#' all.log >cyclic.log
     can_logconvert cyclic.log cyclic.mcap
 
 SDO, NMT and heartbeats are answered by `firmware-sim play LOG --answers-only`. A host takes frames that come within

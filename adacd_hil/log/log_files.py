@@ -94,7 +94,7 @@ RECOVERED = "recovered"
 CUT = "cut"
 """The ending of a stretch of a log."""
 MERGED = "merged"
-"""The ending of several logs in one."""
+"""The ending of several logs in one, as earlier versions made it."""
 COPY_ENDINGS = (RECOVERED, CUT, MERGED)
 """The endings of logs that are made of others."""
 PLANNED_ENDINGS = ("closed", "continued", *COPY_ENDINGS)

@@ -66,12 +66,37 @@ class Losses:
     is_doubtful: bool = False  # the data section fails its CRC for no reason that was found: metadata may be wrong
     notes: list[str] = field(default_factory=list)
     holes: list[Hole] = field(default_factory=list)
+    missing_parts: list[str] = field(default_factory=list)
 
     @property
     def is_any(self) -> bool:
         """Whether anything is lost, or may be."""
-        counts = self.chunks, self.messages != 0, self.attachments, self.metadata
-        return any(counts) or self.is_cut or self.is_doubtful
+        return bool(self.describe())
+
+    @property
+    def holes_s(self) -> float:
+        """How long, all holes together, nothing was saved between the saved messages."""
+        return sum(hole.seconds for hole in self.holes)
+
+    def describe(self) -> str:
+        """Say in words what is lost; "" for nothing. Holes are told of with what made them."""
+        messages = "an unknown number of messages" if self.messages is None else f"{self.messages} messages"
+        head = [
+            ("the end", self.is_cut),
+            (messages, self.messages != 0),
+            (f"{self.chunks} chunks", self.chunks),
+        ]
+        tail = [
+            (f"{self.attachments} attachments", self.attachments),
+            (f"{self.metadata} metadata records", self.metadata),
+            (", ".join(self.missing_parts), self.missing_parts),
+            ("metadata may be wrong", self.is_doubtful),
+        ]
+        holes = (
+            f"{self.holes_s:.3f} s between what was saved",
+            self.holes and any(is_said for _, is_said in head + tail),
+        )
+        return ", ".join(word for word, is_said in (*head, holes, *tail) if is_said)
 
     def note(self, text: str) -> None:
         """Tell of a damage."""

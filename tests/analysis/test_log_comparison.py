@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from log.recorded_run import make_run, record
 
-from adacd_hil.lab.cli.compare_command import _contact as in_words
+from adacd_hil.lab.cli.compare_command import contact_in_words
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.runs.log_comparison import MATCH_S, ComparedContact, compare_logs, match_contacts
 from adacd_hil.log import logged_run
@@ -32,7 +32,7 @@ def contact(time_s: float) -> ComparedContact:
 
 
 def test_a_place_that_a_later_version_may_have_is_no_trouble() -> None:
-    assert in_words(contact(1.0)._replace(force_N=5.0, location=77)) == "1.000 s, link 1, 5.0 N"
+    assert contact_in_words(contact(1.0)._replace(force_N=5.0, location=77)) == "1.000 s, link 1, 5.0 N"
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone() -> No
 
 def test_a_lower_bound_reads_as_one_in_a_comparison() -> None:
     bound, known = contact(1.0)._replace(force_N=-14.7, location=2), contact(1.0)._replace(force_N=-14.7, location=1)
-    assert [in_words(each) for each in (bound, known, contact(1.0))] == [
+    assert [contact_in_words(each) for each in (bound, known, contact(1.0))] == [
         "1.000 s, link 1, ≥ 14.7 N",
         "1.000 s, link 1, -14.7 N",
         "1.000 s, link 1",

@@ -1,16 +1,23 @@
 """A sweep computes every row once, tries again what failed by accident, and goes on where it was stopped."""
 
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from hang import HANG_S
+from sweep_work import Dying, Work
 
 from adacd_hil.cli.main import cli
 from adacd_hil.lab.tune.sweep import Plan, SweepStore, plan_logs, plan_scenarios, replay_task, run_sweep
+from adacd_hil.lab.tune.workers import connect
 from adacd_hil.log.log_files import LogError
 from adacd_hil.replay.replayed_outcome import Replay
 
-distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")
 
 THRESHOLDS = [{"detector.threshold_Nm": "0.1"}, {"detector.threshold_Nm": "0.4"}]
@@ -20,40 +27,83 @@ def plan_of(seeds=range(1, 6), variants=THRESHOLDS, version="1") -> Plan:
     return plan_scenarios(["paper"], seeds, variants, "paper", "", version)
 
 
-def row_of(task, row, **more):
-    return {"key": row.key, "seed": task.subject.seed, **dict(row.changes), "status": "ok", "error": None, **more}
+class ThreadWorkers:
+    """Threads of this process, which ends with the test."""
 
+    room = 2
 
-class Work:
-    """Rows without an arm. Notes what it was asked for, in a file since it is sent about; raises as often as told."""
+    def __init__(self) -> None:
+        self.pool = ThreadPoolExecutor(2)
 
-    def __init__(self, folder: Path, failures: dict[int, int] | None = None) -> None:
-        self.notes = folder / f"notes{len(list(folder.glob('notes*')))}"
-        self.notes.touch()
-        self.failures = failures or {}
+    def submit(self, work, task):
+        return self.pool.submit(work, task)
 
-    def __call__(self, task):
-        with self.notes.open("a") as notes:
-            notes.write(f"{task.subject.seed} {len(task.rows)}\n")
-        if self.tries(task.subject.seed) <= self.failures.get(task.subject.seed, 0):
-            raise OSError("the disk was away")
-        return [row_of(task, row) for row in task.rows]
-
-    def tries(self, seed: int) -> int:
-        """Count the tasks of a seed."""
-        return sum(line.split()[0] == str(seed) for line in self.notes.read_text().splitlines())
+    def restart(self) -> None:
+        raise AssertionError("no thread has died")
 
 
 @pytest.fixture(scope="module")
 def client():
-    """Workers that are threads of this process: what they do can be looked at."""
-    with (
-        distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0", silence_logs=50
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        yield client
+    workers = ThreadWorkers()
+    with workers.pool:
+        yield workers
+
+
+@pytest.mark.slow
+def test_a_task_that_kills_its_worker_costs_its_own_rows_alone(tmp_path: Path) -> None:
+    work = Dying(tmp_path, always=(2,), once=(4,))
+    with connect("", 2, preload=("adacd_hil.lab.tune.sweep",)) as workers:
+        outcome, rows, lines = sweep(tmp_path, workers, work)
+    assert (outcome.computed, outcome.failed) == (10, 2)
+    assert [row["seed"] for row in rows if row["status"] == "failed"] == [2, 2]
+    assert {row["error"] for row in rows if row["seed"] == 2} == {"the worker process died each time"}
+    assert "a worker process has died: killed, or out of memory" in lines
+
+
+@pytest.mark.slow
+def test_processes_and_threads_make_the_same_table(tmp_path: Path, client) -> None:
+    with connect("", 3, preload=("adacd_hil.lab.tune.sweep",)) as workers:
+        _, rows, _ = sweep(tmp_path / "processes", workers, Work(tmp_path))
+    assert rows == sweep(tmp_path / "threads", client, Work(tmp_path))[1]
+
+
+SLOW_SWEEP = """
+import sys, time
+from pathlib import Path
+from adacd_hil.lab.tune.workers import connect
+
+def sleep(seconds):
+    print("asleep", flush=True)
+    time.sleep(seconds)
+
+if __name__ == "__main__":
+    with connect("", 2) as workers:
+        futures = [workers.submit(sleep, 600) for _ in range(2)]
+        try:
+            futures[0].result()
+        except KeyboardInterrupt:
+            sys.exit(130)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)])
+def test_no_process_outlives_the_sweep(tmp_path: Path, number: int, status: int) -> None:
+    script = tmp_path / "slow_sweep.py"
+    script.write_text(SLOW_SWEEP)
+    command = [sys.executable, script]
+    played = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, text=True
+    )
+    assert [played.stdout.readline() for _ in range(2)] == ["asleep\n"] * 2
+    if number == signal.SIGINT:
+        os.killpg(played.pid, number)  # as a terminal does
+    else:
+        played.send_signal(number)
+    assert played.wait(HANG_S) == status
+    said = played.communicate(timeout=HANG_S)  # which waits until nobody holds the pipes any more
+    if number == signal.SIGINT:
+        assert said == ("", "")
 
 
 def sweep(folder: Path, client, work, plan=None, rows_per_task=2):

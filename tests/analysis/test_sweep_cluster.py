@@ -1,4 +1,4 @@
-"""A sweep's connections: by certificates to a cluster, by its own to the processes of this machine; what is refused."""
+"""A sweep's connections to a cluster: by certificates; what is refused."""
 
 import subprocess
 import sys
@@ -11,8 +11,6 @@ from hang import HANG_S
 from made_certificates import Authority
 
 from adacd_hil.cli.main import cli
-from adacd_hil.lab.tune.cluster import NO_FILES, TlsFiles, connect
-from adacd_hil.log.log_files import LogError
 
 distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -122,21 +120,8 @@ def test_certificates_that_cant_be_used_are_one_line_and_status_2(
     assert reason in complaints[0]
 
 
-def test_the_scheduler_of_a_sweep_on_this_machine_takes_nothing_from_others(tmp_path: Path) -> None:
-    stranger = Authority(tmp_path / "stranger")
-    certificate, key = stranger.sign("other-user")
-    with connect("", 1) as client:
-        address = client.scheduler_info()["address"]
-        assert address.startswith("tls://127.0.0.1:")
-        assert client.submit(sum, [1, 2]).result() == 3
-        for other in (address, address.replace("tls://", "tcp://")):
-            tls = TlsFiles(stranger.ca_file, certificate, key) if other == address else NO_FILES
-            with pytest.raises(LogError, match="no Dask scheduler"), connect(other, 1, tls):
-                pass
-
-
 def test_an_open_scheduler_is_called_open(tmp_path: Path, log: Path, monkeypatch) -> None:
-    monkeypatch.setattr("adacd_hil.lab.tune.cluster._TIMEOUT_S", 0.1)
+    monkeypatch.setattr("adacd_hil.lab.tune.workers.TIMEOUT_S", 0.1)
     words = ["sweep", str(log), "--scheduler", "tcp://127.0.0.1:1", "--out", str(tmp_path / "out")]
     refused = CliRunner().invoke(cli, words)
     assert refused.exit_code == 1

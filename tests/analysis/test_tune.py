@@ -17,8 +17,8 @@ from adacd_hil.cli.embedded_run import Cast, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.lab.tune import tune_roc
-from adacd_hil.lab.tune.tune import _best, _problems, base_of, suggested_toml, write_tuning
-from adacd_hil.lab.tune.tune_candidates import _Shown, candidates, observe_candidates, thresholds_as_changes
+from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, suggested_toml, write_tuning
+from adacd_hil.lab.tune.tune_candidates import ShownLog, candidates, observe_candidates, thresholds_as_changes
 from adacd_hil.lab.tune.tune_roc import (
     FACTORS,
     Candidate,
@@ -226,7 +226,7 @@ def batch_of(settings, states, **fields):
 
 def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_monitors_untouched():
     settings = load_settings("paper")
-    shown = _Shown(hand_made_log(), settings)
+    shown = ShownLog(hand_made_log(), settings)
     states = [A] * 50 + [M] * 350
     value = np.linspace(0.0, 1.0, 400)[:, None] * [1.0, -2.0]
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
@@ -243,7 +243,7 @@ def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_moni
 
 def test_a_candidate_that_does_not_monitor_misses_the_contact_and_counts_no_motion():
     settings = load_settings("paper")
-    shown = _Shown(hand_made_log(), settings)
+    shown = ShownLog(hand_made_log(), settings)
     states = [M] * 100 + [A] * 300
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
     shown.take(rows, batch_of(settings, states, tau_ext_hat=1.0, threshold=100.0))
@@ -253,7 +253,7 @@ def test_a_candidate_that_does_not_monitor_misses_the_contact_and_counts_no_moti
 
 def test_the_certified_scheme_s_statistic_is_the_largest_ratio_to_its_thresholds():
     settings = load_settings("certified")
-    shown = _Shown(hand_made_log(), settings)
+    shown = ShownLog(hand_made_log(), settings)
     bank = np.zeros(2 * settings.channel_count)
     bank[3] = -0.3
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000 + np.where(np.arange(400) < 100, 0, 7))
@@ -295,27 +295,27 @@ def candidate(delay_ms=2.0, name="made", changes=None, problems=(), seconds=600.
     ],
 )
 def test_a_candidate_is_fit_if_it_adapts_misses_nothing_and_alarms_no_more_than_wanted(changes, problem):
-    assert _problems(candidate().choice, outcome(**changes), outcome(), 1.0) == problem
+    assert problems_of(candidate().choice, outcome(**changes), outcome(), 1.0) == problem
 
 
 def test_alarms_in_the_half_to_check_on_and_too_short_a_motion_are_no_fit():
     choice = candidate().choice
     alarmed = dataclasses.replace(choice, checked=choice.checked._replace(alarms=2))
-    assert _problems(alarmed, outcome(), outcome(), 1.0) == ("2 false alarms in the half to check on",)
-    assert _problems(candidate(seconds=20.0).choice, outcome(), outcome(), 1.0)[0] == "too little motion for a tail"
+    assert problems_of(alarmed, outcome(), outcome(), 1.0) == ("2 false alarms in the half to check on",)
+    assert problems_of(candidate(seconds=20.0).choice, outcome(), outcome(), 1.0)[0] == "too little motion for a tail"
 
 
 def test_of_the_fit_ones_the_fastest_is_suggested():
     slow, fast, unfit = candidate(4.0), candidate(3.0), candidate(1.0, problems=("1 missed",))
-    assert _best([slow, fast, unfit, candidate(None)]) is fast
-    assert _best([unfit]) is None
+    assert best_of([slow, fast, unfit, candidate(None)]) is fast
+    assert best_of([unfit]) is None
     early, late = (
         dataclasses.replace(
             each, choice=dataclasses.replace(each.choice, chosen=each.choice.chosen._replace(delays_ms=d))
         )
         for each, d in ((fast, (2.0, 3.0, 8.0)), (slow, (2.0, 3.0, 9.0)))
     )
-    assert _best([late, early]) is early
+    assert best_of([late, early]) is early
 
 
 def test_a_rate_too_far_from_the_motion_leaves_filter_and_gain_as_they_are():
@@ -327,9 +327,9 @@ def test_a_rate_too_far_from_the_motion_leaves_filter_and_gain_as_they_are():
 
     assert [round(far(1.0, rate).choice.extrapolation, 6) for rate in (0.125, 0.12)] == [96.0, 100.0]
     own, faster = far(4.0, 0.1), far(3.0, 0.1)
-    assert _best([own, faster]) is own
+    assert best_of([own, faster]) is own
     own, faster = far(4.0, 0.125), far(3.0, 0.125)
-    assert _best([own, faster]) is faster
+    assert best_of([own, faster]) is faster
 
 
 def tuning_of(best, rate_per_h=1.0, path="run.mcap", **changes):

@@ -139,7 +139,6 @@ def test_what_a_log_says_stays_within_its_line(tmp_path):
         ("check", path),
         ("check", cut),
         ("recover", cut, "--out", out),
-        ("merge", path, "--out", out),
         ("cut", path, "--out", out),
     ):
         _, text, err = call(*words)
@@ -196,12 +195,11 @@ def test_a_stretch_that_makes_no_sense_is_wrong_usage(options, recorded, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_merge_names_the_topics_that_more_than_one_log_has(tmp_path):
-    paths = [write(tmp_path / f"{name}.mcap") for name in "xy"]
-    out = tmp_path / "out.mcap"
-    code, text, err = call("merge", *paths, "--out", out)
-    assert (code, text) == (0, f"{out}: 40 messages\n")
-    assert err.splitlines()[-1].endswith(": /a, /b")
-    code, text, err = call("merge", *paths, "--out", out, "--prefix", "--json")
-    assert json.loads(text) == {"out": str(out), "logs": ["x", "y"], "messages": 40, "shared": []}
-    assert err.splitlines() == ["merging x, y"]
+@pytest.mark.parametrize("options", [(), ("--prefix",), ("--out", "both.mcap", "--json"), ("--help-me",)])
+def test_merge_names_its_successors_and_touches_nothing(options, tmp_path):
+    path = write(tmp_path / "x.mcap")
+    code, text, err = call("merge", path, path, *options)
+    assert (code, text) == (2, "")
+    assert "mcap merge" in err
+    assert "log cut" in err
+    assert list(tmp_path.iterdir()) == [path]

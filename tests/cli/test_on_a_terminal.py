@@ -61,7 +61,7 @@ COMMANDS = [
     (HOST, "config", "docs", "arm.torque_error_share"),
     (HOST, "log", "info", "truth.mcap"),
     (HOST, "log", "check", "truth.mcap"),
-    (HOST, "log", "export", "truth.mcap", "--format", "candump"),
+    (HOST, "log", "export", "truth.mcap", "--format", "csv"),
     (HOST, "runs", "."),
     (HOST, "scan", "-i", "virtual", "-c", "empty", "--seconds", "0.1"),
     (HOST, "monitor", "-i", "virtual", "-c", "empty", "--seconds", "0.1"),

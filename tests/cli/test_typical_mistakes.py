@@ -64,7 +64,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("report", USAGE, ("Missing argument 'LOGS...'", "report --help")),
     ("report --from 5 --until 3 log.mcap", USAGE, ("--from 5 s is not before --until 3 s",)),
     ("monitor", USAGE, ("give --interface and --channel, or --url",)),
-    ("log export log.mcap --format exel --out x", USAGE, ("'exel' is not one of 'parquet', 'csv', 'blf'",)),
+    ("log export log.mcap --format exel --out x", USAGE, ("'exel' is not one of 'parquet', 'csv'",)),
     # -- the bus
     ("run -i sockecan -c can0", BUS_MISSING, ("unknown interface 'sockecan'", "did you mean 'socketcan'?")),
     ("scan -i socketcan -c cann0", BUS_MISSING, ("CAN interface cann0 does not exist", "did you mean 'can0'?")),

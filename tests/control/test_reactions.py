@@ -1,12 +1,7 @@
 """What an arm does about a contact: the desired motion of each reaction, and arms that meet people and walls."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from contact_rig import Rig, Sample, reports, rig_settings
 from desired_motion import START_DEG, Desired
 

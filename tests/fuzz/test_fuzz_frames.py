@@ -1,4 +1,4 @@
-"""Random and damaged frames into everything that takes frames: a seeded portion of `tools/fuzz.py`."""
+"""Random and damaged frames into everything that takes frames: a seeded portion of `tools/campaigns/fuzz.py`."""
 
 from collections.abc import Iterable
 from itertools import islice

@@ -13,7 +13,7 @@ from mcap.records import Chunk
 from recorded_run import make_run, start
 
 from adacd_hil.lab.logs.check.log_check import check_log
-from adacd_hil.lab.logs.cut_and_merge import TimeWindow, cut
+from adacd_hil.lab.logs.cut import TimeWindow, cut
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.lab.logs.signal_tables import export_tables
 from adacd_hil.log.frames.frame_log import read_frames

@@ -68,7 +68,7 @@ def test_a_log_without_a_checksum_is_whole(compression, tail, use_chunking, tmp_
     assert read_log(path).problem == ""
     assert {finding.rule for finding in check_log(path).findings if finding.severity == "error"} <= {"summary-channels"}
     recovery = recover(path)
-    assert (recovery.messages, recovery.attachments, recovery.is_lossy) == (COUNT, 1, False)
+    assert (recovery.messages, recovery.attachments, recovery.losses.is_any) == (COUNT, 1, False)
     assert recovery.losses.unvouched == COUNT
     assert f"{COUNT} messages are unchecked" in recovery_as_text(recovery)
     assert "end" not in info_as_text(info).splitlines()[0]
@@ -109,7 +109,7 @@ def test_of_a_cut_log_without_a_checksum_all_is_saved_that_a_reader_of_streams_g
         path.write_bytes(whole[:length])
         recovery = recover(path)
         assert recovery.messages == recovery.losses.unvouched == streamed(whole[:length]), length
-        assert recovery.is_lossy
+        assert recovery.losses.is_any
         assert read_info(path).problems
 
 

@@ -1,9 +1,7 @@
 """Recovered logs: everything intact is in them, nothing else is, and they say what was lost."""
 
-import sys
-from pathlib import Path
-
 import pytest
+from damage_trials import make_undamaged, run_trial
 from made_log import (
     ATTACHMENTS,
     RUN,
@@ -25,10 +23,6 @@ from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from damage_trials import make_undamaged, run_trial
 
 CHUNKS = tuple((start, start + 3) for start in range(0, 12, 3))
 COUNT = 24
@@ -69,7 +63,7 @@ def flipped(data, place, bit=0):
 
 def test_of_an_undamaged_log_nothing_is_lost(whole, tmp_path):
     recovery, messages, attachments, metadata = recovered(tmp_path, WHOLE)
-    assert (recovery.is_lossy, recovery.describe_loss(), recovery.messages) == (False, "", COUNT)
+    assert (recovery.losses.is_any, recovery.losses.describe(), recovery.messages) == (False, "", COUNT)
     assert (messages, attachments) == whole[:2]
     assert metadata["run"] == RUN
     assert metadata["summary"] == {
@@ -88,7 +82,7 @@ def test_a_cut_log_keeps_every_whole_chunk_and_says_that_the_end_is_lost(whole, 
     recovery, messages, attachments, metadata = recovered(tmp_path, WHOLE[: chunks[2].offset + 30])
     assert messages == whole[0][:12]
     assert attachments == ATTACHMENTS
-    assert (recovery.is_lossy, recovery.losses.is_cut, recovery.losses.messages) == (True, True, None)
+    assert (recovery.losses.is_any, recovery.losses.is_cut, recovery.losses.messages) == (True, True, None)
     assert metadata["summary"]["lost"] == "the end, an unknown number of messages"
     assert metadata["summary"]["lost_messages"] == "unknown"
     assert [finding.rule for finding in check_log(recovery.out).findings] == ["lost"]
@@ -106,7 +100,7 @@ def test_a_damaged_chunk_costs_only_itself(number, whole, tmp_path):
     assert len(recovery.losses.holes) == (number < len(CHUNKS) - 1)
     if number == 1:
         assert recovery.losses.holes[0].seconds == pytest.approx(0.004)
-        assert recovery.describe_loss() == "6 messages, 1 chunks, 0.004 s between what was saved"
+        assert recovery.losses.describe() == "6 messages, 1 chunks, 0.004 s between what was saved"
 
 
 def test_without_first_chunk_and_summary_no_message_is_saved(tmp_path):
@@ -115,7 +109,7 @@ def test_without_first_chunk_and_summary_no_message_is_saved(tmp_path):
     data = flipped(flipped(WHOLE, chunk.offset + 60), len(WHOLE) - 20)
     recovery, messages, attachments, _ = recovered(tmp_path, data)
     assert (messages, attachments) == ([], ATTACHMENTS)
-    assert recovery.is_lossy
+    assert recovery.losses.is_any
 
 
 @pytest.mark.parametrize(("place", "bit"), [(1, 4), (1, 3), (8, 4)])
@@ -124,7 +118,7 @@ def test_records_are_found_again_behind_a_length_that_is_wrong(place, bit, whole
     part = kinds(take_apart(WHOLE), Opcode.MESSAGE_INDEX)[0]
     recovery, messages, _, _ = recovered(tmp_path, flipped(WHOLE, part.offset + place, bit))
     assert messages == whole[0]
-    assert not recovery.is_lossy
+    assert not recovery.losses.is_any
     assert recovery.losses.bytes == 9 + len(part.body)
 
 
@@ -145,7 +139,7 @@ def test_nothing_is_lost_when_only_what_is_made_anew_is_damaged(whole, tmp_path)
         assert (messages, attachments, metadata["run"]) == (whole[0], ATTACHMENTS, RUN), opcode
         assert not recovery.losses.chunks, opcode
         if opcode not in (Opcode.STATISTICS, Opcode.FOOTER, Opcode.CHUNK_INDEX, Opcode.DATA_END):
-            assert not recovery.is_lossy, opcode
+            assert not recovery.losses.is_any, opcode
     for place in (0, len(WHOLE) - 1):
         assert recovered(tmp_path, flipped(WHOLE, place))[1] == whole[0]
 
@@ -154,7 +148,7 @@ def test_metadata_that_may_be_wrong_are_said(tmp_path):
     place = WHOLE.index("Prüfung".encode())
     recovery, _, _, metadata = recovered(tmp_path, flipped(WHOLE, place))
     assert metadata["run"]["name"] == "Qrüfung"
-    assert (recovery.is_lossy, recovery.describe_loss()) == (True, "metadata may be wrong")
+    assert (recovery.losses.is_any, recovery.losses.describe()) == (True, "metadata may be wrong")
 
 
 def test_a_damaged_attachment_is_left_out(tmp_path):
@@ -184,7 +178,7 @@ def test_what_no_crc_vouches_for_is_saved_only_while_the_whole_fits_its_own(tmp_
     assert len(messages) == COUNT + 1
     recovery, messages, _, _ = recovered(tmp_path, flipped(data, data.index(b"x = 1")))
     assert messages == []
-    assert recovery.is_lossy
+    assert recovery.losses.is_any
 
 
 def test_an_index_that_looks_like_a_message_is_not_saved_as_one(whole, tmp_path):
@@ -233,8 +227,8 @@ def parts_of_a_log(folder, count, run=RUN):
 def test_parts_become_one_log(tmp_path):
     recovery = recover(parts_of_a_log(tmp_path, 3))
     messages, attachments, metadata = read(recovery.out)
-    assert (len(messages), attachments, recovery.is_lossy) == (30, ATTACHMENTS, False)
-    assert metadata["run"] == {**RUN, "part": "0"}
+    assert (len(messages), attachments, recovery.losses.is_any) == (30, ATTACHMENTS, False)
+    assert metadata["run"] == RUN
     assert metadata["summary"]["dropped"] == "3"
     log = read_log(recovery.out)
     assert (log.problem, log.parts) == ("", 1)
@@ -246,12 +240,12 @@ def test_parts_that_are_missing_or_of_another_run_cost_themselves(tmp_path):
     (tmp_path / "run_003.mcap").unlink()
     (tmp_path / "run_002.mcap").write_bytes(make_log(run={**RUN, "part": "2", "name": "other"}))
     recovery = recover(path)
-    assert recovery.missing_parts == ("run_001.mcap", "run_002.mcap (of another run)")
-    assert recovery.describe_loss() == "run_001.mcap, run_002.mcap (of another run)"
+    assert recovery.losses.missing_parts == ["run_001.mcap", "run_002.mcap (of another run)"]
+    assert recovery.losses.describe() == "run_001.mcap, run_002.mcap (of another run)"
     assert len(read(recovery.out)[0]) == 10
     parts_of_a_log(tmp_path, 3)
     (tmp_path / "run_002.mcap").unlink()
-    assert recover(path).missing_parts == ("run_002.mcap",)
+    assert recover(path).losses.missing_parts == ["run_002.mcap"]
 
 
 def test_a_part_whose_metadata_have_one_damaged_entry_is_still_of_the_run(tmp_path):
@@ -260,7 +254,7 @@ def test_a_part_whose_metadata_have_one_damaged_entry_is_still_of_the_run(tmp_pa
     second.write_bytes(flipped(second.read_bytes(), second.read_bytes().index("Prüfung".encode())))
     recovery = recover(path)
     assert recovery.messages == 20
-    assert recovery.describe_loss() == "metadata may be wrong"
+    assert recovery.losses.describe() == "metadata may be wrong"
 
 
 @pytest.fixture(scope="module")

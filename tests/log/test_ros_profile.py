@@ -14,7 +14,7 @@ from recorded_run import fd_contract, make_run, record
 from rosbags.highlevel import AnyReader, AnyReaderError
 
 from adacd_hil.lab.logs.check.log_check import check_log
-from adacd_hil.lab.logs.cut_and_merge import TimeWindow, cut, merge
+from adacd_hil.lab.logs.cut import TimeWindow, cut
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.frames.mcap_frames import FrameWriter, RecordedFrame
 from adacd_hil.log.reader import read_log
@@ -109,13 +109,12 @@ def test_a_log_of_before_the_profile_is_read_as_ever_and_a_copy_of_it_opens_in_r
     assert before.frames.tobytes() == now.frames.tobytes()
     assert before.contacts == now.contacts
     assert [finding for finding in check_log(old).findings if finding.rule == "profile"] == []
-    copies = [tmp_path / name for name in ("cut.mcap", "merged.mcap", "recovered.mcap")]
+    copies = [tmp_path / name for name in ("cut.mcap", "recovered.mcap")]
     cut(old, copies[0], TimeWindow(0.02, 0.05))
-    merge([old, log_path], copies[1], has_prefix=True)
-    recover(old, copies[2])
-    assert [header_of(copy).profile for copy in copies] == ["ros2"] * 3
+    recover(old, copies[1])
+    assert [header_of(copy).profile for copy in copies] == ["ros2"] * 2
     assert len(by_rosbags(copies[0])["/scheme"]) == 30
-    assert by_rosbags(copies[2]) == by_mcap(log_path)
+    assert by_rosbags(copies[1]) == by_mcap(log_path)
 
 
 def test_a_copy_of_somebody_elses_log_does_not_claim_the_profile(tmp_path):
@@ -124,10 +123,9 @@ def test_a_copy_of_somebody_elses_log_does_not_claim_the_profile(tmp_path):
     ours = tmp_path / "ours.mcap"
     ours.write_bytes(make_log())
     cut(theirs, tmp_path / "cut.mcap", TimeWindow(0.0, 1.0))
-    merge([ours, theirs], tmp_path / "merged.mcap", has_prefix=True)
     cut(ours, tmp_path / "own.mcap", TimeWindow(0.0, 1.0))
-    profiles = [header_of(tmp_path / f"{name}.mcap").profile for name in ("cut", "merged", "own")]
-    assert profiles == ["", "", "ros2"]
+    profiles = [header_of(tmp_path / f"{name}.mcap").profile for name in ("cut", "own")]
+    assert profiles == ["", "ros2"]
 
 
 def test_frames_that_python_can_records_open_in_rosbags(tmp_path):

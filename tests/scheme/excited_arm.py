@@ -1,13 +1,12 @@
 """The small 2R arm of `planar_arm` on the excitation: recorded and played, or in closed loop with the pipeline."""
 
-import sys
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from planar_arm import ENCODER_LSB_RAD, THETA, TORQUE_LSB_NM, TORQUE_NOISE_NM, VELOCITY_LSB_RAD_S, advance
+from played_record import play_record
 
 from adacd_hil.compiled import compiled
 from adacd_hil.control.motions import Excitation
@@ -15,10 +14,6 @@ from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutpu
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import Settings, load_settings
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from played_record import play_record
 
 PERIOD_S = 1e-3
 SETTINGS = load_settings("certified", "P")

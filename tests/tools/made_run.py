@@ -1,4 +1,4 @@
-"""A run written by hand, cycle by cycle, for the judges of tools/run_rules.py: everything right unless changed."""
+"""A run written by hand, cycle by cycle, for the judges of run_rules.py: everything right unless changed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

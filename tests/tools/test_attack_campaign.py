@@ -1,20 +1,17 @@
-"""tools/attack_campaign.py: what each attack sends, what the judge makes of a run, and two attacks in virtual time."""
+"""attack_campaign.py: what each attack sends, what the judge makes of a run, and two attacks in virtual time."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pytest
-from crccheck.crc import Crc8Autosar
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import attack_campaign
 import attack_vcan
 import attacked_run
 import attacks
+import numpy as np
+import pytest
 from attacked_run import Finding
 from attacks import ATTACKS, MS, Forged, Forger, find_attack
+from crccheck.crc import Crc8Autosar
 
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import TRUTH_LAYOUT, Event

@@ -1,13 +1,10 @@
-"""tools/blind_grid.py: its rows, what it makes of a push, and the scenario that began it."""
+"""tools/campaigns/blind_grid.py: its rows, what it makes of a push, and the scenario that began it."""
 
-import sys
 from pathlib import Path
 
+import blind_grid
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-import blind_grid
 from blind_grid import FIRST, SHORT, Outcome, Row
 from made_run import ENABLED, Made, states
 from run_rules import Case

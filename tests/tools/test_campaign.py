@@ -1,4 +1,4 @@
-"""tools/campaign.py: what is chosen, and what a run that deviates or can't be played comes to."""
+"""tools/campaigns/campaign.py: what is chosen, and what a run that deviates or can't be played comes to."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-CAMPAIGN = Path(__file__).parents[2] / "tools" / "campaign.py"
+CAMPAIGN = Path(__file__).parents[2] / "tools" / "campaigns" / "campaign.py"
 SHORT = """
 about = "Too short to adapt."
 group = "short"

@@ -1,13 +1,9 @@
-"""tools/campaign_loop.py: trials in order in any number of processes, progress, options, and the table of figures."""
+"""campaign_loop.py: trials in order in any number of processes, progress, options, and the table of figures."""
 
 import argparse
 import os
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from campaign_loop import (
     Figure,
     add_jobs,

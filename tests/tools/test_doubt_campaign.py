@@ -1,12 +1,7 @@
-"""tools/doubt_campaign.py: one arm of each part, and its figures."""
+"""tools/campaigns/doubt_campaign.py: one arm of each part, and its figures."""
 
-import sys
-from pathlib import Path
-
-import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import doubt_campaign
+import pytest
 from doubt_campaign import Played
 
 LOADED = "2 contacts look like 0.19 ± 0.01 kg picked up: the certificate is taken back, `changed` learns it"

@@ -1,17 +1,12 @@
-"""tools/error_campaign.py: what it plays, and when it says that a step was found."""
+"""tools/campaigns/error_campaign.py: what it plays, and when it says that a step was found."""
 
-import sys
-from pathlib import Path
-
+import error_campaign
 import numpy as np
 import pytest
+from error_campaign import AGREES, ERRORS, SENSORS, WITHIN, Case, Played, find_steps, mechanics_of, quiet_onsets, row_of
 
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import MechanicsSettings, SensorSettings
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-import error_campaign
-from error_campaign import AGREES, ERRORS, SENSORS, WITHIN, Case, Played, find_steps, mechanics_of, quiet_onsets, row_of
 
 FILTERS, CHANNELS = 3, 5
 RISING = np.tile(np.linspace(0.0, 1.0, WITHIN), (CHANNELS, 1))

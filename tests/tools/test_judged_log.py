@@ -1,14 +1,11 @@
-"""tools/judged_log.py, and the long runs on a vcan: kills, a clock that is set, hogs."""
+"""tools/campaigns/judged_log.py, and the long runs on a vcan: kills, a clock that is set, hogs."""
 
 import dataclasses
-import sys
 from pathlib import Path
 
+import damage_campaign
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-import damage_campaign
 import run_rules
 import timing_clock
 import timing_hogs

@@ -1,20 +1,15 @@
-"""tools/lab.py: it plays the emulator itself, so a record is what the emulator measures, bit for bit."""
+"""tools/campaigns/lab.py: it plays the emulator itself, so a record is what the emulator measures, bit for bit."""
 
-import sys
-from pathlib import Path
-
+import lab
 import numpy as np
 import pytest
+from lab import Motion, Push, profile_arm, random_arm, random_moves, record
 
 from adacd_hil.control.controller import fill_torque
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import ContactSettings
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-import lab
-from lab import Motion, Push, profile_arm, random_arm, random_moves, record
 
 CYCLES = 150
 PUSHED = slice(80, 120)
@@ -23,7 +18,7 @@ PUSHED = slice(80, 120)
 @pytest.fixture(autouse=True)
 def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Play with the emulator's compiled functions from Python: the whole loop takes longer to compile than these."""
-    monkeypatch.setattr(lab, "_play", getattr(lab._play, "py_func", lab._play))
+    monkeypatch.setattr(lab, "play_loop", getattr(lab.play_loop, "py_func", lab.play_loop))
 
 
 def short_motion(seed: int = 5):

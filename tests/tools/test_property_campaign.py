@@ -1,23 +1,19 @@
-"""tools/property_campaign.py: its decoder, each of its rules, what it draws, and a dozen of its runs."""
+"""tools/campaigns/property_campaign.py: its decoder, each of its rules, what it draws, and a dozen of its runs."""
 
 import dataclasses
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import cantools
 import numpy as np
-import pytest
-from crccheck.crc import Crc8Autosar, Crc16CcittFalse
-from long_cases import long_but
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import property_campaign
+import pytest
 import random_run
 import run_rules
 import wire_record
 import witnessed_run
+from crccheck.crc import Crc8Autosar, Crc16CcittFalse
+from long_cases import long_but
 from made_run import DISABLED_WORD, ENABLED, ENABLED_WORD, Made, states
 from wire_record import Passed, WireRecord
 
@@ -364,7 +360,7 @@ def test_the_summary_counts_runs_and_not_violations() -> None:
 
 def test_a_seed_that_the_judge_itself_cannot_bear_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(property_campaign, "draw_run", lambda seed: 1 / 0)
-    result = property_campaign._run((4, None, False))
+    result = property_campaign.play_seed((4, None, False))
     assert [violation.rule for violation in result.violations] == ["judge-crash"]
 
 

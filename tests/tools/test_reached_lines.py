@@ -1,11 +1,6 @@
-"""tools/reached_lines.py: what it counts is what runs on an arm and replays its logs."""
-
-import sys
-from pathlib import Path
+"""tools/campaigns/reached_lines.py: what it counts is what runs on an arm and replays its logs."""
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import reached_lines
 
 

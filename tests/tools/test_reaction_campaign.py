@@ -1,13 +1,9 @@
-"""tools/reaction_campaign.py: what it makes of forces, and what it calls worse."""
+"""tools/campaigns/reaction_campaign.py: what it makes of forces, and what it calls worse."""
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import reaction_campaign
 from reaction_campaign import Harm
 

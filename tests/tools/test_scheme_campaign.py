@@ -1,19 +1,14 @@
-"""tools/scheme_campaign.py: its bound, its counting and its tables, on numbers made by hand."""
-
-import sys
-from pathlib import Path
+"""tools/campaigns/scheme_campaign.py: its bound, its counting and its tables, on numbers made by hand."""
 
 import numpy as np
 import pytest
-
-from firmware_sim.arm.touch_settings import ContactSettings
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from campaign_bound import Bound, fit, threshold_sigma, whiten
 from campaign_figures import Figure, figure_table, is_all_good, variant_table
 from campaign_schemes import ADAPTING, ARMED, Outcome
-from campaign_trials import _judge, alarms, is_moving, predicted_change
+from campaign_trials import alarms, is_moving, judge_contact, predicted_change
 from lab import Motion, Recording, profile_arm, random_moves
+
+from firmware_sim.arm.touch_settings import ContactSettings
 
 WHITE = np.zeros((1, 2, 2))
 STEP = np.stack([np.stack([np.ones(250), np.zeros(250)], 1), np.stack([np.zeros(250), np.ones(250)], 1)])
@@ -100,7 +95,7 @@ def judged(found_over: list[int], sign: float = 1.0):
     theta = np.zeros((300, 7))
     recording = Recording(arm, motion, (contact,), (), 0, q, zeros, zeros, zeros, tau_ext, theta)
     outcome = outcome_of(over, sign * 1.02 * tau_ext)
-    return _judge(contact, recording, outcome, Bound(WHITE, 0.02**2 * np.eye(2), STEP))
+    return judge_contact(contact, recording, outcome, Bound(WHITE, 0.02**2 * np.eye(2), STEP))
 
 
 def test_a_contact_is_judged_by_link_direction_size_and_place():

@@ -1,17 +1,12 @@
 """tools/straightforward.py: its numpy step gives the numbers of the compiled one, so that it is no straw man."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scheme.smooth_motion import PLACES, settings_with, smooth_motion, torque_of
+from straightforward import NumpyScheme
 
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.settings.configuration import Settings
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from straightforward import NumpyScheme
 
 LEARNED, WATCHED = 300, 150
 THETA = np.array([0.19, 0.034, 0.02, 0.08, 0.05, 0.1, 0.06])

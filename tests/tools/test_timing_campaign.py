@@ -1,20 +1,17 @@
-"""tools/timing_campaign.py: the inputs it writes can be used, and what it makes of frames and memory is right."""
+"""timing_campaign.py: the inputs it writes can be used, and what it makes of frames and memory is right."""
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import side_by_side
 import timing_campaign
 import timing_disk
 import timing_hour
 import witness
 import yardstick
+from mcap.writer import Writer
 
 from adacd_hil.cli.commands.run_command import check_budget_of
 from adacd_hil.settings.configuration import load_settings

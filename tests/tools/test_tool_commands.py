@@ -11,11 +11,9 @@ import sys
 import tomllib
 from pathlib import Path
 
-import pytest
-from tool_files import PROGRAMS, PYTHON_TOOLS, ROOT, TOOLS
-
-sys.path.insert(0, str(TOOLS))
 import mutate
+import pytest
+from tool_files import PROGRAMS, PYTHON_TOOLS, ROOT
 
 PATH = re.compile(r"(?<![\w/.])(?:adacd_hil|firmware_sim|tests|tools|docs|dbc)/[\w/-]+\.(?:py|md|c|toml|dbc)")
 

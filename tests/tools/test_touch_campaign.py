@@ -1,17 +1,13 @@
-"""tools/touch_campaign.py: what it draws, one of its trials, and its figures."""
+"""tools/campaigns/touch_campaign.py: what it draws, one of its trials, and its figures."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from long_cases import long_but
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import touch_campaign
 import touch_trials
 from excited_arm import PERIOD_S
+from long_cases import long_but
 from mujoco_arm import MujocoArm, model_of
 from planar_arm import THETA, advance
 from touch_trials import Hand, HandLoop, Trial

@@ -1,16 +1,13 @@
 """tools/yardstick.c and .py: it compiles without a warning, checks its arguments, and gets frames that devices take."""
 
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+import yardstick
 
 from adacd_hil.wire.codec import contract_folder, load_codec
 from adacd_hil.wire.e2e import E2eStatus
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-import yardstick
 
 GOOD = ["-i", "none0", "-s", "080", "-r", "181", "-c", "201#0011"]
 

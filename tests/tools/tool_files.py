@@ -1,4 +1,4 @@
-"""The files of tools/: instruments, studies, and what they are composed of."""
+"""The files of tools/: instruments, campaigns, and the modules that they are composed of."""
 
 import ast
 from pathlib import Path
@@ -21,7 +21,7 @@ def _is_program(path: Path) -> bool:
     return path.suffix == ""
 
 
-_FILES = sorted(path for folder in (TOOLS, TOOLS / "studies") for path in folder.iterdir() if path.is_file())
+_FILES = sorted(path for folder in (TOOLS, TOOLS / "campaigns") for path in folder.iterdir() if path.is_file())
 PYTHON_TOOLS = [path for path in _FILES if _is_python(path)]
 PROGRAMS = [path for path in _FILES if _is_program(path)]
 """Those that somebody types; others are modules of theirs, C sources, and the guest's init."""

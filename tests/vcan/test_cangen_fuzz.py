@@ -7,7 +7,7 @@ took is in a readable log, its bad frames counted; afterwards no drive is enable
 which, when the flood is over, succeeds as if nothing had been. An arm that nobody enables stays without torque. A flood
 on an identifier that isn't the arm's is filtered in the kernel and changes no decision, to the bit.
 
-Flooded runs are a campaign, `tools/fuzz.py --cangen 60`; it sets the environment variable ADACD_HIL_FUZZ_S.
+Flooded runs are a campaign, `tools/campaigns/fuzz.py --cangen 60`; it sets the environment variable ADACD_HIL_FUZZ_S.
 """
 
 import contextlib
@@ -35,7 +35,7 @@ pytestmark = [
     pytest.mark.skipif(shutil.which("cangen") is None, reason="cangen (Debian package can-utils) is not installed"),
 ]
 
-CAMPAIGN = pytest.mark.skipif("ADACD_HIL_FUZZ_S" not in os.environ, reason="a campaign: tools/fuzz.py --cangen 60")
+CAMPAIGN = pytest.mark.skipif("ADACD_HIL_FUZZ_S" not in os.environ, reason="a campaign: fuzz.py --cangen 60")
 DURATION_S = float(os.environ.get("ADACD_HIL_FUZZ_S", "5"))
 FLOOD = 20_000
 """Frames of random identifiers at an arm that nobody enables: 10 of each."""

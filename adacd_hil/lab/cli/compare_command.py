@@ -71,7 +71,7 @@ def _as_text(found: "LogComparison") -> str:
         ]
         lines += ["", format_table(("field", "differs from", "cycle", "cycles", "by at most"), rows, (1, 2, 3, 4))]
     if found.contacts:
-        rows3 = [(_contact(pair.first), _contact(pair.second)) for pair in found.contacts]
+        rows3 = [(contact_in_words(pair.first), contact_in_words(pair.second)) for pair in found.contacts]
         lines += ["", format_table(("contact in 1", "in 2"), rows3)]
     lines += ["", format_table(("state", "1", "2"), _states(found))]
     lines += ["", format_table(("parameter", "1", "2"), _parameters(found))]
@@ -79,7 +79,8 @@ def _as_text(found: "LogComparison") -> str:
     return "\n".join(lines)
 
 
-def _contact(contact: "ComparedContact | None") -> str:
+def contact_in_words(contact: "ComparedContact | None") -> str:
+    """Write a contact in a cell of the table."""
     if contact is None:
         return "–"
     from adacd_hil.records import Location

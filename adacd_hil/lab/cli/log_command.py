@@ -1,7 +1,8 @@
-"""`adacd-hil log`: info, check, recover, cut, merge and export of logs, and their output for people."""
+"""`adacd-hil log`: logs at a glance, checked, recovered, cut and exported, with the text printed of them."""
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from adacd_hil.lab.logs.recover import LogRecovery
     from adacd_hil.log.log_files import TimeWindow
     from adacd_hil.log.log_info import LogInfo
-    from adacd_hil.wire.dbc_decoder import DbcDecoder
 
 _TOLD_FAULTS = 5
 _log_argument = click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
@@ -33,7 +33,7 @@ def _tell(line: str) -> None:
 
 @click.group("log", cls=CommandGroup)
 def log() -> None:
-    """Look at logs, check, recover, cut and merge them. A log is named by its first part."""
+    """Look at logs, check, recover, cut and export them. A log is named by its first part."""
 
 
 @log.command(epilog="Exit status: 0 done; 1 a log can't be read; 2 wrong usage; 3 a log is cut or lacks a part.")
@@ -95,7 +95,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     recovery = recover_log(log, out, _tell)
     as_table = recovery_as_json(recovery)
     answer(as_json, as_table, recovery_as_text(recovery))
-    return ExitCode.PARTIAL if recovery.is_lossy else ExitCode.OK
+    return ExitCode.PARTIAL if recovery.losses.is_any else ExitCode.OK
 
 
 @log.command(epilog="Exit status: 0 done; 1 no data there, or the log is damaged; 2 wrong usage.")
@@ -124,8 +124,8 @@ def cut(
     stretch: "TimeWindow",
 ) -> ExitCode:
     """Cut a stretch out of a log, whole cycles, with attachments and metadata. --out: default NAME.cut.mcap."""
-    from adacd_hil.lab.logs.cut_and_merge import cut as cut_log
-    from adacd_hil.lab.logs.cut_and_merge import default_out, find_contact
+    from adacd_hil.lab.logs.cut import cut as cut_log
+    from adacd_hil.lab.logs.cut import default_out, find_contact
 
     if contact is not None:
         if not stretch.is_whole:
@@ -137,22 +137,16 @@ def cut(
     return ExitCode.OK
 
 
-@log.command(epilog="Exit status: 0 done; 1 a log is damaged or can't be read; 2 wrong usage.")
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(dir_okay=False), shell_complete=complete_run)
-@click.option("--out", type=WrittenPath(dir_okay=False), default=Path("merged.mcap"), show_default=True)
-@click.option("--prefix", "has_prefix", is_flag=True, help="Put each log's name before its topics, as /NAME/topic.")
-@json_option
+@log.command(hidden=True, context_settings={"ignore_unknown_options": True})
+@click.argument("logs", nargs=-1, type=click.UNPROCESSED)
 @explained
-def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) -> ExitCode:
-    """Merge logs into one by their log times: of several hosts, of a run and the emulator, or of one log's parts."""
-    from adacd_hil.lab.logs.cut_and_merge import merge as merge_logs
-
-    done = merge_logs(logs, out, has_prefix, _tell)
-    if done.shared and not has_prefix:
-        _tell(f"topics of more than one log; only their channels distinguish them: {', '.join(done.shared)}")
-    result = {"out": str(done.out), "logs": list(done.names), "messages": done.messages, "shared": list(done.shared)}
-    answer(as_json, result, in_line(f"{done.out}: {done.messages} messages"))
-    return ExitCode.OK
+def merge(logs: tuple[str, ...]) -> ExitCode:  # noqa: ARG001
+    """Left the package: a viewer opens several logs at once, and `mcap merge` makes one file of them."""
+    raise CommandError(
+        "`log merge` has left: open the logs together in Foxglove, Lichtblick or PlotJuggler; `mcap merge -o OUT LOG "
+        "LOG` of the MCAP command line makes one file of them, `adacd-hil log cut LOG` one file of a log's parts",
+        ExitCode.USAGE,
+    )
 
 
 def info_as_json(info: "LogInfo") -> dict[str, Any]:
@@ -228,15 +222,15 @@ def recovery_as_json(recovery: "LogRecovery") -> dict[str, Any]:
         "messages": recovery.messages,
         "attachments": recovery.attachments,
         "metadata": recovery.metadata,
-        "is_lossy": recovery.is_lossy,
-        "lost": recovery.describe_loss(),
+        "is_lossy": losses.is_any,
+        "lost": losses.describe(),
         "unvouched_messages": losses.unvouched,
         "lost_messages": losses.messages,
         "lost_chunks": losses.chunks,
         "lost_bytes": losses.bytes,
         "is_cut": losses.is_cut,
         "holes_s": [hole.seconds for hole in losses.holes],
-        "missing_parts": list(recovery.missing_parts),
+        "missing_parts": losses.missing_parts,
         "notes": losses.notes,
     }
 
@@ -244,7 +238,7 @@ def recovery_as_json(recovery: "LogRecovery") -> dict[str, Any]:
 def recovery_as_text(recovery: "LogRecovery") -> str:
     """Format saved and lost data for people."""
     saved = f"{recovery.messages} messages, {recovery.attachments} attachments"
-    lost = recovery.describe_loss()
+    lost = recovery.losses.describe()
     lines = [f"{recovery.out}: {saved}", *(f"  {note}" for note in recovery.losses.notes)]
     if recovery.losses.unvouched:
         lines.append(f"{recovery.losses.unvouched} messages are unchecked: {recovery.path.name} has no checksums")
@@ -253,36 +247,30 @@ def recovery_as_text(recovery: "LogRecovery") -> str:
 
 
 TABLES = ("parquet", "csv")
-FRAMES = ("blf", "asc", "candump")
-_SUFFIXES = {"candump": ".log"}
+_FRAMES = ("blf", "asc", "candump")
 _TOLD_EACH = 1_000_000
-"""Rows or frames between two progress lines."""
-
-
-class HexId(click.ParamType[int]):
-    """A CAN identifier in hexadecimal."""
-
-    name = "hex"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Parse the identifier."""
-        try:
-            number = int(str(value), 16)
-        except ValueError:
-            self.fail(f"{value} is not a hexadecimal identifier", param, ctx)
-        if not 0 <= number < 1 << 29:
-            self.fail(f"{value} has more than 29 bits", param, ctx)
-        return number
-
-
-id_option = click.option("--id", "can_ids", type=HexId(), multiple=True, metavar="HEX", help="Only these identifiers.")
-only_option = click.option(
-    "--only",
-    type=click.Choice(["host", "devices", "both"]),
-    default="both",
-    show_default=True,
-    help="Sender of the frames: by the contract, else by their direction.",
+"""Rows between two lines of progress."""
+_CONVERTED = (
+    "`log export` makes tables; python-can makes BLF, ASC and candump logs of frames: `can_logconvert run.mcap "
+    "run.blf`, or run.asc, run.log."
 )
+
+
+class TableFormat(click.Choice[str]):
+    """A format of tables; those of frames, which have left, name their successor."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Check it."""
+        if str(value).lower() in _FRAMES:
+            self.fail(_CONVERTED, param, ctx)
+        return super().convert(value, param, ctx)
+
+
+def _refuse(ctx: click.Context, _param: click.Parameter, value: object) -> None:
+    if value:
+        raise click.UsageError(_CONVERTED, ctx)
+
+
 dbc_option = click.option(
     "--dbc", type=GivenPath(dir_okay=False), help="A DBC; default: the log's contract, else the arm's."
 )
@@ -294,57 +282,50 @@ dbc_option = click.option(
     "usage or contract; 3 the recording is damaged, or a disk is full; 130 interrupted.",
 )
 @click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
-@click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Format of the output.")
-@click.option("--out", type=WrittenPath(), help="Folder of the tables, or file of the frames; default: beside LOG.")
-@click.option(
-    "--topic", "topics", multiple=True, metavar="TOPIC", help="For tables: a topic, or a pattern such as 'decoded/*'."
-)
-@click.option(
-    "--direction",
-    "has_direction",
-    is_flag=True,
-    help="candump: T or R behind each frame, sent or received. Wireshark opens no file that has them.",
-)
-@only_option
-@id_option
+@click.option("--format", "kind", type=TableFormat(TABLES), required=True, help="Of the output.")
+@click.option("--out", type=WrittenPath(), help="Folder of the tables; default: beside LOG.")
+@click.option("--topic", "topics", multiple=True, metavar="TOPIC", help="A topic, or a pattern such as 'decoded/*'.")
+@click.option("--direction", is_flag=True, hidden=True, expose_value=False, callback=_refuse)
+@click.option("--only", hidden=True, expose_value=False, callback=_refuse)
+@click.option("--id", multiple=True, hidden=True, expose_value=False, callback=_refuse)
 @dbc_option
 @json_option
 @explained
 def export(
-    log: Path,
-    kind: str,
-    out: Path | None,
-    topics: tuple[str, ...],
-    has_direction: bool,
-    only: str,
-    can_ids: tuple[int, ...],
-    dbc: Path | None,
-    as_json: bool,
+    log: Path, kind: str, out: Path | None, topics: tuple[str, ...], dbc: Path | None, as_json: bool
 ) -> ExitCode:
-    """Write a recording as tables (Parquet, CSV), or its frames as BLF, ASC or candump log.
+    """Write what a recording holds as tables, Parquet or CSV.
 
-    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. Frames that the target format can't hold are counted on
-    stderr. Tables replace tables; a file of frames replaces only an identical one.
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. Tables replace tables, and no other file. For BLF, ASC and
+    candump logs of the frames: can_logconvert.
     """
+    from adacd_hil.lab.logs.signal_tables import export_tables
     from adacd_hil.wire.dbc_decoder import DbcDecoder
 
-    if kind in TABLES and (can_ids or only != "both"):
-        raise CommandError(f"--only and --id choose frames, {kind} holds tables; use --topic", ExitCode.USAGE)
-    if kind in FRAMES and topics:
-        raise CommandError(f"--topic chooses tables, {kind} holds frames; use --only or --id", ExitCode.USAGE)
-    if has_direction and kind != "candump":
-        raise CommandError(f"--direction is candump's; {kind} needs none", ExitCode.USAGE)
     decoder = DbcDecoder(*find_dbc(log, dbc))
-    if kind in TABLES:
-        described, problem = _export_tables(log, out or log.with_name(f"{log.stem}-tables"), kind, topics, decoder)
-    else:
-        suffix = _SUFFIXES.get(kind, f".{kind}")
-        out = out or log.with_suffix(suffix if log.suffix.lower() != suffix else f".exported{suffix}")
-        described, problem = _export_frames(log, out, kind, only, can_ids, decoder, has_direction)
-    if problem:
-        print(in_line(f"warning: {problem}"), file=sys.stderr)
-    answer(as_json, described | {"problem": problem}, described["text"])
-    return ExitCode.PARTIAL if problem else ExitCode.OK
+    summary = export_tables(log, out or log.with_name(f"{log.stem}-tables"), kind, topics, decoder, _tell_rows())
+    for note in summary.notes:
+        _tell(f"{kind}: {note}")
+    if summary.problem:
+        _tell(f"warning: {summary.problem}")
+    lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
+    text = "\n".join(lines) or in_line(f"nothing to export: {decoder.path.name} knows no frame of {log.name}")
+    files = {str(path): rows for path, rows in summary.rows.items()}
+    answer(as_json, {"files": files, "text": text, "problem": summary.problem}, text)
+    return ExitCode.PARTIAL if summary.problem else ExitCode.OK
+
+
+def _tell_rows() -> Callable[[int], None]:
+    """Print how many rows are written, a line for every so many."""
+    told = 0
+
+    def tell(count: int) -> None:
+        nonlocal told
+        if count - told >= _TOLD_EACH:
+            told = count
+            _tell(f"{count} rows")
+
+    return tell
 
 
 def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
@@ -354,49 +335,3 @@ def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
 
     text = attachment(log, "arm.dbc") if dbc is None and log.suffix.lower() == ".mcap" else None
     return read_dbc(dbc) if text is None else (text, log / "arm.dbc")
-
-
-def _export_tables(
-    log: Path, out: Path, kind: str, topics: tuple[str, ...], decoder: "DbcDecoder"
-) -> tuple[dict[str, Any], str]:
-    from adacd_hil.lab.logs.signal_tables import export_tables
-
-    summary = export_tables(log, out, kind, topics, decoder, _progress_of("rows"))
-    for note in summary.notes:
-        _tell(f"{kind}: {note}")
-    lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
-    described = {
-        "files": {str(path): rows for path, rows in summary.rows.items()},
-        "text": "\n".join(lines) or in_line(f"nothing to export: {decoder.path.name} knows no frame of {log.name}"),
-    }
-    return described, summary.problem
-
-
-def _export_frames(
-    log: Path, out: Path, kind: str, only: Any, can_ids: tuple[int, ...], decoder: "DbcDecoder", has_direction: bool
-) -> tuple[dict[str, Any], str]:
-    from adacd_hil.lab.logs.frame_export import FrameChoice, export_frames, sides
-    from adacd_hil.log.frames.frame_log import open_frames
-
-    if out.exists() and log.exists() and out.samefile(log):
-        raise CommandError(f"{out} is the recording itself; name another file with --out", ExitCode.USAGE)
-    host_ids, device_ids = sides(decoder)
-    choice = FrameChoice(only, host_ids, device_ids, frozenset(can_ids))
-    source = open_frames(log)
-    summary = export_frames(source, choice.pieces(source), out, kind, _progress_of("frames"), has_direction)
-    for loss in summary.losses:
-        print(in_line(f"{kind}: {loss}"), file=sys.stderr)
-    described = {
-        "file": str(out),
-        "frames": summary.frames,
-        "losses": list(summary.losses),
-        "text": in_line(f"{out}: {summary.frames} frames"),
-    }
-    return described, source.problem
-
-
-def _progress_of(noun: str) -> "Callable[[int], None]":
-    """Return a function that prints a count of rows or frames every `_TOLD_EACH` of them."""
-    from adacd_hil.log.logged_run import Milestones
-
-    return Milestones(lambda count: _tell(f"{count} {noun}"), _TOLD_EACH).reach

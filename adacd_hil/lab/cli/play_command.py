@@ -1,9 +1,9 @@
 """`adacd-hil play`: sends the frames of a recording on a bus at their times."""
 
-import queue
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +15,7 @@ from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.given_path import GivenPath
-from adacd_hil.lab.cli.log_command import dbc_option, find_dbc, id_option, only_option
-from adacd_hil.log.log_files import LogError
+from adacd_hil.lab.cli.log_command import dbc_option, find_dbc
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import Bus, BusError
@@ -25,14 +24,29 @@ from adacd_hil.wire.can_interface import is_virtual
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from adacd_hil.lab.logs.frame_export import FrameChoice
-    from adacd_hil.wire.playback import PlayedFrame
+    from adacd_hil.lab.logs.frame_choice import FrameChoice
+    from adacd_hil.lab.logs.playback import PlayedFrame
 
-_PIECES_AHEAD = 4
 _BLOCK = 256
 """Most frames that are prepared between two sends."""
 _SWITCH_S = 50e-6
 """Thread switch interval of Python: longest delay of the sending thread by the one that reads ahead."""
+
+
+class HexId(click.ParamType[int]):
+    """A CAN identifier in hexadecimal."""
+
+    name = "hex"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Read it."""
+        try:
+            number = int(str(value), 16)
+        except ValueError:
+            self.fail(f"{value} is not a hexadecimal identifier", param, ctx)
+        if not 0 <= number < 1 << 29:
+            self.fail(f"{value} has more than 29 bits", param, ctx)
+        return number
 
 
 @click.command("play", epilog=EPILOG)
@@ -65,8 +79,14 @@ _SWITCH_S = 50e-6
 @click.option(
     "--commands", is_flag=True, help="On a real bus, send frames of others than devices, too: they can move a real arm."
 )
-@only_option
-@id_option
+@click.option(
+    "--only",
+    type=click.Choice(["host", "devices", "both"]),
+    default="both",
+    show_default=True,
+    help="Whose frames: by the contract, else by their direction.",
+)
+@click.option("--id", "can_ids", type=HexId(), multiple=True, metavar="HEX", help="Only these identifiers.")
 @dbc_option
 @json_option
 @explained
@@ -92,7 +112,7 @@ def play(
     Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. On a real bus only frames that the contract assigns to devices
     are sent, unless --commands asks for the others: NMT, SDO and torque commands can move an arm.
     """
-    from adacd_hil.lab.logs.frame_export import FrameChoice, sides
+    from adacd_hil.lab.logs.frame_choice import FrameChoice, sides
     from adacd_hil.log.frames.frame_log import open_frames
     from adacd_hil.wire.codec import parse_codec
 
@@ -128,8 +148,8 @@ class Playback:
     problem: str = ""
 
     def frames(self) -> "Iterator[PlayedFrame]":
-        """Yield the frames, read ahead by a thread. Raises LogError."""
-        from adacd_hil.wire.playback import PlayedFrame
+        """Give the frames, read ahead by a thread. Raises LogError."""
+        from adacd_hil.lab.logs.playback import PlayedFrame
 
         for piece in _ahead(self._pieces()):
             for start in range(0, len(piece), _BLOCK):
@@ -161,8 +181,8 @@ def _run(
 ) -> tuple[dict[str, Any], ExitCode]:
     """Play onto a bus until the recording ends or the user interrupts. Raises LogError, CommandError."""
     from adacd_hil.cli.connection import on_interrupt
-    from adacd_hil.wire.playback import play as play_frames
-    from adacd_hil.wire.playback import repeat
+    from adacd_hil.lab.logs.playback import play as play_frames
+    from adacd_hil.lab.logs.playback import repeat
 
     interrupted = threading.Event()
     for refusal in request_realtime().missing:
@@ -225,37 +245,10 @@ def may_move_an_arm(interface: str, channel: str) -> bool:
     return not is_virtual(interface, channel)
 
 
-def _ahead(pieces: "Iterable[NDArray[Any]]") -> "Iterator[NDArray[Any]]":
-    """Yield the items of an iterator, read some pieces ahead by a thread. Raises its errors."""
-    waiting: queue.Queue[NDArray[Any] | LogError | None] = queue.Queue(_PIECES_AHEAD)
-    is_over = threading.Event()
-
-    def put(item: "NDArray[Any] | LogError | None") -> bool:
-        while not is_over.is_set():
-            try:
-                waiting.put(item, timeout=0.1)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    def read() -> None:
-        try:
-            for piece in pieces:
-                if not put(piece):
-                    return
-        except LogError as error:
-            put(error)
-        else:
-            put(None)
-
-    thread = threading.Thread(target=read, name="playback reader", daemon=True)
-    thread.start()
-    try:
-        while (item := waiting.get()) is not None:
-            if isinstance(item, LogError):
-                raise item
-            yield item
-    finally:
-        is_over.set()
-        thread.join()
+def _ahead(pieces: "Iterator[NDArray[Any]]") -> "Iterator[NDArray[Any]]":
+    """Give the pieces; a thread reads the next one meanwhile. Raises what reading raises."""
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(next, pieces, None)
+        while (piece := following.result()) is not None:
+            following = reader.submit(next, pieces, None)
+            yield piece

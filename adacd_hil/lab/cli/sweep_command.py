@@ -81,8 +81,8 @@ def sweep(
 
     A folder stands for every run.mcap below it. With the same folder again, a sweep computes only missing rows.
     """
-    from adacd_hil.lab.tune.cluster import TLS, TlsFiles, connect
     from adacd_hil.lab.tune.sweep import SweepStore, replay_task, run_sweep
+    from adacd_hil.lab.tune.workers import TLS, TlsFiles, connect
 
     if bool(logs) == bool(scenarios):
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
@@ -96,9 +96,12 @@ def sweep(
             f"{counted(len(plan.variants), 'setting')}"
         )
         if scheduler and not scheduler.startswith(TLS) and not any(tls):
-            progress(f"{scheduler} is open: it runs code of anybody who reaches it; tls:// requires certificates")
-        with connect(scheduler, workers or os.cpu_count() or 1, tls) as client:
-            outcome = run_sweep(plan, work, store, client, progress)
+            progress(
+                f"{scheduler} is open: it runs whatever anybody sends who reaches it; tls:// asks for a certificate"
+            )
+        count = workers or len(os.sched_getaffinity(0))
+        with connect(scheduler, min(count, plan.size), tls, (work.__module__, "adacd_hil.replay.replay")) as pool:
+            outcome = run_sweep(plan, work, store, pool, progress)
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
         table = store.join(plan.row_keys(), about)
     result = {

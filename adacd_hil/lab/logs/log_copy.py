@@ -1,21 +1,23 @@
-"""A log made of the records of others: recovered, cut or merged. It appears when it is whole.
+"""A log made of the records of another: recovered or cut. It appears when it is whole.
 
-Records stay as they are, but for the numbers of their channels: each source has channels of its own, and schemas are
-shared where they are equal.
+Records stay as they are, but for the numbers of their channels.
 """
 
 import contextlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from mcap.records import Attachment, Channel, Header, Schema
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import Replacement, open_input
+from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import (
     COPY_ENDINGS,
+    DROPPED_KEY,
+    ENDING_KEY,
+    PART_KEY,
     PRODUCT,
     ROS_PROFILE,
     SUMMARY_METADATA,
@@ -27,88 +29,101 @@ from adacd_hil.log.log_info import read_info
 from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end, read_header
+from adacd_hil.log.types.record_arrays import count_frames
 
 _CHANNEL = 9
 """Where the number of the channel is in a message record, bytes."""
 
 
-class Messages(NamedTuple):
-    """Message records one after the other, with the copy's numbers of channels. Columns (n,)."""
-
-    records: NDArray[np.uint8]
-    channels: NDArray[np.uint16]
-    log_times: NDArray[np.int64]
-    ends: NDArray[np.int64]
-
-    def select(self, chosen: NDArray[np.int64]) -> "Messages":
-        """Take the messages of these numbers, in this order."""
-        starts = np.concatenate(([0], self.ends[:-1]))
-        records, ends = _gather(self.records, starts[chosen], self.ends[chosen])
-        return Messages(records, self.channels[chosen], self.log_times[chosen], ends)
-
-
 class LogCopy:
     """The log in the making: a hidden file beside until `finish`, which replaces another copy, but no recording."""
 
-    def __init__(self, path: Path, sources: Iterable[Path]) -> None:
-        """Begin a log at `path` that is copied from others. Raises LogError."""
-        self.path = path
-        self._target = _CopyTarget(path)
-        self.file = ChunkedFile(self._target, LIBRARY, _common_profile(sources))
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._channels = 0
-        self._metadata: set[str] = set()
+    def __init__(self, path: Path, log: SalvagedLog, topics: Collection[str] | None = None) -> None:
+        """Begin a log at `path` that is copied from another, all of it or only `topics`.
 
-    def source(self, prefix: str = "", topics: frozenset[str] | None = None) -> "CopySource":
-        """Begin to copy from another log: put `prefix` before its topics, copy only `topics` if given."""
-        return CopySource(self, prefix, topics)
+        Raises LogError, also where `path` is the log itself.
+        """
+        if path.exists() and any(part.exists() and path.samefile(part) for part in log.parts.values()):
+            raise LogError(f"{path} is the log itself; --out names another file")
+        self._log = log
+        self._wanted = topics
+        self._target = _CopyTarget(path)
+        self._file = ChunkedFile(self._target, LIBRARY, _common_profile(log.parts.values()))
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._metadata: set[str] = set()
+        self._topics: dict[int, str] = {}  # by the copy's number of the channel
+        self._numbers = np.full(CHANNEL_NUMBERS, -1, np.int32)  # of each channel of the source
+
+    @property
+    def messages(self) -> int:
+        """How many messages have been copied."""
+        return self._file.messages
 
     def attach(self, attachment: Attachment) -> None:
-        """Add an attachment."""
-        self.file.attach(attachment)
+        """Copy an attachment."""
+        self._file.attach(attachment)
 
-    def add_all_metadata(self, records: Mapping[str, dict[str, str]]) -> None:
-        """Add the metadata records whose names are new."""
-        for name in [name for name in records if name not in self._metadata]:
+    def add(self, contents: Contents, is_chosen: NDArray[np.bool_] | None = None) -> None:
+        """Copy messages of a chunk, those of channels that aren't copied left out."""
+        self._follow()
+        numbers = self._numbers[contents.channels]
+        is_taken = numbers >= 0 if is_chosen is None else (numbers >= 0) & is_chosen
+        if not is_taken.any():
+            return
+        channels = numbers[is_taken].astype(np.uint16)
+        data = np.frombuffer(contents.data, np.uint8)
+        records, ends = _gather(data, contents.starts[is_taken], contents.ends[is_taken])
+        starts = np.concatenate(([0], ends[:-1]))
+        records[starts + _CHANNEL] = channels & 0xFF
+        records[starts + _CHANNEL + 1] = channels >> 8
+        log_times = contents.log_times[is_taken].astype(np.int64)
+        self._file.add(records, channels, log_times, ends, np.empty(0, np.int64))
+
+    def _follow(self) -> None:
+        """Copy the metadata and define the channels that have become known."""
+        for name in [name for name in self._log.metadata if name not in self._metadata]:
             self._metadata.add(name)
-            self.file.add_metadata(name, records[name])
+            table = self._log.metadata[name]
+            self._file.add_metadata(name, {key: text for key, text in table.items() if key != PART_KEY})
+        for number, channel in self._log.definitions.channels.items():
+            if self._numbers[number] < 0 and (self._wanted is None or channel.topic in self._wanted):
+                self._define(channel)
 
-    def add(self, messages: Messages) -> None:
-        """Add messages."""
-        if len(messages.ends):
-            none_end = np.empty(0, np.int64)
-            self.file.add(messages.records, messages.channels, messages.log_times, messages.ends, none_end)
-
-    def define(self, channel: Channel, schema: Schema | None) -> int:
-        """Define a channel of a source; return its number here."""
+    def _define(self, channel: Channel) -> None:
         schema_id = 0
-        if schema is not None:
+        if channel.schema_id:
+            schema = self._log.definitions.schemas.get(channel.schema_id)
+            if schema is None:
+                return
             key = schema.name, schema.encoding, schema.data
             if key not in self._schemas:
                 self._schemas[key] = len(self._schemas) + 1
-                self.file.define_schema(
+                self._file.define_schema(
                     Schema(id=self._schemas[key], data=schema.data, encoding=schema.encoding, name=schema.name)
                 )
             schema_id = self._schemas[key]
-        self._channels += 1
-        if self._channels >= CHANNEL_NUMBERS:
+        number = len(self._topics) + 1
+        if number >= CHANNEL_NUMBERS:
             raise LogError(f"more than {CHANNEL_NUMBERS - 1} channels don't go into one file")
-        self.file.define_channel(
-            Channel(
-                id=self._channels,
-                topic=channel.topic,
-                message_encoding=channel.message_encoding,
-                metadata=channel.metadata,
-                schema_id=schema_id,
-            )
-        )
-        return self._channels
+        self._file.define_channel(Channel(number, channel.topic, channel.message_encoding, channel.metadata, schema_id))
+        self._numbers[channel.id] = number
+        self._topics[number] = channel.topic
 
-    def finish(self, summary: dict[str, str]) -> None:
-        """End the log, say what is to be said of it, and give it its name. Raises LogError."""
-        self.file.flush_definitions()
-        self.file.add_metadata(SUMMARY_METADATA, summary)
-        self.file.complete()
+    def finish(self, ending: str, more: Mapping[str, str]) -> None:
+        """End the log with a summary, `more` in it, and give it its name. Raises LogError."""
+        self._follow()
+        self._file.flush()
+        summary = {
+            "frames": str(count_frames(self._topics, self._file.counts)),
+            "messages": str(self._file.messages),
+            DROPPED_KEY: str(self._log.dropped),
+            ENDING_KEY: ending,
+            "source": self._log.path.name,
+            **more,
+        }
+        self._file.flush_definitions()
+        self._file.add_metadata(SUMMARY_METADATA, summary)
+        self._file.complete()
         self._target.commit()
 
     def __enter__(self) -> "LogCopy":
@@ -126,45 +141,6 @@ def _common_profile(sources: Iterable[Path]) -> str:
 
 def _is_ros(header: Header) -> bool:
     return header.profile == ROS_PROFILE or (header.profile == "" and header.library.startswith(f"{PRODUCT} "))
-
-
-class CopySource:
-    """One log that a copy takes records from."""
-
-    def __init__(self, copy: LogCopy, prefix: str, topics: frozenset[str] | None) -> None:
-        self._copy = copy
-        self._prefix = prefix
-        self._topics = topics
-        self.topics: dict[int, str] = {}
-        """Topics by the copy's number of their channel."""
-        self._numbers: dict[int, tuple[Channel, int]] = {}
-        self._map = np.full(CHANNEL_NUMBERS, -1, np.int32)
-
-    def define(self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]) -> None:
-        """Take in what the source has defined so far."""
-        for number, channel in channels.items():
-            if number in self._numbers or (channel.schema_id and channel.schema_id not in schemas):
-                continue
-            if self._topics is not None and channel.topic not in self._topics:
-                continue
-            named = Channel(
-                number, self._prefix + channel.topic, channel.message_encoding, channel.metadata, channel.schema_id
-            )
-            self._map[number] = self._copy.define(named, schemas.get(channel.schema_id))
-            self._numbers[number] = channel, int(self._map[number])
-            self.topics[int(self._map[number])] = named.topic
-
-    def take(self, contents: Contents, is_chosen: NDArray[np.bool_] | None = None) -> Messages:
-        """Take messages of a chunk, those of channels that aren't copied left out."""
-        numbers = self._map[contents.channels]
-        is_taken = numbers >= 0 if is_chosen is None else (numbers >= 0) & is_chosen
-        channels = numbers[is_taken].astype(np.uint16)
-        data = np.frombuffer(contents.data, np.uint8)
-        records, ends = _gather(data, contents.starts[is_taken], contents.ends[is_taken])
-        starts = np.concatenate(([0], ends[:-1])) if len(ends) else ends
-        records[starts + _CHANNEL] = channels & 0xFF
-        records[starts + _CHANNEL + 1] = channels >> 8
-        return Messages(records, channels, contents.log_times[is_taken].astype(np.int64), ends)
 
 
 def _gather(

@@ -250,7 +250,7 @@ def choose_topics(
         found = _matching(topics, pattern)
         if not found:
             if frames := _matching(raw, pattern):
-                raise LogError(f"topic {frames[0]} holds frames, which become no table: --format candump, blf or asc")
+                raise LogError(f"topic {frames[0]} holds frames, which become no table: `can_logconvert` converts them")
             near = nearest_name("/" + pattern.strip("/"), topics) or nearest_name(DECODED + pattern, topics)
             hint = f"did you mean {near}" if near else f"there are {', '.join(topics)}"
             raise LogError(f"{owner} has no topic {pattern}, {hint}")

@@ -1,6 +1,6 @@
-"""The report's files: a self-contained HTML page, its numbers as JSON and CSV, figures as PNG, the index of a folder.
+"""The report's files: a self-contained HTML page, its numbers as JSON and CSV, the index of a folder.
 
-Where it is asked for, report.png has the verdict and all figures, too. A browser prints the page.
+`adacd-hil report` draws figures as PNG, too, and report.png with the verdict and all figures. A browser prints.
 
 The same log gives the same bytes. Tables in CSV have times in s since motion start, and units in the names.
 """
@@ -59,7 +59,6 @@ class Report:
     source: ReportSource
     html_path: Path
     json_path: Path
-    figure_paths: tuple[Path, ...]
     stretch: StretchOfRun | None = None
 
     @property
@@ -116,24 +115,22 @@ def write_run_report(
     shown_run = run if has_paper(metrics) else dataclasses.replace(run, beside=None)
     drawings = draw(shown_run, metrics)
     timing = draw_timing(run.timing, metrics.timing, run.zero_ns, "motion start")
-    pngs = {drawing.name: drawing.png() for drawing in drawings if drawing.name in _PNG_FIGURES}
     report = Report(
         metrics=metrics,
         metadata=run.metadata,
         source=source,
         html_path=out_dir / HTML_NAME,
         json_path=out_dir / JSON_NAME,
-        figure_paths=tuple(out_dir / f"{name}.png" for name in pngs),
         stretch=run.stretch,
     )
     table = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
     files: dict[str, bytes | str] = {
         **report_tables(run, metrics),
-        **{f"{name}.png": png for name, png in pngs.items()},
         report.json_path.name: table + "\n",
         report.html_path.name: report_page(metrics, shown_run, source, drawings, timing),
     }
     if is_printed:
+        files |= {f"{drawing.name}.png": drawing.png() for drawing in drawings if drawing.name in _PNG_FIGURES}
         files["report.png"] = report_png(metrics.verdict, metrics.is_clean, [*drawings, *timing])
     with failing_as(f"report in {out_dir} can't be written"):
         replace_files(out_dir, files)

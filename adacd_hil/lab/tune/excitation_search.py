@@ -88,7 +88,9 @@ class ExcitationLimits(NamedTuple):
         return {name: np.degrees(limit).tolist() for name, limit in degrees} | {"torque_Nm": torque}
 
 
-class _Motion(NamedTuple):
+class Motion(NamedTuple):
+    """A motion of both joints, (n, 2) each."""
+
     q: Vector
     dq: Vector
     ddq: Vector
@@ -148,7 +150,7 @@ class Search:
 
     def figures(self, excitation: ExcitationSettings) -> Figures:
         """Say what a motion of this period and number of harmonics shows and needs."""
-        motion = self._move(np.array(excitation.cosine), np.array(excitation.sine))
+        motion = self.move(np.array(excitation.cosine), np.array(excitation.sine))
         W = self._regressors(motion)
         smallest, largest, inertia = self._shown(W)
         peaks = [np.abs(part).max(axis=0) for part in motion]
@@ -165,7 +167,7 @@ class Search:
 
     def overshoot(self, excitation: ExcitationSettings) -> float:
         """Return the part by which a motion is over the limit that it keeps worst; 0 or less: it keeps all."""
-        motion = self._move(np.array(excitation.cosine), np.array(excitation.sine))
+        motion = self.move(np.array(excitation.cosine), np.array(excitation.sine))
         return max(float(used.max()) for used in self._used(motion, self._regressors(motion))) - 1.0
 
     def run(
@@ -222,23 +224,23 @@ class Search:
             np.column_stack((-sine @ order, sine)),
         )
 
-    def _move(self, cosine: Vector, sine: Vector) -> _Motion:
+    def move(self, cosine: Vector, sine: Vector) -> Motion:
         """Return the motion (N, 2) over the period: that of `control.excitation`, at all times at once."""
         cosine, sine = (self._amplitude * part.T for part in (cosine, sine))
         rate = self._rad_s[:, np.newaxis]
-        return _Motion(
+        return Motion(
             -self._amplitude + (self._cosine - 1.0) @ cosine + self._sine @ sine,
             self._cosine @ (rate * sine) - self._sine @ (rate * cosine),
             -self._cosine @ (rate**2 * cosine) - self._sine @ (rate**2 * sine),
         )
 
-    def _regressors(self, motion: _Motion) -> Vector:
+    def _regressors(self, motion: Motion) -> Vector:
         """Return the regressors of the dynamic parameters (N, 2, base)."""
         W = np.empty((len(motion.q), JOINTS, self._base))
         _fill_regressors(*motion, self._level_rad, W)
         return W
 
-    def _used(self, motion: _Motion, W: Vector) -> list[Vector]:
+    def _used(self, motion: Motion, W: Vector) -> list[Vector]:
         """Return which part of each limit is used, (N, 2) each."""
         parts = [np.abs(value) / limit for value, limit in zip(motion, self.limits[:3], strict=True)]
         return parts if self._theta is None else [*parts, np.abs(W @ self._theta) / self.limits.torque_Nm]
@@ -266,7 +268,7 @@ class Search:
         return np.asarray(np.linalg.eigvalsh(self._step_s * rows.T @ rows), dtype=np.float64)
 
     def _cost(self, free: Vector, penalty: float) -> float:
-        motion = self._move(*self._complete(free))
+        motion = self.move(*self._complete(free))
         W = self._regressors(motion)
         over = sum(float(np.mean(np.maximum(used - 1.0, 0.0) ** 2)) for used in self._used(motion, W))
         for joint, column in enumerate((F_C1, F_C2)):

@@ -1,8 +1,9 @@
-"""A sweep on Dask: tasks go to workers, rows come back and are kept at once; processes of this machine, or a cluster.
+"""A sweep: tasks go to workers, rows come back and are kept at once.
 
-The client holds a few tasks per worker in flight and writes what comes back every few seconds, so that memory doesn't
-grow with the plan. A worker that dies costs its tasks, which go to another; a task that raises is tried again; after
-that its rows say what it raised. Workers need the package and, of replays, the logs at the same paths.
+A few tasks per worker are in flight, and what comes back is written every few seconds, so that memory doesn't grow with
+the plan. A task that raises is tried again. A worker that dies costs nobody but its task: the tasks that were in flight
+are tried again one by one, so that the one at fault is found. What fails every time leaves rows that say why. Workers
+need the package and, of replays, the logs at the same paths.
 
 Results are parts as they come, one Parquet table in the end. The sweep writes a part beside and renames it, so that a
 sweep that is killed leaves whole parts only. Columns are those of all rows; a row that lacks one has null there.
@@ -16,13 +17,16 @@ log that has changed, other settings, and another version of the package or of t
 import hashlib
 import json
 import statistics
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.file_access import replace_file, replacing
+from adacd_hil.lab.tune.workers import Workers
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.records import SchemeState
@@ -278,7 +282,7 @@ def _parquet() -> Any:
     try:
         from pyarrow import parquet
     except ImportError:
-        raise LogError(f"sweep needs pyarrow and dask: {install_command('sweep')}") from None
+        raise LogError(f"sweep needs pyarrow: {install_command('tables')}") from None
     return parquet
 
 
@@ -297,7 +301,6 @@ def _write(parquet: Any, path: Path, table: Any) -> None:
 ROWS_PER_TASK = 20
 """So many replays share the decoding of a log; more would make a lost worker cost more."""
 RETRIES = 2
-_IN_FLIGHT = 4  # tasks per worker, so that none waits for the client
 _WRITE_NS = 5_000_000_000
 
 Work = Callable[[Task], list[Values]]
@@ -316,40 +319,23 @@ def run_sweep(
     plan: Plan,
     work: Work,
     store: SweepStore,
-    client: Any,
+    workers: Workers,
     progress: Progress,
     rows_per_task: int = ROWS_PER_TASK,
 ) -> SweepOutcome:
-    """Compute the rows that the store lacks. client: of dask.distributed. Raises LogError when the cluster is lost."""
-    from distributed import as_completed
-
+    """Compute the rows that the store lacks. Raises LogError when the cluster is lost."""
     clock = MonotonicClock()
     begin_ns = written_ns = clock.now_ns()
     done = store.done()
     wanted = sum(key not in done for key in plan.row_keys())
-    tasks = plan.tasks(done, rows_per_task)
-    flying: dict[Any, Task] = {}
-    completed = as_completed(loop=client.loop)
+    flights = _Flights(plan.tasks(done, rows_per_task), work, workers, progress)
     rows: list[Values] = []
     computed = failures = 0
-
-    def launch() -> None:
-        workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-        while len(flying) < _IN_FLIGHT * workers and (task := next(tasks, None)) is not None:
-            future = client.submit(work, task, retries=RETRIES, pure=False)
-            flying[future] = task
-            completed.add(future)
-
     try:
-        launch()
-        while flying:
-            future = next(completed)
-            found = _result(future, flying.pop(future))
-            future.release()
+        for found in flights:
             rows += found
             computed += len(found)
             failures += sum(row["status"] != "ok" for row in found)
-            launch()
             now_ns = clock.now_ns()
             if now_ns - written_ns >= _WRITE_NS:
                 store.add(rows)
@@ -363,16 +349,78 @@ def run_sweep(
     return SweepOutcome(computed, plan.size - wanted, failures, elapsed_s)
 
 
-def _result(future: Any, task: Task) -> list[Values]:
-    """Return the rows of a task; of one that raised every time, rows that say what."""
-    if future.status == "cancelled":
-        raise LogError("sweep: the scheduler is gone; begin again to go on with what is missing")
-    error = future.exception()
-    if error is None:
-        found: list[Values] = future.result()
-        return found
-    text = f"{type(error).__name__}: {error}"
-    return [failed(task.subject, row, text) for row in task.rows]
+class _Flights:
+    """Tasks on their way through the workers: iterate for the rows of each, in the order in which they come back."""
+
+    def __init__(self, tasks: Iterator[Task], work: Work, workers: Workers, progress: Progress) -> None:
+        self._tasks = tasks
+        self._work = work
+        self._workers = workers
+        self._progress = progress
+        self._flying: dict[Future[list[Values]], Task] = {}
+        self._again: deque[Task] = deque()
+        self._suspects: deque[Task] = deque()
+        """In flight as a worker died: each flies alone, so that one that kills its worker shows."""
+        self._is_alone = False
+        self._failures: Counter[Task] = Counter()
+
+    def __iter__(self) -> Iterator[list[Values]]:
+        while self._launch():
+            finished, _ = wait(self._flying, return_when=FIRST_COMPLETED)
+            for future in finished:
+                if future not in self._flying:
+                    continue  # lost with the worker of another
+                if future.cancelled():
+                    raise LogError("sweep: the scheduler is gone; begin again to go on with what is missing")
+                error = future.exception()
+                if isinstance(error, BrokenExecutor):
+                    yield from self._land_broken()
+                    continue
+                task = self._flying.pop(future)
+                if error is None:
+                    yield future.result()
+                else:
+                    yield from self._fail(task, f"{type(error).__name__}: {error}", self._again)
+
+    def _launch(self) -> bool:
+        """Begin as many tasks as there is room for; return whether any is in flight."""
+        if not self._flying:
+            self._is_alone = bool(self._suspects)
+        room = 1 if self._is_alone or self._suspects else self._workers.room
+        while len(self._flying) < room and (task := self._next()) is not None:
+            try:
+                future = self._workers.submit(self._work, task)
+            except BrokenExecutor:  # a worker died before it had work
+                self._workers.restart()
+                future = self._workers.submit(self._work, task)
+            self._flying[future] = task
+        return bool(self._flying)
+
+    def _next(self) -> Task | None:
+        for waiting in (self._suspects, self._again):
+            if waiting:
+                return waiting.popleft()
+        return next(self._tasks, None)
+
+    def _land_broken(self) -> Iterator[list[Values]]:
+        """Take the tasks out of flight that ended as a worker died."""
+        self._progress("a worker process has died: killed, or out of memory")
+        self._workers.restart()
+        wait(self._flying)
+        lost = [future for future in self._flying if isinstance(future.exception(), BrokenExecutor)]
+        tasks = [self._flying.pop(future) for future in lost]
+        if len(tasks) > 1:
+            self._suspects.extend(tasks)
+        else:
+            yield from self._fail(tasks[0], "the worker process died each time", self._suspects)
+
+    def _fail(self, task: Task, error: str, again: deque[Task]) -> Iterator[list[Values]]:
+        """Try a task again, or give rows that say why it failed."""
+        self._failures[task] += 1
+        if self._failures[task] <= RETRIES:
+            again.append(task)
+        else:
+            yield [failed(task.subject, row, error) for row in task.rows]
 
 
 def _describe(computed: int, wanted: int, failures: int, elapsed_s: float) -> str:

@@ -93,12 +93,12 @@ def tune(
     ]
     own, *outcomes = replay_all(logs, [{}, *changes], progress)
     judged = [
-        Candidate(name_of(filter_and_gain), change, choice, outcome, _problems(choice, outcome, own, rate_per_h))
+        Candidate(name_of(filter_and_gain), change, choice, outcome, problems_of(choice, outcome, own, rate_per_h))
         for filter_and_gain, change, choice, outcome in zip(tried, changes, choices, outcomes, strict=True)
     ]
     if len(judged) > 1 and judged[0].choice.extrapolation > FARTHEST:
         notes.append(f"a rate of {rate_per_h:g} per hour is too far from this motion to choose filter and gain by it")
-    return Tuning(rate_per_h, tuple(logs), own, tuple(judged), _best(judged), tuple(detectors), tuple(notes))
+    return Tuning(rate_per_h, tuple(logs), own, tuple(judged), best_of(judged), tuple(detectors), tuple(notes))
 
 
 def _choices(
@@ -154,7 +154,7 @@ def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
     )
 
 
-def _problems(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_per_h: float) -> tuple[str, ...]:
+def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_per_h: float) -> tuple[str, ...]:
     """Say why a candidate is not fit."""
     problems = []
     if choice.calibration is None:
@@ -170,7 +170,7 @@ def _problems(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_p
     return tuple(problems)
 
 
-def _best(judged: Sequence[Candidate]) -> Candidate | None:
+def best_of(judged: Sequence[Candidate]) -> Candidate | None:
     """Return the fit candidate with the smallest median delay of the half that thresholds are chosen on.
 
     Of a rate that is extrapolated too far, only the logs' own filter and gain, which come first, are looked at.

@@ -90,11 +90,11 @@ def thresholds_as_changes(settings: Settings, thresholds: Vector) -> Changes:
 
 def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progress: Progress) -> list[Observed]:
     """Replay the logs with every candidate. Raises LogError, ConfigError, CodecError."""
-    gathered: list[list[_Shown]] = [[] for _ in tried]
+    gathered: list[list[ShownLog]] = [[] for _ in tried]
     for log in logs:
         progress(f"replaying {log.path} with {len(tried)} filters and gains")
         variants = [_monitoring(apply_settings(log.settings, changes)) for changes in tried]
-        shown = [_Shown(log, settings) for settings in variants]
+        shown = [ShownLog(log, settings) for settings in variants]
         replay_many(log.path, variants, progress, watch=_show_to(shown), stretch=log.stretch)
         for place, one in enumerate(shown):
             gathered[place].append(one)
@@ -110,7 +110,7 @@ def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progr
     ]
 
 
-def _show_to(shown: "Sequence[_Shown]") -> Watch:
+def _show_to(shown: "Sequence[ShownLog]") -> Watch:
     return lambda place, ticks, batch: shown[place].take(ticks, batch)
 
 
@@ -127,7 +127,7 @@ def _monitoring(settings: Settings) -> Settings:
     return dataclasses.replace(settings, detector=dataclasses.replace(settings.detector, threshold_Nm=thresholds))
 
 
-class _Shown:
+class ShownLog:
     """What one candidate shows on one log of N cycles, stretch by stretch."""
 
     def __init__(self, log: TunedLog, settings: Settings) -> None:

@@ -26,19 +26,19 @@ from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
-from adacd_hil.log.frames.frame_log import ERROR_FLAG
 from adacd_hil.log.frames.mcap_frames import FrameWriter, McapFrames, RecordedFrame
 from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import MOST_BYTES
 from adacd_hil.log.types.message_types import MAX_DATA
 from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE
+from adacd_hil.terminal import in_line
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 
 class McapReader(BinaryIOMessageReader):
     """The messages of an MCAP file, in its order; of a log of ours all parts.
 
-    `problem` names afterwards the missing data, "" for a whole file.
+    `problem` names afterwards the missing data, "" for a whole file. It is also logged as a warning.
     """
 
     def __init__(self, file: Any, **_: Any) -> None:
@@ -59,6 +59,8 @@ class McapReader(BinaryIOMessageReader):
     def __iter__(self) -> Generator[can.Message, None, None]:
         for frames in self._frames:
             yield from to_messages(frames, self._frames.channels, self._frames.epoch_ns)
+        if self.problem:  # for the terminal of python-can's tools, which know no `problem`
+            logging.getLogger(__name__).warning("%s", in_line(self.problem))
         self.stop()
 
 
@@ -224,6 +226,10 @@ def _asc_lines(lines: Iterable[str], is_relative: bool) -> Iterator[str]:
         yield line
 
 
+_ERROR_FLAG = 0x20000000
+"""Of a candump log's identifiers: CAN_ERR_FLAG of the kernel."""
+
+
 class _CandumpReader(can.CanutilsLogReader):
     """python-can's, but a line that is no frame ends nothing, and error frames keep their class.
 
@@ -255,7 +261,7 @@ class _CandumpReader(can.CanutilsLogReader):
             self._number += 1
             error = re.search(r" ([23][0-9A-Fa-f]{7})#", self._line)
             self._is_error = error is not None
-            line = self._line.replace(error[0], f" {int(error[1], 16) & ~ERROR_FLAG:08X}#") if error else self._line
+            line = self._line.replace(error[0], f" {int(error[1], 16) & ~_ERROR_FLAG:08X}#") if error else self._line
             yield re.sub(r"(#[0-9A-Fa-f]{16})_[0-9A-Fa-f]", r"\1", line)  # a raw DLC, which means 8
 
 

@@ -6,12 +6,11 @@ TRC, CSV and MF4 from 1970; ASC from its beginning.
 
 A line of a candump log, `candump -L`, is `(1436509052.249713) vcan0 044#2A366C2BBA`. An identifier of 8 digits is a
 29-bit one; with bit 0x20000000 it is an error frame and the rest its class. ` T` and ` R` at the end say sent and
-received, as python-can and `candump -x` write them; they are written if asked for, because Wireshark takes no file that
-has them. Source: can-utils, lib.h.
+received, as python-can and `candump -x` write them; without them all frames count as received. Source: can-utils,
+lib.h.
 """
 
 import importlib.util
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
@@ -65,33 +64,3 @@ def read_frames(path: Path) -> FrameLog:
     source = open_frames(path)
     pieces = [np.zeros(0, RECORDED_FRAME_DTYPE), *source]
     return FrameLog(tuple(source.channels), np.concatenate(pieces), source.epoch_ns, source.problem)
-
-
-ERROR_FLAG = 0x20000000
-_RATE_SWITCH = 1
-_ERROR_STATE = 2
-
-
-def candump_channel(name: str) -> str:
-    """Spell a channel for a line; a number is that of an interface, as in python-can."""
-    spelled = re.sub(r"\s+", "_", name)
-    return f"can{spelled}" if spelled.isdecimal() or not spelled else spelled
-
-
-def candump_line(row: Any, channel: str, epoch_ns: int = 0, has_direction: bool = False) -> str:
-    """Write a row of RECORDED_FRAME_DTYPE, its time cut to the µs that canplayer reads."""
-    seconds, rest_ns = divmod(int(row["t_ns"]) + epoch_ns, 1_000_000_000)
-    can_id, length = int(row["can_id"]), int(row["length"])
-    if row["is_error"]:
-        identifier = f"{ERROR_FLAG | can_id:08X}"
-    else:
-        identifier = f"{can_id:08X}" if row["is_extended"] else f"{can_id:03X}"
-    if row["is_remote"]:
-        content = f"R{length or ''}"
-    else:
-        content = row["data"][:length].tobytes().hex().upper()
-        if row["is_fd"] and not row["is_error"]:
-            flags = _RATE_SWITCH * bool(row["has_rate_switch"]) | _ERROR_STATE * bool(row["has_error_state"])
-            content = f"#{flags:X}{content}"
-    way = (" T" if row["is_tx"] else " R") if has_direction else ""
-    return f"({seconds}.{rest_ns // 1000:06d}) {channel} {identifier}#{content}{way}\n"

@@ -9,7 +9,6 @@ file is the one that mcap's writer would make, byte for byte.
 """
 
 import struct
-import zlib
 from collections.abc import Iterable
 from typing import Protocol
 
@@ -38,7 +37,7 @@ from numpy.typing import NDArray
 
 from adacd_hil import __version__
 from adacd_hil.log.log_files import PRODUCT
-from adacd_hil.log.mcap.mcap_records import INDEX_ENTRY, MAGIC
+from adacd_hil.log.mcap.mcap_records import INDEX_ENTRY, MAGIC, crc32
 
 LIBRARY = f"{PRODUCT} {__version__}; {LIBRARY_IDENTIFIER}"
 CHUNK_BYTES = 256 * 1024
@@ -89,7 +88,7 @@ class ChunkedFile:
 
     def _put(self, data: bytes, packets: int = 0) -> None:
         """Write a part of the data section, which completes so many packets."""
-        self._crc = zlib.crc32(data, self._crc)
+        self._crc = crc32(data, self._crc)
         self._target.write(data, packets)
 
     def attach(self, attachment: Attachment) -> None:
@@ -178,7 +177,7 @@ class ChunkedFile:
             data=compressed,
             message_start_time=int(entries["log_time"].min()),
             message_end_time=int(entries["log_time"].max()),
-            uncompressed_crc=zlib.crc32(self._chunk),
+            uncompressed_crc=crc32(self._chunk),
             uncompressed_size=len(self._chunk),
         )
         offset = self._target.tell()
@@ -242,7 +241,7 @@ class ChunkedFile:
         footer = Footer(
             summary_start=start,
             summary_offset_start=offset_start,
-            summary_crc=zlib.crc32(footer_head, zlib.crc32(data)),
+            summary_crc=crc32(footer_head, crc32(data)),
         )
         self._target.write(data + encode(footer) + MAGIC)
 

@@ -34,6 +34,7 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+from zlib_ng import zlib_ng
 
 from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError
@@ -82,12 +83,8 @@ def fits(opcode: int, length: int, read: Callable[[int, int], bytes]) -> bool:
     return position == length
 
 
-try:
-    from zlib_ng import zlib_ng as fast_zlib  # six times as fast, which saves a sixth of the time to read a log
-except ImportError:
-    import zlib as fast_zlib  # type: ignore[no-redef]
-
-crc32: Callable[..., int] = fast_zlib.crc32
+crc32: Callable[..., int] = zlib_ng.crc32
+"""Six times as fast as zlib's, which saves a sixth of the time to read a log."""
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
 RECORD_HEAD_BYTES = HEAD.size

@@ -11,7 +11,7 @@ their mean, with x or without, each sum says how likely the samples are:
 
 The model lacks a torque by place if x makes them e^GAIN times likelier, leaves less than 1 - SHARE of the weighted
 squares that the basic model leaves, and comes to LEAST_NM rms. Of clean arms, with every error of
-`tools/error_campaign.py` but a tilt and a cable, the gain was -25 to -3, or the share below 0.4; tilts of 0.5 and 1
+the error campaign but a tilt and a cable, the gain was -25 to -3, or the share below 0.4; tilts of 0.5 and 1
 deg and a cable of 0.1 Nm came to a gain of 20 and more on a motion that shows them.
 
 Asked of an adaptation as a whole, when it refuses a fit. A torque by place is asked for while the arm monitors, too: of

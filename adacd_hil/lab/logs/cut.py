@@ -1,0 +1,98 @@
+"""A stretch of a sound log: of our own logs whole cycles, by their publish_time, of others' messages by their log_time.
+
+Times count from the first of them in the log. A log of which anything is lost is recovered first.
+"""
+
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from mcap.records import Attachment
+from numpy.typing import NDArray
+
+from adacd_hil.lab.logs.log_copy import LogCopy
+from adacd_hil.lab.logs.salvaged_log import SalvagedLog
+from adacd_hil.log.log_files import CUT, RUN_METADATA, LogError, TimeWindow
+from adacd_hil.log.mcap.chunks import Contents
+from adacd_hil.log.reader import LoggedContact, read_log
+
+
+class Cut(NamedTuple):
+    """The result of `cut`."""
+
+    path: Path
+    out: Path
+    stretch: TimeWindow
+    messages: int
+
+
+def default_out(path: Path) -> Path:
+    """Name the result of cutting `path`."""
+    return path.with_name(f"{path.stem}.{CUT}{path.suffix}")
+
+
+def find_contact(path: Path, contact: int, around_s: float) -> TimeWindow:
+    """Return the stretch around the contact of this number, from 1, of a log. Raises LogError."""
+    log = read_log(path, ("/contact",))
+    begun = contacts_begun(log.contacts)
+    if not 1 <= contact <= len(begun):
+        raise LogError(f"log {path} has {len(begun)} contacts: there is no contact {contact}")
+    at_s = (begun[contact - 1].t_ns + log.epoch_ns - _start_ns(path)) * 1e-9
+    return TimeWindow(at_s - around_s, at_s + around_s)
+
+
+def contacts_begun(contacts: Iterable[LoggedContact]) -> list[LoggedContact]:
+    """Take the first report of each contact: all reports of one name the cycle in which it began."""
+    begun: dict[int, LoggedContact] = {}
+    for contact in contacts:
+        begun.setdefault(contact.report.cycle, contact)
+    return list(begun.values())
+
+
+def _start_ns(path: Path) -> int:
+    """Return the time of the first message."""
+    log = SalvagedLog(path)
+    contents = (item for item in log if not isinstance(item, Attachment) and len(item.starts))
+    return int(_times(log, next(contents))[0])
+
+
+def cut(
+    path: Path,
+    out: Path,
+    stretch: TimeWindow,
+    topics: Collection[str] = (),
+    progress: Callable[[str], None] = lambda _: None,
+) -> Cut:
+    """Cut a stretch out of the log whose first part is `path`, of all topics or of `topics`.
+
+    Raises LogError when the log is damaged, when nothing is in the stretch, or when `out` is the log itself.
+    """
+    log = SalvagedLog(path, progress)
+    known = set()
+    with LogCopy(out, log, frozenset(topics) or None) as copy:
+        bounds_ns: tuple[int, int] | None = None
+        for item in log:
+            if isinstance(item, Attachment):
+                copy.attach(item)
+                continue
+            times = _times(log, item)
+            if bounds_ns is None and len(times):
+                bounds_ns = stretch.bounds_ns(int(times[0]))
+            first_ns, end_ns = bounds_ns or (0, 0)
+            known |= {channel.topic for channel in log.definitions.channels.values()}
+            copy.add(item, (times >= first_ns) & (times < end_ns))
+        if losses := log.losses.describe():
+            what = log.losses.notes[0] if log.losses.notes else f"{path} lacks {losses}"
+            raise LogError(f"{what}: recover the log first")
+        if unknown := sorted(set(topics) - known):
+            raise LogError(f"log {path} has no topic {', '.join(unknown)}; it has {', '.join(sorted(known))}")
+        if not copy.messages:
+            raise LogError(f"log {path} has no message from {stretch.start_s:g} to {stretch.end_s:g} s")
+        copy.finish(CUT, {"from_s": f"{stretch.start_s:.9g}", "until_s": f"{stretch.end_s:.9g}"})
+    return Cut(path, out, stretch, copy.messages)
+
+
+def _times(log: SalvagedLog, contents: Contents) -> NDArray[np.int64]:
+    is_ours = RUN_METADATA in log.metadata
+    return (contents.publish_times if is_ours else contents.log_times).astype(np.int64)

@@ -1,0 +1,96 @@
+"""The trusted records of all parts of a log, for `recover` and `cut`: see salvage.py."""
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+from mcap.records import Attachment, Metadata
+
+from adacd_hil.log.log_files import (
+    CONTINUED,
+    DROPPED_KEY,
+    ENDING_KEY,
+    PART_KEY,
+    RUN_METADATA,
+    SUMMARY_METADATA,
+    LogError,
+    part_path,
+    parts_of,
+    summary_count,
+)
+from adacd_hil.log.mcap.chunks import Contents
+from adacd_hil.log.mcap.mcap_records import Definitions
+from adacd_hil.log.salvage import Losses, Salvage
+
+
+class SalvagedLog:
+    """Iterate once for attachments, of each name the first, and chunks; then `losses` says what is missing.
+
+    `metadata`, by name the first of each, and `definitions`, those of the present part, fill up on the way. Iterating
+    raises LogError when a file can't be read, or when nothing in the log can be trusted.
+    """
+
+    def __init__(self, path: Path, progress: Callable[[str], None] = lambda _: None) -> None:
+        self.path = path
+        self.parts = parts_of(path)
+        self.definitions = Definitions()
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: set[str] = set()
+        self.losses = Losses()
+        self.dropped = 0
+        """Packets that the parts say are not in them."""
+        self.ending = ""
+        """Of the last part, as it says."""
+        self._progress = progress
+        self._is_run_vouched = False
+
+    def __iter__(self) -> Iterator[Attachment | Contents]:
+        has_messages = False
+        foreign = []
+        for part in self.parts.values():
+            self._progress(f"reading {part.name}")
+            salvage = Salvage(part)
+            self.definitions, self.ending = salvage.definitions, ""
+            for item in salvage:
+                if isinstance(item, Metadata):
+                    if self._is_foreign(item, salvage.is_vouched):
+                        foreign.append(f"{part.name} (of another run)")
+                        break
+                    self._take_metadata(item, salvage.is_vouched)
+                elif isinstance(item, Attachment):
+                    if item.name not in self.attachments:
+                        self.attachments.add(item.name)
+                        yield item
+                else:
+                    has_messages |= len(item.starts) > 0 and bool(self.definitions.channels)
+                    yield item
+            else:
+                self.losses.add(salvage.losses)
+        if not (has_messages or self.attachments or self.metadata):
+            raise LogError(f"{self.path}: nothing to save")
+        self.losses.missing_parts = [*self._missing(), *foreign]
+
+    def _is_foreign(self, item: Metadata, is_vouched: bool) -> bool:
+        """Say whether a part is of another run: one damaged entry doesn't make it so."""
+        if item.name != RUN_METADATA:
+            return False
+        mine, theirs = (
+            {pair for pair in table.items() if pair[0] != PART_KEY}
+            for table in (self.metadata.get(RUN_METADATA, item.metadata), item.metadata)
+        )
+        return mine != theirs and ((self._is_run_vouched and is_vouched) or len(mine - theirs) > 1)
+
+    def _take_metadata(self, item: Metadata, is_vouched: bool) -> None:
+        if item.name == SUMMARY_METADATA:
+            self.dropped += summary_count(item.metadata, DROPPED_KEY)
+            self.ending = item.metadata.get(ENDING_KEY, "")
+        elif item.name not in self.metadata:
+            self.metadata[item.name] = item.metadata
+            self._is_run_vouched |= is_vouched and item.name == RUN_METADATA
+
+    def _missing(self) -> Iterator[str]:
+        """Name the parts that are not there."""
+        for before, after in pairwise((-1, *self.parts)):
+            yield from (part_path(self.path, gap).name for gap in range(before + 1, after))
+        if self.ending == CONTINUED:
+            yield part_path(self.path, max(self.parts) + 1).name

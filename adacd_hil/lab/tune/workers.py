@@ -1,0 +1,208 @@
+"""The computing side of a sweep: processes of this machine, or a Dask cluster, behind one interface.
+
+Whoever reaches the port of a Dask scheduler has it run whatever he sends, as the user that started it. So a cluster is
+addressed by tls:// with certificates, as Dask names them. Dask checks who signed a certificate, not for which host. The
+processes of this machine have no port.
+"""
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import ssl
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing import forkserver
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.log.log_files import LogError
+from adacd_hil.remedies import install_command
+from adacd_hil.settings.schema import ConfigError
+
+TLS = "tls://"
+TIMEOUT_S = 10
+_IN_FLIGHT = 4
+"""Tasks per worker of a cluster, so that none waits for the client."""
+_PATIENCE_S = 2.0
+"""For a process that is asked to end, and may be in compiled code."""
+
+
+class TlsFiles(NamedTuple):
+    """Files in PEM format; Dask's configuration, `distributed.comm.tls`, gives those that are None."""
+
+    ca_file: Path | None = None
+    cert: Path | None = None
+    key: Path | None = None
+
+
+NO_FILES = TlsFiles()
+
+
+class Workers(Protocol):
+    """Processes that compute, wherever they are."""
+
+    @property
+    def room(self) -> int:
+        """How many tasks may be with them at a time."""
+
+    def submit(self, work: Callable[..., Any], task: Any) -> "Future[Any]":
+        """Begin a task. Its future, or this call, raises BrokenExecutor when a process has died."""
+
+    def restart(self) -> None:
+        """Begin anew after a process has died."""
+
+
+@contextlib.contextmanager
+def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple[str, ...] = ()) -> Iterator[Workers]:
+    """Give the workers of a Dask scheduler at an address, or, where that is empty, so many processes of this machine.
+
+    preload: modules that the processes import before they are asked for work.
+
+    Raises ConfigError when the certificates can't be used, LogError when nobody answers.
+    """
+    if not scheduler:
+        pool = ProcessWorkers(count, preload)
+        try:
+            yield pool
+        finally:
+            pool.end()
+        return
+    try:
+        from distributed import Client
+    except ImportError:
+        raise LogError(f"--scheduler needs dask: {install_command('sweep')}") from None
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what happens to workers shows in the rows
+    security = _security_of(scheduler, tls)
+    try:
+        client = Client(scheduler, timeout=TIMEOUT_S, set_as_default=False, security=security)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise LogError(f"no Dask scheduler at {scheduler}: {' '.join(str(error).split())}") from None
+    with client:
+        yield DaskWorkers(client)
+
+
+class DaskWorkers:
+    """The workers of a Dask scheduler. It gives the task of a worker that has died to another."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._executor = client.get_executor(pure=False)
+
+    @property
+    def room(self) -> int:
+        """How many tasks may be with them at a time."""
+        return _IN_FLIGHT * max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+
+    def submit(self, work: Callable[..., Any], task: Any) -> "Future[Any]":
+        """Begin a task."""
+        future: Future[Any] = self._executor.submit(work, task)
+        return future
+
+    def restart(self) -> None:
+        """Do nothing: the scheduler does."""
+
+
+class ProcessWorkers:
+    """Processes of this machine. They ignore Ctrl-C; this process ends them, and they end when it has gone."""
+
+    def __init__(self, count: int, preload: tuple[str, ...]) -> None:
+        self.room = count
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload([__name__, *preload])
+        self._others = set(multiprocessing.active_children())
+        self._pool = self._open()
+
+    def _open(self) -> ProcessPoolExecutor:
+        with _ignoring_interrupts():  # as do the processes that it forks, from their first moment
+            forkserver.ensure_running()
+        return ProcessPoolExecutor(self.room, self._context, initializer=_begin)
+
+    def submit(self, work: Callable[..., Any], task: Any) -> "Future[Any]":
+        """Begin a task."""
+        return self._pool.submit(work, task)
+
+    def restart(self) -> None:
+        """Begin anew after a process has died."""
+        self.end()
+        self._pool = self._open()
+
+    def end(self) -> None:
+        """End all processes, whatever they do."""
+        processes: set[BaseProcess] = set(multiprocessing.active_children()) - self._others
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.terminate()
+        clock = MonotonicClock()
+        latest_ns = clock.now_ns() + round(_PATIENCE_S * 1e9)
+        for process in processes:
+            process.join(max(0.0, (latest_ns - clock.now_ns()) * 1e-9))
+            process.kill()
+        self._pool.shutdown()
+
+
+@contextlib.contextmanager
+def _ignoring_interrupts() -> Iterator[None]:
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _begin() -> None:
+    """Prepare a process: asked to end, it puts away what it has begun."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+        threading.Event().wait(_PATIENCE_S)
+        os._exit(1)
+
+
+def _security_of(scheduler: str, tls: TlsFiles) -> Any:
+    """Read the certificates for an address; None where it is not of TLS. Raises ConfigError."""
+    from distributed.security import Security
+
+    if not scheduler.startswith(TLS):
+        if any(tls):
+            raise ConfigError(f"--tls-ca-file, --tls-cert and --tls-key are for {TLS} addresses, not {scheduler}")
+        return None
+    try:
+        security = Security(require_encryption=True, **_given(tls))
+    except (ImportError, ValueError) as error:
+        raise ConfigError(f"TLS can't be used: {error}") from None
+    used = {"CA file": security.tls_ca_file, "certificate": security.tls_client_cert, "key": security.tls_client_key}
+    for name, option in (("CA file", "--tls-ca-file"), ("certificate", "--tls-cert")):
+        if not used[name]:
+            raise ConfigError(f"{scheduler} needs {option}, or Dask's configuration of distributed.comm.tls")
+    try:
+        security.get_connection_args("client")
+    except (OSError, ValueError) as error:
+        reason = error.reason if isinstance(error, ssl.SSLError) else getattr(error, "strerror", None) or error
+        named = ", ".join(f"{name} {value}" for name, value in used.items() if value and "\n" not in value)
+        raise ConfigError(f"TLS can't be used: {reason} ({named})") from None
+    return security
+
+
+def _given(tls: TlsFiles) -> dict[str, str | None]:
+    """Name what doesn't come from Dask's configuration. Raises ConfigError."""
+    if tls.key is not None and tls.cert is None:
+        raise ConfigError("--tls-key needs --tls-cert, the certificate that it belongs to")
+    given: dict[str, str | None] = {}
+    if tls.ca_file is not None:
+        given["tls_ca_file"] = str(tls.ca_file)
+    if tls.cert is not None:  # with its own key, never with the configuration's
+        given["tls_client_cert"] = str(tls.cert)
+        given["tls_client_key"] = None if tls.key is None else str(tls.key)
+    return given

@@ -1,0 +1,214 @@
+"""Measures which lines of the code that runs on an arm, and replays it, the reference runs and five faults reach.
+
+    python tools/campaigns/reached_lines.py -j 2  the share, by package, and the files with the most lines not reached
+    python tools/campaigns/reached_lines.py --functions      and every function that no run enters
+    python tools/campaigns/reached_lines.py paper-quick lose-feedback     these runs alone
+
+Plays each run of `tests/reference` and five scenarios of the emulator without compilation, the log's writer included,
+then replays each log and the stored one. A line counts once it was executed; importing a module reaches the lines that
+define its functions, so the share of lines within functions is told apart. Neither the emulator nor what a run and its
+replay do without (`LEFT_OUT`) counts.
+
+Coverage.py is in no lock. Where it can't be imported, pip fetches it into a folder that is removed.
+Exit status: 0 measured, 1 a run or a replay failed, 2 wrong usage.
+"""
+
+import argparse
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from campaign_loop import add_jobs, play_trials
+
+from adacd_hil.cli.embedded_run import resolve, run_embedded
+from adacd_hil.cli.output import format_table
+from adacd_hil.log.log_files import LOG_NAME
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "reference")]
+
+import reference_runs  # noqa: E402 (it is the tests')
+
+COVERAGE = "coverage==7.17.5"
+FAULTS = ("corrupt-torque", "drive-fault-and-recovery", "lose-feedback", "power-loss-and-return", "stuck-torque")
+STORED_LOG = ROOT / "tests" / "reference" / "logs" / "recovery.mcap"
+LEFT_OUT = ("adacd_hil/lab/", "adacd_hil/api.py", "adacd_hil/cli/completion.py")
+_MOST_FILES = 25
+
+
+class Reached(NamedTuple):
+    """Lines that are reached, and all there are."""
+
+    reached: int
+    lines: int
+
+    @property
+    def percent(self) -> str:
+        """The share in words."""
+        return f"{100 * self.reached / max(self.lines, 1):.1f} %"
+
+
+class Played(NamedTuple):
+    """What came of a run: its error, empty where there is none."""
+
+    name: str
+    error: str
+
+
+def main() -> int:
+    """Play, measure, print."""
+    known = [*reference_runs.names(), *FAULTS]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="reference runs or scenarios; default: all")
+    parser.add_argument("--functions", action="store_true", help="name the functions that no run enters")
+    parser.add_argument("--json", type=Path, help="write Coverage.py's report to this file, too")
+    add_jobs(parser)
+    arguments = parser.parse_args()
+    for name in arguments.names:
+        if name not in known:
+            parser.error(f"no run {name!r}; there are {', '.join(known)}")
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        environment = _environment(folder)
+        trials = [*(arguments.names or known), str(STORED_LOG)]
+        played = list(play_trials(partial(_play_apart, environment=environment), trials, arguments.jobs, _line))
+        failed = [each for each in played if each.error]
+        report = _report(folder, environment)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(report), encoding="utf-8")
+    _print(report, arguments.functions)
+    for each in failed:
+        print(f"{each.name}: {each.error}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def play(name: str, folder: Path) -> Path:
+    """Play a reference run, or a scenario with the certified scheme, and give its log."""
+    if name in reference_runs.names():
+        reference_runs.play(name, folder)
+    else:
+        run_embedded(resolve("certified", name, None, None), "lockstep", folder)
+    return folder / LOG_NAME
+
+
+def replay(log: Path) -> None:
+    """Replay a log by the command; it ends this process unless the decisions are the same."""
+    from adacd_hil.cli.main import main as host
+
+    sys.argv = ["adacd-hil", "replay", str(log)]
+    host()
+
+
+def _play_apart(name: str, environment: dict[str, str]) -> Played:
+    """Play and replay a run, or replay a log, in a process that is measured."""
+    with tempfile.TemporaryDirectory() as scratch:
+        is_log = name.endswith(".mcap")
+        log = repr(name) if is_log else f"reached_lines.play({name!r}, Path({scratch!r}))"
+        program = f"import reached_lines; from pathlib import Path; reached_lines.replay(Path({log}))"
+        done = subprocess.run(
+            [sys.executable, "-c", program], env=environment, cwd=ROOT, capture_output=True, text=True, check=False
+        )
+    said = done.stderr.strip().splitlines() or [""]
+    return Played(Path(name).stem, f"exit status {done.returncode}: {said[-1]}" if done.returncode else "")
+
+
+def _line(played: Played) -> str:
+    return f"{played.name} {played.error or 'played, and replayed the same'}"
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    """Give processes what measures them: Coverage.py begins with the interpreter, in the log's writer as well."""
+    packages = folder / "packages"
+    packages.mkdir()
+    if importlib.util.find_spec("coverage") is None:
+        command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        subprocess.run([*command, "--target", str(packages), COVERAGE], check=True)
+    settings = folder / "coveragerc"
+    (packages / "sitecustomize.py").write_text("import coverage\ncoverage.process_startup()\n", encoding="utf-8")
+    settings.write_text(
+        f"[run]\nparallel = true\nsource = {ROOT / 'adacd_hil'}\ndata_file = {folder / 'data'}\n"
+        "disable_warnings = no-data-collected,module-not-measured,module-not-imported\n",
+        encoding="utf-8",
+    )
+    paths = [packages, ROOT, ROOT / "tools" / "campaigns", ROOT / "tests", ROOT / "tests" / "reference"]
+    return {
+        **os.environ,
+        "NUMBA_DISABLE_JIT": "1",
+        "COVERAGE_PROCESS_START": str(settings),
+        "PYTHONPATH": os.pathsep.join(map(str, paths)),
+    }
+
+
+def _report(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
+    """Join what the processes have measured."""
+    own = {key: value for key, value in environment.items() if key != "COVERAGE_PROCESS_START"}
+    program = [sys.executable, "-m", "coverage"]
+    settings = f"--rcfile={folder / 'coveragerc'}"
+    report = folder / "report.json"
+    for words in (["combine", "--quiet", settings], ["json", "--quiet", settings, "-o", str(report)]):
+        subprocess.run([*program, *words], env=own, cwd=ROOT, check=True)
+    found: dict[str, Any] = json.loads(report.read_text(encoding="utf-8"))
+    return found
+
+
+def is_counted(path: str) -> bool:
+    """Tell whether a file, named from the root, belongs to what runs on an arm or replays it."""
+    return not path.startswith(LEFT_OUT)
+
+
+def _functions(files: dict[str, Any]) -> Iterator[tuple[str, str, Reached]]:
+    """Give file, name and lines of each function."""
+    for path, file in files.items():
+        for name, function in file["functions"].items():
+            if name:
+                summary = function["summary"]
+                yield path, name, Reached(summary["covered_lines"], summary["num_statements"])
+
+
+def _print(report: dict[str, Any], names_functions: bool) -> None:
+    files = {path: file for path, file in report["files"].items() if is_counted(path)}
+    lines = {path: _of(file["summary"]) for path, file in files.items()}
+    functions = list(_functions(files))
+    within = _sum(reached for _, _, reached in functions)
+    whole = _sum(lines.values())
+    print(f"{whole.percent} of {whole.lines} lines reached; within functions {within.percent} of {within.lines}")
+    packages: dict[str, list[Reached]] = {}
+    for path, reached in lines.items():
+        packages.setdefault(str(Path(path).parent), []).append(reached)
+    rows = [[name, *_cells(_sum(each))] for name, each in sorted(packages.items())]
+    print("\n" + format_table(["package", "reached", "lines", "not"], rows))
+    missing = sorted(lines.items(), key=lambda item: item[1].reached - item[1].lines)
+    rows = [[path, *_cells(reached)] for path, reached in missing[:_MOST_FILES]]
+    print("\n" + format_table(["file", "reached", "lines", "not"], rows))
+    never = [(path, name, reached) for path, name, reached in functions if reached.lines and not reached.reached]
+    print(f"\n{len(never)} of {len(functions)} functions never entered, {sum(each.lines for *_, each in never)} lines")
+    if names_functions:
+        count = Counter(path for path, *_ in never)
+        for path, _ in count.most_common():
+            inside = ", ".join(f"{name} ({reached.lines})" for other, name, reached in never if other == path)
+            print(f"{path}: {inside}")
+
+
+def _of(summary: dict[str, int]) -> Reached:
+    return Reached(summary["covered_lines"], summary["num_statements"])
+
+
+def _sum(parts: Any) -> Reached:
+    kept = list(parts)
+    return Reached(sum(each.reached for each in kept), sum(each.lines for each in kept))
+
+
+def _cells(reached: Reached) -> list[str]:
+    return [reached.percent, str(reached.lines), str(reached.lines - reached.reached)]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
