@@ -1,4 +1,4 @@
-"""The truth of a run from the emulator's log: all of its cycles, or of a long one those of contacts; its true contacts.
+"""The truth of a run from the emulator's log: the cycles of its contacts, the model of the arm, its true contacts.
 
 Of a contact the first cycles and the last second are kept as they are. In between, of every `_BUCKET` cycles those
 with the smallest and largest torque of each joint and the largest force; that many contacts of many seconds fit in
@@ -95,10 +95,10 @@ _ROW: Final = np.dtype(
 _MODEL: Final = ("payload", "theta")
 
 
-def read_truth(path: Path, most_rows: int) -> TruthTable:
-    """Read the emulator's log; of one with more than `most_rows` cycles the contacts. Raises LogError."""
+def read_truth(path: Path) -> TruthTable:
+    """Read the contacts from the emulator's log, with the cycle after each. Raises LogError."""
     stream = LogStream(path, ("/truth",))
-    rows = _Gathering(most_rows)
+    rows = _Gathering()
     for piece in stream:
         rows.add(piece.series["/truth"])
     return rows.done(stream)
@@ -107,11 +107,8 @@ def read_truth(path: Path, most_rows: int) -> TruthTable:
 class _Gathering:
     """Takes in the records of /truth, piece by piece."""
 
-    def __init__(self, most_rows: int) -> None:
-        self.count = 0
-        self._most_rows = most_rows
+    def __init__(self) -> None:
         self._has_force = True
-        self._is_long = False
         self._kept: list[NDArray[Any]] = []
         self._kept_rows = 0
         self._contact = _OneContact(_BEGINNING[0])
@@ -127,16 +124,7 @@ class _Gathering:
         rows = self._rows(truth)
         self._first = rows[:1] if self._first is None else self._first
         self._add_models(truth, rows)
-        self.count += len(rows)
-        if not self._is_long and self.count > self._most_rows:
-            self._is_long = True
-            held, self._kept = [*self._kept, rows], []
-            for part in held:
-                self._add_contacts(part)
-        elif self._is_long:
-            self._add_contacts(rows)
-        else:
-            self._kept.append(rows)
+        self._add_contacts(rows)
         self._last = rows[-1:]
 
     def _rows(self, truth: Series) -> NDArray[Any]:
@@ -186,9 +174,7 @@ class _Gathering:
 
     def done(self, stream: LogStream) -> TruthTable:
         """Give what was kept."""
-        if self._is_long:
-            self._kept.append(self._contact.rows())
-        rows = np.concatenate([np.zeros(0, _ROW), *self._kept])
+        rows = np.concatenate([np.zeros(0, _ROW), *self._kept, self._contact.rows()])
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
         models = zip(nothing, *self._models, strict=True)
         attempt, cycle, payload, theta = (np.concatenate(column) for column in models)
@@ -251,7 +237,7 @@ class _OneContact:
         return np.concatenate([*self._chosen, self._waiting])
 
 
-def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector | None) -> Truth | None:
+def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
     """Give the truth on the host's cycles; None where the emulator never cycled.
 
     begins: first cycle of each attempt of the run; last: of the run; time_s: of the rows (m,).
@@ -271,7 +257,7 @@ def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector | Non
         theta=rows.theta,
         force_N=None if rows.force_N is None else rows.force_N[of_host],
         attempt=rows.attempt[of_host],
-        time_s=None if time_s is None else time_s[of_host],
+        time_s=time_s[of_host],
         model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins),
         span=None if rows.span is None else host_span(rows.span, begins),
     )
@@ -406,7 +392,7 @@ def contacts_beside(path: Path, progress: Progress = lambda _: None) -> TrueCont
     if problem := foreign_truth(path, truth):
         progress(f"{problem}; it is left out")
         return None
-    rows = read_truth(truth, 0)
+    rows = read_truth(truth)
     return None if rows.span is None else TrueContacts(_contacts(rows), rows.span)
 
 

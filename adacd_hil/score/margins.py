@@ -20,7 +20,7 @@ a stream (`judge.StreamJudge`), with a pause of 10 time constants; a false alarm
 While the payload is changed it does not detect.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -243,17 +243,6 @@ class MarginGatherer:
 
 def _inverse(share: float) -> float:
     return 1.0 / share if share > 0.0 else float("inf")
-
-
-def gather_untouched(run: Run, pieces: Iterable[Run]) -> Untouched:
-    """Gather what the cycles of a run come to.
-
-    run: has the cycles in which something begins or ends; pieces: together all of its cycles, in order.
-    """
-    gatherer = UntouchedGatherer(run)
-    for piece in pieces:
-        gatherer.add(piece)
-    return gatherer.gathered()
 
 
 class UntouchedGatherer:

@@ -188,7 +188,7 @@ class Outline:
         if busy.size:
             self._busy_ns = max(self._busy_ns, int(scheme.t_ns[busy[-1]]))
 
-    def is_calm_since(self, t_ns: int) -> bool:
+    def is_idle_since(self, t_ns: int) -> bool:
         """Whether nothing has been going on since a time."""
         return self._busy_ns < t_ns
 

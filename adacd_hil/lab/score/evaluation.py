@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.lab.score.run_faults import find_causes, find_faults, gather_data
+from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
 from adacd_hil.lab.score.verdict import compare_with_paper, give_verdict, is_margin_below_1, is_revoked
 from adacd_hil.log.logged_run import (
     COMPUTE,
@@ -43,7 +43,7 @@ from adacd_hil.score.judge import (
     row_at,
     true_contacts,
 )
-from adacd_hil.score.margins import evaluate_certified, gather_untouched, last_row
+from adacd_hil.score.margins import UntouchedGatherer, evaluate_certified, last_row
 from adacd_hil.score.metrics import (
     Count,
     CycleStatistics,
@@ -56,9 +56,39 @@ from adacd_hil.score.metrics import (
 )
 
 
+class RunGatherer:
+    """Sums up all cycles of a run, piece by piece, in bounded memory."""
+
+    def __init__(self, outline: Run) -> None:
+        """Take from `outline` when contacts, reactions and sections begin and end."""
+        self._untouched = UntouchedGatherer(outline)
+        self._data = CyclicDataGatherer(outline.settings)
+        self._timing = TimingGatherer(outline.settings.bus.period_us, not is_realtime(outline))
+        self._state = int(SchemeState.INIT)  # of the last cycle so far
+
+    def add_piece(self, piece: Run) -> None:
+        """Take the next cycles."""
+        reactions = find_reactions(piece.timing, piece.cycle, piece.state, self._state)
+        self._timing.add(piece.timing, reactions)
+        self._data.add(piece.timing, piece.cycle, piece.state)
+        self._untouched.add(piece)
+        if piece.state.size:
+            self._state = int(piece.state[-1])
+
+    def gathered(self, run: Run) -> Gathered:
+        """Sum up. run: has the cycles in which the state changes."""
+        return Gathered(self._untouched.gathered(), self._timing.evidence(), self._data.data(run))
+
+
 def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
-    """Compute all metrics of a run. gathered: of a run that does not have all of its cycles."""
-    gathered = gathered or Gathered(gather_untouched(run, [run]), timing_evidence(run), gather_data(run))
+    """Compute all metrics of a run.
+
+    gathered: the sums over all cycles; None: the run has all of its cycles.
+    """
+    if gathered is None:
+        gatherer = RunGatherer(run)
+        gatherer.add_piece(run)
+        gathered = gatherer.gathered(run)
     touches = true_contacts(run)
     detections = find_detections(run)
     score = judge_run(run, touches, detections)
@@ -152,12 +182,6 @@ def cycle_statistics(run: Run, count: int) -> CycleStatistics:
         clock=run.metadata.get("clock"),
         scheduler=run.metadata.get("scheduler"),
     )
-
-
-def timing_evidence(run: Run) -> TimingEvidence:
-    """Sum up the times of all cycles, those before motion start included."""
-    reactions = find_reactions(run.timing, run.cycle, run.state)
-    return collect_evidence(run.timing, run.settings.bus.period_us, not is_realtime(run), reactions)
 
 
 def list_contacts(
@@ -392,11 +416,13 @@ def collect_evidence(
 
 def find_reactions(
     columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8], before: int = SchemeState.INIT
-) -> NDArray[np.bool_]:
+) -> NDArray[np.bool_] | None:
     """Mark the cycles of `columns` in which the state becomes REACT; cycle, state: those of /scheme (k,).
 
-    before: the state in the cycle before the first.
+    before: the state in the cycle before the first. Returns None for a log that does not number its cycles.
     """
+    if "cycle" not in columns:
+        return None
     is_reacting = state == SchemeState.REACT
     begins = is_reacting & ~np.concatenate(([before == SchemeState.REACT], is_reacting[:-1]))
     return np.isin(columns["cycle"], cycle[begins])

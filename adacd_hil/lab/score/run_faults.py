@@ -143,13 +143,6 @@ class CyclicDataGatherer:
         )
 
 
-def gather_data(run: Run) -> CyclicData:
-    """Sum up a run that has all of its cycles."""
-    gatherer = CyclicDataGatherer(run.settings)
-    gatherer.add(run.timing, run.cycle, run.state)
-    return gatherer.data(run)
-
-
 def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShares]:
     """Tell the cycles of each device apart, from counts that begin anew in each attempt."""
     if checks is None or len(checks.cycle) < 2 or not run.cycle.size:
