@@ -350,7 +350,7 @@ class CycleStatistics:
 class Metrics:
     """Everything that the report says, see the module's first lines for the definitions.
 
-    fault, fault_s: the first one of the run.
+    fault, fault_s: the first one of the run. findings: what happened, the gravest first, a clause each.
     """
 
     sections: tuple[Section, ...]
@@ -371,9 +371,15 @@ class Metrics:
     dropped: int | None
     evidence: CertifiedEvidence | None
     paper: tuple[PaperRow, ...]
-    verdict: str
+    findings: tuple[str, ...]
     is_clean: bool
     armed_false_alarms: int | None  # of them those in MONITOR
+
+    @property
+    def verdict(self) -> str:
+        """All findings in one sentence."""
+        text = "; ".join(self.findings)
+        return f"{text[:1].upper()}{text[1:]}."
 
     @property
     def false_alarm_bound_per_h(self) -> float | None:

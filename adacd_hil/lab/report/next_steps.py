@@ -27,18 +27,16 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> list[NextSte
     log = _quoted(source.log_name)
     steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(source.problem)
     if run.cycle.size == 0:
-        return [*steps, _checked(run, "The arm was not moved. Mend what the sentence above names.")]
+        return [*steps, _checked(run, "The arm was not moved. Mend the cause above.")]
     steps += _repairs(metrics, run, log)
     if metrics.is_clean and not steps:
-        steps.append(NextStep("Nothing went wrong.", ""))
-    if metrics.contacts:
-        steps.append(NextStep("Choose a contact below to see the torques of that moment."))
+        steps.append(NextStep("Nothing went wrong."))
     if run.truth is None and metrics.contacts:
         steps.append(NextStep("Nobody recorded when the arm was touched: compare the detections with what you did."))
     key = "filter.a_rad_s=20" if metrics.evidence is None else "certified.noise_sigmas=8"
     return [
         *steps,
-        NextStep("Check that the log gives the same decisions again.", f"adacd-hil replay {log}"),
+        NextStep("Check that the log replays to the same decisions.", f"adacd-hil replay {log}"),
         NextStep("See what another setting would have decided.", f"adacd-hil replay {log} --set {key}"),
     ]
 
@@ -46,29 +44,29 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> list[NextSte
 def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
     """Say what to do about each kind of thing that went wrong."""
     has_stopped = bool(metrics.fault) or not metrics.adaptation_s
-    stopped = _checked(run, "The run was stopped: the sentence above and the notices below say why.")
+    stopped = _checked(run, "Mend what stopped the run.")
     late = _checked(run, "Frames came late or were lost, more than allowed.")
     rows = (
         (has_stopped, stopped),
         (not has_stopped and bool(metrics.data.excesses), late),
         (
             is_revoked(metrics.evidence),
-            NextStep("What was learned was taken back. Remove the cause, then let the arm learn anew, untouched."),
+            NextStep("The certificate was taken back. Remove the cause, then let the arm learn anew, untouched."),
         ),
         (
             not has_stopped and None in metrics.adaptation_s.values(),
-            NextStep("The model was not learned: the notices below may say why. Another motion may show it better.",
+            NextStep("The model was not learned; the notices may say why. Try another motion.",
                      f"adacd-hil excitation --config {_configuration(run)}"),
         ),
         (
             (any(metrics.adaptation_s.values()) and bool(metrics.false_alarms)) or is_margin_below_1(metrics.evidence),
-            NextStep("Nobody touched the arm, and a threshold was crossed: find thresholds from untouched motion.",
+            NextStep("Nobody touched the arm, and a threshold was crossed. Find thresholds from untouched motion.",
                      f"adacd-hil thresholds {log}"),
         ),
         (
             any(went_wrong(contact) for contact in metrics.contacts),
-            NextStep("Some contacts were missed, or their link or direction is wrong (marked below): try other "
-                     "thresholds and filters.", f"adacd-hil tune {log}"),
+            NextStep("Contacts were missed, or their link or direction is wrong. Try other thresholds and filters.",
+                     f"adacd-hil tune {log}"),
         ),
     )  # fmt: skip
     return [step for is_so, step in rows if is_so]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
-from adacd_hil.lab.score.verdict import compare_with_paper, give_verdict, is_margin_below_1, is_revoked
+from adacd_hil.lab.score.verdict import compare_with_paper, is_margin_below_1, is_revoked, list_findings
 from adacd_hil.log.logged_run import (
     COMPUTE,
     LATENESS,
@@ -127,7 +127,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         dropped=run.dropped,
         evidence=evidence,
         paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
-        verdict=give_verdict(run, sections, score, adaptation_s, payload_kg, evidence, faults, causes, data),
+        findings=list_findings(run, sections, score, adaptation_s, payload_kg, evidence, faults, causes, data),
         is_clean=is_identified
         and missed == 0
         and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),

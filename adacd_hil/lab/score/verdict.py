@@ -1,10 +1,11 @@
-"""The verdict on a run in one sentence, failures first; and the run beside the paper's printed figures.
+"""The findings of a run, failures first, and its headlines; and the run beside the paper's printed figures.
 
 The paper's numbers are those of its experiment: a run that played anything else is shown without them. Beside them
 stands the result of the paper's scheme on the same stream, where it ran beside.
 """
 
 import itertools
+import textwrap
 from collections.abc import Sequence
 from functools import cache
 from typing import Final, TypeGuard
@@ -18,6 +19,7 @@ from adacd_hil.score.metrics import (
     CertifiedEvidence,
     CyclicData,
     Fault,
+    Metrics,
     PaperRow,
     ReportedContact,
     Residual,
@@ -28,9 +30,11 @@ from adacd_hil.settings.configuration import load_settings
 
 LISTED: Final = 4
 """Adaptations that are listed one by one."""
+_BESIDE: Final = "the paper's scheme on the same stream"
+_NO_LOSS: Final = "no cyclic data was late or lost"
 
 
-def give_verdict(
+def list_findings(
     run: Run,
     sections: tuple[Section, ...],
     score: Score,
@@ -40,28 +44,42 @@ def give_verdict(
     faults: tuple[Fault, ...],
     causes: tuple[str, ...],
     data: CyclicData,
-) -> str:
-    """Say in one sentence how the run went. causes: what ended attempts without a fault."""
+) -> tuple[str, ...]:
+    """Say how the run went, a clause for each finding. causes: what ended attempts without a fault."""
     if run.cycle.size == 0:
         cause = "; ".join(causes) or "the log does not say why"
-        return f"No cycle was run: {cause}."
+        return (f"no cycle was run: {cause}",)
     done = "identified" if evidence is None else "certified"
     identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
     found = score_sentence(score)
     if run.truth is None:
         found = f"{number_of(len(score.false_alarms), 'detection')}, whose truth is not recorded"
-    text = f"{found}; {identified}"
     if evidence is not None and not evidence.is_anchored:
-        text += ", with torque offsets that nothing anchors"
+        identified += ", with torque offsets that nothing anchors"
+    beside = ""
     if evidence is not None and evidence.paper_beside is not None and is_papers_experiment(run):
-        text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
+        beside = _beside_text(list(evidence.paper_beside.adaptation_s.values()))
+    margin = ""
     if is_margin_below_1(evidence):
-        text = f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}; {text}"
-    if is_revoked(evidence):
-        text = "; ".join((*evidence.revoked, text))
+        margin = f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}"
+    revoked = evidence.revoked if is_revoked(evidence) else ()
     broken = f"the run was broken off: {'; '.join(causes)}" if causes else ""
-    text = "; ".join(filter(None, (*_fault_texts(faults), broken, text, data_text(data))))
-    return text[:1].upper() + text[1:] + "."
+    findings = (*_fault_texts(faults), broken, *revoked, margin, found, identified, beside, data_text(data))
+    return tuple(filter(None, findings))
+
+
+_HEADLINE_LETTERS: Final = 110
+
+
+def headlines(metrics: Metrics) -> list[str]:
+    """Give the findings as lines for a first screen, the gravest first; a long one is cut, the log has all of it.
+
+    Nothing is said of the paper's scheme beside, nor of cyclic data within its limits: tables have them.
+    """
+    plain = [text for text in metrics.findings if not text.startswith((_BESIDE, _NO_LOSS))]
+    if metrics.is_clean and metrics.false_alarms == 0:
+        plain = [text.replace(", none false", ", no false alarm") for text in plain]
+    return [textwrap.shorten(text[:1].upper() + text[1:], _HEADLINE_LETTERS, placeholder=" …") for text in plain]
 
 
 def is_margin_below_1(evidence: CertifiedEvidence | None) -> bool:
@@ -99,11 +117,11 @@ def _beside_text(times_s: list[float | None]) -> str:
     if not any(time_s is not None for time_s in times_s):
         return ""
     if len(times_s) > LISTED:
-        return f"; the paper's scheme on the same stream took {_summary(times_s, 'did not end')}"
+        return f"{_BESIDE} took {_summary(times_s, 'did not end')}"
     took = " and ".join("did not end" if time_s is None else f"took {time_s:.2f} s" for time_s in times_s)
     if None not in times_s:
         took = took.replace(" and took", " and")
-    return f"; the paper's scheme on the same stream {took}"
+    return f"{_BESIDE} {took}"
 
 
 def _summary(times_s: list[float | None], failed: str) -> str:
@@ -347,5 +365,5 @@ def data_text(data: CyclicData) -> str:
             name, share = max(found.items(), key=lambda entry: entry[1])
             said.append(f"{what} {name} in {percent_text(share)}")
     if not said:
-        return "no cyclic data was late or lost"
+        return _NO_LOSS
     return ", ".join(said) + (", more than allowed" if data.excesses else "")
