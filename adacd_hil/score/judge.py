@@ -71,7 +71,11 @@ Times = NDArray[np.int64]
 
 
 class TouchWindow(NamedTuple):
-    """A true contact as it is judged; is_reacting: the scheme still reacted to something else at its onset."""
+    """A true contact, and when it was detected.
+
+    forgotten_ns: until when it explains alarms. is_armed: detection was armed at its onset; is_reacting: the scheme
+    still reacted to something else then. detected_ns: None if no alarm found it.
+    """
 
     number: int
     link: int
@@ -79,16 +83,7 @@ class TouchWindow(NamedTuple):
     forgotten_ns: int
     is_armed: bool
     is_reacting: bool = False
-
-
-class JudgedContact(NamedTuple):
-    """What became of a true contact; detected_ns: None if nothing found it."""
-
-    number: int
-    link: int
-    onset_ns: int
-    is_armed: bool
-    detected_ns: int | None
+    detected_ns: int | None = None
 
     @property
     def delay_ms(self) -> float | None:
@@ -105,7 +100,7 @@ class JudgedContact(NamedTuple):
 class Score:
     """What became of true contacts, in order, and which alarms were false; unjudged: those the truth does not cover."""
 
-    contacts: tuple[JudgedContact, ...]
+    contacts: tuple[TouchWindow, ...]
     false_alarms: tuple[Alarm, ...]
     unjudged: tuple[Alarm, ...] = ()
 
@@ -216,11 +211,8 @@ def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
     return first
 
 
-def _judged(touches: Sequence[TouchWindow], found: dict[int, int]) -> tuple[JudgedContact, ...]:
-    return tuple(
-        JudgedContact(touch.number, touch.link, touch.onset_ns, touch.is_armed, found.get(place))
-        for place, touch in enumerate(touches)
-    )
+def _judged(touches: Sequence[TouchWindow], found: dict[int, int]) -> tuple[TouchWindow, ...]:
+    return tuple(touch._replace(detected_ns=found.get(place)) for place, touch in enumerate(touches))
 
 
 def rate_bound_per_h(alarms: int, hours: float) -> float:

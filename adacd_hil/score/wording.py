@@ -11,6 +11,8 @@ from adacd_hil.score.judge import Score
 
 NONE: Final = "–"
 _MORE_DIGITS: Final = 3
+_TELLING_PER_H: Final = 3.0
+"""The bound after an hour without a false alarm."""
 
 
 STATE_WORDS: Final = {
@@ -120,8 +122,10 @@ def unjudged_sentence(count: int) -> str:
 
 
 def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
-    """Say what false alarms there were, and which rate the counting leaves possible."""
+    """Say how many false alarms there were, and which rate the counting leaves possible, if that says anything."""
     count = number_of(false_alarms, "false alarm") if false_alarms else "No false alarms"
+    if bound_per_h > _TELLING_PER_H:
+        return f"{count} in that time, which is too short to tell a rate by counting"
     return f"{count} in that time: by counting alone, at most {bound_per_h:.3g} per hour at 95 %"
 
 

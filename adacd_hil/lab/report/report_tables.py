@@ -56,7 +56,7 @@ def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
     for label, channels in _first_and_worst(evidence).items():
         for row in channels:
             cutoff = f"{row.cutoff_rad_s:g}"
-            kind = "bare" if row.smoothing_rad_s is None else "smoothed"
+            kind = "one filter" if row.smoothing_rad_s is None else "two filters"
             margin = Cell(pair_text(row.margin, 1), "bad" if min(row.margin) < 1.0 else "strong")
             pairs = (pair_text(row.residual_max_Nm, 3), pair_text(row.threshold_Nm, 3))
             name = Cell(label, "strong") if row is channels[0] else ""
@@ -106,7 +106,7 @@ def further_table(evidence: CertifiedEvidence | None) -> Table | None:
     for name in next(iter(estimates.values())):
         cells: list[object] = [_symbol(name), PARAMETER_UNITS.get(name, "Nm")]
         for found in estimates.values():
-            cells += [Cell(number_text(found[name].value, 5), "strong"), number_text(found[name].std, 5)]
+            cells += [Cell(f"{found[name].value:.3g}", "strong"), f"{found[name].std:.2g}"]
         rows.append(cells)
     return make_table(head, rows, left=(0, 1))
 

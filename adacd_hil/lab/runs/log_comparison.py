@@ -204,11 +204,8 @@ class FieldDifference(NamedTuple):
         return self._asdict() | {"largest": self.largest if math.isfinite(self.largest) else None}
 
 
-class ContactPair(NamedTuple):
-    """A contact in both runs, or in one."""
-
-    first: ComparedContact | None
-    second: ComparedContact | None
+ContactPair = tuple[ComparedContact | None, ComparedContact | None]
+"""A contact in both runs, or in one."""
 
 
 @dataclass(frozen=True)
@@ -394,6 +391,6 @@ def match_contacts(first: list[ComparedContact], second: list[ComparedContact]) 
         if distance <= MATCH_S and i not in partner and k not in taken:
             partner[i] = k
             taken.add(k)
-    pairs = [ContactPair(a, second[partner[i]] if i in partner else None) for i, a in enumerate(first)]
-    pairs += [ContactPair(None, b) for k, b in enumerate(second) if k not in taken]
+    pairs: list[ContactPair] = [(a, second[partner[i]] if i in partner else None) for i, a in enumerate(first)]
+    pairs += [(None, b) for k, b in enumerate(second) if k not in taken]
     return sorted(pairs, key=lambda pair: min(each.time_s for each in pair if each is not None))

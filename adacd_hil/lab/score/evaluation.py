@@ -32,9 +32,9 @@ from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, 
 from adacd_hil.scheme.contact.contact_report import KIND_S
 from adacd_hil.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
 from adacd_hil.score.judge import (
-    JudgedContact,
     LoggedDetection,
     Score,
+    TouchWindow,
     TruthTouch,
     channels_at,
     find_detections,
@@ -257,7 +257,7 @@ def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: L
 
 
 def _contact(
-    run: Run, sections: tuple[Section, ...], touch: TruthTouch, judged: JudgedContact, detection: LoggedDetection | None
+    run: Run, sections: tuple[Section, ...], touch: TruthTouch, judged: TouchWindow, detection: LoggedDetection | None
 ) -> ReportedContact:
     truth = run.truth
     assert truth is not None

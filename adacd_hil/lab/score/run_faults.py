@@ -1,7 +1,7 @@
 """The failures of a run, by its log: faults and their logged causes, and cyclic data that did not come in time.
 
 Cyclic data is counted while the drives are to have torque. *Incomplete*: a cyclic frame was missing, late or wrong.
-*Aged*: the oldest value used was older than the cycle. Windows are the host's own, of one second (`device.arm_report`),
+*Aged*: the oldest value used was older than the cycle. Windows are the host's own, of one second,
 and the limits those of the configuration's `[data]`. By device, the checks' running counts tell how many cycles had no
 new frame or a repeated one; they are logged once a second, so the counts of the last second, which a fault may have
 ended, are missing.
@@ -13,13 +13,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.device.arm_report import SHORTEST_SHARE, WINDOW_S
 from adacd_hil.log.logged_run import CheckCounts, CycleColumns, Cycles, Mask, Run
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.score.metrics import CyclicData, DeviceShares, Fault
 from adacd_hil.score.wording import percent_text
-from adacd_hil.settings.arm_settings import DataSettings
+from adacd_hil.settings.arm_settings import DATA_WINDOW_S, SHORTEST_DATA_WINDOW, DataSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.terminal import one_line
 from adacd_hil.wire.e2e import E2eStatus
@@ -77,7 +76,7 @@ class CyclicDataGatherer:
     """Sums up the cycles of a run, piece by piece, in constant memory."""
 
     def __init__(self, settings: Settings) -> None:
-        self._window = max(1, round(WINDOW_S / settings.bus.period_s))
+        self._window = max(1, round(DATA_WINDOW_S / settings.bus.period_s))
         self._counted = {"frames_missing": 0, "data_age": 0}
         self._cycles = 0  # with powered drives
         self._logged = 0  # of which /cycle tells how they went
@@ -121,7 +120,7 @@ class CyclicDataGatherer:
 
     def _end_window(self) -> None:
         cycles, incomplete, last = self._present
-        if cycles >= SHORTEST_SHARE * self._window:
+        if cycles >= SHORTEST_DATA_WINDOW * self._window:
             self._worst = max(self._worst, incomplete / cycles)
         self._present = 0, 0, last
 
