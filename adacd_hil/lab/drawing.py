@@ -36,15 +36,7 @@ COLOURS: Final = {
     "joint1": "#00856a",
     "joint2": "#8a4fa3",
     "alarm": "#c4342d",
-    "good": "#1b7a43",
     "bar": "#7d8a97",
-    "queue_receive": "#2a6f97",
-    "queue_transmit": "#b0611a",
-    "queue_log": "#6c5fb0",
-    "adaptation": "#dcebf8",
-    "detection": "#fdfdfe",
-    "payload": "#f3ebdb",
-    "fault": "#f7dedc",
 }
 _DOTS_PER_INCH: Final = 150
 _ENVELOPE_BINS: Final = 1000

@@ -60,7 +60,7 @@ ADAPTATION_CYCLES: Final = 10_000
 _AROUND_S: Final = (0.15, 0.6)
 _AFTER_ADAPTATION: Final = 0.1
 """Share of an adaptation's length by which its figure goes on."""
-_ROOM: Final = 500_000
+_ROOM: Final = 200_000
 """Rows that memory is asked for at once, more than are kept of most runs."""
 _NOISE_STRETCHES: Final = 16
 _NOISE_CYCLES: Final = 500
@@ -149,8 +149,8 @@ def _windows(run: Run) -> Iterator[tuple[float, float]]:
 
 RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events")
 """Of a run's log, what a report reads."""
-FULL_CYCLES: Final = 500_000
-"""Cycles that are kept and drawn one by one: eight minutes at 1 kHz; some 1.2 kB each in the log."""
+FULL_CYCLES: Final = 150_000
+"""Cycles that are kept and drawn one by one: 150 s at 1 kHz, about as many as are kept of hours."""
 _MOST_DIGITS: Final = 18
 
 Bounds = tuple[int, int]

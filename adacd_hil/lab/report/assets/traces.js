@@ -158,6 +158,8 @@
   // --- panels -------------------------------------------------------------------------------------------------------
 
   const secondsText = (_, value) => (value === null || value === undefined ? "–" : value.toFixed(3));
+  const dateText = (_, t) => (t === null || t === undefined ? "–" : new Date(1e3 * t).toLocaleString("sv").slice(0, 16));
+  const datesText = (plot, splits) => splits.map((t) => dateText(plot, t).slice(2));
   const available = () => {  // a folded part has no width in some browsers
     const main = document.querySelector("main");
     const [left, right] = [getComputedStyle(main).paddingLeft, getComputedStyle(main).paddingRight];
@@ -258,9 +260,8 @@
       width,
       height: HEIGHT,
       scales: { x: { time: plan.isDated, range: () => view }, y: { range: (_, low, high) => rangeOf(panel, low, high) } },
-      axes: [axis(plan.isDated ? 40 : 28, { space: 70, ...(plan.isDated && { values: undefined }) }),
-        axis(56, { space: 28 })],
-      series: [plan.isDated ? { label: "" } : { label: "s", value: secondsText }, ...series],
+      axes: [axis(28, plan.isDated ? { space: 110, values: datesText } : { space: 70 }), axis(56, { space: 28 })],
+      series: [plan.isDated ? { label: "run of", value: dateText } : { label: "s", value: secondsText }, ...series],
       cursor: { sync: { key: "time" }, drag: { x: true, y: false, setScale: false }, points: { size: 6 } },
       legend: { live: true },
       hooks: {
