@@ -68,7 +68,7 @@ def style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure with its name, its title and one sentence that says what to see."""
+    """A figure with its name, its title and a caption."""
 
     name: str
     title: str

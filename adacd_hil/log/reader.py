@@ -157,17 +157,17 @@ class RunLog:
 
     @property
     def epoch_ns(self) -> int:
-        """What was added to t_ns for the times of the file."""
+        """Offset of the times in the file from t_ns."""
         return _number(self.metadata, EPOCH_KEY, 0)
 
     @property
     def scheme(self) -> Series:
-        """What the scheme decided, records.scheme_layout."""
+        """Decisions of the scheme, records.scheme_layout."""
         return self.topics["/scheme"]
 
     @property
     def control(self) -> Series:
-        """What was desired and commanded, records.CONTROL_LAYOUT."""
+        """Desired motion and commanded torque, records.CONTROL_LAYOUT."""
         return self.topics["/control"]
 
     @property
@@ -177,7 +177,7 @@ class RunLog:
 
     @property
     def truth(self) -> Series:
-        """What the emulator knows, records.TRUTH_LAYOUT."""
+        """The emulator's truth, records.TRUTH_LAYOUT."""
         return self.topics["/truth"]
 
 
@@ -289,7 +289,7 @@ def check_states(scheme: Series) -> None:
 
 
 def contacts_of(series: Series) -> list[LoggedContact]:
-    """Give what /contact has. Raises LogError for a level, kind, reaction or place that there is not."""
+    """Give the reports of /contact. Raises LogError for an unknown level, kind, reaction or place."""
     contacts = []
     members = [member for member in CONTACT.head if member.name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
@@ -319,7 +319,7 @@ class Piece(NamedTuple):
 class LogStream:
     """A log read once from front to back in constant memory, all parts as one.
 
-    What is damaged or missing is left out; `problem` says so.
+    Damaged and missing parts are left out; `problem` says so.
     """
 
     def __init__(
@@ -354,7 +354,7 @@ class LogStream:
 
     @property
     def attachments(self) -> dict[str, bytes]:
-        """What the run was made with, by file name."""
+        """The files that the run was made with, by name."""
         return self._walk.attachments
 
     def empty(self) -> Piece:
@@ -363,7 +363,7 @@ class LogStream:
 
     @property
     def problem(self) -> str:
-        """What is missing, one line, as far as has been read; "" for a whole log."""
+        """Damaged and missing parts in one line, as far as has been read; "" for a whole log."""
         return self._walk.problem
 
     @property
@@ -377,7 +377,7 @@ class LogStream:
         return self._walk.summary
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
-        """Unpack what a piece has of /events."""
+        """Unpack the events of a piece."""
         topic = self.topics.get("/events")
         if topic is None or topic.type_name != LOG.name:
             return []

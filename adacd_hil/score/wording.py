@@ -64,7 +64,7 @@ def signed_text(value: float) -> str:
 
 
 def scaled(value: float | None, factor: float) -> float | None:
-    """Multiply what is known."""
+    """Multiply a value, if there is one."""
     return None if value is None else factor * value
 
 
@@ -96,7 +96,7 @@ def number_of(count: int, noun: str) -> str:
 
 
 def score_sentence(score: Score) -> str:
-    """Say what was found within what time, what was missed, and how many alarms were false."""
+    """Count the contacts found and missed, the longest delay, and the false alarms."""
     armed = [contact for contact in score.contacts if contact.is_armed]
     delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
     within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
@@ -145,7 +145,7 @@ def delays_phrase(delays_ms: Sequence[float]) -> str:
 
 
 def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float, float]) -> str:
-    """Say how many contacts were found, the bounds of their share, and after what time."""
+    """Say how many contacts were found, the bounds of their share, and their delays."""
     found = found_text(len(delays_ms), contacts)
     return f"{found} contacts found ({100 * bounds[0]:.0f} to {100 * bounds[1]:.0f} %){delays_phrase(delays_ms)}"
 

@@ -1,7 +1,7 @@
-"""What a reader of a report may do next: a sentence each, with the command for it, the gravest first.
+"""Next steps for the reader of a report: a sentence each, with the command for it, the gravest first.
 
 Commands are for the folder of the log: they name it by its file name alone, so that the same log gives the same page
-wherever it lies. Whatever a log says of itself is quoted for the shell.
+wherever it lies. Texts of a log are quoted for the shell.
 """
 
 import shlex
@@ -16,14 +16,14 @@ from adacd_hil.terminal import in_line
 
 
 class NextStep(NamedTuple):
-    """What a reader may do next, and the command for it; empty where there is none."""
+    """A next step, and the command for it; empty where there is none."""
 
     text: str
     command: str = ""
 
 
 def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]:
-    """Say what to do next, the gravest first."""
+    """List the next steps, the gravest first."""
     log = _quoted(source.log_name)
     steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(source.problem)
     if run.cycle.size == 0:
@@ -42,7 +42,7 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> list[NextSte
 
 
 def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
-    """Say what to do about each kind of thing that went wrong."""
+    """List the repairs of each kind of failure."""
     has_stopped = bool(metrics.fault) or not metrics.adaptation_s
     stopped = _checked(run, "Mend what stopped the run.")
     late = _checked(run, "Frames came late or were lost, more than allowed.")
@@ -95,7 +95,7 @@ def _quoted(text: str) -> str:
 
 
 def origin_words(run: Run) -> list[str]:
-    """Name the arm, where it is, and what was played."""
+    """Name the arm, its bus, and the scenario."""
     said = run.metadata
     name, profile, interface = said.get("config", ""), said.get("profile", ""), said.get("interface", "")
     is_own = name not in builtin_names()

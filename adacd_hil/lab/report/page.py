@@ -1,6 +1,6 @@
 """Pages from the Jinja2 templates in `templates`: words, forms and limits that all share; the only place that renders.
 
-A page needs nothing from outside and allows nothing but what it brings: its styles and scripts by their digests, no
+A page needs nothing from outside and allows its own styles and scripts alone, by their digests: no
 inline style, no request (content security policy). Every value is escaped; where a template marks one as safe, it says
 why it is. A template that asks for a value that it isn't given is an error. Pages follow the reader's light or dark
 scheme and print in the light one.
@@ -24,7 +24,7 @@ from adacd_hil.score.wording import NONE, number_text, pair_text, signs_text, wh
 from adacd_hil.terminal import keep_units
 
 if TYPE_CHECKING:
-    from adacd_hil.lab.report.traces import Traces  # it imports what judges a run
+    from adacd_hil.lab.report.traces import Traces  # it imports the judge
 
 TRACED_CONTACTS: Final = 60
 
@@ -233,7 +233,7 @@ _PLAIN_NAMES: Final = {
     "Filter a / b": "Filter of the residual",
     "Smallest threshold / residual": "Smallest margin: threshold over unexplained torque",
 }
-"""Names of quantities for a reader who has nothing of the paper before him; report.json keeps the others."""
+"""Names of quantities for readers who do not know the paper; report.json keeps the paper's."""
 
 
 def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:

@@ -41,7 +41,7 @@ from adacd_hil.score.wording import (
 
 
 def paper_table(metrics: Metrics) -> Table:
-    """Put what the paper printed beside what was measured."""
+    """Put the paper's figures beside the measured ones."""
     rows = [[*cells[:-1], Cell(cells[-1], "strong")] for cells in paper_cells(metrics)]
     head = paper_head(metrics)
     return make_table(head, rows, left=range(len(head)))
@@ -81,7 +81,7 @@ def push_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def counted_sentence(metrics: Metrics) -> str:
-    """Say what false alarms there were, and which rate that leaves possible; empty where nobody knows."""
+    """Count the false alarms and bound their rate; empty without the truth."""
     bound = metrics.false_alarm_bound_per_h
     return "" if bound is None else rate_sentence(metrics.armed_false_alarms or 0, bound)
 

@@ -221,7 +221,7 @@ def _why_not(contact: ReportedContact) -> str:
 
 
 def _found(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Give what the report says."""
+    """Give the entries of the contact's report."""
     lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
     return [
         ("found after", number_text(contact.delay_ms, 0, "ms")),
@@ -234,7 +234,7 @@ def _found(contact: ReportedContact) -> list[tuple[str, str]]:
 
 
 def _finders(contact: ReportedContact, run: Run) -> list[tuple[str, str]]:
-    """Say who has found a contact, where live detectors say so, as they do in the cycle of its detection."""
+    """Name the live detectors that found a contact, by their events in the cycle of its detection."""
     if contact.detected_s is None:
         return []
     said = [(t_ns, event.message) for t_ns, event in run.events if event.name == DETECTOR_EVENT]
@@ -357,7 +357,7 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> Heading:
 
 
 def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
-    """Give the handful of numbers to be read first: what each is, the number, its unit."""
+    """Give the numbers of the first screen: label, number, unit."""
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
     times_s = [number_text(value, 2) for value in metrics.adaptation_s.values()]

@@ -129,7 +129,7 @@ def _bucket_starts(before: int, count: int, bucket: int) -> Rows:
 
 
 def _curves(run: Run) -> Iterator[Vector]:
-    """Give what the report draws over the whole run."""
+    """Give the curves that the report draws over the whole run."""
     for panel in panels_of(run):
         for trace in panel.traces:
             yield trace.values
@@ -148,7 +148,7 @@ def _windows(run: Run) -> Iterator[tuple[float, float]]:
 
 
 RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events")
-"""Of a run's log, what a report reads."""
+"""Topics that a report reads."""
 FULL_CYCLES: Final = 150_000
 """Cycles that are kept and drawn one by one: 150 s at 1 kHz, about as many as are kept of hours."""
 _MOST_DIGITS: Final = 18
@@ -200,7 +200,7 @@ class _Reading:
         self._read = stream  # that was last read to its end
 
     def _begin(self, stream: LogStream) -> Run:
-        """Give a run without a cycle, with what a log says of it before its first message."""
+        """Give a run without a cycle, with metadata and settings of the log."""
         metadata = dict(stream.metadata)
         if "arm.dbc" in stream.attachments:
             metadata["dbc_sha256"] = hashlib.sha256(stream.attachments["arm.dbc"]).hexdigest()
@@ -231,7 +231,7 @@ class _Reading:
         return run_of_piece(self._scheme, empty)
 
     def _pieces(self, doing: str, bounds_ns: Bounds | None = None) -> Iterator[tuple[LogStream, Piece]]:
-        """Read the log, or what of it lies between two times."""
+        """Read the log, or its part between two times."""
         stream = LogStream(self._path, RUN_TOPICS)
         cycles = 0
         milestones = Milestones(lambda count: self._progress(f"{self._path}: {doing}, {count} cycles"))
@@ -249,7 +249,7 @@ class _Reading:
         self._read = stream
 
     def _done(self, run: Run, gathered: Gathered) -> ReadRun:
-        """Give what was read."""
+        """Add the ending, the problems and the counts of the log."""
         stream, truth = self._read, self._truth
         ending = stream.summary.get(ENDING_KEY, "")
         if ending and ending not in PLANNED_ENDINGS:
@@ -298,7 +298,7 @@ class _Reading:
         return self._done(run, sums.gathered(run))
 
     def read_stretch(self, stretch: TimeWindow, full_cycles: int) -> ReadRun:
-        """Read a stretch of the log, and what of it is needed to cut nothing. Raises LogError if nothing is in it."""
+        """Read a part of the log, widened so that it cuts nothing. Raises LogError for a part without a cycle."""
         start_ns = self._shell.log_start_ns
         if start_ns is None:
             raise LogError(f"log {self._path} has no message")
@@ -327,7 +327,7 @@ class _Reading:
 
 
 def _within(piece: Piece, bounds_ns: Bounds, epoch_ns: int) -> Piece:
-    """Give what of a piece lies between two times, but for its events."""
+    """Give a piece's messages between two times, and all of its events."""
     series = {}
     for name, values in piece.series.items():
         t_ns = values.t_ns
@@ -336,7 +336,7 @@ def _within(piece: Piece, bounds_ns: Bounds, epoch_ns: int) -> Piece:
 
 
 def _truth_within(truth: Truth | None, bounds_s: tuple[float, float]) -> Truth | None:
-    """Give what of the truth lies between two times, s since motion start."""
+    """Give the rows of the truth between two times, s since motion start."""
     if truth is None or truth.time_s is None:
         return truth
     rows = (truth.time_s >= bounds_s[0]) & (truth.time_s < bounds_s[1])

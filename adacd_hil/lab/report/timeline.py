@@ -57,7 +57,7 @@ class Notice(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """A mark on a lane: the stretch that it stands for, its words, its place, colour or class, and what it shows."""
+    """A mark on a lane: the stretch that it stands for, its words, its place, its colour or class, its label."""
 
     from_s: float
     to_s: float
@@ -70,7 +70,7 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """The content of each lane. ticks: place and label; is_thinned: what is narrower than a mark is drawn together."""
+    """The content of each lane. ticks: place and label; is_thinned: stays narrower than a mark are drawn together."""
 
     left: float
     width: float
@@ -96,7 +96,7 @@ def stays_of(run: Run) -> list[Stay]:
 
 
 def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
-    """List what went wrong in the order of time, at most `_MOST_NOTICES`, the bad ones first to stay."""
+    """List warnings, errors, faults and false alarms by time; of too many, the bad ones stay."""
     notices = [
         Notice((t_ns - run.zero_ns) * 1e-9, event.level == "error", f"{event.name}: {event.message}")
         for t_ns, event in run.events
@@ -113,7 +113,7 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
 
 
 class CertificateNote(NamedTuple):
-    """What the log says of a certificate: given, or taken back, and each thing that it tells."""
+    """A certificate of the log: given or taken back, and its clauses."""
 
     at_s: float
     is_taken_back: bool

@@ -1,4 +1,4 @@
-"""The curves of a page: what is drawn in which panel, how finely it is written down, how it is packed.
+"""The curves of a page: their panels, their rounding, their packing.
 
 The page's script draws them, so that a reader can enlarge any part; the data lie in the page, at their full rate.
 Panels with the same abscissa make a *track*: the cycles of /scheme, those of /cycle, the dates of runs.
@@ -40,7 +40,7 @@ FINEST: Final = {
     "bytes": 1.0,
     "periods": 1.0,
 }
-"""Steps that nobody reads finer, by unit: the encoders' own, a fortieth of a threshold, a hundredth of its margin."""
+"""Finest steps by unit: the encoders' own, a fortieth of a threshold, a hundredth of its margin."""
 _PARAMETER_STEP: Final = 1e-5
 _NEAR: Final = 3.0
 """The range near zero, in thresholds."""
@@ -132,7 +132,7 @@ def _true_torque(run: Run) -> Vector:
 
 
 def _in_view(threshold: Vector, residual: Vector) -> Vector:
-    """Leave out of a threshold what is above every residual, as while a model is uncertain, or infinite."""
+    """Leave out the threshold where it is above every residual, as while a model is uncertain, or infinite."""
     largest = float(np.max(np.abs(residual[np.isfinite(residual)]), initial=0.0))
     finite = threshold[np.isfinite(threshold)]
     ceiling = max(largest, _NEAR * float(finite.min())) if finite.size else 0.0
@@ -261,7 +261,7 @@ def noise_of(values: Vector, is_next: NDArray[np.bool_] | None = None) -> float:
 
 
 def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
-    """Choose a step: half the noise's standard deviation, see `noise_of`, but no finer than what anybody reads."""
+    """Choose a step: half the noise's standard deviation, see `noise_of`, but no finer than `finest`."""
     return max(finest, noise_of(values, is_next) / STEPS_PER_SIGMA)
 
 
@@ -291,7 +291,7 @@ _TIME_STEP_S: Final = 1e-5
 
 
 class Traces(NamedTuple):
-    """The curves of a page: panels by track, the series as text by name, and the script's plan of what to draw."""
+    """The curves of a page: panels by track, the series as text by name, and the script's plan."""
 
     panels: dict[str, tuple[TracePanel, ...]]
     blocks: dict[str, str]

@@ -1,4 +1,4 @@
-"""Pages over many runs: the list that leads to their reports, and what an arm's figures did from run to run."""
+"""Pages over many runs: the list that leads to their reports, and the trend of an arm's figures from run to run."""
 
 import os
 from collections.abc import Sequence

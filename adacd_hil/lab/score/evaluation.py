@@ -1,9 +1,9 @@
 """The evaluation of a run: pure functions from its arrays to the results that `metrics` defines.
 
-Timing evidence comes from the columns of /cycle, records.CycleRecord. Percentiles are values that occurred: of what
-must be small p50, p99, p99.9 and the largest; of slack, which must be large, p50, p1, p0.1 and the smallest. *Reaction
-latency* is the compute time of each cycle in which the state becomes REACT: from the data that decided to the first
-command that reacts.
+Timing evidence comes from the columns of /cycle, records.CycleRecord. Percentiles are values that occurred: of
+times that must be small p50, p99, p99.9 and the largest; of slack, which must be large, p50, p1, p0.1 and the smallest.
+*Reaction latency* is the compute time of each cycle in which the state becomes REACT: from the data that decided to
+the first command that reacts.
 """
 
 import math
@@ -202,7 +202,7 @@ def list_contacts(
 
 
 def _reported(detection: LoggedDetection | None) -> dict[str, Any]:
-    """Give what the reports of a detection say."""
+    """Give the fields of a contact that the reports of its detection have."""
     if detection is None:
         return {}
     said: dict[str, Any] = {"detected_s": detection.detected_s}
@@ -220,7 +220,7 @@ def _reported(detection: LoggedDetection | None) -> dict[str, Any]:
 
 
 def _told(report: ContactReport) -> dict[str, Any]:
-    """Give what only the certified scheme tells."""
+    """Give the fields that only the certified scheme has."""
     return {
         "level": report.level.name,
         "kind": report.kind.name,
@@ -265,7 +265,7 @@ def _contact(
     tau_ext = truth.tau_ext[rows]
     since_s = run.truth_time_s(rows) - touch.onset_s
     delay_s = detection.detected_s - touch.onset_s if detection else math.inf
-    # What the host can have seen: up to the detection for the delay, up to the end of the window for the rest.
+    # The host sees samples up to the detection for the delay, up to the end of the window for the rest.
     until_alarm = np.abs(tau_ext[since_s <= delay_s]).max(axis=0)
     is_seen = since_s <= delay_s + _window_s(run)
     until_final = tau_ext[is_seen]

@@ -24,7 +24,7 @@ from adacd_hil.terminal import one_line
 from adacd_hil.wire.e2e import E2eStatus
 
 _RUN = "run"
-"""Who says in /events what ended an attempt without a fault: no boot-up, a bus that failed."""
+"""Name of the events that end an attempt without a fault: no boot-up, a bus that failed."""
 _SUPERVISOR = "supervisor"
 _NEAR_NS = 2_000_000
 """How far the event of a fault may lie from its cycle's time."""
@@ -46,7 +46,7 @@ def find_faults(run: Run) -> tuple[Fault, ...]:
 
 
 def _cause(run: Run, t_ns: int) -> str:
-    """Find what the supervisor said of a fault, without state and reason, which are known."""
+    """Find the supervisor's words for a fault, without state and reason."""
     for logged in run.events:
         event = logged.event
         if event.name == _SUPERVISOR and event.level == "error" and abs(logged.t_ns - t_ns) <= _NEAR_NS:
@@ -55,7 +55,7 @@ def _cause(run: Run, t_ns: int) -> str:
 
 
 def find_causes(run: Run) -> tuple[str, ...]:
-    """List what ended attempts, or the log, without a fault, each once."""
+    """List the causes that ended attempts, or the log, without a fault, each once."""
     said = [
         logged.event.message for logged in run.events if logged.event.name == _RUN and logged.event.level == "error"
     ]
@@ -101,7 +101,7 @@ class CyclicDataGatherer:
             self._add_windows(powered["cycle"], powered["frames_missing"] > 0)
 
     def _add_windows(self, cycle: Cycles, is_incomplete: Mask) -> None:
-        """Judge what is whole of the windows of cycles that follow each other."""
+        """Judge the windows of consecutive cycles that are whole."""
         edges = np.flatnonzero(np.diff(cycle, prepend=self._present[2]) != 1)
         counted = np.concatenate(([0], np.cumsum(is_incomplete)))
         bounds = np.unique(np.concatenate(([0], edges, [len(cycle)]))).tolist()
@@ -167,7 +167,7 @@ def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShar
 
 
 def _excesses(worst: float | None, devices: dict[str, DeviceShares], limits: DataSettings) -> list[str]:
-    """Say what was over its limit in some second."""
+    """List the shares that were over their limit in some second."""
     judged = [("incomplete cycles", worst, limits.incomplete_share)]
     for name, shares in devices.items():
         judged.append((f"no new data of {name}", shares.worst_no_new_data, limits.no_new_data_share))

@@ -45,7 +45,7 @@ def list_findings(
     causes: tuple[str, ...],
     data: CyclicData,
 ) -> tuple[str, ...]:
-    """Say how the run went, a clause for each finding. causes: what ended attempts without a fault."""
+    """Say how the run went, a clause for each finding. causes: of attempts that ended without a fault."""
     if run.cycle.size == 0:
         cause = "; ".join(causes) or "the log does not say why"
         return (f"no cycle was run: {cause}",)
@@ -74,7 +74,7 @@ _HEADLINE_LETTERS: Final = 110
 def headlines(metrics: Metrics) -> list[str]:
     """Give the findings as lines for a first screen, the gravest first; a long one is cut, the log has all of it.
 
-    Nothing is said of the paper's scheme beside, nor of cyclic data within its limits: tables have them.
+    The paper's scheme beside, and cyclic data within its limits, are left to the tables.
     """
     plain = [text for text in metrics.findings if not text.startswith((_BESIDE, _NO_LOSS))]
     if metrics.is_clean and metrics.false_alarms == 0:
@@ -83,7 +83,7 @@ def headlines(metrics: Metrics) -> list[str]:
 
 
 def is_margin_below_1(evidence: CertifiedEvidence | None) -> bool:
-    """Tell whether some residual was over its threshold while nobody touched the arm."""
+    """Tell whether some residual was over its threshold in a free cycle."""
     return evidence is not None and evidence.smallest_margin is not None and evidence.smallest_margin < 1.0
 
 
@@ -132,7 +132,7 @@ def _summary(times_s: list[float | None], failed: str) -> str:
 
 
 def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:
-    """Name the adaptations with which the arm began again after a fault, or after what broke an attempt off."""
+    """Name the adaptations with which the arm began again after a fault, or after a broken attempt."""
     pairs = itertools.pairwise(sections)
     return frozenset(now.label for before, now in pairs if now.kind == "adaptation" and before.kind != "payload")
 
@@ -175,7 +175,7 @@ _ELSEWHERE = {
 
 
 def is_papers_experiment(run: Run) -> bool:
-    """Tell whether the emulator played the paper's experiment, with its arm; of a real arm nobody knows."""
+    """Tell whether the emulator played the paper's experiment, with its arm; False on a real arm."""
     played = (run.metadata.get("scenario"), run.metadata.get("emulator_scenario"))
     arm, papers = run.settings.arm, _papers_arm(run.settings.arm.profile)
     return _EXPERIMENT in played and (arm.link_length_m, arm.cad_theta) == (papers.link_length_m, papers.cad_theta)
@@ -196,7 +196,7 @@ def compare_with_paper(
     payload_kg: dict[str, float | None],
     evidence: CertifiedEvidence | None,
 ) -> tuple[PaperRow, ...]:
-    """Set what was measured beside what the paper printed, where it is the same experiment."""
+    """Set measured figures beside the paper's, where it is the same experiment."""
     settings = run.settings
     times_s = list(adaptation_s.values())
     detections = [section.label for section in sections if section.kind == "detection"]
@@ -316,7 +316,7 @@ def _threshold_text(evidence: CertifiedEvidence, detections: list[str]) -> str:
 
 
 def _push_text(evidence: CertifiedEvidence) -> str:
-    """Say how small a push is found, in the middle and at the worst moment."""
+    """Give the smallest push that is found: median, and at the worst moment."""
     if evidence.smallest_push is None:
         return NONE
     median, worst = (
