@@ -95,6 +95,13 @@ class TimingEvidence:
         }
 
 
+class Finding(NamedTuple):
+    """A clause about the run; is_bad: the run was not good because of it."""
+
+    text: str
+    is_bad: bool = False
+
+
 class Fault(NamedTuple):
     """A stay in FAULT. cause: the log's words for it, "" without any; is_last: the run ended in it."""
 
@@ -371,15 +378,19 @@ class Metrics:
     dropped: int | None
     evidence: CertifiedEvidence | None
     paper: tuple[PaperRow, ...]
-    findings: tuple[str, ...]
-    is_clean: bool
+    findings: tuple[Finding, ...]
     armed_false_alarms: int | None  # of them those in MONITOR
 
     @property
     def verdict(self) -> str:
         """All findings in one sentence."""
-        text = "; ".join(self.findings)
+        text = "; ".join(finding.text for finding in self.findings)
         return f"{text[:1].upper()}{text[1:]}."
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether the run was good: no finding is bad."""
+        return not any(finding.is_bad for finding in self.findings)
 
     @property
     def false_alarm_bound_per_h(self) -> float | None:

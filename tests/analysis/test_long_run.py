@@ -277,6 +277,12 @@ def test_a_long_stretch_comes_to_the_same_as_one_that_is_kept_whole(few_kept, pa
     assert table_of(thinned) == table_of(whole)
 
 
+def test_a_stretch_without_an_adaptation_is_not_bad_for_that(certified):
+    metrics = evaluate(stretched(certified, 2.8, 3.5).run)
+    assert metrics.adaptation_s == {}
+    assert not any("adapt" in finding.text for finding in metrics.findings)
+
+
 def test_a_stretch_beside_the_log_is_a_log_error(certified):
     with pytest.raises(LogError, match=r"run\.mcap has no cycle from 100 to 200 s"):
         stretched(certified, 100.0, 200.0)

@@ -284,6 +284,12 @@ def test_the_first_screen_of_a_run_with_many_faults_has_one_cause_and_a_list():
     assert (first[:30], len(first) <= 110, len(further) >= 2) == ("FAULT (DRIVE) at 0.10 s: drive1"[:30], True, True)
 
 
+def test_the_first_headline_of_a_bad_run_is_the_cause():
+    run = make_run((A, 1000), (M, 500), (SchemeState.PAYLOAD, 20), (A, 100))
+    first, *_ = headlines(evaluate(run))
+    assert "not again" in first
+
+
 def test_the_heading_does_not_part_a_number_from_its_unit(html):
     assert "1.00\u00a0s and again in 0.80\u00a0s after 1\u00a0kg" in html
 

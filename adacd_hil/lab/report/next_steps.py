@@ -43,7 +43,7 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> list[NextSte
 
 def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
     """List the repairs of each kind of failure."""
-    has_stopped = bool(metrics.fault) or not metrics.adaptation_s
+    has_stopped = bool(metrics.fault) or (not metrics.adaptation_s and run.stretch is None)
     stopped = _checked(run, "Mend what stopped the run.")
     late = _checked(run, "Frames came late or were lost, more than allowed.")
     rows = (

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
-from adacd_hil.lab.score.verdict import compare_with_paper, is_margin_below_1, is_revoked, list_findings
+from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
 from adacd_hil.log.logged_run import (
     COMPUTE,
     LATENESS,
@@ -106,8 +106,6 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     missed = score.missed
     faults, causes, data = find_faults(run), find_causes(run), gathered.data
     payload_kg = _payloads(run, sections)
-    is_identified = bool(adaptation_s) and all(value is not None for value in adaptation_s.values())
-    has_false = has_truth and len(false_s) > 0
     return Metrics(
         sections=sections,
         adaptation_s=adaptation_s,
@@ -128,9 +126,6 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         evidence=evidence,
         paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
         findings=list_findings(run, sections, score, adaptation_s, payload_kg, evidence, faults, causes, data),
-        is_clean=is_identified
-        and missed == 0
-        and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),
         armed_false_alarms=score.armed_false_alarms if has_truth else None,
     )
 

@@ -19,6 +19,7 @@ from adacd_hil.score.metrics import (
     CertifiedEvidence,
     CyclicData,
     Fault,
+    Finding,
     Metrics,
     PaperRow,
     ReportedContact,
@@ -44,11 +45,11 @@ def list_findings(
     faults: tuple[Fault, ...],
     causes: tuple[str, ...],
     data: CyclicData,
-) -> tuple[str, ...]:
-    """Say how the run went, a clause for each finding. causes: of attempts that ended without a fault."""
+) -> tuple[Finding, ...]:
+    """Say how the run went. causes: of attempts that ended without a fault."""
     if run.cycle.size == 0:
         cause = "; ".join(causes) or "the log does not say why"
-        return (f"no cycle was run: {cause}",)
+        return (Finding(f"no cycle was run: {cause}", True),)
     done = "identified" if evidence is None else "certified"
     identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
     found = score_sentence(score)
@@ -59,25 +60,30 @@ def list_findings(
     beside = ""
     if evidence is not None and evidence.paper_beside is not None and is_papers_experiment(run):
         beside = _beside_text(list(evidence.paper_beside.adaptation_s.values()))
-    margin = ""
+    grave = _fault_texts(faults)
+    grave += [f"the run was broken off: {'; '.join(causes)}"] if causes else []
+    grave += evidence.revoked if is_revoked(evidence) else ()
     if is_margin_below_1(evidence):
-        margin = f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}"
-    revoked = evidence.revoked if is_revoked(evidence) else ()
-    broken = f"the run was broken off: {'; '.join(causes)}" if causes else ""
-    findings = (*_fault_texts(faults), broken, *revoked, margin, found, identified, beside, data_text(data))
-    return tuple(filter(None, findings))
+        grave.append(f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}")
+    has_wrong = score.missed > 0 or (run.truth is not None and bool(score.false_alarms))
+    findings = [*(Finding(text, True) for text in grave), Finding(found, has_wrong)]
+    if adaptation_s or run.stretch is None:  # a part of a run need not have any
+        findings.append(Finding(identified, not adaptation_s or None in adaptation_s.values()))
+    findings += [Finding(beside), Finding(data_text(data), bool(data.excesses))]
+    return tuple(finding for finding in findings if finding.text)
 
 
 _HEADLINE_LETTERS: Final = 110
 
 
 def headlines(metrics: Metrics) -> list[str]:
-    """Give the findings as lines for a first screen, the gravest first; a long one is cut, the log has all of it.
+    """Give the findings as lines for a first screen, the bad ones first; a long one is cut, the log has all of it.
 
-    The paper's scheme beside, and cyclic data within its limits, are left to the tables.
+    The paper's scheme beside, and cyclic data without a loss, are left to the tables.
     """
-    plain = [text for text in metrics.findings if not text.startswith((_BESIDE, _NO_LOSS))]
-    if metrics.is_clean and metrics.false_alarms == 0:
+    ordered = sorted(metrics.findings, key=lambda finding: not finding.is_bad)
+    plain = [finding.text for finding in ordered if not finding.text.startswith((_BESIDE, _NO_LOSS))]
+    if metrics.false_alarms == 0:
         plain = [text.replace(", none false", ", no false alarm") for text in plain]
     return [textwrap.shorten(text[:1].upper() + text[1:], _HEADLINE_LETTERS, placeholder=" …") for text in plain]
 
