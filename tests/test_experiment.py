@@ -81,7 +81,7 @@ def test_the_experiment_ends_well_and_its_log_is_whole(played: dict[str, Played]
 
 def test_every_file_of_the_report_is_there(played: dict[str, Played]) -> None:
     names = {path.name for path in played["P"].folder.iterdir()}
-    assert names >= {"run.mcap", "truth.mcap", "report.html", "report.json", "contacts.csv"}
+    assert names >= {"run.mcap", "truth.mcap", "report.html", "report.json"}
 
 
 def test_there_is_no_torque_on_the_wire_before_the_checks_have_passed(played: dict[str, Played]) -> None:

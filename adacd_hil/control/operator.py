@@ -4,6 +4,7 @@ A request goes to the scheme in one cycle. The progress lines also show the stat
 """
 
 import contextlib
+import difflib
 import io
 import sys
 import threading
@@ -85,12 +86,27 @@ class ScriptedOperator:
         return Request.ACKNOWLEDGE
 
 
-class ConsoleOperator:
-    """Reads commands from a terminal, one per line, in a thread of its own; also returns the script's requests."""
+_AWAITED = {
+    SchemeState.STOPPED: "waiting: type `ack` to go on",
+    SchemeState.PAYLOAD: "waiting: type `changed` once the payload has been changed",
+}
+_MOST_LETTERS = 40
+"""Letters of an unknown word that are repeated."""
 
-    def __init__(self, script: ScriptedOperator, stream: TextIO = sys.stdin) -> None:
+
+class ConsoleOperator:
+    """Reads words from a terminal, a line each, on a thread of its own, and passes on the requests of a script.
+
+    tell: prints a line for the user: which word a state waits for, and that a word is unknown.
+    """
+
+    def __init__(
+        self, script: ScriptedOperator, stream: TextIO = sys.stdin, tell: Callable[[str], None] = lambda _: None
+    ) -> None:
         self._script = script
         self._stream = stream
+        self._tell = tell
+        self._state = SchemeState.INIT
         self._asked: deque[Request] = deque()
         self._thread = threading.Thread(target=self._listen, name="console", daemon=True)
         self._thread.start()
@@ -104,12 +120,18 @@ class ConsoleOperator:
             self._stream.reconfigure(errors="replace")  # an invalid character must not end the thread
         with contextlib.suppress(OSError):  # the terminal has hung up, or this process is in its background
             for line in self._stream:
-                request = CONSOLE_WORDS.get(line.strip().lower())
-                if request is not None:
-                    self._asked.append(request)
+                word = line.strip().lower()
+                if word in CONSOLE_WORDS:
+                    self._asked.append(CONSOLE_WORDS[word])
+                elif word:
+                    self._tell(_unknown(word))
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return the user's next request, else the script's; none during a fault, see `answer_fault`."""
+        """Return what the user asked first, else what the script asks; of a faulted arm, leave it to `answer_fault`."""
+        if state is not self._state:
+            self._state = state
+            if state in _AWAITED and not self._asked:
+                self._tell(_AWAITED[state])
         if self._asked and state is not SchemeState.FAULT:
             return self._asked.popleft()
         return self._script.request(elapsed_s, state)
@@ -123,6 +145,13 @@ class ConsoleOperator:
             if request is Request.FINISH:
                 return FaultAnswer.END
         return FaultAnswer.WAIT if self._thread.is_alive() else self._script.answer_fault(elapsed_s)
+
+
+def _unknown(word: str) -> str:
+    """Answer a word that is none of `CONSOLE_WORDS`."""
+    nearest = difflib.get_close_matches(word, CONSOLE_WORDS, n=1)
+    meant = f"; did you mean `{nearest[0]}`?" if nearest else ""
+    return f"unknown word {word[:_MOST_LETTERS]!r}{meant} (known: {', '.join(CONSOLE_WORDS)})"
 
 
 _STATES = {

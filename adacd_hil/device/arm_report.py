@@ -16,13 +16,11 @@ from adacd_hil.device.canopen_bus import name_error
 from adacd_hil.device.cycle_frames import SensorStatus, TorqueSensor
 from adacd_hil.device.drive import Cia402State, Drive
 from adacd_hil.records import ArmState, Event
+from adacd_hil.settings.arm_settings import DATA_WINDOW_S, SHORTEST_DATA_WINDOW
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.e2e import E2eStatus
 
-WINDOW_S = 1.0
 MOST_IN_A_ROW = 2
-SHORTEST_SHARE = 0.2
-"""Part of a window that is judged, too, when the attempt ends in it."""
 _REVOLUTION_DEG = 360.0
 
 
@@ -49,7 +47,7 @@ class DataWatch:
     def __init__(self, settings: Settings, arm: Arm) -> None:
         limits = settings.data
         self._arm = arm
-        self._window_cycles = max(1, round(WINDOW_S / settings.bus.period_s))
+        self._window_cycles = max(1, round(DATA_WINDOW_S / settings.bus.period_s))
         self._names = [device.name for device in arm.devices]
         self._limits = {"incomplete cycles": limits.incomplete_share}
         self._limits |= {f"no frame of {name} in time": limits.no_new_data_share for name in self._names}
@@ -120,7 +118,7 @@ class DataWatch:
 
     def shares(self) -> DataShares:
         """Sum up the attempt."""
-        if self._cycles >= SHORTEST_SHARE * self._window_cycles:
+        if self._cycles >= SHORTEST_DATA_WINDOW * self._window_cycles:
             self._end_window()
         cycles = max(self._all_cycles, 1)
         share = [total / cycles for total in self._totals.values()]

@@ -1,4 +1,4 @@
-"""The files of a log: their names, the words in their headers and summaries, and what goes wrong with them.
+"""The files of a log: their names, the words in their headers and summaries, and their errors.
 
 A window of time in a log is given in s since the beginning of the log, its first message.
 """
@@ -33,7 +33,7 @@ PRODUCT = "adacd-hil"
 RUN_METADATA = "run"
 SUMMARY_METADATA = "summary"
 EPOCH_KEY = "epoch_ns"
-"""Of the metadata `run`: what was added to t_ns for the times in the file."""
+"""Of the metadata `run`: offset of the times in the file from t_ns."""
 PART_KEY = "part"
 """Of the metadata `run`: number of the part, from 0."""
 ENDING_KEY = "ending"
@@ -43,7 +43,7 @@ CONTINUED = "continued"
 ROS_PROFILE = "ros2"
 """Of the header: every channel is CDR with a schema of ROS 2, so rosbags and rosbag2 take the file."""
 QOS_KEY = "offered_qos_profiles"
-"""Channel metadata that the profile asks for; nobody offered one."""
+"""Channel metadata that the profile requires; there was no offer."""
 FIELDS_KEY = "fields"
 """Channel metadata: our names of the fields, which ROS would have in lower case."""
 LOG_NAME = "run.mcap"
@@ -99,7 +99,7 @@ COPY_ENDINGS = (RECOVERED, CUT, MERGED)
 """The endings of logs that are made of others."""
 PLANNED_ENDINGS = ("closed", "continued", *COPY_ENDINGS)
 LOST_KEY = "lost"
-"""Of the summary of a recovered log: what was lost, in words; missing when nothing was."""
+"""Of the summary of a recovered log: its losses in words; missing without any."""
 DROPPED_KEY = "dropped"
 """Of the summary: packets that are not in the log."""
 
@@ -113,14 +113,14 @@ def parts_of(path: Path) -> dict[int, Path]:
 
 
 def summary_count(texts: Mapping[str, str], key: str) -> int:
-    """Read a count; what isn't one counts as 0."""
+    """Read a count; any other text counts as 0."""
     text = texts.get(key, "0")
     return int(text) if text.isdecimal() else 0
 
 
 def arithmetic() -> dict[str, str]:
-    """Describe what this machine computes with, for a log's metadata: equal descriptions compute equal bits."""
-    from importlib.metadata import version  # costs 20 ms, which most who import this file can spare
+    """Describe processor and libraries for a log's metadata: equal descriptions compute equal bits."""
+    from importlib.metadata import version  # costs 20 ms, and most importers don't need it
 
     return {
         "machine": f"{platform.system()} {platform.release()} {platform.machine()}",

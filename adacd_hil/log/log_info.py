@@ -121,7 +121,7 @@ def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
 
 
 class _InfoView:
-    """What has been seen of a log."""
+    """The records of a log that have been read."""
 
     def __init__(self, info: LogInfo, is_brief: bool) -> None:
         self._info = info
@@ -308,7 +308,7 @@ def run_metadata(path: Path) -> dict[str, str]:
 
 
 def _records_before_chunks(path: Path) -> Iterator[Attachment | Metadata]:
-    """Give the records before the first chunk, as far as they are sound: who reads the log says what is wrong."""
+    """Give the records before the first chunk, as far as they are sound: the reader of the log reports damage."""
     try:
         with open_input(path) as file:
             if file.read(len(MAGIC)) != MAGIC:

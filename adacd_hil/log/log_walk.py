@@ -1,6 +1,7 @@
 """A walk over all parts of a log, as if they were one file.
 
-What is intact of a cut or damaged file is kept; a part that is missing or damaged costs only itself and raises nothing.
+The intact messages of a cut or damaged file are kept; a part that is missing or damaged costs only itself and raises
+nothing.
 """
 
 import contextlib
@@ -59,7 +60,7 @@ class Definition(NamedTuple):
 
 
 class _Extras:
-    """What a file holds besides messages."""
+    """Attachments and metadata of a file."""
 
     def __init__(self) -> None:
         self.attachments: dict[str, bytes] = {}
@@ -86,7 +87,7 @@ class _Part(NamedTuple):
 
 
 def _read_head(path: Path) -> _Extras:
-    """Read what comes before the messages. Raises LogError when the file can't be read or isn't MCAP."""
+    """Read the records before the messages. Raises LogError when the file can't be read or isn't MCAP."""
     extras = _Extras()
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
         for record in walk(file, str(path), _NOT_OF_HEAD):
@@ -120,7 +121,7 @@ class _Definitions:
 
 
 class LogWalk:
-    """What a log holds. `problem` says in one line what is missing, "" for a whole log."""
+    """The content of a log. `problem` names missing parts in one line, "" for a whole log."""
 
     def __init__(
         self,
@@ -147,7 +148,7 @@ class LogWalk:
 
     @property
     def problem(self) -> str:
-        """What is missing, as far as has been walked."""
+        """Damaged and missing parts, as far as has been walked."""
         return "; ".join(self._problems)
 
     def _find_parts(self) -> None:
@@ -188,9 +189,9 @@ class LogWalk:
     def pieces(
         self, cycles: int, epoch_ns: int, has_frame_records: bool = False, is_ahead: bool = True
     ) -> Iterator[RawPiece]:
-        """Read the messages of all parts, at most so many cycles at a time; what is known of the log grows meanwhile.
+        """Read the messages of all parts, so many cycles at a time; topics, summary and problems grow meanwhile.
 
-        epoch_ns: what the times of frames are less than those of the file; has_frame_records: of frames the records
+        epoch_ns: offset of the times in the file from those of frames; has_frame_records: of frames the records
         are gathered, too; is_ahead: a thread opens chunks before they are asked for.
         """
         builder = PieceBuilder(cycles, epoch_ns, has_frame_records)

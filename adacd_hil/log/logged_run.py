@@ -1,4 +1,4 @@
-"""A run as plain arrays: what the host recorded, what the emulator knows, the streams of the certified scheme.
+"""A run as plain arrays: the host's records, the emulator's truth, the streams of the certified scheme.
 
 Torques in Nm, joint arrays (2,), histories time-first (n, 2). Times in s count from *motion start*: the first cycle in
 ADAPT.
@@ -98,7 +98,7 @@ class CycleColumns:
         return np.asarray(values_ns / 1000.0, dtype=np.float64)
 
     def steps(self, name: str, before: int = 0) -> Cycles:
-        """Give what each cycle added to a running count (n,); a count that began anew begins at 0.
+        """Give the increments of a running count (n,); a count that began anew begins at 0.
 
         before: the count in the cycle before the first.
         """
@@ -129,7 +129,7 @@ _NEVER: Final = 1 << 62
 PROGRESS_CYCLES: Final = 1_000_000
 """Between two lines of progress."""
 Progress = Callable[[str], None]
-"""Is told a line now and then."""
+"""Prints a line about work in progress."""
 
 
 class Milestones:
@@ -188,14 +188,14 @@ def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:
 
 
 def host_span(span: EmulatorSpan, begins: Cycles) -> Span:
-    """Turn what the emulator recorded into the host's cycles; what goes on after the host's log has no last one."""
+    """Turn the emulator's first and last cycle into the host's; no last one if the emulator goes on after the log."""
     attempts, cycles = (np.array(column) for column in zip(*span, strict=True))
     first, last = host_cycles(cycles, attempts, begins).tolist()
     return Span(first, last if attempts[1] < len(begins) else _NEVER)
 
 
 def whole_rounds(begins: Cycles) -> Cycles:
-    """Give what the emulator's cycles lack of the host's, in attempts that begin with such cycles (k,)."""
+    """Return, per attempt that begins with such a cycle (k,), the offset of the host's cycles from the emulator's."""
     return np.asarray(begins - begins % SYNC_OVERFLOW)
 
 
@@ -204,7 +204,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Truth:
-    """What the emulator knows, on its own cycles (m,): external torque (m, 2), contact, payload, parameters (m, 7).
+    """The emulator's truth on its own cycles (m,): external torque (m, 2), contact, payload, parameters (m, 7).
 
     Of a long run it has the cycles of contacts and the one after each. Payload and parameters then have cycles of their
     own, `model_cycle` (k,): those from which on they are as they are.
@@ -221,10 +221,10 @@ class Truth:
     model_cycle: Cycles | None = None
     attempt: Cycles | None = None  # of its cycles (m,), from 0; None: all are of one
     span: Span | None = None
-    """What the emulator recorded, whichever cycles are kept; None: all."""
+    """Cycles that the emulator recorded, whichever are kept; None: all."""
 
     def covers(self, cycle: int) -> bool:
-        """Whether the emulator recorded what was true in a cycle."""
+        """Whether the emulator recorded a cycle."""
         return self.span is None or bool(self.span.covers(np.array(cycle)))
 
     def model_row(self, cycle: int) -> int | None:
@@ -235,7 +235,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class CertifiedStream:
-    """What the block of the certified scheme has beyond the paper's, over n cycles.
+    """Fields of the certified scheme's block beyond the paper's, over n cycles.
 
     tau_ext, threshold: of the bank (n, channels, 2): each filter smoothed, then all but the slowest bare. theta_further
     (n, k): offsets, lags and friction terms; theta_std (n, p + k); promotions (n,).
@@ -259,7 +259,7 @@ class PaperStream:
 
 @dataclass(frozen=True)
 class MeasuredMotion:
-    """What was measured over n cycles: q rad, dq rad/s, tau_J Nm, each (n, 2)."""
+    """Measured values over n cycles: q rad, dq rad/s, tau_J Nm, each (n, 2)."""
 
     q: Vector
     dq: Vector
@@ -268,7 +268,7 @@ class MeasuredMotion:
 
 @dataclass(frozen=True)
 class CheckCounts:
-    """What the checks of the cyclic frames had counted when it was logged (k,): counts (k, devices, statuses)."""
+    """Running counts of the checks of cyclic frames, as logged (k,): counts (k, devices, statuses)."""
 
     devices: tuple[str, ...]
     cycle: Cycles
@@ -309,7 +309,7 @@ class Run:
     metadata: Mapping[str, str]
     frames: int | None
     dropped: int | None
-    finish_cycle: int | None = None  # in which the user asked to finish; None if nobody did
+    finish_cycle: int | None = None  # in which the user asked to finish; None: never
     contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
     certified: CertifiedStream | None = None  # None of the paper's scheme
     beside: PaperStream | None = None
@@ -417,7 +417,7 @@ def is_interrupted(state: NDArray[np.uint8]) -> Mask:
 
 
 def split_sections(run: Run) -> tuple[Section, ...]:
-    """Split a run into lettered sections; what comes before the first ADAPT belongs to none."""
+    """Split a run into lettered sections; cycles before the first ADAPT belong to none."""
     if run.state.size == 0:
         return ()
     kinds = np.array([_KINDS.get(SchemeState(value), "") for value in range(len(SchemeState))])[origins(run.state)]
@@ -456,7 +456,7 @@ def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
         raise LogError(f"log {path} has no attachment config.toml: its settings are not known")
     try:
         return parse(Settings, renewed(parse_toml(attachments["config.toml"])))
-    except ValueError as error:  # what is wrong with the text, the TOML or a setting is a ValueError each
+    except ValueError as error:  # errors of the text, the TOML and a setting are ValueErrors
         raise LogError(f"log {path}, attachment config.toml: {error}") from None
 
 

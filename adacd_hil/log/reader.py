@@ -1,13 +1,13 @@
-"""A log read whole into memory (`read_log`), or piece by piece in constant memory (`LogStream`).
+"""A log as a stream of pieces (`LogStream`), or as one piece (`read_log`).
 
-In memory: one structured array per topic, frames in the order of the bus, events, contacts, attachments. Cut and
-damaged files are read as far as they are intact; `is_complete` and `problem` say so.
+A piece has one structured array per topic, frames in the order of the bus, and events. Cut and damaged files are read
+as far as they are intact; `is_complete` and `problem` say so.
 
 On two processors one reads, checks and decompresses ahead while the other gathers the messages; topics that weren't
 asked for cost nothing but their decompression.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -35,10 +35,8 @@ from adacd_hil.log.types.record_arrays import (
     FRAME_DTYPE,
     LONG_FRAME_DTYPE,
     Payload,
-    RawPiece,
     Topic,
     is_of_frames,
-    joined_frames,
 )
 from adacd_hil.log.types.topics import CONTACT, DECODED, run_channels, truth_channels
 from adacd_hil.records import (
@@ -159,17 +157,17 @@ class RunLog:
 
     @property
     def epoch_ns(self) -> int:
-        """What was added to t_ns for the times of the file."""
+        """Offset of the times in the file from t_ns."""
         return _number(self.metadata, EPOCH_KEY, 0)
 
     @property
     def scheme(self) -> Series:
-        """What the scheme decided, records.scheme_layout."""
+        """Decisions of the scheme, records.scheme_layout."""
         return self.topics["/scheme"]
 
     @property
     def control(self) -> Series:
-        """What was desired and commanded, records.CONTROL_LAYOUT."""
+        """Desired motion and commanded torque, records.CONTROL_LAYOUT."""
         return self.topics["/control"]
 
     @property
@@ -179,7 +177,7 @@ class RunLog:
 
     @property
     def truth(self) -> Series:
-        """What the emulator knows, records.TRUTH_LAYOUT."""
+        """The emulator's truth, records.TRUTH_LAYOUT."""
         return self.topics["/truth"]
 
 
@@ -188,25 +186,22 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
 
     A folder stands for the run's log in it, `run.mcap`. Raises LogError when the file doesn't exist or isn't MCAP.
     """
-    path = log_in(path)
-    walk, epoch_ns = open_log(path, topics)
-    pieces = list(walk.pieces(_EVERY_CYCLE, epoch_ns, has_frame_records=True))
-    piece = pieces[0] if pieces else RawPiece({}, joined_frames([]), {})
-    own = own_topics(walk.metadata)
-    every = series_of(piece.records, walk.topics, own, epoch_ns)
-    series = {name: values for name, values in every.items() if name.startswith(DECODED) or name in own}
+    stream = LogStream(path, topics, _EVERY_CYCLE, has_every_topic=True)
+    piece = [stream.empty(), *stream][-1]
+    own = _own_topics(stream.metadata)
+    series = {name: values for name, values in piece.series.items() if name.startswith(DECODED) or name in own}
     return RunLog(
-        path=path,
-        problem=walk.problem,
-        metadata=walk.metadata,
-        summary=walk.summary,
-        attachments=walk.attachments,
+        path=stream.path,
+        problem=stream.problem,
+        metadata=stream.metadata,
+        summary=stream.summary,
+        attachments=stream.attachments,
         topics=series,
         decoded={name.removeprefix(DECODED): values for name, values in series.items() if name.startswith(DECODED)},
         frames=piece.frames,
-        events=events_of(piece.payloads, walk.topics, epoch_ns),
+        events=stream.events(piece),
         contacts=contacts_of(series["/contact"]),
-        parts=walk.parts,
+        parts=stream.parts,
     )
 
 
@@ -215,22 +210,14 @@ def topic_bytes(path: str | Path, topic: str) -> bytes:
 
     path: as for `read_log`. Raises LogError when the file can't be read or lacks the topic.
     """
-    walk, _ = open_log(path, (topic,))
-    found = []
-    for piece in walk.pieces(_EVERY_CYCLE, 0, has_frame_records=True):
+    stream = LogStream(path, (topic,), _EVERY_CYCLE, has_every_topic=True)
+    found: list[bytes] = []
+    for piece in stream:
         found += piece.payloads.get(topic, [])
-        if topic in piece.records:
-            rows = {topic: piece.records[topic]}
-            found.append(series_of(rows, {topic: walk.topics[topic]}, {}, 0)[topic].payloads())
-    if topic not in walk.topics:
+        found += [piece.series[topic].payloads()] if topic in piece.series else []
+    if topic not in stream.topics:
         raise LogError(f"log {path} has no topic {topic}")
     return b"".join(found)
-
-
-def open_log(path: str | Path, topics: Collection[str] | None) -> tuple[LogWalk, int]:
-    """Begin to read a log; return the walk over it and what was added to t_ns for its times. Raises LogError."""
-    walk = LogWalk(log_in(path), lambda channel, schema: _payload_layout(channel, schema, bool(walk.metadata)), topics)
-    return walk, _number(walk.metadata, EPOCH_KEY, 0)
 
 
 def _payload_layout(channel: Channel, schema: Schema, is_of_run: bool) -> Payload | None:
@@ -260,7 +247,7 @@ def _number(metadata: Mapping[str, str], key: str, default: int) -> int:
         raise LogError(f"the log's metadata {key} = {metadata[key]!r} is not a number") from None
 
 
-def own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
+def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
     """Describe our own topics in a log with such metadata. Raises LogError."""
     parameter_count = _number(metadata, "parameter_count", len(PARAMETER_NAMES))
     channels = (*run_channels(parameter_count), *truth_channels())
@@ -269,7 +256,7 @@ def own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
     }
 
 
-def series_of(
+def _series_of(
     rows: Mapping[str, NDArray[np.uint8]], topics: Mapping[str, Topic], own: Mapping[str, Topic], epoch_ns: int
 ) -> dict[str, Series]:
     """Make a series of each topic of fixed size: of our own ones, present or not, and of the others that there are.
@@ -288,16 +275,6 @@ def series_of(
     return series
 
 
-def events_of(payloads: Mapping[str, Iterable[bytes]], topics: Mapping[str, Topic], epoch_ns: int) -> list[LoggedEvent]:
-    """Unpack what /events has."""
-    events: list[LoggedEvent] = []
-    if "/events" not in topics or topics["/events"].type_name != LOG.name:
-        return events
-    for payload in payloads.get("/events", ()):
-        events.append(LoggedEvent(log_time_ns(payload) - epoch_ns, unpack_log(payload)))
-    return events
-
-
 _STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": FaultReason}
 
 
@@ -312,7 +289,7 @@ def check_states(scheme: Series) -> None:
 
 
 def contacts_of(series: Series) -> list[LoggedContact]:
-    """Give what /contact has. Raises LogError for a level, kind, reaction or place that there is not."""
+    """Give the reports of /contact. Raises LogError for an unknown level, kind, reaction or place."""
     contacts = []
     members = [member for member in CONTACT.head if member.name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
@@ -342,7 +319,7 @@ class Piece(NamedTuple):
 class LogStream:
     """A log read once from front to back in constant memory, all parts as one.
 
-    What is damaged or missing is left out; `problem` says so.
+    Damaged and missing parts are left out; `problem` says so.
     """
 
     def __init__(
@@ -351,16 +328,24 @@ class LogStream:
         topics: Collection[str] | None = None,
         cycles_per_piece: int = 5_000,
         is_ahead: bool = True,
+        has_every_topic: bool = False,
     ) -> None:
         """Begin to read the log whose first part is `path`, of the messages only those of `topics` when given.
 
         A folder stands for the run's log in it. is_ahead: a thread opens chunks ahead, for a caller that has none of
-        its own for the reading. Raises LogError when nothing of it can be read.
+        its own for the reading. has_every_topic: pieces have series of bus frames, too, and empty ones of our own
+        topics that were not asked for. Raises LogError when nothing of it can be read.
         """
-        self._walk, self.epoch_ns = open_log(path, topics)
+        self.path = log_in(path)
+        self._walk = LogWalk(self.path, self._layout_of, topics)
+        self.epoch_ns = _number(self.metadata, EPOCH_KEY, 0)
         self._topics = topics
         self._cycles_per_piece = cycles_per_piece
         self._is_ahead = is_ahead
+        self._has_every_topic = has_every_topic
+
+    def _layout_of(self, channel: Channel, schema: Schema) -> Payload | None:
+        return _payload_layout(channel, schema, bool(self.metadata))
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -369,16 +354,16 @@ class LogStream:
 
     @property
     def attachments(self) -> dict[str, bytes]:
-        """What the run was made with, by file name."""
+        """The files that the run was made with, by name."""
         return self._walk.attachments
 
     def empty(self) -> Piece:
         """Give a piece without messages, with our own topics."""
-        return Piece(series_of({}, {}, self._own_topics(), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
+        return Piece(_series_of({}, {}, self._own_topics(), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
 
     @property
     def problem(self) -> str:
-        """What is missing, one line, as far as has been read; "" for a whole log."""
+        """Damaged and missing parts in one line, as far as has been read; "" for a whole log."""
         return self._walk.problem
 
     @property
@@ -392,8 +377,17 @@ class LogStream:
         return self._walk.summary
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
-        """Unpack what a piece has of /events."""
-        return events_of(piece.payloads, self._walk.topics, self.epoch_ns)
+        """Unpack the events of a piece."""
+        topic = self.topics.get("/events")
+        if topic is None or topic.type_name != LOG.name:
+            return []
+        payloads = piece.payloads.get("/events", ())
+        return [LoggedEvent(log_time_ns(payload) - self.epoch_ns, unpack_log(payload)) for payload in payloads]
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """Those that were asked for and are defined, as far as has been read."""
+        return self._walk.topics
 
     @property
     def parts(self) -> int:
@@ -407,7 +401,9 @@ class LogStream:
 
     def _own_topics(self) -> dict[str, Topic]:
         """List those of our topics that pieces have series of."""
-        own = own_topics(self.metadata)
+        own = _own_topics(self.metadata)
+        if self._has_every_topic:
+            return own
         return {
             name: topic
             for name, topic in own.items()
@@ -415,10 +411,10 @@ class LogStream:
         }
 
     def __iter__(self) -> Iterator[Piece]:
-        own = self._own_topics()
-        for piece in self._walk.pieces(self._cycles_per_piece, self.epoch_ns, is_ahead=self._is_ahead):
-            topics = {name: topic for name, topic in self._walk.topics.items() if not is_of_frames(topic)}
-            yield Piece(series_of(piece.records, topics, own, self.epoch_ns), piece.frames, piece.payloads)
+        own, walk = self._own_topics(), self._walk
+        for piece in walk.pieces(self._cycles_per_piece, self.epoch_ns, self._has_every_topic, self._is_ahead):
+            there = {name: each for name, each in walk.topics.items() if name in piece.records}
+            yield Piece(_series_of(piece.records, there, own, self.epoch_ns), piece.frames, piece.payloads)
 
 
 def start_of_log(path: Path) -> int | None:

@@ -1,1 +1,1 @@
-"""What a run found, missed or reported falsely."""
+"""The judge: contacts that a run found or missed, and its false alarms."""

@@ -1,10 +1,10 @@
-"""The truth of a run from the emulator's log: all of its cycles, or of a long one those of contacts; its true contacts.
+"""The truth of a run from the emulator's log: the cycles of its contacts, the model of the arm, its true contacts.
 
 Of a contact the first cycles and the last second are kept as they are. In between, of every `_BUCKET` cycles those
 with the smallest and largest torque of each joint and the largest force; that many contacts of many seconds fit in
-memory, and what is asked of them (peaks, the filtered torque at their end) stays what it was.
+memory, and the peaks and the filtered torque at their end stay exact.
 
-The reader refuses a log of another run, as far as both logs name what was played.
+The reader refuses a log of another run, as far as both logs name their scenario.
 """
 
 import hashlib
@@ -60,14 +60,14 @@ _PLENTY: Final = 1_000_000
 _ENDING: Final = 1_000
 _BUCKET: Final = 100
 _HELD: Final = 30_000
-"""Rows of one contact that wait at most until those in the middle are chosen."""
+"""Rows of one contact that are held before some of them are chosen."""
 
 
 class TruthTable(NamedTuple):
     """Kept rows of the truth (m,), on the emulator's own cycles; attempt (m,): of the run, from 0.
 
     model_attempt, model_cycle (k,): from when on payload and parameters are as they are. metadata: of the log; problem:
-    what it lacks; is_complete: it is whole and nothing was dropped on the way to it.
+    missing parts; is_complete: it is whole and nothing was dropped on the way to it.
     """
 
     attempt: Cycles
@@ -95,10 +95,10 @@ _ROW: Final = np.dtype(
 _MODEL: Final = ("payload", "theta")
 
 
-def read_truth(path: Path, most_rows: int) -> TruthTable:
-    """Read the emulator's log; of one with more than `most_rows` cycles the contacts. Raises LogError."""
+def read_truth(path: Path) -> TruthTable:
+    """Read the contacts from the emulator's log, with the cycle after each. Raises LogError."""
     stream = LogStream(path, ("/truth",))
-    rows = _Gathering(most_rows)
+    rows = _Gathering()
     for piece in stream:
         rows.add(piece.series["/truth"])
     return rows.done(stream)
@@ -107,11 +107,8 @@ def read_truth(path: Path, most_rows: int) -> TruthTable:
 class _Gathering:
     """Takes in the records of /truth, piece by piece."""
 
-    def __init__(self, most_rows: int) -> None:
-        self.count = 0
-        self._most_rows = most_rows
+    def __init__(self) -> None:
         self._has_force = True
-        self._is_long = False
         self._kept: list[NDArray[Any]] = []
         self._kept_rows = 0
         self._contact = _OneContact(_BEGINNING[0])
@@ -127,16 +124,7 @@ class _Gathering:
         rows = self._rows(truth)
         self._first = rows[:1] if self._first is None else self._first
         self._add_models(truth, rows)
-        self.count += len(rows)
-        if not self._is_long and self.count > self._most_rows:
-            self._is_long = True
-            held, self._kept = [*self._kept, rows], []
-            for part in held:
-                self._add_contacts(part)
-        elif self._is_long:
-            self._add_contacts(rows)
-        else:
-            self._kept.append(rows)
+        self._add_contacts(rows)
         self._last = rows[-1:]
 
     def _rows(self, truth: Series) -> NDArray[Any]:
@@ -164,7 +152,7 @@ class _Gathering:
         self._model = tuple(column[-1:].copy() for column in columns)
 
     def _add_contacts(self, rows: NDArray[Any]) -> None:
-        """Keep of these rows what belongs to contacts, and the row after each."""
+        """Keep the rows of contacts, and the row after each contact."""
         key = np.stack((rows["attempt"].astype(np.float64), rows["contact_index"]), axis=1)
         edges = np.flatnonzero((key[1:] != key[:-1]).any(axis=1)) + 1
         bounds = [0, *edges.tolist(), len(rows)]
@@ -185,10 +173,8 @@ class _Gathering:
         self._contact = _OneContact(_BEGINNING[self._kept_rows > _PLENTY])
 
     def done(self, stream: LogStream) -> TruthTable:
-        """Give what was kept."""
-        if self._is_long:
-            self._kept.append(self._contact.rows())
-        rows = np.concatenate([np.zeros(0, _ROW), *self._kept])
+        """Give the kept rows."""
+        rows = np.concatenate([np.zeros(0, _ROW), *self._kept, self._contact.rows()])
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
         models = zip(nothing, *self._models, strict=True)
         attempt, cycle, payload, theta = (np.concatenate(column) for column in models)
@@ -251,12 +237,12 @@ class _OneContact:
         return np.concatenate([*self._chosen, self._waiting])
 
 
-def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector | None) -> Truth | None:
+def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
     """Give the truth on the host's cycles; None where the emulator never cycled.
 
     begins: first cycle of each attempt of the run; last: of the run; time_s: of the rows (m,).
 
-    The arm goes on when the host has died; what happens to it then is none of the host's cycles.
+    The arm goes on when the host has died; cycles after the host's last one are left out.
     """
     if not rows.model_cycle.size:
         return None
@@ -271,7 +257,7 @@ def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector | Non
         theta=rows.theta,
         force_N=None if rows.force_N is None else rows.force_N[of_host],
         attempt=rows.attempt[of_host],
-        time_s=None if time_s is None else time_s[of_host],
+        time_s=time_s[of_host],
         model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins),
         span=None if rows.span is None else host_span(rows.span, begins),
     )
@@ -284,7 +270,7 @@ def foreign_truth(log: Path, truth: Path) -> str:
     """Say in one line why a truth is of another run than a log; "" where nothing says so.
 
     Both name scenario and seed where one process played host and arm, and the truth has a digest of the host's
-    configuration: in lockstep, the same three make the same run. On a bus the host doesn't know what is played.
+    configuration: in lockstep, the same three make the same run. On a bus the host doesn't know the scenario.
     """
     ours, theirs = run_metadata(log), _played(truth)
     for key in _PLAYED:
@@ -312,11 +298,11 @@ def _digest(config: bytes) -> str | None:
     try:
         return config_digest(config.decode("utf-8", "replace"))
     except ConfigError:
-        return None  # who reads the log says so
+        return None  # the reader of the log reports it
 
 
 def _played(truth: Path) -> dict[str, str]:
-    """Give what a truth says of itself: of old, the scenario was attached only."""
+    """Give scenario and seed of a truth; old ones have them in an attachment alone."""
     said = run_metadata(truth)
     try:
         table = parse_toml(attachment(truth, "scenario.toml") or b"")
@@ -398,7 +384,7 @@ def windows_of(contacts: Sequence[TrueContact], host: HostCycles, settings: Sett
 def contacts_beside(path: Path, progress: Progress = lambda _: None) -> TrueContacts | None:
     """Read the true contacts from the emulator's log in the same folder; None where there is none. Raises LogError.
 
-    That of another run is left out, and `progress` is told why.
+    The truth of another run is left out, and `progress` gets a line with the reason.
     """
     truth = path.with_name(TRUTH_NAME)
     if not truth.exists():
@@ -406,7 +392,7 @@ def contacts_beside(path: Path, progress: Progress = lambda _: None) -> TrueCont
     if problem := foreign_truth(path, truth):
         progress(f"{problem}; it is left out")
         return None
-    rows = read_truth(truth, 0)
+    rows = read_truth(truth)
     return None if rows.span is None else TrueContacts(_contacts(rows), rows.span)
 
 

@@ -1,4 +1,4 @@
-"""The judge: which alarm is about which true contact, what was found, how late, what was missed, what was false.
+"""The judge: which alarm is about which true contact; contacts found, how late, or missed; false alarms.
 
 A scheme raises an *alarm* with a transition to REACT by a contact, in whatever state: the certified scheme detects
 while it adapts and while it parks, too. While it is in REACT or STOPPED it is still about the contact before. REACT
@@ -8,13 +8,13 @@ A true contact explains alarms from its onset until it is forgotten: until one t
 filtered, is back within the threshold (`forgotten_after_s`). An alarm is about the last contact that began
 before it, as long as that contact, or one before it, is not forgotten; so an alarm is about one contact at most. The
 first alarm about a contact finds it. An alarm about none is *false*, in whatever state it was raised, unless the
-emulator did not record what was true then: nobody knows about such an alarm. Where gravity acts, an alarm in PAYLOAD
+emulator did not record that time: such an alarm is not judged. Where gravity acts, an alarm in PAYLOAD
 about a payload that is not that of the last MONITOR is about its weight, and not false.
 
 A contact is *armed* if detection was armed in the logged cycle before its onset. It is *missed* if it is armed and
 nothing found it. A contact that began before the log did is not armed.
 
-Of a run: its true contacts, the detections of its scheme, and what an ideal detector with its filters would see.
+Of a run: its true contacts, the detections of its scheme, and the response of an ideal detector with its filters.
 
 Bounds of shares and rates are exact. Sources: Clopper and Pearson, "The use of confidence or fiducial limits
 illustrated in the case of the binomial", Biometrika 26 (1934); Garwood, "Fiducial limits for the Poisson
@@ -71,7 +71,11 @@ Times = NDArray[np.int64]
 
 
 class TouchWindow(NamedTuple):
-    """A true contact as it is judged; is_reacting: the scheme still reacted to something else at its onset."""
+    """A true contact, and when it was detected.
+
+    forgotten_ns: until when it explains alarms. is_armed: detection was armed at its onset; is_reacting: the scheme
+    still reacted to something else then. detected_ns: None if no alarm found it.
+    """
 
     number: int
     link: int
@@ -79,16 +83,7 @@ class TouchWindow(NamedTuple):
     forgotten_ns: int
     is_armed: bool
     is_reacting: bool = False
-
-
-class JudgedContact(NamedTuple):
-    """What became of a true contact; detected_ns: None if nothing found it."""
-
-    number: int
-    link: int
-    onset_ns: int
-    is_armed: bool
-    detected_ns: int | None
+    detected_ns: int | None = None
 
     @property
     def delay_ms(self) -> float | None:
@@ -103,9 +98,9 @@ class JudgedContact(NamedTuple):
 
 @dataclass(frozen=True)
 class Score:
-    """What became of true contacts, in order, and which alarms were false; unjudged: those the truth does not cover."""
+    """True contacts in order with their detections, and false alarms; unjudged: alarms beyond the truth."""
 
-    contacts: tuple[JudgedContact, ...]
+    contacts: tuple[TouchWindow, ...]
     false_alarms: tuple[Alarm, ...]
     unjudged: tuple[Alarm, ...] = ()
 
@@ -130,7 +125,7 @@ class Score:
         return tuple(contact.delay_ms for contact in self.contacts if contact.delay_ms is not None)
 
     def since(self, first_ns: int) -> "Score":
-        """Leave out what began before a time."""
+        """Leave out contacts and alarms that began before a time."""
         return Score(
             tuple(contact for contact in self.contacts if contact.onset_ns >= first_ns),
             tuple(alarm for alarm in self.false_alarms if alarm.t_ns >= first_ns),
@@ -187,7 +182,7 @@ class StreamJudge:
         self._pause_ns = pause_ns
         self._found: dict[int, int] = {}
         self._false: list[Alarm] = []
-        self._last_ns: int | None = None  # of what no contact explains
+        self._last_ns: int | None = None  # of the last sample that no contact explains
 
     def add(self, t_ns: Times, is_over: NDArray[np.bool_], is_judged: NDArray[np.bool_]) -> None:
         """Take in the next samples (n,). is_judged: where an alarm that no contact explains counts as false."""
@@ -200,7 +195,7 @@ class StreamJudge:
             self._last_ns = int(false_ns[-1])
 
     def score(self) -> Score:
-        """Judge what has been taken in."""
+        """Judge all samples so far."""
         return Score(_judged(self._touches, self._found), tuple(self._false))
 
 
@@ -216,11 +211,8 @@ def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
     return first
 
 
-def _judged(touches: Sequence[TouchWindow], found: dict[int, int]) -> tuple[JudgedContact, ...]:
-    return tuple(
-        JudgedContact(touch.number, touch.link, touch.onset_ns, touch.is_armed, found.get(place))
-        for place, touch in enumerate(touches)
-    )
+def _judged(touches: Sequence[TouchWindow], found: dict[int, int]) -> tuple[TouchWindow, ...]:
+    return tuple(touch._replace(detected_ns=found.get(place)) for place, touch in enumerate(touches))
 
 
 def rate_bound_per_h(alarms: int, hours: float) -> float:
@@ -236,7 +228,7 @@ def least_rate_per_h(alarms: int, hours: float) -> float:
 def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int, int]]:
     """Give from which row to before which each contact of a truth lasts; index, attempt (m,): of its rows.
 
-    Another index is another contact, though nobody lets go in between. What goes on as an attempt begins is another
+    Another index is another contact, though the touch goes on. A contact that goes on as an attempt begins is another
     one, too: the scheme begins anew.
     """
     is_edge = index[1:] != index[:-1]
@@ -393,7 +385,7 @@ def row_at(run: Run, time_s: float) -> int:
 
 
 def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
-    """Give what detects at a time: the paper's one filter, or the bank with its thresholds."""
+    """Give the filters that detect at a time, with their thresholds: the paper's one, or the bank."""
     if run.certified is None:
         return (FilterChannel(run.a_rad_s, None, threshold_at(run, time_s)),)
     thresholds = run.certified.threshold[row_at(run, time_s)]

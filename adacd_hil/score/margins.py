@@ -1,9 +1,9 @@
-"""What a run's cycles come to where nobody touches the arm: residuals, margins, and the paper's scheme beside.
+"""Sums over a run's cycles in which nobody touches the arm: residuals, margins, and the paper's scheme beside.
 
 Cycles are taken piece by piece, in order; a run in memory is one piece. A cycle is *free* unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
-5 Nm. Without the truth, [detection - 10/a, detection + 10/a] stands for the contact; of what a truth doesn't cover
-nobody knows whether it is free, so it isn't. After the request to finish the
+5 Nm. Without the truth, [detection - 10/a, detection + 10/a] stands for the contact. Cycles that the
+truth does not cover are not free. After the request to finish the
 arm parks and stands, where friction may hold any torque up to F_c: those cycles are not free.
 
 The smallest push that is found in time (`scheme.detect.margin`) is an estimate, since threshold and residual change
@@ -20,7 +20,7 @@ a stream (`judge.StreamJudge`), with a pause of 10 time constants; a false alarm
 While the payload is changed it does not detect.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -56,7 +56,7 @@ SETTLING_TIME_CONSTANTS = 10.0
 
 
 def larger(largest: Vector | None, values: Vector) -> Vector | None:
-    """Give the larger of the sizes of `values` (k, …) and of what was the largest of each so far (…).
+    """Give the larger of the sizes of `values` (k, …) and the largest of each so far (…).
 
     None so far: none. NaN stays.
     """
@@ -67,7 +67,7 @@ def larger(largest: Vector | None, values: Vector) -> Vector | None:
 
 
 class BesideGatherer:
-    """Gathers what the paper's scheme reached, piece by piece."""
+    """Gathers the results of the paper's scheme, piece by piece."""
 
     def __init__(self, run: Run, sections: Sequence[Section], touches: Sequence[TruthTouch]) -> None:
         assert run.beside is not None
@@ -104,7 +104,7 @@ class BesideGatherer:
         self._judge.add(piece.t_ns, over, is_judged)
         for label, start_s, left_s in self._adaptations:
             if self._adaptation_s[label] is None and start_s <= time_s[-1] and left_s >= time_s[0]:
-                # In the first cycle of ADAPT it is still what it was before.
+                # In the first cycle of ADAPT it still has its value of before.
                 rows = slice(np.searchsorted(time_s, start_s, "right"), np.searchsorted(time_s, left_s, "right"))
                 first = np.flatnonzero(stream.is_armed[rows])
                 if first.size:
@@ -243,17 +243,6 @@ class MarginGatherer:
 
 def _inverse(share: float) -> float:
     return 1.0 / share if share > 0.0 else float("inf")
-
-
-def gather_untouched(run: Run, pieces: Iterable[Run]) -> Untouched:
-    """Gather what the cycles of a run come to.
-
-    run: has the cycles in which something begins or ends; pieces: together all of its cycles, in order.
-    """
-    gatherer = UntouchedGatherer(run)
-    for piece in pieces:
-        gatherer.add(piece)
-    return gatherer.gathered()
 
 
 class UntouchedGatherer:

@@ -1,11 +1,11 @@
-"""What a run achieved, in numbers: adaptation times, residuals, contacts, false alarms, margins, times of the cycle.
+"""The results of a run in numbers: adaptation times, residuals, contacts, false alarms, margins, times of the cycle.
 
 `evaluation` makes these results of a run's arrays. Times in s count from *motion start*: the first cycle in ADAPT.
 Torques in Nm, joint arrays (2,), histories time-first (n, 2); `tau_ext_hat` has the filter's DC gain taken out, so
 that a torque step tau crosses the threshold h after t = -ln(1 - h / |tau|) / a.
 
 **Sections** are lettered A, B, C, … in order, see `adacd_hil.log.logged_run`. An adaptation's time is that of its
-section: up to MONITOR, the test of the frozen model and what a contact on the way costs included.
+section: up to MONITOR, the test of the frozen model and contacts on the way included.
 
 **Frozen residual**: largest |tau_ext_hat| of each joint where nobody touches the arm. A cycle counts unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
@@ -18,7 +18,7 @@ to F_c: those cycles don't count.
 detections are false alarms: `adacd_hil.score.judge`; detection is armed in MONITOR.
 
 **Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
-those of the fastest channel of its bank. What else it has: `adacd_hil.score.margins`; the paper's
+those of the fastest channel of its bank. Its other results: `adacd_hil.score.margins`; the paper's
 scheme that ran beside it on the same stream: `adacd_hil.score.margins`.
 """
 
@@ -62,7 +62,7 @@ class ReactionLatency:
 
 @dataclass(frozen=True)
 class TimingEvidence:
-    """What the times of a run come to; None is what the log does not have, or what lockstep has no meaning for.
+    """The times of a run, summed up; None: not in the log, or without a meaning in lockstep.
 
     is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. data_age: cycles by
     the age of the oldest value used; the last entry counts all from OLDEST_CYCLES on.
@@ -93,6 +93,13 @@ class TimingEvidence:
             "counts": {name: None if count is None else count._asdict() for name, count in self.counts.items()},
             "histograms_us": {**absent, **{name: found.histogram.as_json() for name, found in times.items()}},
         }
+
+
+class Finding(NamedTuple):
+    """A clause about the run; is_bad: the run was not good because of it."""
+
+    text: str
+    is_bad: bool = False
 
 
 class Fault(NamedTuple):
@@ -160,7 +167,7 @@ class BesideContact:
 
 @dataclass(frozen=True)
 class Beside:
-    """What the paper's scheme would have come to, by the definitions of the module's first lines.
+    """The results of the paper's scheme beside, by the definitions of the module's first lines.
 
     Without the truth there are no contacts, and false alarms and misses are None.
     """
@@ -224,7 +231,7 @@ class CertifiedEvidence:
 
 
 def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
-    """Give the certificates that events, by name and message, have as numbers; what is none is left out."""
+    """Give the certificates that events, by name and message, have as numbers; unreadable ones are left out."""
     from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
 
     for name, message in told:
@@ -248,7 +255,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class Untouched:
-    """What was gathered, by section. promotions: refined models that took over; beside: None where none ran.
+    """Sums over free cycles, by section. promotions: refined models that took over; beside: None where none ran.
 
     smallest_push: None of the paper's scheme, and where nothing was armed.
     """
@@ -291,7 +298,7 @@ class ReportedContact:
     link_at_alarm, link_detected: isolated at detection and at the end of the isolation window.
     torque_error_ratio: peak with the filter undone over the true peak, at the joint with the larger true torque.
     true_force_N: size of the true force, at whatever angle.
-    level to blind_deg: what the last report says, in the names of `records`; None where it doesn't say. A sigma is a
+    level to blind_deg: of the last report, in the names of `records`; None where it has no value. A sigma is a
     standard deviation.
     """
 
@@ -338,7 +345,7 @@ class ReportedContact:
 
 @dataclass(frozen=True)
 class CycleStatistics:
-    """How many cycles, for how long, and what drove them."""
+    """Number of cycles, duration, clock and scheduler."""
 
     count: int
     duration_s: float
@@ -350,7 +357,7 @@ class CycleStatistics:
 class Metrics:
     """Everything that the report says, see the module's first lines for the definitions.
 
-    fault, fault_s: the first one of the run.
+    fault, fault_s: the first one of the run. findings: a clause each, the gravest first.
     """
 
     sections: tuple[Section, ...]
@@ -371,9 +378,19 @@ class Metrics:
     dropped: int | None
     evidence: CertifiedEvidence | None
     paper: tuple[PaperRow, ...]
-    verdict: str
-    is_clean: bool
+    findings: tuple[Finding, ...]
     armed_false_alarms: int | None  # of them those in MONITOR
+
+    @property
+    def verdict(self) -> str:
+        """All findings in one sentence."""
+        text = "; ".join(finding.text for finding in self.findings)
+        return f"{text[:1].upper()}{text[1:]}."
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether the run was good: no finding is bad."""
+        return not any(finding.is_bad for finding in self.findings)
 
     @property
     def false_alarm_bound_per_h(self) -> float | None:
@@ -385,7 +402,7 @@ class Metrics:
 
 
 class Gathered(NamedTuple):
-    """What takes all cycles of a run to say."""
+    """Sums over all cycles of a run."""
 
     untouched: Untouched
     timing: TimingEvidence

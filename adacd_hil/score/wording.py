@@ -11,6 +11,8 @@ from adacd_hil.score.judge import Score
 
 NONE: Final = "–"
 _MORE_DIGITS: Final = 3
+_TELLING_PER_H: Final = 3.0
+"""The bound after an hour without a false alarm."""
 
 
 STATE_WORDS: Final = {
@@ -62,7 +64,7 @@ def signed_text(value: float) -> str:
 
 
 def scaled(value: float | None, factor: float) -> float | None:
-    """Multiply what is known."""
+    """Multiply a value, if there is one."""
     return None if value is None else factor * value
 
 
@@ -94,7 +96,7 @@ def number_of(count: int, noun: str) -> str:
 
 
 def score_sentence(score: Score) -> str:
-    """Say what was found within what time, what was missed, and how many alarms were false."""
+    """Count the contacts found and missed, the longest delay, and the false alarms."""
     armed = [contact for contact in score.contacts if contact.is_armed]
     delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
     within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
@@ -120,8 +122,10 @@ def unjudged_sentence(count: int) -> str:
 
 
 def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
-    """Say what false alarms there were, and which rate the counting leaves possible."""
+    """Say how many false alarms there were, and which rate the counting leaves possible, if that says anything."""
     count = number_of(false_alarms, "false alarm") if false_alarms else "No false alarms"
+    if bound_per_h > _TELLING_PER_H:
+        return f"{count} in that time, which is too short to tell a rate by counting"
     return f"{count} in that time: by counting alone, at most {bound_per_h:.3g} per hour at 95 %"
 
 
@@ -141,7 +145,7 @@ def delays_phrase(delays_ms: Sequence[float]) -> str:
 
 
 def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float, float]) -> str:
-    """Say how many contacts were found, the bounds of their share, and after what time."""
+    """Say how many contacts were found, the bounds of their share, and their delays."""
     found = found_text(len(delays_ms), contacts)
     return f"{found} contacts found ({100 * bounds[0]:.0f} to {100 * bounds[1]:.0f} %){delays_phrase(delays_ms)}"
 

@@ -221,6 +221,12 @@ class BusSettings:
         return self.period_us * 1000
 
 
+DATA_WINDOW_S = 1.0
+"""Shares of missing data are judged over this time."""
+SHORTEST_DATA_WINDOW = 0.2
+"""Part of that time that is judged, too, when the attempt ends in it."""
+
+
 @dataclass(frozen=True)
 class DataSettings:
     """How much of the cyclic data may be missing. Shares are of the cycles of any second with enabled drives."""

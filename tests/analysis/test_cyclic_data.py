@@ -7,7 +7,7 @@ import pytest
 from hand_made_run import EPOCH_NS, A, M, make_certified_run, make_run, with_columns
 
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_faults, gather_data
+from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_faults
 from adacd_hil.lab.score.verdict import data_text
 from adacd_hil.log.logged_run import CheckCounts, CycleColumns
 from adacd_hil.log.reader import LoggedEvent
@@ -23,6 +23,10 @@ def missing_frames(run, rows, age=0):
     missing = np.zeros(len(run.cycle), np.int64)
     missing[rows] = 1
     return with_columns(run, frames_missing=missing, data_age=missing * age)
+
+
+def gather_data(run):
+    return evaluate(run).data
 
 
 def said(t_ms, name, message, level="error"):

@@ -119,7 +119,8 @@ def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end() ->
         nothing, nothing, np.zeros((1, 2)), np.zeros(1), np.full(1, -1.0), None, nothing, nothing, np.zeros(1),
         np.zeros((1, 7)), {}, "", True, ((0, 3), (1, 50)),
     )  # fmt: skip
-    one, both = (emulator_truth.host_truth(rows, np.array(begins), 1000, None) for begins in ([0], [0, 480]))
+    begun = ([0], [0, 480])
+    one, both = (emulator_truth.host_truth(rows, np.array(begins), 1000, np.zeros(1)) for begins in begun)
     assert one is not None
     assert both is not None
     assert (one.covers(2), one.covers(3), one.covers(900)) == (False, True, True)

@@ -137,7 +137,7 @@ def truth_of(path):
 def test_a_long_run_comes_to_the_same_as_one_that_is_kept_whole(few_kept, path, has_truth):
     truth = truth_of(path) if has_truth else None
     whole, thinned = read_run(path, truth), read_run(path, truth, full_cycles=1000)
-    assert (whole.gathered, thinned.run.all_cycles) == (None, len(whole.run.cycle))
+    assert thinned.run.all_cycles == whole.run.all_cycles == len(whole.run.cycle)
     assert len(thinned.run.cycle) < len(whole.run.cycle) / 4
     assert table_of(thinned) == table_of(whole)
 
@@ -175,15 +175,16 @@ def test_the_page_of_a_long_run_says_that_cycles_are_left_out(few_kept, certifie
 
 
 def test_a_log_of_just_so_many_cycles_is_kept_whole(certified):
-    assert read_run(certified, None, full_cycles=9050).gathered is None
-    assert read_run(certified, None, full_cycles=9049).gathered is not None
+    whole, thinned = (read_run(certified, None, full_cycles=cycles).run for cycles in (9050, 9049))
+    assert (len(whole.cycle), whole.bucket, thinned.bucket) == (9050, 1, 4)
 
 
-def test_a_long_truth_keeps_what_is_asked_of_its_contacts(monkeypatch, certified):
+def test_a_truth_keeps_of_long_contacts_the_ends_and_the_peaks(monkeypatch, certified):
+    whole = read_truth(truth_of(certified))
     for name, value in (("_BEGINNING", (50, 20)), ("_ENDING", 60), ("_HELD", 150), ("_BUCKET", 10)):
         monkeypatch.setattr(emulator_truth, name, value)
-    whole, thinned = (read_truth(truth_of(certified), most) for most in (10**6, 100))
-    assert len(thinned.cycle) < 450
+    thinned = read_truth(truth_of(certified))
+    assert (len(whole.cycle), len(thinned.cycle) < 450) == (250 + 250 + 700 + 3, True)
     for index in (0, 1, 2):
         ours, theirs = (rows.tau_ext[rows.contact_index == index] for rows in (thinned, whole))
         cycles = [rows.cycle[rows.contact_index == index] for rows in (thinned, whole)]
@@ -195,7 +196,7 @@ def test_a_long_truth_keeps_what_is_asked_of_its_contacts(monkeypatch, certified
 
 
 def test_a_truth_says_from_when_on_the_payload_is_another(certified):
-    truth = read_truth(truth_of(certified), 100)
+    truth = read_truth(truth_of(certified))
     assert list(zip(truth.model_cycle.tolist(), truth.payload_kg.tolist(), strict=True)) == [(100, 0.0), (5400, 1.0)]
 
 
@@ -272,8 +273,14 @@ def test_a_contact_of_a_stretch_is_what_it_is_in_the_whole_log(certified):
 def test_a_long_stretch_comes_to_the_same_as_one_that_is_kept_whole(few_kept, path):
     whole = stretched(path, 1.0, 2.5)
     thinned = stretched(path, 1.0, 2.5, full_cycles=700)
-    assert (whole.gathered, thinned.gathered is None) == (None, False)
+    assert len(thinned.run.cycle) < len(whole.run.cycle)
     assert table_of(thinned) == table_of(whole)
+
+
+def test_a_stretch_without_an_adaptation_is_not_bad_for_that(certified):
+    metrics = evaluate(stretched(certified, 2.8, 3.5).run)
+    assert metrics.adaptation_s == {}
+    assert not any("adapt" in finding.text for finding in metrics.findings)
 
 
 def test_a_stretch_beside_the_log_is_a_log_error(certified):

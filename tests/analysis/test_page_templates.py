@@ -16,13 +16,10 @@ from hand_made_run import make_certified_run, react, touch, touched_run
 from jinja2 import UndefinedError
 from parsed_page import Page
 
-from adacd_hil.lab.drawing import Drawing
 from adacd_hil.lab.report import page
 from adacd_hil.lab.report.page import Heading, render, render_page
 from adacd_hil.lab.report.report_tables import timing_tables
-from adacd_hil.lab.report.run_figures import draw
 from adacd_hil.lab.report.run_page import report_page
-from adacd_hil.lab.report.timing_figures import draw_timing
 from adacd_hil.lab.runs.run_pages import ListedRun, runs_page, trend_page
 from adacd_hil.lab.runs.run_summary import BROKEN, CERTIFIED, GOOD, CertificateState, RunSummary
 from adacd_hil.lab.runs.run_trend import trends
@@ -41,8 +38,6 @@ def spoilt(value: Any) -> Any:
     """Append markup to every text in a value; a run's own are not shown, and a figure's name is the program's."""
     if isinstance(value, str):
         return value + EVIL
-    if isinstance(value, Drawing):
-        return replace(value, title=value.title + EVIL, caption=value.caption + EVIL)
     if isinstance(value, tuple):
         return type(value)(*map(spoilt, value)) if hasattr(value, "_fields") else tuple(map(spoilt, value))
     if isinstance(value, list):
@@ -75,9 +70,7 @@ def certified_run() -> Run:
 
 
 def page_of(run: Run) -> str:
-    metrics = evaluate(run)
-    timing = draw_timing(run.timing, metrics.timing, run.zero_ns)[:1]
-    return report_page(metrics, run, ReportSource("run.mcap", "cut"), draw(run, metrics)[:1], timing)
+    return report_page(evaluate(run), run, ReportSource("run.mcap", "cut"))
 
 
 def run_summaries() -> list[RunSummary]:
@@ -102,7 +95,7 @@ def page_of_a_trend(_: Run) -> str:
 def page_of_a_communication_test(run: Run) -> str:
     timing = timing_tables(evaluate(run).timing)
     heading = Heading("commtest", "good", ("event: late",), True)
-    return render_page("communication_test_page.html.j2", "test", heading, timing=timing, timing_figures=[])
+    return render_page("communication_test_page.html.j2", "test", heading, timing=timing)
 
 
 PAGES = {
@@ -139,7 +132,7 @@ def test_what_is_not_escaped_is_the_packages_own_and_says_why() -> None:
             unescaped += re.findall(r"{{ (\S+)\|\s*safe", line)
             assert "safe" not in line or "{#" in line or " safe: " in before, f"{template.name}: {line}"
             assert "autoescape" not in line
-    assert sorted(unescaped) == ["script.text", "style.text", "svg.shapes"]
+    assert sorted(unescaped) == ["script.text", "style.text"]
 
 
 TAGS = (
@@ -149,8 +142,6 @@ TAGS = (
 )
 MARKUP = re.compile(rf"(?<!\?P)</?(?:{TAGS.replace(' ', '|')})(?=[\s/>])|</\0|<!DOCTYPE|&(?:nbsp|lt|gt|quot);")
 """An element of a page, also one whose name is filled in."""
-OTHERS_MARKUP = {Path("adacd_hil/lab/drawing.py")}
-"""Takes apart what matplotlib wrote."""
 
 
 def markup_in(module: Path) -> list[str]:
@@ -170,7 +161,7 @@ def markup_in(module: Path) -> list[str]:
 def test_no_module_writes_markup() -> None:
     modules = [module for package in ("adacd_hil", "firmware_sim") for module in (ROOT / package).rglob("*.py")]
     found = {module.relative_to(ROOT): markup_in(module) for module in modules}
-    assert {module for module, texts in found.items() if texts} == OTHERS_MARKUP
+    assert {module: texts for module, texts in found.items() if texts} == {}
 
 
 def test_help_is_given_without_the_templates_engine() -> None:

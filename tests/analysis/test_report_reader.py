@@ -87,7 +87,7 @@ def heads_over_cells(html: str) -> list[tuple[list[str], list[list[str]]]]:
 
 def test_each_cell_of_a_table_that_folds_bears_the_head_of_its_column() -> None:
     run = touched_run()
-    html = report_page(evaluate(run), run, SOURCE, [], [])
+    html = report_page(evaluate(run), run, SOURCE)
     tables = heads_over_cells(html)
     assert len(tables) >= 4
     wrong = [(heads, row) for heads, rows in tables if heads[0] != "µs" for row in rows if row != heads]
@@ -171,7 +171,7 @@ def test_the_papers_numbers_are_those_of_its_arm_alone() -> None:
     own = on_a_bus(run)
     own = replace(own, settings=replace(run.settings, arm=replace(run.settings.arm, link_length_m=(0.4, 0.3))))
     assert (has_paper(evaluate(run)), has_paper(evaluate(own))) == (True, False)
-    page = report_page(evaluate(own), own, SOURCE, [], [])
+    page = report_page(evaluate(own), own, SOURCE)
     assert "eq. (15)" not in page.partition("How it is computed")[0]
     assert "<h2>Measured</h2>" in page
     assert "run report · arm lab · on socketcan can1</p>" in page
@@ -181,7 +181,7 @@ def test_notices_are_written_out_below_the_timeline() -> None:
     run = make_run((A, 1000), (M, 1000))
     event = LoggedEvent(int(run.t_ns[500]), Event("warning", "bus", "slow <&>"))
     run = replace(run, events=(event,) * 14)
-    page = report_page(evaluate(run), run, SOURCE, [], [])
+    page = report_page(evaluate(run), run, SOURCE)
     assert page.count("bus: slow &lt;&amp;&gt;</li>") == 12
     assert "The first 12 of 14 notices." in page
 
@@ -205,10 +205,10 @@ def test_certificates_are_told_clause_by_clause_and_one_that_was_taken_back_is_m
     told = (("certificate", "offsets anchored; a <push>"), ("revoked", "the load changed"), ("sight", "not of it"))
     events = (LoggedEvent(int(run.t_ns[1100 + row]), Event("info", *each)) for row, each in enumerate(told))
     run = replace(run, events=tuple(events))
-    page = report_page(evaluate(run), run, SOURCE, [], [])
-    section = page.partition("<h2>Certificates</h2>")[2].partition("</section>")[0]
+    page = report_page(evaluate(run), run, SOURCE)
+    section = page.partition("<h2>Certificates</h2>")[2].partition("</details>")[0]
     assert re.findall(r"<li>(.*?)</li>", section) == ["offsets anchored", "a &lt;push&gt;", "the load changed"]
     assert len(re.findall(r"<p>Given at \d+\.\d\d s:", section)) == 1
     assert len(re.findall(r'<p class="bad">Taken back at', section)) == 1
     bare = replace(run, events=())
-    assert "<h2>Certificates</h2>" not in report_page(evaluate(bare), bare, SOURCE, [], [])
+    assert "<h2>Certificates</h2>" not in report_page(evaluate(bare), bare, SOURCE)

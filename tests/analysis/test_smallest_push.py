@@ -12,6 +12,7 @@ from adacd_hil.lab.report.report_tables import counted_sentence, push_table
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.logged_run import Span
 from adacd_hil.scheme.detect.sensitivity import AGREES
+from adacd_hil.score.wording import rate_sentence
 
 SLOWEST = 0.612758  # what 10 and then 200 rad/s show of a step after 0.1 s: 1 - (200 e^-1 - 10 e^-20) / 190
 
@@ -94,7 +95,8 @@ def test_the_rate_of_false_alarms_is_bounded_by_counting():
     assert metrics.false_alarm_bound_per_h == pytest.approx(-math.log(0.05) / hours)
     alarmed = evaluate(react(make_certified_run(), 3000, 20))
     assert alarmed.false_alarm_bound_per_h > 1.5 * metrics.false_alarm_bound_per_h
-    assert "No false alarms in that time: by counting alone, at most" in told(metrics)
+    assert "No false alarms in that time, which is too short to tell a rate" in told(metrics)
+    assert "per hour at 95 %" not in told(metrics)
     assert "1 false alarm in that time" in told(alarmed)
 
 
@@ -108,6 +110,11 @@ def test_the_rate_under_a_gaussian_tail_follows_from_how_near_residuals_came():
     expected = 3600.0 * nu_Hz * (nu_Hz * found.hours * 3600.0) ** (-1.0 / 0.8**2)
     assert found.tail_rate_per_h == pytest.approx(expected)
     assert f"; {expected:.2g} per hour if residuals have the tail of a Gaussian" in told(evaluate(run))
+
+
+def test_the_bound_of_the_rate_is_told_from_an_hour_on():
+    assert "at most 2.9 per hour" in rate_sentence(0, 2.9)
+    assert "per hour" not in rate_sentence(0, 42127.0)
 
 
 def test_an_alarm_while_the_arm_learns_is_none_of_those():

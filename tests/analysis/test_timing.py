@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hand_made_run import A, M, R, S, like_an_old_log, make_run, with_columns
 
-from adacd_hil.lab.report.timing_figures import draw_timing
+from adacd_hil.lab.report.traces import timing_track
 from adacd_hil.lab.score.evaluation import OLDEST_CYCLES, collect_evidence, evaluate, find_reactions
 from adacd_hil.log.logged_run import COMPUTE, CycleColumns, columns_of_records, columns_of_series
 from adacd_hil.log.reader import Series
@@ -125,13 +125,10 @@ def evidence_without_cycles():
     return collect_evidence(columns_of_records([], []), 1000, is_modelled=False)
 
 
-def figures_of(run):
-    found = evaluate(run).timing
-    return {drawing.name: drawing.figure for drawing in draw_timing(run.timing, found, run.zero_ns, "motion start")}
-
-
-def titles(figure):
-    return [axes.get_title(loc="left").split(" — ")[0] for axes in figure.axes]
+def panels_of(run):
+    is_realtime = run.metadata["clock"] == "realtime"
+    track = timing_track(run.timing, run.settings.bus.period_us, run.zero_ns, has_grid=is_realtime)
+    return {panel.name: panel for panel in track.panels}
 
 
 def short_run(**changes):
@@ -139,43 +136,31 @@ def short_run(**changes):
     return with_columns(run, lateness_ns=np.arange(120) * 1000, **changes)
 
 
-def test_without_a_cycle_there_is_no_figure():
-    assert draw_timing(columns_of_records([], []), evidence_without_cycles(), 0) == []
+def test_the_curves_of_a_cycle_are_its_times_and_its_queues():
+    names = ["time-lateness", "time-compute", "time-sync_to_command", "time-slack", "queues"]
+    assert list(panels_of(short_run())) == names
 
 
-def test_the_figures_show_four_distributions_and_three_lines():
-    figures = figures_of(short_run())
-    assert titles(figures["timing-distributions"]) == ["Lateness", "Compute", "SYNC → command", "Slack"]
-    assert titles(figures["timing-line"]) == ["Lateness", "SYNC → command", "Queues"]
-
-
-def test_the_distribution_marks_its_percentiles_and_the_period():
-    axes = figures_of(short_run())["timing-distributions"].axes[0]
-    assert [line.get_xdata()[0] for line in axes.lines] == pytest.approx([60.0, 118.0, 119.0, 1000.0])
-
-
-def test_the_line_in_time_keeps_a_single_late_cycle():
+def test_a_single_late_cycle_is_in_its_curve():
     run = make_run((M, 50_000), clock="realtime", has_truth=False)
     lateness_ns = np.full(50_000, 5000)
     lateness_ns[31_417] = 7_000_000
-    band = figures_of(with_columns(run, lateness_ns=lateness_ns))["timing-line"].axes[0].collections[0]
-    assert band.get_paths()[0].vertices[:, 1].max() == 7000.0
+    (trace,) = panels_of(with_columns(run, lateness_ns=lateness_ns))["time-lateness"].traces
+    assert (trace.values[31_417], trace.values.max()) == (7000.0, 7000.0)
 
 
-def test_overruns_are_marked_where_they_happened():
+def test_a_skipped_period_is_drawn_in_its_cycle():
     overruns = np.zeros(120, dtype=np.int64)
     overruns[70:] = 2
-    axes = figures_of(short_run(overruns=overruns))["timing-line"].axes[0]
-    (marks,) = (line for line in axes.lines if line.get_marker() == "v")
-    assert marks.get_xdata().tolist() == pytest.approx([0.07])
+    (trace,) = panels_of(short_run(overruns=overruns))["skipped"].traces
+    assert (np.flatnonzero(trace.values).tolist(), trace.values[70]) == ([70], 2.0)
 
 
-def test_an_old_log_says_which_distribution_it_lacks():
-    axes = figures_of(like_an_old_log(short_run()))["timing-distributions"].axes
-    assert [[text.get_text() for text in axes[place].texts] for place in (1, 3)] == [["not in this log"]] * 2
+def test_an_old_log_has_the_curves_that_it_can_have():
+    assert list(panels_of(like_an_old_log(short_run()))) == ["time-lateness", "time-sync_to_command"]
 
 
 def test_lockstep_draws_neither_lateness_nor_queues():
     run = short_run()
-    figures = figures_of(replace(run, metadata={**run.metadata, "clock": "lockstep"}))
-    assert titles(figures["timing-line"]) == ["SYNC → command"]
+    names = panels_of(replace(run, metadata={**run.metadata, "clock": "lockstep"}))
+    assert list(names) == ["time-compute", "time-sync_to_command", "time-slack"]

@@ -102,19 +102,20 @@ def names_of(run):
     return [panel.name for panel in panels_of(run)]
 
 
-PAPERS = ["residual1", "residual2", "theta-a1", "theta-F_v1", "theta-F_c1"]
+RESIDUALS = ["residual1", "residual2"]
+PARAMETERS = ["theta-a1", "theta-F_v1", "theta-F_c1"]
 
 
 def test_a_run_of_the_papers_scheme_has_motion_residuals_and_parameters():
-    assert names_of(moved(make_run())) == ["q", "dq", "tau_J", *PAPERS]
+    assert names_of(moved(make_run())) == [*RESIDUALS, "q", "dq", "tau_J", *PARAMETERS]
 
 
 def test_a_run_without_measured_motion_has_none_to_show():
-    assert names_of(make_run()) == PAPERS
+    assert names_of(make_run()) == [*RESIDUALS, *PARAMETERS]
 
 
 def test_a_run_of_the_certified_scheme_has_its_channels():
-    assert names_of(make_certified_run()) == [*PAPERS[:2], "channels1", "channels2", "share", *PAPERS[2:]]
+    assert names_of(make_certified_run()) == [*RESIDUALS, "channels1", "channels2", "share", *PARAMETERS]
 
 
 def test_every_channel_of_the_bank_is_a_trace_of_its_joint():
@@ -151,6 +152,26 @@ def test_the_range_near_zero_is_three_thresholds():
     assert panel.near == pytest.approx(0.45)
 
 
+def curves_of(run, name):
+    panel = next(panel for panel in panels_of(run) if panel.name == name)
+    return {trace.label: trace.values for trace in panel.traces}
+
+
+def test_the_true_torque_of_a_contact_is_drawn_where_the_truth_has_it():
+    run = make_run()
+    touch(run, 2000, 250, (5.0, -1.0))
+    true = curves_of(run, "residual2")["true"]
+    assert (true[1999], true[2000], true[2249], true[2250]) == (0.0, -1.0, -1.0, 0.0)
+    assert "true" not in curves_of(make_run(has_truth=False), "residual2")
+
+
+def test_a_true_parameter_is_drawn_as_it_was_in_each_cycle():
+    run = make_run()
+    run.truth.theta[3000:, 0] = 0.5
+    true = curves_of(run, "theta-a1")["true a1"]
+    assert (true[2999], true[3000], true[-1]) == (0.2, 0.5, 0.5)
+
+
 def plan_of(html):
     return json.loads(re.search(r'id="trace-plan">(.*?)</script>', html)[1])
 
@@ -164,13 +185,14 @@ def shown():
     run.state[9300:] = 8
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("warning", "bus", "slow")),))
     traces = traces_of(run, evaluate(run))
-    return run, render("traces.html.j2", run=run, traces=traces, state_key=[], traced_contacts=60)
+    return run, render("trace_data.html.j2", traces=traces)
 
 
 def test_every_series_of_the_plan_is_in_the_page_at_its_full_rate(shown):
     run, html = shown
-    plan = plan_of(html)
-    series = [plan["time"], *(curve for panel in plan["panels"] for curve in panel["curves"])]
+    scheme, timing = plan_of(html)["tracks"]
+    curves = [curve for track in (scheme, timing) for panel in track["panels"] for curve in panel["curves"]]
+    series = [scheme["time"], timing["time"], *curves]
     blocks = dict(re.findall(r'<script type="text/plain" id="([^"]*)">([^<]*)</script>', html))
     sizes = {len(zlib.decompress(base64.b64decode(blocks.pop(one["id"])))) / one["planes"] for one in series}
     assert (sizes, blocks) == ({len(run.cycle)}, {})

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from adacd_hil.control.operator import ConsoleOperator, FaultAnswer, ScriptedOperator
+from adacd_hil.control.operator import CONSOLE_WORDS, ConsoleOperator, FaultAnswer, ScriptedOperator
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 
@@ -74,6 +74,44 @@ def test_the_console_takes_a_word_a_line(word: str, request_: Request) -> None:
     operator = ConsoleOperator(script(), io.StringIO(f"{word}\n"))
     operator.join(1.0)
     assert operator.request(1.0, SchemeState.STOPPED) is request_
+
+
+def told(typed_words: str, *states: SchemeState) -> list[str]:
+    lines: list[str] = []
+    operator = ConsoleOperator(script(), io.StringIO(typed_words), lines.append)
+    operator.join(1.0)
+    for state in states:
+        operator.request(1.0, state)
+    return lines
+
+
+def test_an_unknown_word_is_answered_with_the_nearest_one_and_all_that_there_are() -> None:
+    (line,) = told("akc\n")
+    assert ("'akc'" in line, "did you mean `ack`" in line) == (True, True)
+    assert all(word in line for word in CONSOLE_WORDS)
+
+
+def test_an_empty_line_is_not_answered() -> None:
+    assert told("\n  \n") == []
+
+
+def test_a_long_unknown_word_is_cut() -> None:
+    (line,) = told("x" * 10_000 + "\n")
+    assert len(line) < 150
+
+
+def test_a_stop_says_once_which_word_it_waits_for() -> None:
+    lines = told("", SchemeState.MONITOR, *[SchemeState.STOPPED] * 3, SchemeState.MONITOR, SchemeState.STOPPED)
+    assert [("`ack`" in line) for line in lines] == [True, True]
+
+
+def test_a_payload_change_says_which_word_it_waits_for() -> None:
+    (line,) = told("", SchemeState.PAYLOAD)
+    assert "`changed`" in line
+
+
+def test_a_stop_that_is_already_acknowledged_waits_for_nothing() -> None:
+    assert told("ack\n", SchemeState.STOPPED) == []
 
 
 def test_what_the_user_types_while_the_arm_is_faulted_answers_the_fault() -> None:

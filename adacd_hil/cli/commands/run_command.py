@@ -116,9 +116,9 @@ def run_on_bus(
         stack.callback(bus.close)
         drop_old_frames(bus, interface)
         operator: Operator = ScriptedOperator(settings.operator)
-        if sys.stdin is not None and sys.stdin.isatty():
-            operator = ConsoleOperator(ScriptedOperator(settings.operator))
         progress = stack.enter_context(Progress())
+        if sys.stdin is not None and sys.stdin.isatty():
+            operator = ConsoleOperator(ScriptedOperator(settings.operator), tell=progress)
         session = Session(
             settings,
             codec,

@@ -153,33 +153,30 @@ def _open_log(
 
 
 def write_pictures(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
-    """Write commtest.html, the tables and figures of the times as in the report of a run, and its figures as PNG.
+    """Write commtest.html, with the tables and curves of the times as in the report of a run.
 
-    Return the written files, the page first; [] without a cycle. Raises LogError if they can't be written.
+    Returns the files that were written; none without a cycle. Raises LogError when they can't be written.
     """
-    # Imported here: plots take a second to import, and memory that the test itself doesn't need.
+    # Here and not above: they take a second to import, and memory that the test itself has no use for.
     from adacd_hil.lab.report.page import Heading, render_page
     from adacd_hil.lab.report.report_tables import timing_tables
-    from adacd_hil.lab.report.timing_figures import draw_timing
+    from adacd_hil.lab.report.traces import pack_tracks, timing_track
 
     if not len(report.columns):
         return []
-    evidence = _evidence(report, described["period_us"])
-    drawings = draw_timing(report.columns, evidence, int(report.columns.t_ns[0]))
+    period_us = described["period_us"]
+    evidence = _evidence(report, period_us)
+    track = timing_track(report.columns, period_us, int(report.columns.t_ns[0]), has_grid=True)
     findings = [line for line in _findings(described) if not line.startswith(("log: ", "pictures: "))]
     page = render_page(
         "communication_test_page.html.j2",
         "communication test",
         Heading("adacd-hil commtest", findings[-1], findings[:-1], report.verdict is Verdict.GOOD),
+        pack_tracks([track], period_us * 1e-6),
         timing=timing_tables(evidence),
-        timing_figures=drawings,
     )
-    pictures: dict[str, bytes | str] = {
-        HTML_NAME: page,
-        **{f"{drawing.name}.png": drawing.png() for drawing in drawings},
-    }
     with failing_as(f"pictures in {out} can't be written"):
-        return [*replace_files(out, pictures)]
+        return [*replace_files(out, {HTML_NAME: page})]
 
 
 def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:

@@ -126,7 +126,7 @@ def tare(
 @explained
 @stretch_options
 def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "TimeWindow") -> ExitCode:
-    """Report logs: HTML, PNG, CSV and JSON. The emulator's truth.mcap beside a log is joined to it.
+    """Report logs: HTML, CSV and JSON. The emulator's truth.mcap beside a log is joined to it.
 
     A folder stands for the run.mcap in it, or without one for all runs in its folders: then index.html leads to their
     reports.

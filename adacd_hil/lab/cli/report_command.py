@@ -115,7 +115,7 @@ def as_json(reported: Sequence[Reported]) -> list[dict[str, Any]]:
 def _report_one(path: Path, folder: Path, stretch: TimeWindow, progress: Progress) -> Report:
     truth = path.parent / TRUTH_NAME
     truth_path = truth if truth.exists() else None
-    return write_report(path, truth_path, folder, is_printed=True, stretch=stretch, progress=progress)
+    return write_report(path, truth_path, folder, stretch=stretch, progress=progress)
 
 
 def _code(report: Report | None) -> ExitCode:

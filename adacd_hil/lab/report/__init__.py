@@ -1,1 +1,1 @@
-"""The report of a run: read, judged, drawn, written as HTML, PNG, CSV and JSON."""
+"""The report of a run: read, judged, written as HTML, CSV and JSON."""

@@ -1,7 +1,7 @@
-"""What a reader of a report may do next: a sentence each, with the command for it, the gravest first.
+"""Next steps for the reader of a report: a sentence each, with the command for it, the gravest first.
 
 Commands are for the folder of the log: they name it by its file name alone, so that the same log gives the same page
-wherever it lies. Whatever a log says of itself is quoted for the shell.
+wherever it lies. Texts of a log are quoted for the shell.
 """
 
 import shlex
@@ -16,59 +16,57 @@ from adacd_hil.terminal import in_line
 
 
 class NextStep(NamedTuple):
-    """What a reader may do next, and the command for it; empty where there is none."""
+    """A next step, and the command for it; empty where there is none."""
 
     text: str
     command: str = ""
 
 
 def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]:
-    """Say what to do next, the gravest first."""
+    """List the next steps, the gravest first."""
     log = _quoted(source.log_name)
     steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(source.problem)
     if run.cycle.size == 0:
-        return [*steps, _checked(run, "The arm was not moved. Mend what the sentence above names.")]
+        return [*steps, _checked(run, "The arm was not moved. Mend the cause above.")]
     steps += _repairs(metrics, run, log)
     if metrics.is_clean and not steps:
-        steps.append(NextStep("Nothing went wrong.", ""))
-    if metrics.contacts:
-        steps.append(NextStep("Choose a contact below to see the torques of that moment."))
+        steps.append(NextStep("Nothing went wrong."))
     if run.truth is None and metrics.contacts:
         steps.append(NextStep("Nobody recorded when the arm was touched: compare the detections with what you did."))
     key = "filter.a_rad_s=20" if metrics.evidence is None else "certified.noise_sigmas=8"
     return [
         *steps,
-        NextStep("Check that the log gives the same decisions again.", f"adacd-hil replay {log}"),
+        NextStep("Check that the log replays to the same decisions.", f"adacd-hil replay {log}"),
         NextStep("See what another setting would have decided.", f"adacd-hil replay {log} --set {key}"),
     ]
 
 
 def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
-    """Say what to do about each kind of thing that went wrong."""
-    has_stopped = bool(metrics.fault) or not metrics.adaptation_s
-    stopped = _checked(run, "The run was stopped: the sentence above and the notices below say why.")
+    """List the repairs of each kind of failure."""
+    has_stopped = bool(metrics.fault) or (not metrics.adaptation_s and run.stretch is None)
+    stopped = _checked(run, "Mend what stopped the run.")
     late = _checked(run, "Frames came late or were lost, more than allowed.")
     rows = (
         (has_stopped, stopped),
         (not has_stopped and bool(metrics.data.excesses), late),
         (
             is_revoked(metrics.evidence),
-            NextStep("What was learned was taken back. Remove the cause, then let the arm learn anew, untouched."),
+            NextStep("The certificate was taken back. Remove the cause, then let the arm learn anew, untouched."),
         ),
         (
             not has_stopped and None in metrics.adaptation_s.values(),
-            NextStep("The model was not learned: the notices below may say why. Another motion may show it better.",
+            NextStep("The model was not learned; the notices may say why. Try another motion.",
                      f"adacd-hil excitation --config {_configuration(run)}"),
         ),
         (
             (any(metrics.adaptation_s.values()) and bool(metrics.false_alarms)) or is_margin_below_1(metrics.evidence),
-            NextStep("Nobody touched the arm, and a threshold was crossed: find thresholds from untouched motion.",
+            NextStep("Nobody touched the arm, and a threshold was crossed. Find thresholds from untouched motion.",
                      f"adacd-hil thresholds {log}"),
         ),
         (
             any(went_wrong(contact) for contact in metrics.contacts),
-            NextStep("Some contacts were missed, or their link or direction is wrong (marked below): try other "
-                     "thresholds and filters.", f"adacd-hil tune {log}"),
+            NextStep("Contacts were missed, or their link or direction is wrong. Try other thresholds and filters.",
+                     f"adacd-hil tune {log}"),
         ),
     )  # fmt: skip
     return [step for is_so, step in rows if is_so]
@@ -97,7 +95,7 @@ def _quoted(text: str) -> str:
 
 
 def origin_words(run: Run) -> list[str]:
-    """Name the arm, where it is, and what was played."""
+    """Name the arm, its bus, and the scenario."""
     said = run.metadata
     name, profile, interface = said.get("config", ""), said.get("profile", ""), said.get("interface", "")
     is_own = name not in builtin_names()

@@ -147,7 +147,7 @@ class TruthClock:
         return -1 if self._before is None else self._before[0]
 
     def end(self) -> None:
-        """Let what comes after the last cycle have its time."""
+        """Give rows after the last cycle the time of that cycle."""
         if self._before is not None:
             self.t_ns[self._pending] = self._before[1]
         self._pending = self._pending[:0]
@@ -157,7 +157,7 @@ class Outline:
     """One reading of a log, piece by piece."""
 
     def __init__(self, shell: Run, empty: Series, truth: TruthTable | None) -> None:
-        """`shell`: what is known of the run before, a truth on the host's cycles included; its arrays are empty.
+        """`shell`: a run with empty arrays: settings, metadata, and a truth on the host's cycles if there is one.
 
         empty: a piece of /scheme without records; truth: whose place on the host's cycles is to be found.
         """
@@ -188,7 +188,7 @@ class Outline:
         if busy.size:
             self._busy_ns = max(self._busy_ns, int(scheme.t_ns[busy[-1]]))
 
-    def is_calm_since(self, t_ns: int) -> bool:
+    def is_idle_since(self, t_ns: int) -> bool:
         """Whether nothing has been going on since a time."""
         return self._busy_ns < t_ns
 
@@ -266,7 +266,7 @@ class SchemeRows:
         if not len(scheme):
             return
         if self.count == 0:
-            self._begin(scheme)  # only a record says what fields a log has
+            self._begin(scheme)  # only a record shows the fields of a log
         t_ns = scheme.t_ns[rows]
         end = self.count + len(t_ns)
         if end > len(self._rows):
@@ -315,7 +315,7 @@ def _arrays(columns: dict[str, NDArray[Any]], settings: Settings) -> dict[str, A
 
 
 MARGIN_S: Final = 0.2
-"""Before what a stretch would cut."""
+"""Margin before a contact or a reaction."""
 
 
 def settling_s(run: Run) -> float:

@@ -1,6 +1,6 @@
 """Pages from the Jinja2 templates in `templates`: words, forms and limits that all share; the only place that renders.
 
-A page needs nothing from outside and allows nothing but what it brings: its styles and scripts by their digests, no
+A page needs nothing from outside and allows its own styles and scripts alone, by their digests: no
 inline style, no request (content security policy). Every value is escaped; where a template marks one as safe, it says
 why it is. A template that asks for a value that it isn't given is an error. Pages follow the reader's light or dark
 scheme and print in the light one.
@@ -14,7 +14,7 @@ from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib import resources
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -22,6 +22,9 @@ from adacd_hil.log.logged_run import StretchOfRun
 from adacd_hil.score.metrics import Beside, Metrics, ReportedContact
 from adacd_hil.score.wording import NONE, number_text, pair_text, signs_text, why_not_found, yes_text
 from adacd_hil.terminal import keep_units
+
+if TYPE_CHECKING:
+    from adacd_hil.lab.report.traces import Traces  # it imports the judge
 
 TRACED_CONTACTS: Final = 60
 
@@ -36,8 +39,6 @@ SECTIONS: Final = 60
 """Sections with a row in the tables of sections and margins."""
 CONTACTS: Final = 200
 """Contacts with a row in the table of contacts, and so many more that went wrong."""
-PRINTED_CONTACTS: Final = 40
-"""The same for a terminal and on paper."""
 NOTICES: Final = 12
 """Notices in words below the timeline."""
 ADAPTATIONS: Final = 8
@@ -49,13 +50,18 @@ MARKS: Final = 1_500
 _PACKAGE: Final = "adacd_hil.lab.report"
 
 
+STEPS: Final = 2
+"""Next steps on the first screen; the others are folded."""
+
+
 class Heading(NamedTuple):
-    """The head of a page: a line over the title, the title, and what is wrong, a line each."""
+    """The head of a page: a line over the title, the title, problems of the log, and further findings, a line each."""
 
     over: str
     title: str
     problems: Sequence[str]
     is_good: bool
+    further: Sequence[str] = ()
 
 
 class Cell(NamedTuple):
@@ -89,12 +95,15 @@ class _Asset(NamedTuple):
     digest: str
 
 
-def render_page(
-    template: str, title: str, heading: Heading, styles: Sequence[str] = (), scripts: Sequence[str] = (), **values: Any
-) -> str:
-    """Write a page whose template extends `page.html.j2`; styles, scripts: further assets, by name."""
-    sheets, programs = ([_asset(name) for name in names] for names in ((*styles, "report.css"), scripts))
-    return render(template, title=title, heading=heading, styles=sheets, scripts=programs, **values)
+_STYLES: Final = ("uplot-1.6.32.min.css", "report.css")
+_SCRIPTS: Final = ("uplot-1.6.32.iife.min.js", "traces.js")
+"""uPlot is Leon Sorokin's, MIT licence, from npm; its licence lies beside it."""
+
+
+def render_page(template: str, title: str, heading: Heading, traces: "Traces | None" = None, **values: Any) -> str:
+    """Write a page whose template extends `page.html.j2`. traces: its curves; without any it has no script."""
+    sheets, programs = ([_asset(name) for name in names] for names in (_STYLES, _SCRIPTS if traces else ()))
+    return render(template, title=title, heading=heading, traces=traces, styles=sheets, scripts=programs, **values)
 
 
 def render(template: str, **values: Any) -> str:
@@ -108,7 +117,13 @@ def _environment() -> Environment:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    bounds = {"ADAPTATIONS": ADAPTATIONS, "CONTACTS": CONTACTS, "NOTICES": NOTICES, "SECTIONS": SECTIONS}
+    bounds = {
+        "ADAPTATIONS": ADAPTATIONS,
+        "CONTACTS": CONTACTS,
+        "NOTICES": NOTICES,
+        "SECTIONS": SECTIONS,
+        "STEPS": STEPS,
+    }
     environment.globals["bounds"] = bounds
     environment.filters |= {"number": number_text, "keep_units": lambda text: keep_units(text, "\u00a0")}
     environment.policies["json.dumps_kwargs"] = {
@@ -124,8 +139,8 @@ def _asset(name: str) -> _Asset:
 
 
 _CONTACT_HEAD: Final = (
-    "contact", "section", "link", "found", "at alarm", "onset s", "delay ms", "law ms", "ideal ms", "direction",
-    "direction right", "true Nm", "peak ratio",
+    "contact", "section", "link", "found on link", "first named link", "begins at s", "found after ms",
+    "filter's share ms", "ideal detector ms", "direction", "direction right", "true torque Nm", "peak ratio",
 )  # fmt: skip
 
 
@@ -182,7 +197,7 @@ def contact_rows(
     if beside is None or not beside.contacts:
         return _CONTACT_HEAD, rows
     delays = {c.number: number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts}
-    return (*_CONTACT_HEAD, "paper's ms"), [
+    return (*_CONTACT_HEAD, "paper's scheme ms"), [
         (*row, delays[contact.number]) for row, contact in zip(rows, contacts, strict=True)
     ]
 
@@ -218,7 +233,7 @@ _PLAIN_NAMES: Final = {
     "Filter a / b": "Filter of the residual",
     "Smallest threshold / residual": "Smallest margin: threshold over unexplained torque",
 }
-"""Names of quantities for a reader who has nothing of the paper before him; report.json keeps the others."""
+"""Names of quantities for readers who do not know the paper; report.json keeps the paper's."""
 
 
 def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:

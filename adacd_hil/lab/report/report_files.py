@@ -1,6 +1,4 @@
-"""The report's files: a self-contained HTML page, its numbers as JSON and CSV, the index of a folder.
-
-`adacd-hil report` draws figures as PNG, too, and report.png with the verdict and all figures. A browser prints.
+"""The report's files: a self-contained HTML page, and its numbers as JSON and CSV. A browser prints the page.
 
 The same log gives the same bytes. Tables in CSV have times in s since motion start, and units in the names.
 """
@@ -9,45 +7,29 @@ import csv
 import dataclasses
 import io
 import json
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.image import imsave
-from numpy.typing import NDArray
-
 from adacd_hil.file_access import replace_files
-from adacd_hil.lab.drawing import COLOURS, Drawing, style
-from adacd_hil.lab.report.page import (
-    PRINTED_CONTACTS,
-    contact_rows,
-    has_paper,
-    left_out_text,
-    paper_cells,
-    paper_head,
-    shown_contacts,
-)
+from adacd_hil.lab.report.next_steps import NextStep, next_steps
+from adacd_hil.lab.report.page import STEPS, has_paper, went_wrong
 from adacd_hil.lab.report.report_json import JSON_NAME, report_json
-from adacd_hil.lab.report.run_figures import draw
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.report.timeline import stays_of
-from adacd_hil.lab.report.timing_figures import draw_timing
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.verdict import headlines
 from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
 from adacd_hil.log.logged_run import Progress, Run, StretchOfRun, section_at
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.score.metrics import Gathered, Metrics, ReportedContact, ReportSource
+from adacd_hil.score.wording import NONE, number_of, number_text, why_not_found
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import in_line, terminal_columns
 
 HTML_NAME: Final = "report.html"
-_PNG_FIGURES: Final = ("fig5", "fig6", "fig7")
 
 
 @dataclass(frozen=True)
@@ -59,6 +41,7 @@ class Report:
     source: ReportSource
     html_path: Path
     json_path: Path
+    next_steps: tuple[NextStep, ...]
     stretch: StretchOfRun | None = None
 
     @property
@@ -71,20 +54,36 @@ class Report:
         return report_json(self.metrics, self.metadata, self.source, self.stretch)
 
     def as_text(self) -> str:
-        """Give the verdict, what the paper had, the contacts and where the report is, for a terminal of its width."""
-        lines = [in_line(self.metrics.verdict), *_tables(self.metrics, self.source, terminal_columns())]
-        return "\n".join([*lines, "", in_line(f"Report: {self.html_path}")])
+        """Say for a terminal what happened, what to do, and where the report is."""
+        first, *further = headlines(self.metrics)
+        lines = [in_line(f"{'Good' if self.metrics.is_clean else 'NOT GOOD'}: {first}")]
+        lines += [in_line(f"The log is not whole: {self.source.problem}")] if self.source.problem else []
+        lines += [in_line(f"- {line}") for line in further]
+        wrong = [contact for contact in self.metrics.contacts if went_wrong(contact)]
+        if wrong:
+            more = "; all contacts are in contacts.csv" if len(wrong) > PRINTED_CONTACTS else ""
+            lines += ["", f"{number_of(len(wrong), 'contact')} missed or misnamed{more}:"]
+            lines += _contact_lines(wrong[:PRINTED_CONTACTS], terminal_columns())
+        lines.append("")
+        for step in self.next_steps[:STEPS]:
+            lines += [in_line(step.text), *([f"    {in_line(step.command)}"] if step.command else [])]
+        return "\n".join([*lines, in_line(f"Report: {self.html_path}")])
 
 
-def _tables(metrics: Metrics, source: ReportSource, width: int | None = None) -> list[str]:
-    """Give what the log lacks, what the paper had and the contacts, line by line."""
-    lines = [in_line(f"The log is not whole: {source.problem}")] if source.problem else []
-    lines += ["", *fit_table([paper_head(metrics), *paper_cells(metrics)], width=width)]
-    if metrics.contacts:
-        head, rows = contact_rows(metrics, shown_contacts(metrics, PRINTED_CONTACTS))
-        left_out = left_out_text(metrics, PRINTED_CONTACTS)
-        lines += ["", *fit_table([head, *rows], width=width), *([left_out] if left_out else [])]
-    return lines
+PRINTED_CONTACTS: Final = 8
+"""Contacts that went wrong with a line in the terminal."""
+
+
+def _contact_lines(contacts: Sequence[ReportedContact], width: int | None) -> list[str]:
+    """Write a table of contacts for a terminal."""
+    rows: list[tuple[str, ...]] = [("contact", "at", "touched", "found on", "after")]
+    for contact in contacts:
+        found = NONE if contact.link_detected is None else f"link {contact.link_detected}"
+        is_found = contact.detected_s is not None
+        delay = number_text(contact.delay_ms, 0, "ms") if is_found else why_not_found(contact.is_armed)
+        touched = NONE if contact.link is None else f"link {contact.link}"
+        rows.append((str(contact.number), number_text(contact.at_s, 2, "s"), touched, found, delay))
+    return fit_table(rows, width=width)
 
 
 def write_report(
@@ -92,7 +91,6 @@ def write_report(
     truth_path: Path | None,
     out_dir: Path,
     *,
-    is_printed: bool = False,
     stretch: TimeWindow = WHOLE,
     progress: Progress = lambda _: None,
 ) -> Report:
@@ -101,37 +99,31 @@ def write_report(
     Raises LogError, ConfigError when a log can't be read, and LogError when the report can't be written.
     """
     run, gathered, source = read_run(log_path, truth_path, stretch, progress)
-    return write_run_report(run, out_dir, source, gathered, is_printed=is_printed)
+    return write_run_report(run, out_dir, source, gathered)
 
 
-def write_run_report(
-    run: Run, out_dir: Path, source: ReportSource, gathered: Gathered | None = None, *, is_printed: bool = False
-) -> Report:
+def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: Gathered | None = None) -> Report:
     """Write the report of a run that is in memory. Raises LogError when it can't be written.
 
-    gathered: what all of its cycles come to, where it does not have all of them.
+    gathered: the sums over all cycles; None: the run has all of its cycles.
     """
     metrics = evaluate(run, gathered)
     shown_run = run if has_paper(metrics) else dataclasses.replace(run, beside=None)
-    drawings = draw(shown_run, metrics)
-    timing = draw_timing(run.timing, metrics.timing, run.zero_ns, "motion start")
     report = Report(
         metrics=metrics,
         metadata=run.metadata,
         source=source,
         html_path=out_dir / HTML_NAME,
         json_path=out_dir / JSON_NAME,
+        next_steps=tuple(next_steps(metrics, run, source)),
         stretch=run.stretch,
     )
     table = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
     files: dict[str, bytes | str] = {
         **report_tables(run, metrics),
         report.json_path.name: table + "\n",
-        report.html_path.name: report_page(metrics, shown_run, source, drawings, timing),
+        report.html_path.name: report_page(metrics, shown_run, source),
     }
-    if is_printed:
-        files |= {f"{drawing.name}.png": drawing.png() for drawing in drawings if drawing.name in _PNG_FIGURES}
-        files["report.png"] = report_png(metrics.verdict, metrics.is_clean, [*drawings, *timing])
     with failing_as(f"report in {out_dir} can't be written"):
         replace_files(out_dir, files)
     return report
@@ -187,55 +179,3 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     writer.writerow(head)
     writer.writerows([f"{cell:.{_CSV_DIGITS}g}" if isinstance(cell, float) else cell for cell in row] for row in rows)
     return out.getvalue()
-
-
-_WIDTH_IN: Final = 10.0
-"""That of all figures."""
-_VERDICT_LETTERS: Final = 96
-_PNG_DOTS_PER_INCH: Final = 110
-_ROOM_IN: Final = 0.32
-"""Above each figure, for its title."""
-
-
-def report_png(verdict: str, is_good: bool, drawings: Sequence[Drawing]) -> bytes:
-    """Draw the verdict and all figures below one another, each with its title."""
-    with style():
-        strips = [_pixels(_head(verdict, is_good))]
-        for drawing in drawings:
-            strips += [_pixels(_title(drawing.title)), _pixels(drawing.figure)]
-    width = max(strip.shape[1] for strip in strips)
-    sheet = np.full((sum(len(strip) for strip in strips), width, 4), 255, np.uint8)
-    row = 0
-    for strip in strips:
-        sheet[row : row + len(strip), : strip.shape[1]] = strip
-        row += len(strip)
-    out = io.BytesIO()
-    without_versions: Any = {"Software": None}
-    imsave(out, sheet, format="png", metadata=without_versions)
-    return out.getvalue()
-
-
-def _pixels(figure: Figure) -> NDArray[np.uint8]:
-    canvas: Any = FigureCanvasAgg(figure)
-    figure.dpi = _PNG_DOTS_PER_INCH
-    canvas.draw()
-    return np.array(canvas.buffer_rgba())
-
-
-def _head(verdict: str, is_good: bool) -> Figure:
-    """Write the verdict, in the colour and the words of whether it is good."""
-    words = textwrap.wrap(verdict, _VERDICT_LETTERS)
-    figure = Figure(figsize=(_WIDTH_IN, 0.55 + 0.24 * len(words)))
-    colour = COLOURS["good" if is_good else "alarm"]
-    height_in = figure.get_figheight()
-    text = "\n".join([("Good: " if is_good else "Not good: ") + words[0], *words[1:]])
-    figure.text(
-        0.04, 1.0 - 0.35 / height_in, text, fontsize=12, fontweight="bold", color=colour, va="top", parse_math=False
-    )
-    return figure
-
-
-def _title(title: str) -> Figure:
-    figure = Figure(figsize=(_WIDTH_IN, _ROOM_IN))
-    figure.text(0.04, 0.25, title, fontsize=10.5, fontweight="bold", va="bottom", parse_math=False)
-    return figure

@@ -77,14 +77,14 @@ def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
 
 
 def _evidence_json(evidence: CertifiedEvidence) -> dict[str, Any]:
-    """Give what only the certified scheme has; the keys are described in `adacd_hil.score.margins`."""
+    """Give the evidence of the certified scheme; the keys are described in `adacd_hil.score.margins`."""
     certificates = [certificate._asdict() for certificate in evidence.certificates]
     margin = evidence.smallest_margin
     return {**dataclasses.asdict(evidence), "smallest_margin": margin, "certificates": certificates}
 
 
 def _plain(value: Any) -> Any:
-    """Make a value of JSON's types: numbers with six digits, null for what is not finite."""
+    """Make a value of JSON's types: numbers with six digits, null for infinity and NaN."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -41,7 +41,7 @@ from adacd_hil.score.wording import (
 
 
 def paper_table(metrics: Metrics) -> Table:
-    """Put what the paper printed beside what was measured."""
+    """Put the paper's figures beside the measured ones."""
     rows = [[*cells[:-1], Cell(cells[-1], "strong")] for cells in paper_cells(metrics)]
     head = paper_head(metrics)
     return make_table(head, rows, left=range(len(head)))
@@ -56,7 +56,7 @@ def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
     for label, channels in _first_and_worst(evidence).items():
         for row in channels:
             cutoff = f"{row.cutoff_rad_s:g}"
-            kind = "bare" if row.smoothing_rad_s is None else "smoothed"
+            kind = "one filter" if row.smoothing_rad_s is None else "two filters"
             margin = Cell(pair_text(row.margin, 1), "bad" if min(row.margin) < 1.0 else "strong")
             pairs = (pair_text(row.residual_max_Nm, 3), pair_text(row.threshold_Nm, 3))
             name = Cell(label, "strong") if row is channels[0] else ""
@@ -81,7 +81,7 @@ def push_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def counted_sentence(metrics: Metrics) -> str:
-    """Say what false alarms there were, and which rate that leaves possible; empty where nobody knows."""
+    """Count the false alarms and bound their rate; empty without the truth."""
     bound = metrics.false_alarm_bound_per_h
     return "" if bound is None else rate_sentence(metrics.armed_false_alarms or 0, bound)
 
@@ -106,7 +106,7 @@ def further_table(evidence: CertifiedEvidence | None) -> Table | None:
     for name in next(iter(estimates.values())):
         cells: list[object] = [_symbol(name), PARAMETER_UNITS.get(name, "Nm")]
         for found in estimates.values():
-            cells += [Cell(number_text(found[name].value, 5), "strong"), number_text(found[name].std, 5)]
+            cells += [Cell(f"{found[name].value:.3g}", "strong"), f"{found[name].std:.2g}"]
         rows.append(cells)
     return make_table(head, rows, left=(0, 1))
 

@@ -1,13 +1,11 @@
 """The page of a report, put together, and its cards of contacts."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.lab.drawing import Drawing
 from adacd_hil.lab.report.next_steps import next_steps, origin_words
 from adacd_hil.lab.report.page import (
     CONTACTS,
@@ -20,7 +18,6 @@ from adacd_hil.lab.report.page import (
     left_out_text,
     make_table,
     render_page,
-    shown_beside,
     shown_contacts,
     stretch_text,
 )
@@ -37,23 +34,20 @@ from adacd_hil.lab.report.report_tables import (
     timing_tables,
 )
 from adacd_hil.lab.report.timeline import (
-    SCRIPTS,
-    STYLES,
     certificates_of,
     notices_of,
     state_key,
     timeline_of,
     traces_of,
 )
-from adacd_hil.lab.score.verdict import LISTED
+from adacd_hil.lab.score.verdict import LISTED, headlines
 from adacd_hil.log.logged_run import Run
 from adacd_hil.records import DETECTOR_EVENT, Location, Vector
 from adacd_hil.score.judge import row_at
-from adacd_hil.score.metrics import Beside, Metrics, ReportedContact, ReportSource
+from adacd_hil.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.score.wording import (
     NONE,
     number_text,
-    percent_text,
     scaled,
     signs_text,
     state_words,
@@ -227,7 +221,7 @@ def _why_not(contact: ReportedContact) -> str:
 
 
 def _found(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Give what the report says."""
+    """Give the entries of the contact's report."""
     lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
     return [
         ("found after", number_text(contact.delay_ms, 0, "ms")),
@@ -240,7 +234,7 @@ def _found(contact: ReportedContact) -> list[tuple[str, str]]:
 
 
 def _finders(contact: ReportedContact, run: Run) -> list[tuple[str, str]]:
-    """Say who has found a contact, where live detectors say so, as they do in the cycle of its detection."""
+    """Name the live detectors that found a contact, by their events in the cycle of its detection."""
     if contact.detected_s is None:
         return []
     said = [(t_ns, event.message) for t_ns, event in run.events if event.name == DETECTOR_EVENT]
@@ -309,19 +303,14 @@ def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Pus
     return Push(link, side, 0.5, None, None)
 
 
-def report_page(
-    metrics: Metrics, run: Run, source: ReportSource, drawings: Sequence[Drawing], timing: Sequence[Drawing]
-) -> str:
-    """Write the page. drawings, timing: the figures of the run and of its times."""
-    figures = {drawing.name: drawing for drawing in drawings}
-    traces = traces_of(run, metrics)
+def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
+    """Write the page."""
     since_ns = None if run.log_start_ns is None else run.zero_ns - run.log_start_ns
     return render_page(
         "run_page.html.j2",
         f"{_name(run, source)} – run report",
         _heading(metrics, run, source),
-        STYLES if traces else (),
-        SCRIPTS if traces else (),
+        traces_of(run, metrics),
         run=run,
         metrics=metrics,
         next_steps=next_steps(metrics, run, source),
@@ -330,25 +319,20 @@ def report_page(
         state_key=state_key(run),
         notices=notices_of(run, metrics),
         certificates=certificates_of(run),
-        residuals=figures.get("fig5"),
         has_paper=has_paper(metrics),
         paper=paper_table(metrics),
         sections=sections_table(metrics, run),
         margins=margins_table(metrics.evidence),
         push=push_table(metrics.evidence),
         counted=counted_sentence(metrics),
-        close_ups=figures.get("contacts"),
         contacts=contacts_table(metrics),
         left_out=left_out_text(metrics, CONTACTS),
         cards=contact_cards(metrics, run),
-        adaptations=[figures[name] for name in figures if name.removeprefix("fig") not in (name, "5")],
         parameters=parameters_table(metrics, run),
         further=further_table(metrics.evidence),
-        traces=traces,
         traced_contacts=TRACED_CONTACTS,
         data=data_table(metrics.data),
         timing=timing_tables(metrics.timing),
-        timing_figures=timing,
         origin=origin_table(metrics, run, source),
         settling_s=f"{10.0 / run.a_rad_s:g}",
         motion_start_s=None if since_ns is None else since_ns * 1e-9,
@@ -368,46 +352,28 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> Heading:
     if not problems and metrics.dropped:
         problems = [f"{metrics.dropped} packets are not in the log."]
     over = " · ".join(["run report", *words])
-    return Heading(over, metrics.verdict, problems, metrics.is_clean)
+    first, *further = headlines(metrics)
+    return Heading(over, first, problems, metrics.is_clean, further)
 
 
 def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
-    """Give the handful of numbers to be read first: what each is, the number, its unit."""
+    """Give the numbers of the first screen: label, number, unit."""
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
-    times_s = _listed([number_text(value, 2) for value in metrics.adaptation_s.values()])
+    times_s = [number_text(value, 2) for value in metrics.adaptation_s.values()]
+    if len(times_s) > LISTED:
+        times_s = [*times_s[:LISTED], "…"]
     delays_ms = [contact.delay_ms for contact in seen if contact.delay_ms is not None]
-    laws_ms = [contact.law_ms for contact in seen if contact.law_ms is not None]
-    frozen = [max(r.identified) for r in metrics.frozen_residual_max_Nm.values() if r.identified is not None]
     links = [contact for contact in seen if contact.link is not None]
     right = sum(contact.link == contact.link_detected for contact in links)
-    has_truth, evidence = metrics.missed is not None, metrics.evidence
+    found = f"{len(seen)} of {len(armed)}" if metrics.missed is not None else str(len(seen))
+    if not armed and not metrics.contacts:
+        found = NONE
     tiles = [
-        ("identified in" if evidence is None else "certified in", " · ".join(times_s) or NONE, "s"),
-        ("the paper's scheme, same stream", _beside_times(shown_beside(metrics)), "s"),
-        ("contacts detected", f"{len(seen)} of {len(armed)}", "") if has_truth else ("detections", str(len(seen)), ""),
+        ("model learned in", " · ".join(times_s) or NONE, "s"),
+        ("contacts found", found, ""),
         ("false alarms", NONE if metrics.false_alarms is None else str(metrics.false_alarms), ""),
-        ("link right", f"{right} of {len(links)}" if links else NONE, ""),
-        ("median delay", number_text(float(np.median(delays_ms)), 1) if delays_ms else NONE, "ms"),
-        ("of which the filter's", number_text(float(np.median(laws_ms)), 1) if laws_ms else NONE, "ms"),
-        ("largest unexplained torque", number_text(max(frozen), 3) if frozen else NONE, "Nm"),
-        ("incomplete cycles", _share_number(metrics.data.incomplete), "%"),
-        ("smallest margin", NONE if evidence is None else number_text(evidence.smallest_margin, 2), "×"),
+        ("link named rightly", f"{right} of {len(links)}" if links else NONE, ""),
+        ("found after, median", number_text(float(np.median(delays_ms)), 1) if delays_ms else NONE, "ms"),
     ]
     return [tile for tile in tiles if tile[1] != NONE]
-
-
-def _share_number(share: float | None) -> str:
-    return NONE if share is None else percent_text(share).removesuffix(" %")
-
-
-def _beside_times(beside: Beside | None) -> str:
-    if beside is None:
-        return NONE
-    times_s = [number_text(time_s, 2) for time_s in beside.adaptation_s.values()]
-    return " · ".join(_listed(times_s)) or NONE
-
-
-def _listed(times: list[str]) -> list[str]:
-    """Leave out all but the first of many."""
-    return times if len(times) <= LISTED else [*times[:LISTED], "…"]

@@ -1,24 +1,20 @@
 """A run read from its logs: the data that report and metrics need, in bounded memory.
 
-A log is read once, and all of its cycles are kept, while they are no more than `FULL_CYCLES`. A longer one is read
-twice more: for when something begins or ends (`outline`), then for what all cycles come to and for those that are drawn
-(`LongRun`). Of a stretch of a log, the outline of the whole says how far it has to be widened to cut no contact and no
-adaptation.
+A log is read twice, whatever its length: once for when something begins or ends (`outline`), then piece by piece
+through the gatherers, which sum up all cycles and keep those that are drawn (`KeptCycles`). For a stretch of a log, the
+outline of the whole log says how far it has to be widened to cut no contact and no adaptation.
 
-Of a long run are kept, besides the cycles of the outline: of every bucket of cycles those in which a curve of the
-report is smallest or largest, so that no peak is lost; all cycles around the first contacts and of the first
-adaptations; and some stretches for the noise to be told from. The report draws these as they are, so its size is
-bounded, whatever the length.
+A run of at most `FULL_CYCLES` cycles keeps all of them. A longer one keeps, besides the cycles of the outline:
 
-| of a long run | is kept |
+| of a long run | cycles that are kept |
 |---|---|
-| curves | the extremes of each in `BUCKETS` buckets |
-| contacts | every cycle from 0.15 s before to 0.6 s after the first `TRACED_CONTACTS` |
-| adaptations | every cycle of those with a figure, where they are no longer than `ADAPTATION_CYCLES` |
-| times of the cycle | their extremes in `TIME_BUCKETS` buckets |
+| curves | the smallest and the largest value of each in `BUCKETS` buckets |
+| contacts | all from 0.15 s before to 0.6 s after the first `TRACED_CONTACTS` |
+| adaptations | all of the first `ADAPTATIONS` that are no longer than `ADAPTATION_CYCLES` |
+| times of the cycle | the smallest and the largest value of each in `TIME_BUCKETS` buckets |
+| noise | `_NOISE_STRETCHES` stretches of `_NOISE_CYCLES` cycles, by which the steps of the curves are chosen |
 """
 
-import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -27,11 +23,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.lab.report.outline import Facts, Outline, SchemeRows, run_of_piece, settling_s, widen
+from adacd_hil.lab.report.outline import Outline, SchemeRows, run_of_piece, settling_s, widen
 from adacd_hil.lab.report.page import ADAPTATIONS, TRACED_CONTACTS
 from adacd_hil.lab.report.traces import panels_of
-from adacd_hil.lab.score.evaluation import QUEUES, TimingGatherer, find_reactions
-from adacd_hil.lab.score.run_faults import CyclicDataGatherer
+from adacd_hil.lab.score.evaluation import QUEUES, RunGatherer
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import (
     QUANTITIES,
@@ -42,22 +37,19 @@ from adacd_hil.log.logged_run import (
     StretchOfRun,
     Truth,
     columns_of_series,
-    is_realtime,
     settings_of,
     split_sections,
 )
 from adacd_hil.log.reader import LogStream, Piece, Series, check_states, start_of_log
-from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.score.emulator_truth import (
     Rows,
     TruthTable,
     extreme_rows,
     foreign_truth,
-    host_truth,
     read_truth,
 )
 from adacd_hil.score.judge import find_detections, true_contacts
-from adacd_hil.score.margins import UntouchedGatherer
 from adacd_hil.score.metrics import Gathered, ReportSource
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.terminal import one_line
@@ -68,52 +60,41 @@ ADAPTATION_CYCLES: Final = 10_000
 _AROUND_S: Final = (0.15, 0.6)
 _AFTER_ADAPTATION: Final = 0.1
 """Share of an adaptation's length by which its figure goes on."""
-_ROOM: Final = 500_000
+_ROOM: Final = 200_000
 """Rows that memory is asked for at once, more than are kept of most runs."""
 _NOISE_STRETCHES: Final = 16
 _NOISE_CYCLES: Final = 500
 
 
-class LongRun:
-    """Takes in the pieces of a run whose outline is known."""
+class KeptCycles:
+    """Keeps those cycles of a run that are drawn."""
 
-    def __init__(self, outline: Run, indexes: Rows, cycles: int, empty: Piece) -> None:
-        """`indexes`: which of the run's `cycles` cycles the outline has; empty: a piece without messages."""
-        self._outline = outline
+    def __init__(self, outline: Run, indexes: Rows, cycles: int, empty: Run, scheme: Series, full_cycles: int) -> None:
+        """`indexes`: places of the outline's cycles among the `cycles` cycles of the run. scheme: without records."""
         self._indexes = indexes
         self._cycles = cycles
-        self._shell = dataclasses.replace(outline, truth=None, reports=(), events=())
-        self._rows = SchemeRows(empty.series["/scheme"], _ROOM)
-        self._columns: list[CycleColumns] = [columns_of_series(empty.series["/cycle"])]
-        self._untouched = UntouchedGatherer(outline)
-        self._data = CyclicDataGatherer(outline.settings)
-        self._timing = TimingGatherer(outline.settings.bus.period_us, not is_realtime(outline))
+        self._bucket, self._time_bucket = (
+            1 if cycles <= full_cycles else -(-cycles // buckets) for buckets in (BUCKETS, TIME_BUCKETS)
+        )
+        self._rows = SchemeRows(scheme, _ROOM)
+        self._columns = [empty.timing]
         self._windows = np.array(list(_windows(outline))).reshape(-1, 2)
         self._noise_starts = np.linspace(0, cycles, _NOISE_STRETCHES, endpoint=False).astype(np.int64)
         self._read = 0
         self._timed = 0
-        self._overruns = 0
-        self._state = int(SchemeState.INIT)
 
-    @property
-    def bucket(self) -> int:
-        """Cycles of a bucket."""
-        return -(-self._cycles // BUCKETS)
-
-    def add(self, piece: Piece) -> None:
-        """Take in the next piece."""
-        scheme = piece.series["/scheme"]
-        self._add_times(columns_of_series(piece.series["/cycle"]), scheme)
-        if not len(scheme):
-            return
-        run = run_of_piece(scheme, self._shell)
-        self._untouched.add(run)
-        self._rows.add(scheme, self._chosen(run))
-        self._read += len(scheme)
+    def add_piece(self, scheme: Series, piece: Run) -> None:
+        """Choose from the next cycles: the records of /scheme, and the same as a run."""
+        self._add_times(piece.timing)
+        if len(scheme):
+            self._rows.add(scheme, self._chosen(piece))
+            self._read += len(scheme)
 
     def _chosen(self, run: Run) -> Rows:
         """Choose the rows of a piece that are kept."""
         count, first = run.cycle.size, self._read
+        if self._bucket == 1:
+            return np.arange(count)
         is_kept = np.zeros(count, np.bool_)
         is_kept[[0, -1]] = True
         here = self._indexes[np.searchsorted(self._indexes, first) : np.searchsorted(self._indexes, first + count)]
@@ -123,37 +104,32 @@ class LongRun:
             is_kept[np.searchsorted(time_s, start_s) : np.searchsorted(time_s, end_s, side="right")] = True
         for start in self._noise_starts.tolist():
             is_kept[max(start - first, 0) : max(start + _NOISE_CYCLES - first, 0)] = True
-        starts = np.unique(np.append(0, np.arange(-first % self.bucket, count, self.bucket)))
-        is_kept[extreme_rows(_curves(run), starts)] = True
+        is_kept[extreme_rows(_curves(run), _bucket_starts(first, count, self._bucket))] = True
         return np.flatnonzero(is_kept)
 
-    def _add_times(self, columns: CycleColumns, scheme: Series) -> None:
-        """Sum up the times of a piece, and keep their extremes."""
-        state = scheme.records["state"]
-        cycle = scheme.records["cycle"].astype(np.int64)
-        self._timing.add(columns, find_reactions(columns, cycle, state, self._state))
-        self._data.add(columns, cycle, state)
-        if len(state):
-            self._state = int(state[-1])
+    def _add_times(self, columns: CycleColumns) -> None:
         if not len(columns):
             return
-        bucket = -(-self._cycles // TIME_BUCKETS)
-        starts = np.unique(np.append(0, np.arange(-self._timed % bucket, len(columns), bucket)))
+        starts = _bucket_starts(self._timed, len(columns), self._time_bucket)
         names = (*(quantity.column for quantity in QUANTITIES), *QUEUES.values(), "overruns")
         series = [columns[name].astype(np.float64) for name in names if name in columns]
         self._columns.append(columns.rows(extreme_rows(series, starts)))
         self._timed += len(columns)
 
-    def done(self) -> tuple[Run, Gathered]:
-        """Give the run with the rows that were kept, and what all of them come to."""
-        run = self._rows.fill(self._outline)
+    def run(self, outline: Run) -> Run:
+        """Give the run with the cycles that were kept."""
         timing = CycleColumns.joined(self._columns)
-        run = dataclasses.replace(run, timing=timing, all_cycles=self._cycles, bucket=self.bucket)
-        return run, Gathered(self._untouched.gathered(), self._timing.evidence(), self._data.data(run))
+        kept = self._rows.fill(outline)
+        return replace(kept, timing=timing, all_cycles=self._cycles, bucket=self._bucket)
+
+
+def _bucket_starts(before: int, count: int, bucket: int) -> Rows:
+    """Give the rows of a piece at which buckets begin. before: rows before the piece."""
+    return np.unique(np.append(0, np.arange(-before % bucket, count, bucket)))
 
 
 def _curves(run: Run) -> Iterator[Vector]:
-    """Give what the report draws over the whole run."""
+    """Give the curves that the report draws over the whole run."""
     for panel in panels_of(run):
         for trace in panel.traces:
             yield trace.values
@@ -172,9 +148,9 @@ def _windows(run: Run) -> Iterator[tuple[float, float]]:
 
 
 RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events")
-"""Of a run's log, what a report reads."""
-FULL_CYCLES: Final = 500_000
-"""Cycles that are kept and drawn one by one: eight minutes at 1 kHz; some 1.2 kB each in the log."""
+"""Topics that a report reads."""
+FULL_CYCLES: Final = 150_000
+"""Cycles that are kept and drawn one by one: 150 s at 1 kHz, about as many as are kept of hours."""
 _MOST_DIGITS: Final = 18
 
 Bounds = tuple[int, int]
@@ -182,10 +158,10 @@ Bounds = tuple[int, int]
 
 
 class ReadRun(NamedTuple):
-    """A run, and what all of its cycles come to; None where it has all of them."""
+    """A run with the cycles that are drawn, the sums over all of its cycles, and its log."""
 
     run: Run
-    gathered: Gathered | None
+    gathered: Gathered
     source: ReportSource
 
 
@@ -198,15 +174,15 @@ def read_run(
 ) -> ReadRun:
     """Read a log, or a stretch of it, and the emulator's truth if there is one. Raises LogError, ConfigError.
 
-    The truth of another run is left out, and said to be a problem of the source.
+    The truth of another run is left out, and is a problem of the source.
     full_cycles: of a log with more, some are kept.
     """
     problem = "" if truth_path is None else foreign_truth(log_path, truth_path)
-    truth = None if truth_path is None or problem else read_truth(truth_path, full_cycles)
+    truth = None if truth_path is None or problem else read_truth(truth_path)
     reading = _Reading(log_path, truth, progress, problem)
-    if not stretch.is_whole:
-        return reading.read_stretch(stretch, full_cycles)
-    return reading.read_whole(full_cycles) or reading.read_long(*reading.outline())
+    if stretch.is_whole:
+        return reading.gather(reading.outline(), full_cycles)
+    return reading.read_stretch(stretch, full_cycles)
 
 
 class _Reading:
@@ -224,7 +200,7 @@ class _Reading:
         self._read = stream  # that was last read to its end
 
     def _begin(self, stream: LogStream) -> Run:
-        """Give a run without a cycle, with what a log says of it before its first message."""
+        """Give a run without a cycle, with metadata and settings of the log."""
         metadata = dict(stream.metadata)
         if "arm.dbc" in stream.attachments:
             metadata["dbc_sha256"] = hashlib.sha256(stream.attachments["arm.dbc"]).hexdigest()
@@ -255,7 +231,7 @@ class _Reading:
         return run_of_piece(self._scheme, empty)
 
     def _pieces(self, doing: str, bounds_ns: Bounds | None = None) -> Iterator[tuple[LogStream, Piece]]:
-        """Read the log, or what of it lies between two times."""
+        """Read the log, or its part between two times."""
         stream = LogStream(self._path, RUN_TOPICS)
         cycles = 0
         milestones = Milestones(lambda count: self._progress(f"{self._path}: {doing}, {count} cycles"))
@@ -272,8 +248,8 @@ class _Reading:
             yield stream, _within(piece, bounds_ns, stream.epoch_ns)
         self._read = stream
 
-    def _done(self, run: Run, gathered: Gathered | None) -> ReadRun:
-        """Give what was read."""
+    def _done(self, run: Run, gathered: Gathered) -> ReadRun:
+        """Add the ending, the problems and the counts of the log."""
         stream, truth = self._read, self._truth
         ending = stream.summary.get(ENDING_KEY, "")
         if ending and ending not in PLANNED_ENDINGS:
@@ -286,60 +262,48 @@ class _Reading:
             run = replace(run, frames=_count(stream.summary, "frames"), dropped=_count(stream.summary, "dropped"))
         return ReadRun(run, gathered, source)
 
-    def read_whole(self, most_cycles: int, bounds_ns: Bounds | None = None, shell: Run | None = None) -> ReadRun | None:
-        """Read all cycles, or those between two times; None if they are more than so many.
-
-        shell: what is known of the run before, its truth included.
-        """
-        facts = Facts()
-        rows = SchemeRows(self._scheme, most_cycles)
-        columns = [columns_of_series(self._empty.series["/cycle"])]
-        for stream, piece in self._pieces("reading", bounds_ns):
-            facts.add(stream, piece)
-            if facts.cycles > most_cycles:
-                return None
-            rows.add(piece.series["/scheme"])
-            columns.append(columns_of_series(piece.series["/cycle"]))
-        run = facts.apply(rows.fill(shell or self._shell))
-        if shell is None and self._truth is not None:
-            last = int(run.cycle[-1]) if run.cycle.size else -1
-            run = replace(run, truth=host_truth(self._truth, facts.begins, last, None))
-        return self._done(replace(run, timing=CycleColumns.joined(columns)), None)
-
     def outline(
         self, bounds_ns: Bounds | None = None, shell: Run | None = None, until_ns: int | None = None
-    ) -> tuple[Run, Outline]:
+    ) -> Outline:
         """Find when something begins and ends, in all cycles or between two times.
 
-        until_ns: what comes later is not asked for, once all is calm.
+        shell: facts about the run that are known before, its truth included. until_ns: read no further than needed to
+        know what happens until then.
         """
         outline = Outline(shell or self._shell, self._scheme, self._truth if shell is None else None)
-        calm_ns = round(settling_s(self._shell) * 1e9)
+        settling_ns = round(settling_s(self._shell) * 1e9)
         for stream, piece in self._pieces("looking for what happens", bounds_ns):
             outline.add(stream, piece)
             times_ns = piece.series["/scheme"].t_ns
             if until_ns is None or not times_ns.size:
                 continue
-            before_ns = int(times_ns[-1]) - calm_ns
-            if before_ns > until_ns and outline.is_calm_since(before_ns):
+            before_ns = int(times_ns[-1]) - settling_ns
+            if before_ns > until_ns and outline.is_idle_since(before_ns):
                 break
-        return outline.done(), outline
+        return outline
 
-    def read_long(self, run: Run, outline: Outline, bounds_ns: Bounds | None = None) -> ReadRun:
-        """Read what all cycles come to, and those that are drawn."""
+    def gather(self, outline: Outline, full_cycles: int, bounds_ns: Bounds | None = None) -> ReadRun:
+        """Pass all cycles, or those between two times, through the gatherers."""
+        run = outline.done()
+        shell = replace(run, truth=None, reports=(), events=())
         indexes = np.concatenate([np.empty(0, np.int64), *outline.indexes])
-        long_run = LongRun(run, indexes, outline.facts.cycles, self._empty)
-        for _, piece in self._pieces("adding up what all cycles come to", bounds_ns):
-            long_run.add(piece)
-        return self._done(*long_run.done())
+        kept = KeptCycles(run, indexes, outline.facts.cycles, self._shell, self._scheme, full_cycles)
+        sums = RunGatherer(run)
+        for _, piece in self._pieces("adding up", bounds_ns):
+            scheme = piece.series["/scheme"]
+            cycles = replace(run_of_piece(scheme, shell), timing=columns_of_series(piece.series["/cycle"]))
+            sums.add_piece(cycles)
+            kept.add_piece(scheme, cycles)
+        run = kept.run(run)
+        return self._done(run, sums.gathered(run))
 
-    def read_stretch(self, stretch: TimeWindow, most_cycles: int) -> ReadRun:
-        """Read a stretch of the log, and what of it is needed to cut nothing. Raises LogError if nothing is in it."""
+    def read_stretch(self, stretch: TimeWindow, full_cycles: int) -> ReadRun:
+        """Read a part of the log, widened so that it cuts nothing. Raises LogError for a part without a cycle."""
         start_ns = self._shell.log_start_ns
         if start_ns is None:
             raise LogError(f"log {self._path} has no message")
         asked_ns = stretch.bounds_ns(start_ns)
-        run, _ = self.outline(until_ns=asked_ns[1])
+        run = self.outline(until_ns=asked_ns[1]).done()
         zero_ns = run.zero_ns
         asked_s = ((asked_ns[0] - zero_ns) * 1e-9, (asked_ns[1] - zero_ns) * 1e-9)
         bounds_s = widen(run, *asked_s)
@@ -356,16 +320,14 @@ class _Reading:
                 stretch, found, sum(at_s < bounds_s[0] for at_s in begun_s), (zero_ns - start_ns) * 1e-9
             ),
         )
-        whole = self.read_whole(most_cycles, bounds_ns, shell)
-        if whole is None:
-            whole = self.read_long(*self.outline(bounds_ns, shell), bounds_ns)
-        if whole.run.cycle.size == 0:
+        read = self.gather(self.outline(bounds_ns, shell), full_cycles, bounds_ns)
+        if read.run.cycle.size == 0:
             raise LogError(f"log {self._path} has no cycle from {stretch.start_s:g} to {stretch.end_s:g} s")
-        return whole
+        return read
 
 
 def _within(piece: Piece, bounds_ns: Bounds, epoch_ns: int) -> Piece:
-    """Give what of a piece lies between two times, but for its events."""
+    """Give a piece's messages between two times, and all of its events."""
     series = {}
     for name, values in piece.series.items():
         t_ns = values.t_ns
@@ -374,7 +336,7 @@ def _within(piece: Piece, bounds_ns: Bounds, epoch_ns: int) -> Piece:
 
 
 def _truth_within(truth: Truth | None, bounds_s: tuple[float, float]) -> Truth | None:
-    """Give what of the truth lies between two times, s since motion start."""
+    """Give the rows of the truth between two times, s since motion start."""
     if truth is None or truth.time_s is None:
         return truth
     rows = (truth.time_s >= bounds_s[0]) & (truth.time_s < bounds_s[1])

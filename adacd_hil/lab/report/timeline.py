@@ -1,18 +1,18 @@
-"""A run over time on a page: marks of the timeline, on the lanes of a drawing 1000 wide, and what a script draws below.
+"""A run over time on a page: marks of the timeline, on the lanes of a drawing 1000 wide, and the curves of the run.
 
-Lanes are states, contacts and notices; below them the script draws the traces. A mark carries the stretch that it
+Lanes are states, contacts and notices. A mark carries the stretch that it
 stands for, s since motion start, so that a script can enlarge the stretch; without a script the mark still shows its
 words.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from adacd_hil.lab.report.page import MARKS
-from adacd_hil.lab.report.traces import Packed, TracePanel, pack, panels_of, step_of
+from adacd_hil.lab.report.traces import Traces, pack_tracks, run_tracks
 from adacd_hil.log.logged_run import Run
 from adacd_hil.records import SchemeState
 from adacd_hil.score.metrics import Metrics, ReportedContact
@@ -57,7 +57,7 @@ class Notice(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """A mark on a lane: the stretch that it stands for, its words, its place, colour or class, and what it shows."""
+    """A mark on a lane: the stretch that it stands for, its words, its place, its colour or class, its label."""
 
     from_s: float
     to_s: float
@@ -70,7 +70,7 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """The content of each lane. ticks: place and label; is_thinned: what is narrower than a mark is drawn together."""
+    """The content of each lane. ticks: place and label; is_thinned: stays narrower than a mark are drawn together."""
 
     left: float
     width: float
@@ -96,7 +96,7 @@ def stays_of(run: Run) -> list[Stay]:
 
 
 def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
-    """List what went wrong in the order of time, at most `_MOST_NOTICES`, the bad ones first to stay."""
+    """List warnings, errors, faults and false alarms by time; of too many, the bad ones stay."""
     notices = [
         Notice((t_ns - run.zero_ns) * 1e-9, event.level == "error", f"{event.name}: {event.message}")
         for t_ns, event in run.events
@@ -113,7 +113,7 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
 
 
 class CertificateNote(NamedTuple):
-    """What the log says of a certificate: given, or taken back, and each thing that it tells."""
+    """A certificate of the log: given or taken back, and its clauses."""
 
     at_s: float
     is_taken_back: bool
@@ -258,54 +258,11 @@ def _ticks(scale: _Scale) -> Iterator[tuple[float, str]]:
         yield scale.x(number * step_s), number_text(number * step_s, digits)
 
 
-STYLES: Final = ("uplot-1.6.32.min.css",)
-
-SCRIPTS: Final = ("uplot-1.6.32.iife.min.js", "traces.js")
-"""uPlot is Leon Sorokin's, MIT licence, from npm; its licence lies beside it."""
-
-_TIME_STEP_S: Final = 1e-5
-
-
-class Traces(NamedTuple):
-    """The data of the traces. blocks: the series as text, by name; plan: what the script draws of them."""
-
-    panels: tuple[TracePanel, ...]
-    blocks: dict[str, str]
-    plan: dict[str, Any]
-
-
 def traces_of(run: Run, metrics: Metrics) -> Traces | None:
-    """Pack the series; None of a run of less than two cycles."""
-    panels = panels_of(run)
-    if run.cycle.size < 2 or not panels:
+    """Pack the curves of a run, with its states, contacts and faults; None of a run of less than two cycles."""
+    if run.cycle.size < 2:
         return None
-    is_next = None if run.all_cycles is None else np.diff(run.cycle, prepend=run.cycle[0] - 2) == 1
-    time = pack(run.time_s(), _TIME_STEP_S)
-    blocks = {"trace-t": time.text}
-    drawn = []
-    for panel in panels:
-        curves = []
-        for number, trace in enumerate(panel.traces):
-            packed = pack(trace.values, step_of(trace.values, trace.finest, is_next))
-            name = f"trace-{panel.name}-{number}"
-            blocks[name] = packed.text
-            curves.append(
-                {
-                    **_numbers(name, packed),
-                    "label": trace.label,
-                    "colour": trace.colour,
-                    "isDashed": trace.is_dashed,
-                    "isMirrored": trace.is_mirrored,
-                }
-            )
-        drawn.append(
-            {"name": panel.name, "unit": panel.unit, "near": panel.near, "levels": panel.levels, "curves": curves}
-        )
-    plan = {
-        "count": int(run.cycle.size),
-        "period": run.settings.bus.period_s,
-        "time": _numbers("trace-t", time),
-        "panels": drawn,
+    marks = {
         "bands": [
             [round(stay.start_s, 4), round(stay.end_s, 4), STATE_COLOURS[stay.state]]
             for stay in stays_of(run)
@@ -317,8 +274,4 @@ def traces_of(run: Run, metrics: Metrics) -> Traces | None:
         ],
         "faults": [round(notice.at_s, 4) for notice in notices_of(run, metrics) if notice.is_bad],
     }
-    return Traces(panels, blocks, plan)
-
-
-def _numbers(name: str, packed: Packed) -> dict[str, Any]:
-    return {"id": name, "low": packed.low, "step": packed.step, "order": packed.order, "planes": packed.planes}
+    return pack_tracks(run_tracks(run), run.settings.bus.period_s, marks)

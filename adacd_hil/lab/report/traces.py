@@ -1,6 +1,7 @@
-"""The traces of a run, at its full rate: what is drawn in which panel, how finely it is written down, how it is packed.
+"""The curves of a page: their panels, their rounding, their packing.
 
-Times in s since motion start, on the rows of the run.
+The page's script draws them, so that a reader can enlarge any part; the data lie in the page, at their full rate.
+Panels with the same abscissa make a *track*: the cycles of /scheme, those of /cycle, the dates of runs.
 
 A series x (n,) becomes whole numbers, 0 where x is not finite, else 1 + round((x - low) / step). Of their first or
 second differences, whichever is smaller (32 bits, they wrap), the sign goes to the lowest bit (zigzag); the bytes of
@@ -10,14 +11,24 @@ Smooth series take a fraction of a bit per sample, noise about four.
 
 import zlib
 from base64 import b64encode
-from collections.abc import Iterator
-from typing import Final, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.logged_run import CertifiedStream, Run
-from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
+from adacd_hil.lab.score.evaluation import QUEUES
+from adacd_hil.log.logged_run import (
+    COMPUTE,
+    LATENESS,
+    SLACK,
+    SYNC_TO_COMMAND,
+    CertifiedStream,
+    CycleColumns,
+    Run,
+    is_realtime,
+)
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, PARAMETER_UNITS, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of
 
 FINEST: Final = {
@@ -25,8 +36,11 @@ FINEST: Final = {
     "rad/s": 5e-4,
     "Nm": 1e-3,
     "×": 0.02,
+    "µs": 0.1,
+    "bytes": 1.0,
+    "periods": 1.0,
 }
-"""Steps that nobody reads finer, by unit: the encoders' own, a fortieth of a threshold, a hundredth of its margin."""
+"""Finest steps by unit: the encoders' own, a fortieth of a threshold, a hundredth of its margin."""
 _PARAMETER_STEP: Final = 1e-5
 _NEAR: Final = 3.0
 """The range near zero, in thresholds."""
@@ -55,9 +69,18 @@ class TracePanel(NamedTuple):
     near: float | None = None
 
 
+class Track(NamedTuple):
+    """Panels over one abscissa, s (n,). is_next (n,): samples that follow the one before at once; None: all do."""
+
+    name: str
+    at_s: Vector
+    panels: tuple[TracePanel, ...]
+    is_next: NDArray[np.bool_] | None = None
+
+
 def panels_of(run: Run) -> tuple[TracePanel, ...]:
     """List the panels that the run has something for."""
-    return (*_motion(run), *_residuals(run), *_channels(run), *_parameters(run))
+    return (*_residuals(run), *_motion(run), *_channels(run), *_parameters(run))
 
 
 def _motion(run: Run) -> Iterator[TracePanel]:
@@ -89,14 +112,27 @@ def _residuals(run: Run) -> Iterator[TracePanel]:
         bound = _in_view(run.threshold[:, joint], residual)
         traces.append(Trace(ours, residual, finest, "identified"))
         traces.append(Trace("threshold", bound, finest, "ink", True, True))
+        if run.truth is not None:
+            traces.append(Trace("true", _true_torque(run)[:, joint], finest, "good"))
         finite = bound[np.isfinite(bound)]
         near = _NEAR * float(np.median(finite)) if finite.size else None
         title = f"Estimated external torque tau_ext_hat, joint {joint + 1}"
         yield TracePanel(f"residual{joint + 1}", title, "Nm", tuple(traces), near=near)
 
 
+def _true_torque(run: Run) -> Vector:
+    """Give the true external torque in each cycle (n, 2); zero where the truth has no contact."""
+    assert run.truth is not None
+    torque = np.zeros((run.cycle.size, JOINTS))
+    if run.truth.cycle.size:
+        rows = np.minimum(np.searchsorted(run.truth.cycle, run.cycle), run.truth.cycle.size - 1)
+        is_there = run.truth.cycle[rows] == run.cycle
+        torque[is_there] = run.truth.tau_ext[rows[is_there]]
+    return torque
+
+
 def _in_view(threshold: Vector, residual: Vector) -> Vector:
-    """Leave out of a threshold what is above every residual, as while a model is uncertain, or infinite."""
+    """Leave out the threshold where it is above every residual, as while a model is uncertain, or infinite."""
     largest = float(np.max(np.abs(residual[np.isfinite(residual)]), initial=0.0))
     finite = threshold[np.isfinite(threshold)]
     ceiling = max(largest, _NEAR * float(finite.min())) if finite.size else 0.0
@@ -136,11 +172,60 @@ def _parameters(run: Run) -> Iterator[TracePanel]:
     names = run.parameter_names
     for unit in dict.fromkeys(PARAMETER_UNITS[name] for name in names):
         chosen = [name for name in names if PARAMETER_UNITS[name] == unit]
-        traces = tuple(
-            Trace(name, run.theta_hat[:, names.index(name)], _PARAMETER_STEP, colour)
-            for name, colour in zip(chosen, _BANK_COLOURS, strict=False)
+        traces: list[Trace] = []
+        for name, colour in zip(chosen, _BANK_COLOURS, strict=False):
+            traces.append(Trace(name, run.theta_hat[:, names.index(name)], _PARAMETER_STEP, colour))
+            true = _true_parameter(run, name)
+            if true is not None:
+                traces.append(Trace(f"true {name}", true, _PARAMETER_STEP, colour, is_dashed=True))
+        title = f"Identified parameters theta_hat: {', '.join(chosen)}"
+        yield TracePanel(f"theta-{chosen[0]}", title, unit, tuple(traces))
+
+
+def _true_parameter(run: Run, name: str) -> Vector | None:
+    """Give a parameter's true value in each cycle (n,); None where it is not known."""
+    truth = run.truth
+    if truth is None or name not in PARAMETER_NAMES:
+        return None
+    since = truth.cycle if truth.model_cycle is None else truth.model_cycle
+    if not since.size:
+        return None
+    rows = np.maximum(np.searchsorted(since, run.cycle, side="right") - 1, 0)
+    return np.asarray(truth.theta[rows, PARAMETER_NAMES.index(name)])
+
+
+_TIMES: Final = ((LATENESS, "identified"), (COMPUTE, "joint1"), (SYNC_TO_COMMAND, "joint2"), (SLACK, "cad"))
+
+
+def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid: bool) -> Track:
+    """Give the times, queues and skipped periods of the cycles, s since zero_ns; has_grid: not of lockstep."""
+    panels = []
+    for quantity, colour in _TIMES:
+        values_us = columns.times_us(quantity)
+        if values_us is not None and (has_grid or quantity is not LATENESS):
+            title = f"{quantity.title}: {quantity.meaning}"
+            trace = Trace(quantity.title, values_us, FINEST["µs"], colour)
+            panels.append(TracePanel(f"time-{quantity.name}", title, "µs", (trace,), levels=(period_us,)))
+    queues = [name for name, column in QUEUES.items() if has_grid and column in columns]
+    if queues:
+        traces = (
+            Trace(name, columns[QUEUES[name]].astype(np.float64), FINEST["bytes"], f"queue_{name}") for name in queues
         )
-        yield TracePanel(f"theta-{chosen[0]}", f"Identified parameters theta_hat: {', '.join(chosen)}", unit, traces)
+        title = "Queues: of the bus, to be received and to be sent, and to the log's writer"
+        panels.append(TracePanel("queues", title, "bytes", tuple(traces)))
+    if "overruns" in columns and columns["overruns"].any():
+        skipped = Trace("skipped", columns.steps("overruns").astype(np.float64), FINEST["periods"], "alarm")
+        panels.append(TracePanel("skipped", "Periods that were skipped", "periods", (skipped,)))
+    is_next = np.diff(columns["cycle"], prepend=-2) == 1 if "cycle" in columns else None
+    at_s = np.asarray((columns.t_ns - zero_ns) * 1e-9, np.float64)
+    return Track("timing", at_s, tuple(panels), is_next)
+
+
+def run_tracks(run: Run) -> list[Track]:
+    """Give the curves of a run: those of /scheme and those of /cycle."""
+    is_next = None if run.bucket == 1 else np.diff(run.cycle, prepend=run.cycle[:1] - 2) == 1
+    timing = timing_track(run.timing, run.settings.bus.period_us, run.zero_ns, is_realtime(run))
+    return [Track("scheme", run.time_s(), panels_of(run), is_next), timing]
 
 
 STEPS_PER_SIGMA: Final = 2.0
@@ -176,7 +261,7 @@ def noise_of(values: Vector, is_next: NDArray[np.bool_] | None = None) -> float:
 
 
 def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
-    """Choose a step: half the noise's standard deviation, see `noise_of`, but no finer than what anybody reads."""
+    """Choose a step: half the noise's standard deviation, see `noise_of`, but no finer than `finest`."""
     return max(finest, noise_of(values, is_next) / STEPS_PER_SIGMA)
 
 
@@ -200,3 +285,61 @@ def pack(values: Vector, step: float) -> Packed:
 
 def _zigzag(numbers: NDArray[np.int32]) -> NDArray[np.uint32]:
     return ((numbers << 1) ^ (numbers >> 31)).view(np.uint32)
+
+
+_TIME_STEP_S: Final = 1e-5
+
+
+class Traces(NamedTuple):
+    """The curves of a page: panels by track, the series as text by name, and the script's plan."""
+
+    panels: dict[str, tuple[TracePanel, ...]]
+    blocks: dict[str, str]
+    plan: dict[str, Any]
+
+
+def pack_tracks(
+    tracks: Sequence[Track], period_s: float, marks: dict[str, Any] | None = None, is_dated: bool = False
+) -> Traces | None:
+    """Pack the curves of a page; None without any.
+
+    period_s: eight of it are the shortest part that is shown. marks: bands, contacts and faults of the run. is_dated:
+    the abscissa is the time since 1970.
+    """
+    tracks = [track for track in tracks if track.at_s.size > 1 and track.panels]
+    if not tracks:
+        return None
+    blocks: dict[str, str] = {}
+    planned = []
+    for track in tracks:
+        at = _packed(blocks, f"trace-t-{track.name}", track.at_s, _TIME_STEP_S)
+        panels = [
+            {
+                "name": panel.name,
+                "unit": panel.unit,
+                "near": panel.near,
+                "levels": panel.levels,
+                "curves": [
+                    {
+                        **_packed(blocks, f"trace-{panel.name}-{number}", trace.values,
+                                  step_of(trace.values, trace.finest, track.is_next)),
+                        "label": trace.label,
+                        "colour": trace.colour,
+                        "isDashed": trace.is_dashed,
+                        "isMirrored": trace.is_mirrored,
+                    }
+                    for number, trace in enumerate(panel.traces)
+                ],
+            }
+            for panel in track.panels
+        ]  # fmt: skip
+        planned.append({"name": track.name, "count": int(track.at_s.size), "time": at, "panels": panels})
+    nothing: dict[str, Any] = {"bands": [], "contacts": [], "faults": []}
+    plan = {"period": period_s, "isDated": is_dated, "tracks": planned, **nothing, **(marks or {})}
+    return Traces({track.name: track.panels for track in tracks}, blocks, plan)
+
+
+def _packed(blocks: dict[str, str], name: str, values: Vector, step: float) -> dict[str, Any]:
+    packed = pack(values, step)
+    blocks[name] = packed.text
+    return {"id": name, "low": packed.low, "step": packed.step, "order": packed.order, "planes": packed.planes}

@@ -1,1 +1,1 @@
-"""Many runs: what each came to, found again, and how it went on from run to run."""
+"""Many runs: the figures of each, a list, and trends from run to run."""

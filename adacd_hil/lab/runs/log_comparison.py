@@ -28,7 +28,7 @@ _NOT_METADATA: Final = ("epoch_ns",)
 
 
 class ComparedContact(NamedTuple):
-    """What a run reported of a contact in the end; time since motion start."""
+    """The last report of a contact; time since motion start."""
 
     time_s: float
     link: int
@@ -36,7 +36,7 @@ class ComparedContact(NamedTuple):
     kind: int
     tau_ext_peak: tuple[float, ...]
     force_N: float
-    location: int = 0  # records.Location: what force_N is
+    location: int = 0  # records.Location: the meaning of force_N
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class RunReader:
         )
 
     def digest(self) -> RunDigest:
-        """Return what is kept, once everything has been read."""
+        """Return the digest, once everything has been read."""
         if not self._parameters and self.cycles:
             self._keep_parameters(self._last)
         timing = {}
@@ -204,11 +204,8 @@ class FieldDifference(NamedTuple):
         return self._asdict() | {"largest": self.largest if math.isfinite(self.largest) else None}
 
 
-class ContactPair(NamedTuple):
-    """A contact in both runs, or in one."""
-
-    first: ComparedContact | None
-    second: ComparedContact | None
+ContactPair = tuple[ComparedContact | None, ComparedContact | None]
+"""A contact in both runs, or in one."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +259,7 @@ class LogComparison:
 
 
 class _Differences:
-    """Counts what differs, field by field."""
+    """Counts differences, field by field."""
 
     def __init__(self, period_s: float, zero_cycle: int) -> None:
         self.found: dict[str, FieldDifference] = {}
@@ -349,7 +346,7 @@ def compare_logs(
 def _walk_together(
     readers: tuple[RunReader, RunReader], differences: _Differences, progress: Progress
 ) -> tuple[int, tuple[int, int]]:
-    """Compare what both logs have; return how many cycles that were, and how many only one of them has."""
+    """Compare the cycles that both logs have; return their number, and the numbers of cycles that only one log has."""
     streams = iter(readers[0]), iter(readers[1])
     first, second = (_next_rows(stream) for stream in streams)
     common = 0
@@ -379,7 +376,7 @@ def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
 
 
 def match_contacts(first: list[ComparedContact], second: list[ComparedContact]) -> list[ContactPair]:
-    """Match detections by time, the nearest ones first; what has no counterpart stands alone. In order of time."""
+    """Match detections by time, the nearest ones first; others stand alone. In order of time."""
     order = sorted(range(len(second)), key=lambda k: second[k].time_s)
     times_s = [second[k].time_s for k in order]
     distances = []
@@ -394,6 +391,6 @@ def match_contacts(first: list[ComparedContact], second: list[ComparedContact]) 
         if distance <= MATCH_S and i not in partner and k not in taken:
             partner[i] = k
             taken.add(k)
-    pairs = [ContactPair(a, second[partner[i]] if i in partner else None) for i, a in enumerate(first)]
-    pairs += [ContactPair(None, b) for k, b in enumerate(second) if k not in taken]
+    pairs: list[ContactPair] = [(a, second[partner[i]] if i in partner else None) for i, a in enumerate(first)]
+    pairs += [(None, b) for k, b in enumerate(second) if k not in taken]
     return sorted(pairs, key=lambda pair: min(each.time_s for each in pair if each is not None))

@@ -1,4 +1,4 @@
-"""Pages over many runs: the list that leads to their reports, and what an arm's figures did from run to run."""
+"""Pages over many runs: the list that leads to their reports, and the trend of an arm's figures from run to run."""
 
 import os
 from collections.abc import Sequence
@@ -6,13 +6,21 @@ from pathlib import Path
 from typing import Final, NamedTuple
 from urllib.parse import quote
 
-from adacd_hil.lab.drawing import Drawing, HistoryPanel, history_figure
+import numpy as np
+
+from adacd_hil.lab.drawing import SIGMAS, Drawing, HistoryPanel, history_figure
 from adacd_hil.lab.report.page import Heading, Table, make_table, render_page
+from adacd_hil.lab.report.traces import Trace, TracePanel, Track, pack_tracks
 from adacd_hil.lab.runs.run_summary import BROKEN, RunSummary
 from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, cells, count_text
 from adacd_hil.lab.runs.run_trend import Trend
+from adacd_hil.records import JOINTS
 
 INDEX_NAME: Final = "index.html"
+_MARGIN: Final = "Margin: smallest threshold over residual"
+_FINEST: Final = 1e-5
+_SHORTEST_S: Final = 60.0
+"""An eighth of the shortest part of a trend that is shown."""
 _SHOWN: Final = 60
 """Changes of a quantity that a page lists, the last ones."""
 
@@ -52,7 +60,7 @@ def _place(folder: Path, report: Path | None) -> str:
 
 class _TrendSection(NamedTuple):
     trend: Trend
-    figure: Drawing | None
+    track: str
     changes: Table
     runs: Table
 
@@ -60,14 +68,34 @@ class _TrendSection(NamedTuple):
 def trend_page(found: Sequence[Trend]) -> str:
     """Write a page with a section for each arm."""
     sections = [
-        _TrendSection(trend, draw_trend(trend, f"trend{number}"), _changes_table(trend), _runs_table(trend))
+        _TrendSection(trend, f"trend{number}", _changes_table(trend), _runs_table(trend))
         for number, trend in enumerate(found)
     ]
     broken = [run.name for trend in found for run in trend.left_out if run.status == BROKEN]
     problems = (f"Left out, as the log is broken: {', '.join(broken)}",) if broken else ()
     title = found[0].sentence if len(found) == 1 else f"{len(found)} arms"
     heading = Heading("adacd-hil trend", title, problems, not broken)
-    return render_page("trend_page.html.j2", "Trend over runs", heading, sections=sections)
+    traces = pack_tracks([_track_of(each.trend, each.track) for each in sections], _SHORTEST_S, is_dated=True)
+    return render_page("trend_page.html.j2", "Trend over runs", heading, traces, sections=sections)
+
+
+def _track_of(trend: Trend, name: str) -> Track:
+    """Give thresholds, friction, offsets and margins over the dates of the runs."""
+    dated = [row for row, run in enumerate(trend.runs) if run.started is not None]
+    at_s = [run.started.timestamp() for run in trend.runs if run.started is not None]
+    panels = []
+    for number, each in enumerate(trend.quantities):
+        traces = []
+        for joint in range(JOINTS):
+            colour, value, spread = f"joint{joint + 1}", each.values[dated, joint], SIGMAS * each.std[dated, joint]
+            traces.append(Trace(f"joint {joint + 1}", value, _FINEST, colour))
+            if np.isfinite(spread).any():
+                traces.append(Trace("from", value - spread, _FINEST, colour, is_dashed=True))
+                traces.append(Trace("to", value + spread, _FINEST, colour, is_dashed=True))
+        panels.append(TracePanel(f"{name}-{number}", each.title, "", tuple(traces)))
+    margin = (Trace("run", trend.margins[dated, 0], _FINEST, "beside"),)
+    panels.append(TracePanel(f"{name}-margin", _MARGIN, "×", margin, levels=(1.0,)))
+    return Track(name, np.array(at_s, np.float64), tuple(panels))
 
 
 def draw_trend(trend: Trend, name: str = "trend") -> Drawing | None:
@@ -82,9 +110,7 @@ def draw_trend(trend: Trend, name: str = "trend") -> Drawing | None:
         marks = tuple(sorted({places[id(change.run)] for change in each.changes if id(change.run) in places}))
         panels.append(HistoryPanel(each.title, joints, each.values[dated], each.std[dated], marks))
     margins = trend.margins[dated]
-    panels.append(
-        HistoryPanel("Margin: smallest threshold over residual", ("run",), margins, margins * float("nan"), level=1.0)
-    )
+    panels.append(HistoryPanel(_MARGIN, ("run",), margins, margins * float("nan"), level=1.0))
     dates = [run.started.replace(tzinfo=None).isoformat() for run in trend.runs if run.started is not None]
     caption = (
         "Bars: two deviations of the certificate. Dashed: a change beyond what explains it. Dotted: a margin of 1."

@@ -1,4 +1,4 @@
-"""What a run came to, in one line of figures, without reading its log where a report has them.
+"""The figures of a run in one line, without reading its log where a report has them.
 
 A run's figures are those of the judge (`adacd_hil.lab.score`), as report.json beside the log has them. A report of
 a stretch, of another log or of another version of the file's layout is left alone. Without a report there is what the
@@ -44,7 +44,7 @@ _DATED: Final = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:]?(\d\d)[-:]?(\d\d)"
 _MOTION_START: Final = "-> ADAPT"
 _TO_MONITOR: Final = ("ADAPT -> MONITOR", "CERTIFY -> MONITOR")
 _DAMAGES: Final = (LookupError, TypeError, ValueError, AttributeError)
-"""What a value of a report raises that is not what it should be."""
+"""Errors that a damaged value of a report raises."""
 
 Pair = tuple[float, float]
 
@@ -130,7 +130,7 @@ def _has_run(folder: Path, names: Sequence[str]) -> bool:
 
 
 def summarise(folder: Path, name: str = "") -> RunSummary:
-    """Tell what the run in a folder came to, in some milliseconds where it was reported. Raises nothing."""
+    """Sum up the run in a folder, in some milliseconds where it was reported. Raises nothing."""
     log = folder / LOG_NAME
     started, started_by = _started(log)
     broken = RunSummary(folder.resolve().name if name in ("", ".") else name, log, BROKEN, "", started, started_by)
@@ -153,7 +153,7 @@ def summarise(folder: Path, name: str = "") -> RunSummary:
 
 
 def _figured(headed: RunSummary, info: LogInfo) -> RunSummary:
-    """Add the figures: of the report, else what the events say."""
+    """Add the figures: of the report, else of the events."""
     try:
         table = _report_of(headed.log.parent, info)
         return _unjudged(headed, "") if table is None else _with_report(headed, table)
@@ -180,7 +180,7 @@ def judged(summary: RunSummary) -> RunSummary:
 
 
 def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
-    """Tell what a report of the run in a folder says, whichever stretch it is of. table: as in report.json."""
+    """Sum up a report of the run in a folder, whichever part of the log it is of. table: as in report.json."""
     log = folder / LOG_NAME
     empty = RunSummary(name, log, BROKEN, "")
     try:
@@ -198,7 +198,7 @@ def _settings(log: Path) -> Settings | None:
 
 
 def _headed(summary: RunSummary, info: LogInfo, settings: Settings | None) -> RunSummary:
-    """Add what head and end of the log say."""
+    """Add the figures of the log's head and end."""
     said = info.metadata
     config, profile = said.get("config", ""), said.get("profile", "")
     started, started_by = _started(summary.log, info.start_ns if info.metadata.get(EPOCH_KEY, "0") != "0" else 0)
@@ -218,7 +218,7 @@ def _headed(summary: RunSummary, info: LogInfo, settings: Settings | None) -> Ru
 
 
 def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
-    """Tell when a run began, local time, and by what. start_ns: by the log, 0 in lockstep, which has no date."""
+    """Give when a run began, local time, and the source. start_ns: by the log, 0 in lockstep, which has no date."""
     try:
         if start_ns:
             return datetime.fromtimestamp(start_ns // 1_000_000_000).astimezone(), "log"
@@ -260,7 +260,7 @@ def _damage(error: BaseException) -> str:
 
 
 def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
-    """Add what the events of a log say."""
+    """Add the figures of a log's events."""
     try:
         info = read_info(summary.log)
     except LogError as error:
@@ -297,7 +297,7 @@ def _told_certificate(info: LogInfo) -> CertificateState:
 
 
 def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
-    """Add what a report says. Raises LookupError, TypeError, ValueError, AttributeError for one that is damaged."""
+    """Add the figures of a report. A damaged one raises LookupError, TypeError, ValueError, AttributeError."""
     log, certified = table["log"], table["certified"]
     is_good = _flag(table["is_clean"]) and _flag(log["is_complete"])
     missing = f" The log is not whole: {_text(log['problem'])}" if log["problem"] else ""
@@ -408,7 +408,7 @@ def _estimated(estimates: Mapping[str, Any], name: str) -> tuple[Pair | None, Pa
 
 
 def _number(value: Any) -> float | None:
-    """Take a number. Raises TypeError for what is none."""
+    """Take a number. Raises TypeError for any other value."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):

@@ -1,9 +1,9 @@
 """The evaluation of a run: pure functions from its arrays to the results that `metrics` defines.
 
-Timing evidence comes from the columns of /cycle, records.CycleRecord. Percentiles are values that occurred: of what
-must be small p50, p99, p99.9 and the largest; of slack, which must be large, p50, p1, p0.1 and the smallest. *Reaction
-latency* is the compute time of each cycle in which the state becomes REACT: from the data that decided to the first
-command that reacts.
+Timing evidence comes from the columns of /cycle, records.CycleRecord. Percentiles are values that occurred: of
+times that must be small p50, p99, p99.9 and the largest; of slack, which must be large, p50, p1, p0.1 and the smallest.
+*Reaction latency* is the compute time of each cycle in which the state becomes REACT: from the data that decided to
+the first command that reacts.
 """
 
 import math
@@ -12,8 +12,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.lab.score.run_faults import find_causes, find_faults, gather_data
-from adacd_hil.lab.score.verdict import compare_with_paper, give_verdict, is_margin_below_1, is_revoked
+from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
+from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
 from adacd_hil.log.logged_run import (
     COMPUTE,
     LATENESS,
@@ -32,9 +32,9 @@ from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, 
 from adacd_hil.scheme.contact.contact_report import KIND_S
 from adacd_hil.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
 from adacd_hil.score.judge import (
-    JudgedContact,
     LoggedDetection,
     Score,
+    TouchWindow,
     TruthTouch,
     channels_at,
     find_detections,
@@ -43,7 +43,7 @@ from adacd_hil.score.judge import (
     row_at,
     true_contacts,
 )
-from adacd_hil.score.margins import evaluate_certified, gather_untouched, last_row
+from adacd_hil.score.margins import UntouchedGatherer, evaluate_certified, last_row
 from adacd_hil.score.metrics import (
     Count,
     CycleStatistics,
@@ -56,9 +56,39 @@ from adacd_hil.score.metrics import (
 )
 
 
+class RunGatherer:
+    """Sums up all cycles of a run, piece by piece, in bounded memory."""
+
+    def __init__(self, outline: Run) -> None:
+        """Take from `outline` when contacts, reactions and sections begin and end."""
+        self._untouched = UntouchedGatherer(outline)
+        self._data = CyclicDataGatherer(outline.settings)
+        self._timing = TimingGatherer(outline.settings.bus.period_us, not is_realtime(outline))
+        self._state = int(SchemeState.INIT)  # of the last cycle so far
+
+    def add_piece(self, piece: Run) -> None:
+        """Take the next cycles."""
+        reactions = find_reactions(piece.timing, piece.cycle, piece.state, self._state)
+        self._timing.add(piece.timing, reactions)
+        self._data.add(piece.timing, piece.cycle, piece.state)
+        self._untouched.add(piece)
+        if piece.state.size:
+            self._state = int(piece.state[-1])
+
+    def gathered(self, run: Run) -> Gathered:
+        """Sum up. run: has the cycles in which the state changes."""
+        return Gathered(self._untouched.gathered(), self._timing.evidence(), self._data.data(run))
+
+
 def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
-    """Compute all metrics of a run. gathered: of a run that does not have all of its cycles."""
-    gathered = gathered or Gathered(gather_untouched(run, [run]), timing_evidence(run), gather_data(run))
+    """Compute all metrics of a run.
+
+    gathered: the sums over all cycles; None: the run has all of its cycles.
+    """
+    if gathered is None:
+        gatherer = RunGatherer(run)
+        gatherer.add_piece(run)
+        gathered = gatherer.gathered(run)
     touches = true_contacts(run)
     detections = find_detections(run)
     score = judge_run(run, touches, detections)
@@ -76,8 +106,6 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     missed = score.missed
     faults, causes, data = find_faults(run), find_causes(run), gathered.data
     payload_kg = _payloads(run, sections)
-    is_identified = bool(adaptation_s) and all(value is not None for value in adaptation_s.values())
-    has_false = has_truth and len(false_s) > 0
     return Metrics(
         sections=sections,
         adaptation_s=adaptation_s,
@@ -97,10 +125,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         dropped=run.dropped,
         evidence=evidence,
         paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
-        verdict=give_verdict(run, sections, score, adaptation_s, payload_kg, evidence, faults, causes, data),
-        is_clean=is_identified
-        and missed == 0
-        and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),
+        findings=list_findings(run, sections, score, adaptation_s, payload_kg, evidence, faults, causes, data),
         armed_false_alarms=score.armed_false_alarms if has_truth else None,
     )
 
@@ -154,12 +179,6 @@ def cycle_statistics(run: Run, count: int) -> CycleStatistics:
     )
 
 
-def timing_evidence(run: Run) -> TimingEvidence:
-    """Sum up the times of all cycles, those before motion start included."""
-    reactions = find_reactions(run.timing, run.cycle, run.state)
-    return collect_evidence(run.timing, run.settings.bus.period_us, not is_realtime(run), reactions)
-
-
 def list_contacts(
     run: Run,
     sections: tuple[Section, ...],
@@ -178,7 +197,7 @@ def list_contacts(
 
 
 def _reported(detection: LoggedDetection | None) -> dict[str, Any]:
-    """Give what the reports of a detection say."""
+    """Give the fields of a contact that the reports of its detection have."""
     if detection is None:
         return {}
     said: dict[str, Any] = {"detected_s": detection.detected_s}
@@ -196,7 +215,7 @@ def _reported(detection: LoggedDetection | None) -> dict[str, Any]:
 
 
 def _told(report: ContactReport) -> dict[str, Any]:
-    """Give what only the certified scheme tells."""
+    """Give the fields that only the certified scheme has."""
     return {
         "level": report.level.name,
         "kind": report.kind.name,
@@ -233,7 +252,7 @@ def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: L
 
 
 def _contact(
-    run: Run, sections: tuple[Section, ...], touch: TruthTouch, judged: JudgedContact, detection: LoggedDetection | None
+    run: Run, sections: tuple[Section, ...], touch: TruthTouch, judged: TouchWindow, detection: LoggedDetection | None
 ) -> ReportedContact:
     truth = run.truth
     assert truth is not None
@@ -241,7 +260,7 @@ def _contact(
     tau_ext = truth.tau_ext[rows]
     since_s = run.truth_time_s(rows) - touch.onset_s
     delay_s = detection.detected_s - touch.onset_s if detection else math.inf
-    # What the host can have seen: up to the detection for the delay, up to the end of the window for the rest.
+    # The host sees samples up to the detection for the delay, up to the end of the window for the rest.
     until_alarm = np.abs(tau_ext[since_s <= delay_s]).max(axis=0)
     is_seen = since_s <= delay_s + _window_s(run)
     until_final = tau_ext[is_seen]
@@ -392,11 +411,13 @@ def collect_evidence(
 
 def find_reactions(
     columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8], before: int = SchemeState.INIT
-) -> NDArray[np.bool_]:
+) -> NDArray[np.bool_] | None:
     """Mark the cycles of `columns` in which the state becomes REACT; cycle, state: those of /scheme (k,).
 
-    before: the state in the cycle before the first.
+    before: the state in the cycle before the first. Returns None for a log that does not number its cycles.
     """
+    if "cycle" not in columns:
+        return None
     is_reacting = state == SchemeState.REACT
     begins = is_reacting & ~np.concatenate(([before == SchemeState.REACT], is_reacting[:-1]))
     return np.isin(columns["cycle"], cycle[begins])

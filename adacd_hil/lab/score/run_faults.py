@@ -1,7 +1,7 @@
 """The failures of a run, by its log: faults and their logged causes, and cyclic data that did not come in time.
 
 Cyclic data is counted while the drives are to have torque. *Incomplete*: a cyclic frame was missing, late or wrong.
-*Aged*: the oldest value used was older than the cycle. Windows are the host's own, of one second (`device.arm_report`),
+*Aged*: the oldest value used was older than the cycle. Windows are the host's own, of one second,
 and the limits those of the configuration's `[data]`. By device, the checks' running counts tell how many cycles had no
 new frame or a repeated one; they are logged once a second, so the counts of the last second, which a fault may have
 ended, are missing.
@@ -13,19 +13,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.device.arm_report import SHORTEST_SHARE, WINDOW_S
 from adacd_hil.log.logged_run import CheckCounts, CycleColumns, Cycles, Mask, Run
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.score.metrics import CyclicData, DeviceShares, Fault
 from adacd_hil.score.wording import percent_text
-from adacd_hil.settings.arm_settings import DataSettings
+from adacd_hil.settings.arm_settings import DATA_WINDOW_S, SHORTEST_DATA_WINDOW, DataSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.terminal import one_line
 from adacd_hil.wire.e2e import E2eStatus
 
 _RUN = "run"
-"""Who says in /events what ended an attempt without a fault: no boot-up, a bus that failed."""
+"""Name of the events that end an attempt without a fault: no boot-up, a bus that failed."""
 _SUPERVISOR = "supervisor"
 _NEAR_NS = 2_000_000
 """How far the event of a fault may lie from its cycle's time."""
@@ -47,7 +46,7 @@ def find_faults(run: Run) -> tuple[Fault, ...]:
 
 
 def _cause(run: Run, t_ns: int) -> str:
-    """Find what the supervisor said of a fault, without state and reason, which are known."""
+    """Find the supervisor's words for a fault, without state and reason."""
     for logged in run.events:
         event = logged.event
         if event.name == _SUPERVISOR and event.level == "error" and abs(logged.t_ns - t_ns) <= _NEAR_NS:
@@ -56,7 +55,7 @@ def _cause(run: Run, t_ns: int) -> str:
 
 
 def find_causes(run: Run) -> tuple[str, ...]:
-    """List what ended attempts, or the log, without a fault, each once."""
+    """List the causes that ended attempts, or the log, without a fault, each once."""
     said = [
         logged.event.message for logged in run.events if logged.event.name == _RUN and logged.event.level == "error"
     ]
@@ -77,7 +76,7 @@ class CyclicDataGatherer:
     """Sums up the cycles of a run, piece by piece, in constant memory."""
 
     def __init__(self, settings: Settings) -> None:
-        self._window = max(1, round(WINDOW_S / settings.bus.period_s))
+        self._window = max(1, round(DATA_WINDOW_S / settings.bus.period_s))
         self._counted = {"frames_missing": 0, "data_age": 0}
         self._cycles = 0  # with powered drives
         self._logged = 0  # of which /cycle tells how they went
@@ -102,7 +101,7 @@ class CyclicDataGatherer:
             self._add_windows(powered["cycle"], powered["frames_missing"] > 0)
 
     def _add_windows(self, cycle: Cycles, is_incomplete: Mask) -> None:
-        """Judge what is whole of the windows of cycles that follow each other."""
+        """Judge the windows of consecutive cycles that are whole."""
         edges = np.flatnonzero(np.diff(cycle, prepend=self._present[2]) != 1)
         counted = np.concatenate(([0], np.cumsum(is_incomplete)))
         bounds = np.unique(np.concatenate(([0], edges, [len(cycle)]))).tolist()
@@ -121,7 +120,7 @@ class CyclicDataGatherer:
 
     def _end_window(self) -> None:
         cycles, incomplete, last = self._present
-        if cycles >= SHORTEST_SHARE * self._window:
+        if cycles >= SHORTEST_DATA_WINDOW * self._window:
             self._worst = max(self._worst, incomplete / cycles)
         self._present = 0, 0, last
 
@@ -141,13 +140,6 @@ class CyclicDataGatherer:
             devices=devices,
             excesses=tuple(_excesses(worst, devices, limits)),
         )
-
-
-def gather_data(run: Run) -> CyclicData:
-    """Sum up a run that has all of its cycles."""
-    gatherer = CyclicDataGatherer(run.settings)
-    gatherer.add(run.timing, run.cycle, run.state)
-    return gatherer.data(run)
 
 
 def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShares]:
@@ -175,7 +167,7 @@ def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShar
 
 
 def _excesses(worst: float | None, devices: dict[str, DeviceShares], limits: DataSettings) -> list[str]:
-    """Say what was over its limit in some second."""
+    """List the shares that were over their limit in some second."""
     judged = [("incomplete cycles", worst, limits.incomplete_share)]
     for name, shares in devices.items():
         judged.append((f"no new data of {name}", shares.worst_no_new_data, limits.no_new_data_share))

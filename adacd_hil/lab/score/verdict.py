@@ -1,10 +1,11 @@
-"""The verdict on a run in one sentence, failures first; and the run beside the paper's printed figures.
+"""The findings of a run, failures first, and its headlines; and the run beside the paper's printed figures.
 
 The paper's numbers are those of its experiment: a run that played anything else is shown without them. Beside them
 stands the result of the paper's scheme on the same stream, where it ran beside.
 """
 
 import itertools
+import textwrap
 from collections.abc import Sequence
 from functools import cache
 from typing import Final, TypeGuard
@@ -18,6 +19,8 @@ from adacd_hil.score.metrics import (
     CertifiedEvidence,
     CyclicData,
     Fault,
+    Finding,
+    Metrics,
     PaperRow,
     ReportedContact,
     Residual,
@@ -28,9 +31,11 @@ from adacd_hil.settings.configuration import load_settings
 
 LISTED: Final = 4
 """Adaptations that are listed one by one."""
+_BESIDE: Final = "the paper's scheme on the same stream"
+_NO_LOSS: Final = "no cyclic data was late or lost"
 
 
-def give_verdict(
+def list_findings(
     run: Run,
     sections: tuple[Section, ...],
     score: Score,
@@ -40,32 +45,51 @@ def give_verdict(
     faults: tuple[Fault, ...],
     causes: tuple[str, ...],
     data: CyclicData,
-) -> str:
-    """Say in one sentence how the run went. causes: what ended attempts without a fault."""
+) -> tuple[Finding, ...]:
+    """Say how the run went. causes: of attempts that ended without a fault."""
     if run.cycle.size == 0:
         cause = "; ".join(causes) or "the log does not say why"
-        return f"No cycle was run: {cause}."
+        return (Finding(f"no cycle was run: {cause}", True),)
     done = "identified" if evidence is None else "certified"
     identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
     found = score_sentence(score)
     if run.truth is None:
         found = f"{number_of(len(score.false_alarms), 'detection')}, whose truth is not recorded"
-    text = f"{found}; {identified}"
     if evidence is not None and not evidence.is_anchored:
-        text += ", with torque offsets that nothing anchors"
+        identified += ", with torque offsets that nothing anchors"
+    beside = ""
     if evidence is not None and evidence.paper_beside is not None and is_papers_experiment(run):
-        text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
+        beside = _beside_text(list(evidence.paper_beside.adaptation_s.values()))
+    grave = _fault_texts(faults)
+    grave += [f"the run was broken off: {'; '.join(causes)}"] if causes else []
+    grave += evidence.revoked if is_revoked(evidence) else ()
     if is_margin_below_1(evidence):
-        text = f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}; {text}"
-    if is_revoked(evidence):
-        text = "; ".join((*evidence.revoked, text))
-    broken = f"the run was broken off: {'; '.join(causes)}" if causes else ""
-    text = "; ".join(filter(None, (*_fault_texts(faults), broken, text, data_text(data))))
-    return text[:1].upper() + text[1:] + "."
+        grave.append(f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}")
+    has_wrong = score.missed > 0 or (run.truth is not None and bool(score.false_alarms))
+    findings = [*(Finding(text, True) for text in grave), Finding(found, has_wrong)]
+    if adaptation_s or run.stretch is None:  # a part of a run need not have any
+        findings.append(Finding(identified, not adaptation_s or None in adaptation_s.values()))
+    findings += [Finding(beside), Finding(data_text(data), bool(data.excesses))]
+    return tuple(finding for finding in findings if finding.text)
+
+
+_HEADLINE_LETTERS: Final = 110
+
+
+def headlines(metrics: Metrics) -> list[str]:
+    """Give the findings as lines for a first screen, the bad ones first; a long one is cut, the log has all of it.
+
+    The paper's scheme beside, and cyclic data without a loss, are left to the tables.
+    """
+    ordered = sorted(metrics.findings, key=lambda finding: not finding.is_bad)
+    plain = [finding.text for finding in ordered if not finding.text.startswith((_BESIDE, _NO_LOSS))]
+    if metrics.false_alarms == 0:
+        plain = [text.replace(", none false", ", no false alarm") for text in plain]
+    return [textwrap.shorten(text[:1].upper() + text[1:], _HEADLINE_LETTERS, placeholder=" …") for text in plain]
 
 
 def is_margin_below_1(evidence: CertifiedEvidence | None) -> bool:
-    """Tell whether some residual was over its threshold while nobody touched the arm."""
+    """Tell whether some residual was over its threshold in a free cycle."""
     return evidence is not None and evidence.smallest_margin is not None and evidence.smallest_margin < 1.0
 
 
@@ -99,11 +123,11 @@ def _beside_text(times_s: list[float | None]) -> str:
     if not any(time_s is not None for time_s in times_s):
         return ""
     if len(times_s) > LISTED:
-        return f"; the paper's scheme on the same stream took {_summary(times_s, 'did not end')}"
+        return f"{_BESIDE} took {_summary(times_s, 'did not end')}"
     took = " and ".join("did not end" if time_s is None else f"took {time_s:.2f} s" for time_s in times_s)
     if None not in times_s:
         took = took.replace(" and took", " and")
-    return f"; the paper's scheme on the same stream {took}"
+    return f"{_BESIDE} {took}"
 
 
 def _summary(times_s: list[float | None], failed: str) -> str:
@@ -114,7 +138,7 @@ def _summary(times_s: list[float | None], failed: str) -> str:
 
 
 def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:
-    """Name the adaptations with which the arm began again after a fault, or after what broke an attempt off."""
+    """Name the adaptations with which the arm began again after a fault, or after a broken attempt."""
     pairs = itertools.pairwise(sections)
     return frozenset(now.label for before, now in pairs if now.kind == "adaptation" and before.kind != "payload")
 
@@ -157,7 +181,7 @@ _ELSEWHERE = {
 
 
 def is_papers_experiment(run: Run) -> bool:
-    """Tell whether the emulator played the paper's experiment, with its arm; of a real arm nobody knows."""
+    """Tell whether the emulator played the paper's experiment, with its arm; False on a real arm."""
     played = (run.metadata.get("scenario"), run.metadata.get("emulator_scenario"))
     arm, papers = run.settings.arm, _papers_arm(run.settings.arm.profile)
     return _EXPERIMENT in played and (arm.link_length_m, arm.cad_theta) == (papers.link_length_m, papers.cad_theta)
@@ -178,7 +202,7 @@ def compare_with_paper(
     payload_kg: dict[str, float | None],
     evidence: CertifiedEvidence | None,
 ) -> tuple[PaperRow, ...]:
-    """Set what was measured beside what the paper printed, where it is the same experiment."""
+    """Set measured figures beside the paper's, where it is the same experiment."""
     settings = run.settings
     times_s = list(adaptation_s.values())
     detections = [section.label for section in sections if section.kind == "detection"]
@@ -298,7 +322,7 @@ def _threshold_text(evidence: CertifiedEvidence, detections: list[str]) -> str:
 
 
 def _push_text(evidence: CertifiedEvidence) -> str:
-    """Say how small a push is found, in the middle and at the worst moment."""
+    """Give the smallest push that is found: median, and at the worst moment."""
     if evidence.smallest_push is None:
         return NONE
     median, worst = (
@@ -347,5 +371,5 @@ def data_text(data: CyclicData) -> str:
             name, share = max(found.items(), key=lambda entry: entry[1])
             said.append(f"{what} {name} in {percent_text(share)}")
     if not said:
-        return "no cyclic data was late or lost"
+        return _NO_LOSS
     return ", ".join(said) + (", more than allowed" if data.excesses else "")

@@ -12,9 +12,9 @@
   const MOST_POINTS_PER_PIXEL = 2;
   const SHORTEST_ROWS = 8;
   const HEIGHT = 190;
+  const PANEL_PADDING = 30;  // of a panel's frame, both sides together, px
   const PAPER_WIDTH = 690;  // A4 without its margins, px
   const plan = JSON.parse(planElement.textContent);
-  const count = plan.count;
 
   // --- data ---------------------------------------------------------------------------------------------------------
 
@@ -37,7 +37,7 @@
     }
   }
 
-  function decode(planes, series) {
+  function decode(planes, series, count) {
     const codes = new Int32Array(count);
     for (let plane = 0; plane < series.planes; plane++) {
       const first = plane * count;
@@ -55,7 +55,7 @@
     return codes;
   }
 
-  async function unpack(series) {
+  async function unpack(series, count) {
     const element = document.getElementById(series.id);
     const stream = new DecompressionStream("deflate");
     const writer = stream.writable.getWriter();
@@ -63,10 +63,11 @@
     writer.close();
     const planes = await collect(stream.readable.getReader(), count * series.planes);
     element.remove();
-    return decode(planes, series);
+    return decode(planes, series, count);
   }
 
   function extremesOf(codes) {
+    const count = codes.length;
     const blocks = Math.ceil(count / BLOCK);
     const low = new Int32Array(blocks);
     const high = new Int32Array(blocks);
@@ -88,15 +89,14 @@
 
   const valueOf = (curve, code) => (code === 0 ? null : curve.low + (code - 1) * curve.step);
 
-  let time;
-  const timeAt = (row) => plan.time.low + (time[row] - 1) * plan.time.step;
+  const timeAt = (track, row) => track.time.low + (track.codes[row] - 1) * track.time.step;
 
-  function rowAt(t) {  // the first row that is not before t
+  function rowAt(track, t) {  // the first row that is not before t
     let low = 0;
-    let high = count;
+    let high = track.count;
     while (low < high) {
       const middle = (low + high) >> 1;
-      if (timeAt(middle) < t) low = middle + 1;
+      if (timeAt(track, middle) < t) low = middle + 1;
       else high = middle;
     }
     return low;
@@ -105,24 +105,24 @@
   // --- what is shown ------------------------------------------------------------------------------------------------
 
   // Rows [first, last) in bins of `width` rows; a width of 1 is every cycle.
-  function binsFor(from, to, pixels) {
-    let first = Math.max(0, rowAt(from) - 1);
-    let last = Math.min(count, rowAt(to) + 2);
+  function binsFor(track, from, to, pixels) {
+    let first = Math.max(0, rowAt(track, from) - 1);
+    let last = Math.min(track.count, rowAt(track, to) + 2);
     let width = Math.ceil((last - first) / Math.max(pixels, 100));
     if (width <= MOST_POINTS_PER_PIXEL) return { first, last, width: 1 };
     if (width > 2 * BLOCK) {
       width = Math.ceil(width / BLOCK) * BLOCK;
       first -= first % BLOCK;
-      last = Math.min(count, Math.ceil(last / BLOCK) * BLOCK);
+      last = Math.min(track.count, Math.ceil(last / BLOCK) * BLOCK);
     }
     return { first, last, width };
   }
 
-  function timesOf(bins) {
+  function timesOf(track, bins) {
     const times = [];
     for (let row = bins.first; row < bins.last; row += bins.width) {
-      times.push(timeAt(row));
-      if (bins.width > 1) times.push(timeAt(Math.min(bins.last - 1, row + (bins.width >> 1))));
+      times.push(timeAt(track, row));
+      if (bins.width > 1) times.push(timeAt(track, Math.min(bins.last - 1, row + (bins.width >> 1))));
     }
     return times;
   }
@@ -157,6 +157,14 @@
 
   // --- panels -------------------------------------------------------------------------------------------------------
 
+  const secondsText = (_, value) => (value === null || value === undefined ? "–" : value.toFixed(3));
+  const dateText = (_, t) => (t === null || t === undefined ? "–" : new Date(1e3 * t).toLocaleString("sv").slice(0, 16));
+  const datesText = (plot, splits) => splits.map((t) => dateText(plot, t).slice(2));
+  const available = () => {  // a folded part has no width in some browsers
+    const main = document.querySelector("main");
+    const [left, right] = [getComputedStyle(main).paddingLeft, getComputedStyle(main).paddingRight];
+    return Math.max(200, main.clientWidth - parseFloat(left) - parseFloat(right) - PANEL_PADDING);
+  };
   const colour = (name) => getComputedStyle(root).getPropertyValue(`--${name}`).trim();
   const nearBox = document.getElementById("near");
   const shown = document.getElementById("shown");
@@ -214,7 +222,7 @@
   }
 
   function rangeOf(panel, low, high) {
-    if (nearBox.checked && panel.near) return [panel.name === "share" ? 0 : -panel.near, panel.near];
+    if (nearBox && nearBox.checked && panel.near) return [panel.name === "share" ? 0 : -panel.near, panel.near];
     if (low === null || high === null) return [-1, 1];
     const margin = 0.06 * (high - low) || 0.05 * Math.abs(high) || 0.1;
     return [low - margin, high + margin];
@@ -224,7 +232,7 @@
     return Math.max(0, Math.ceil(-Math.log10(Math.min(...panel.curves.map((curve) => curve.step))) - 0.3));
   }
 
-  function makePanel(panel, width) {
+  function makePanel(track, panel, width) {
     const place = document.querySelector(`#panel-${CSS.escape(panel.name)} .plot`);
     const digits = Math.min(digitsFor(panel), 5);
     const drawn = panel.curves.flatMap((curve) =>
@@ -238,7 +246,7 @@
       class: sign < 0 ? "mirror" : undefined,
       value: (_, value) => (value === null || value === undefined ? "–" : value.toFixed(digits).replace("-", "−")),
     }));
-    const bins = (plot) => binsFor(view[0], view[1], plot.bbox.width / devicePixelRatio);
+    const bins = (plot) => binsFor(track, view[0], view[1], plot.bbox.width / devicePixelRatio);
     const axis = (size, more) => ({
       stroke: () => colour("muted"),
       values: (_, splits) => splits.map((value) => String(+value.toPrecision(10)).replace("-", "−")),
@@ -251,10 +259,9 @@
     const plot = new uPlot({
       width,
       height: HEIGHT,
-      scales: { x: { time: false, range: () => view }, y: { range: (_, low, high) => rangeOf(panel, low, high) } },
-      axes: [axis(28, { space: 70 }), axis(56, { space: 28 })],
-      series: [{ label: "s", value: (_, value) => (value === null || value === undefined ? "–" : value.toFixed(3)) },
-        ...series],
+      scales: { x: { time: plan.isDated, range: () => view }, y: { range: (_, low, high) => rangeOf(panel, low, high) } },
+      axes: [axis(28, plan.isDated ? { space: 110, values: datesText } : { space: 70 }), axis(56, { space: 28 })],
+      series: [plan.isDated ? { label: "run of", value: dateText } : { label: "s", value: secondsText }, ...series],
       cursor: { sync: { key: "time" }, drag: { x: true, y: false, setScale: false }, points: { size: 6 } },
       legend: { live: true },
       hooks: {
@@ -272,7 +279,7 @@
     }, [[], ...drawn.map(() => [])], place);
     const update = () => {
       const current = bins(plot);
-      plot.setData([timesOf(current), ...drawn.map(({ curve, sign }) => valuesOf(curve, current, sign))], true);
+      plot.setData([timesOf(track, current), ...drawn.map(({ curve, sign }) => valuesOf(curve, current, sign))], true);
     };
     const paint = () => {  // the legend's marks, which uPlot paints but once
       plot.root.querySelectorAll(".u-series").forEach((row, index) => {
@@ -295,6 +302,7 @@
   }
 
   function tell() {
+    if (!shown) return;
     const digits = view[1] - view[0] < 1 ? 4 : 2;
     shown.textContent = `${view[0].toFixed(digits)} to ${view[1].toFixed(digits)} s`.replaceAll("-", "−");
   }
@@ -347,11 +355,13 @@
     for (const button of document.querySelectorAll("[data-move]")) {
       button.addEventListener("click", MOVES[button.dataset.move]);
     }
-    nearBox.addEventListener("change", drawAll);
+    if (nearBox) nearBox.addEventListener("change", drawAll);
     for (const mark of document.querySelectorAll("[data-from]")) {
       const go = () => {
         show(Number(mark.dataset.from), Number(mark.dataset.to));
-        document.querySelector(".bar").scrollIntoView({ behavior: "smooth", block: "start" });
+        const bar = document.querySelector(".bar");
+        bar.closest("details").open = true;
+        bar.scrollIntoView({ behavior: "smooth", block: "start" });
       };
       mark.setAttribute("tabindex", "0");
       mark.setAttribute("role", "button");
@@ -369,16 +379,19 @@
       }
       drawAll();
     };
-    const available = () => panels[0].place.clientWidth;
     new ResizeObserver(() => {
       if (panels[0].plot.width !== available() && !root.classList.contains("on-paper")) fit(available());
     }).observe(document.querySelector("main"));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => fit(available()));
+    let folded = [];
     window.addEventListener("beforeprint", () => {
+      folded = [...document.querySelectorAll("details:not([open])")];
+      for (const part of folded) part.open = true;
       root.classList.add("on-paper");
       fit(PAPER_WIDTH);
     });
     window.addEventListener("afterprint", () => {
+      for (const part of folded) part.open = false;
       root.classList.remove("on-paper");
       fit(available());
     });
@@ -386,19 +399,20 @@
 
   // --- begin --------------------------------------------------------------------------------------------------------
 
-  time = await unpack(plan.time);
-  start = timeAt(0);
-  end = timeAt(count - 1);
+  for (const track of plan.tracks) track.codes = await unpack(track.time, track.count);
+  start = Math.min(...plan.tracks.map((track) => timeAt(track, 0)));
+  end = Math.max(...plan.tracks.map((track) => timeAt(track, track.count - 1)));
   view = [start, end];
-  const { clientWidth } = document.querySelector(".plot");
-  for (const panel of plan.panels) {
-    await Promise.all(panel.curves.map(async (curve) => {
-      curve.codes = await unpack(curve);
-      curve.extremes = extremesOf(curve.codes);
-    }));
-    const made = makePanel(panel, clientWidth);
-    panels.push(made);
-    made.update();
+  for (const track of plan.tracks) {
+    for (const panel of track.panels) {
+      await Promise.all(panel.curves.map(async (curve) => {
+        curve.codes = await unpack(curve, track.count);
+        curve.extremes = extremesOf(curve.codes);
+      }));
+      const made = makePanel(track, panel, available());
+      panels.push(made);
+      made.update();
+    }
   }
   tell();
   listen();
