@@ -138,11 +138,6 @@ class MechanicsSettings:
                 )
 
     @property
-    def is_rigid(self) -> bool:
-        """Whether the rigid plant is all there is."""
-        return self == MechanicsSettings()
-
-    @property
     def holding_torque_Nm(self) -> Pair:
         """What the motors hold without power: their own friction, their brakes and their cogging."""
         first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, self.ripple_Nm, strict=True)

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import Structured
 from adacd_hil.records import TRUTH_LAYOUT, Vector
 from firmware_sim.arm.arms import ArmProfile
-from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.mechanics import work_space
-from firmware_sim.arm.plant import fit_payload, mirror_stiff_joints
+from firmware_sim.arm.plant import fit_payload
 from firmware_sim.arm.sensing import Measurement, TorqueNoise
 from firmware_sim.arm.touch_forces import BODY, HAND, THING, THING_PLACES, TOUCH_HEADER, TOUCH_TRUTH, WALL
 from firmware_sim.arm.touch_settings import (
@@ -167,10 +166,6 @@ def fade_rate_rad_s(scenario: Scenario) -> float:
     )
 
 
-SUBSTEPS: Final = 1
-"""Integration steps per tick: RK4 at 10 kHz. Halving the step changes a period's velocity by less than 2e-10 rad/s, and
-by up to 2e-8 rad/s where a joint brushes against standstill (profile M in the paper's experiment)."""
-
 # Each source of chance has a stream of its own beside the sensors' noise, which has the seed itself.
 _WALK_STREAM: Final = (1,)
 _ENCODER_STREAM: Final = (2,)
@@ -187,7 +182,6 @@ class BodyParts(NamedTuple):
 
     state: Vector
     numbers: Vector
-    mechanics: Structured | None
     contacts: Structured
     things: Structured
     touch_state: Vector
@@ -202,6 +196,7 @@ def _pack_numbers(scenario: Scenario) -> Vector:
     vector = np.zeros(BODY_NUMBERS.itemsize // 8)
     numbers: np.void = vector.view(BODY_NUMBERS)[0]
     numbers["arm"] = scenario.mechanics.arm_numbers(scenario.arm)
+    numbers["mechanics"] = scenario.mechanics.numbers(scenario.arm)
     numbers["motor"] = motor_numbers(scenario.drives, scenario.arm.rated_torque_Nm)
     numbers["encoder"] = encoder_numbers(scenario.sensors)
     numbers["transducer"] = transducer_numbers(scenario.sensors, scenario.torque_offset_Nm)
@@ -226,14 +221,8 @@ class Body:
         self._things = touch_table(scenario)
         self._touch_state = initial_touch_state(self._things)
         self._touch_truth = np.zeros(TOUCH_TRUTH.itemsize // 8)
-        is_rigid = scenario.mechanics.is_rigid and self._things.size == 0
-        self._mechanics: Structured | None = None
-        self._substeps = SUBSTEPS
         touch_rad_s = largest_rate_rad_s(self._things) + fade_rate_rad_s(scenario)
-        if not is_rigid:
-            self._mechanics = np.array([scenario.mechanics.numbers(scenario.arm)])
-        if not is_rigid or touch_rad_s > 0.0:
-            self._substeps = scenario.mechanics.substeps(scenario.arm, scenario.payload_bodies, touch_rad_s)
+        self._substeps = scenario.mechanics.substeps(scenario.arm, scenario.payload_bodies, touch_rad_s)
         self._work = work_space(self._touch_state.size)
         self._number_vector = _pack_numbers(scenario)
         self._numbers: np.void = self._number_vector.view(BODY_NUMBERS)[0]
@@ -268,18 +257,18 @@ class Body:
         self._tau_m: Vector = self._arm["tau_m"]
         self._temperature_C: Vector = self._arm["temperature_C"]
         self._velocity_rad_s: Vector = self._course["velocity_rad_s"]
-        self._put_at_start(REFERENCE_C if is_rigid else scenario.mechanics.ambient_C)
+        self._put_at_start()
         self._compile()
 
-    def _put_at_start(self, temperature_C: float) -> None:
+    def _put_at_start(self) -> None:
         """Fill the state at power-on."""
         state: np.void = self._state_vector.view(BODY_STATE)[0]
-        self._arm["q"] = self.scenario.start_rad
+        for name in ("q", "q_m", "q_encoder"):
+            self._arm[name] = self.scenario.start_rad
         state["motor"] = motor_state(self.scenario.drives)
         self._course["start_tick"] = -1.0
-        self._arm["temperature_C"] = temperature_C
+        self._arm["temperature_C"] = self.scenario.mechanics.ambient_C
         fit_payload(self._arm, self._numbers["arm"], self.scenario.payload_kg)
-        mirror_stiff_joints(self._arm)
         encoder_rad = [read_angle(self._numbers["encoder"], i, self._arm["q_encoder"][i], 0.0) for i in range(2)]
         self._course["encoder_rad"] = self._course["estimate_rad"] = encoder_rad
         settle_transducer(
@@ -290,7 +279,7 @@ class Body:
     def parts(self) -> BodyParts:
         """What the compiled functions take, for who plays many cycles without a call for each."""
         return BodyParts(
-            self._state_vector, self._number_vector, self._mechanics, self._contacts, self._things, self._touch_state,
+            self._state_vector, self._number_vector, self._contacts, self._things, self._touch_state,
             self._payloads, self._encoder_noise.table, self._substeps, self._work,
         )  # fmt: skip
 
@@ -301,12 +290,12 @@ class Body:
         """Run every compiled function once, on a copy of the state."""
         state = self._state_vector.copy()
         advance_body(
-            state, self._number_vector, self._mechanics, self._contacts, self._things, self._touch_state.copy(),
+            state, self._number_vector, self._contacts, self._things, self._touch_state.copy(),
             self._payloads, self._encoder_noise.table, 0.0, 0.0, 0, 0, 1, self._substeps, self._work,
         )  # fmt: skip
         sample_body(state, self._number_vector, np.zeros(2), np.zeros(2), self._counts)
         fill_truth(
-            state, self._number_vector, self._mechanics, self._contacts, self._things, self._touch_state.copy(),
+            state, self._number_vector, self._contacts, self._things, self._touch_state.copy(),
             self._payloads, self._work, self._touch_truth, np.zeros(TRUTH_LAYOUT.size),
         )  # fmt: skip
 
@@ -384,7 +373,6 @@ class Body:
             advance_body(
                 self._state_vector,
                 self._number_vector,
-                self._mechanics,
                 self._contacts,
                 self._things,
                 self._touch_state,
@@ -410,7 +398,6 @@ class Body:
         fill_truth(
             self._state_vector,
             self._number_vector,
-            self._mechanics,
             self._contacts,
             self._things,
             self._touch_state,
