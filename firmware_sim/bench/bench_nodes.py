@@ -1,7 +1,6 @@
 """The nodes of a bench, two drives and two torque sensors around one arm, and what they exchange on the bus."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
 
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
@@ -11,6 +10,7 @@ from firmware_sim.arm.hardware_settings import HabitSettings
 from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.bench.injector import Handler, Injector
+from firmware_sim.body.body import MovableArm
 from firmware_sim.body.sensors import converter_ends, count_Nm
 from firmware_sim.canopen.object_dictionary import Abort, EmulatedContract, longest_pdo, refuse
 from firmware_sim.nodes.device import EmulatedDevice, SyncListeners
@@ -20,12 +20,6 @@ from firmware_sim.nodes.sensor_node import SensorNode
 from firmware_sim.scenario.faults import device_ids, own_messages
 from firmware_sim.scenario.scenario import Scenario
 
-if TYPE_CHECKING:
-    from firmware_sim.bench.recorded_bench import RecordedBody
-    from firmware_sim.body.body import Body
-
-Movable: TypeAlias = "Body | RecordedBody"
-"""The arm as its devices use it."""
 TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
@@ -42,7 +36,7 @@ class BenchNodes:
         codec: Codec,
         contract: EmulatedContract,
         injector: Injector,
-        arm: Movable,
+        arm: MovableArm,
         is_free_running: bool,
     ) -> None:
         """Build the nodes around an arm. `is_free_running`: time passes without SYNC, so drives watch for it.
