@@ -1,9 +1,9 @@
-"""Sections `[mechanics]`, `[drives]` and `[sensors]` of a scenario: what arm and devices are beyond ideal ones.
+"""Sections `[mechanics]`, `[drives]` and `[sensors]` of a scenario: properties of arm and devices beyond ideal ones.
 
 Pairs are (joint 1, joint 2).
 
-**Mechanics**: beyond rigid links with viscous and Coulomb friction. Everything is off by default, and a scenario
-without this section runs the rigid plant. Equations: `firmware_sim.arm.joint_forces`, `firmware_sim.arm.mechanics`.
+**Mechanics**: beyond rigid links with viscous and Coulomb friction. Everything is off by default: the arm is
+rigid then. Equations: `firmware_sim.arm.joint_forces`, `firmware_sim.arm.mechanics`.
 
 **Devices**: errors and limits of drives, torque sensors and encoders. The defaults are a drive that gives its rated
 torque for ever, with a torque loop of 1 kHz; a linear 16-bit torque sensor of ±50 Nm with 0.02 Nm of noise that
@@ -13,7 +13,7 @@ its nominal torque constant. Equations: `firmware_sim.body.motor`, `firmware_sim
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -45,7 +45,7 @@ PayloadBody = tuple[float, Pair, float]
 
 @dataclass(frozen=True)
 class MechanicsSettings:
-    """The arm beyond the rigid plant."""
+    """Properties of the arm beyond rigid links, viscous and Coulomb friction."""
 
     static_Nm: Pair = setting(
         (0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="F_s, friction at standstill; 0: the profile's Coulomb"
@@ -138,13 +138,8 @@ class MechanicsSettings:
                 )
 
     @property
-    def is_rigid(self) -> bool:
-        """Whether the rigid plant is all there is."""
-        return self == MechanicsSettings()
-
-    @property
     def holding_torque_Nm(self) -> Pair:
-        """What the motors hold without power: their own friction, their brakes and their cogging."""
+        """Torque that the motors hold without power: own friction, brakes and cogging."""
         first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, self.ripple_Nm, strict=True)
         return sum(first), sum(second)
 
@@ -190,30 +185,15 @@ class MechanicsSettings:
     def numbers(self, arm: ArmProfile) -> np.void:
         """Pack for compiled functions, one element of MECHANICS_NUMBERS."""
         numbers: np.void = np.zeros(1, MECHANICS_NUMBERS)[0]
-
+        own = {field.name for field in fields(self)}
+        for name in own.intersection(MECHANICS_NUMBERS.names or ()):
+            numbers[name] = getattr(self, name)
         surplus = [max(0.0, self.static_Nm[joint] - arm.coulomb_Nm[joint]) for joint in range(2)]
         numbers["surplus_Nm"] = surplus
         numbers["stribeck_rad_s"] = self.stribeck_velocity_rad_s
-        numbers["sigma0_Nm_rad"] = self.sigma0_Nm_rad
-        numbers["sigma1_Nm_s"] = self.sigma1_Nm_s
         numbers["sigma2_Nm_s"] = self._sigma2(arm)
-        numbers["load_friction"] = self.load_friction
-        numbers["viscous_drop_per_K"] = self.viscous_drop_per_K
-        numbers["coulomb_drop_per_K"] = self.coulomb_drop_per_K
         numbers["capacity_J_K"] = self.heat_capacity_J_K
-        numbers["cooling_s"] = self.cooling_s
-        numbers["ambient_C"] = self.ambient_C
-        numbers["stiffness_Nm_rad"] = self.stiffness_Nm_rad
-        numbers["damping_Nm_s"] = self.damping_Nm_s
-        numbers["rotor_inertia_kg_m2"] = self.rotor_inertia_kg_m2
-        numbers["backlash_rad"] = self.backlash_rad
-        numbers["ripple_Nm"] = self.ripple_Nm
-        numbers["ripple_share"] = self.ripple_share
-        numbers["ripple_periods"] = self.ripple_periods
         numbers["ripple_phase_rad"] = np.radians(self.ripple_phase_deg)
-        numbers["motor_viscous_Nm_s"] = self.motor_viscous_Nm_s
-        numbers["motor_coulomb_Nm"] = self.motor_coulomb_Nm
-        numbers["holding_brake_Nm"] = self.holding_brake_Nm
         numbers["is_encoder_on_link"] = self.encoder_side == "link"
         numbers["gravity_m_s2"] = STANDARD_GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))
         numbers["downhill_rad"] = math.radians(self.tilt_direction_deg)
@@ -271,7 +251,7 @@ class MechanicsSettings:
         return oscillation, largest
 
     def substeps(self, arm: ArmProfile, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
-        """Choose the substeps of a 100 µs tick; touch_rad_s: fastest eigenfrequency of what touches the arm."""
+        """Choose the substeps of a 100 µs tick; touch_rad_s: fastest rate of bodies, hands and walls."""
         oscillation, largest = self.eigenvalues(arm, payloads)
         oscillation = max(oscillation, touch_rad_s)
         needed = max(oscillation / LARGEST_OSCILLATION, largest / LARGEST_DECAY) * TICK_S
@@ -306,7 +286,7 @@ class HabitSettings:
 
 @dataclass(frozen=True)
 class DriveSettings:
-    """What the drives get wrong and how long they bear it."""
+    """Errors of the drives, and limits of their load."""
 
     current_loop_Hz: Pair = setting(
         (CURRENT_LOOP_HZ, CURRENT_LOOP_HZ), unit="Hz", low=1.0, high=5e3, meaning="-3 dB of the torque loop"
@@ -381,7 +361,7 @@ _STEEPEST_LOOP = 0.5
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """What the torque sensors and the encoders get wrong."""
+    """Errors of the torque sensors and the encoders."""
 
     offset_drift_Nm_s: Pair = setting(
         (0.0, 0.0), unit="Nm/s", low=-10.0, high=10.0, meaning="steady drift of the torque zero since power-on"

@@ -1,4 +1,4 @@
-"""The rigid arm in motion: Lagrange's equations in absolute link angles, friction that truly holds, RK4.
+"""Accelerations of the two rigid links: Lagrange's equations in absolute link angles, friction that truly holds.
 
 With φ₁ = q₁, φ₂ = q₁ + q₂ and the kinetic energy of `firmware_sim.arm.arms`, Lagrange gives
 
@@ -52,8 +52,8 @@ ARM_NUMBERS: Final = float_fields(
         "stop_damping_Nm_s": PAIR,
     }
 )
-"""What `firmware_sim.arm.arms.ArmProfile.numbers` fills in. It is here and not there because compiled code contains it,
-and the cache of compiled code is keyed by the modules that compile."""
+"""Filled in by `firmware_sim.arm.arms.ArmProfile.numbers`. The table is here because
+compiled code contains it, and the cache of compiled code is keyed by the modules that compile."""
 
 MECHANICAL_STATE: Final = float_fields(
     {
@@ -77,11 +77,6 @@ MECHANICAL_STATE: Final = float_fields(
 )
 """The arm in motion, as the integrators carry it on."""
 
-# A step is cut at most this often; a slip lasts much longer than a step, so three are never needed in practice.
-_LARGEST_CUTS: Final = 8
-# Bisections of a step to find the instant of a cut: 100 µs · 2⁻⁴⁰ is below the resolution of time within a step.
-_BISECTIONS: Final = 40
-
 
 @compiled
 def fit_payload(
@@ -94,8 +89,8 @@ def fit_payload(
 ) -> None:
     """Change the payload, a body with its centre of mass at (along, beside) from the tip in the frame of link 2.
 
-    What is added was at rest: the momentum of the moving arm is shared with it, M q̇ stays. What is taken off leaves
-    with the speed that it has: q̇ stays. At rest both change nothing but the inertia.
+    An added mass was at rest: it shares the momentum of the moving arm, M q̇ stays. A mass that is taken off leaves with
+    its speed: q̇ stays. At rest both change only the inertia.
     """
     added_kg = payload_kg - state["payload_kg"]
     m11, m12, m22 = mass_matrix(state, state["q"][1])
@@ -144,8 +139,8 @@ def accelerate(
 ) -> tuple[float, float, float, float]:
     """Give ddq1, ddq2 in rad/s² and the Coulomb friction of both joints in Nm, positive along +dq.
 
-    torque is motor plus external torque. A sticking joint has no acceleration; its friction is what it takes to hold,
-    be it more than F_c or not.
+    torque is motor plus external torque. A sticking joint has no acceleration; its friction is the holding torque,
+    even where that is more than F_c.
     """
     sine = state["beta"] * math.sin(q2)
     if state["sigma"] != 0.0:
@@ -246,136 +241,3 @@ def follow_target(tau_Nm: float, target_Nm: float, turn: float) -> tuple[float, 
     fall = -math.expm1(-turn)
     middle = 0.25 * (6.0 * fall / turn - 2.0 + fall)
     return target_Nm + (tau_Nm - target_Nm) * middle, tau_Nm + (target_Nm - tau_Nm) * fall
-
-
-@compiled
-def mirror_stiff_joints(state: np.void) -> None:
-    """Say what the sensors sit on where the joints are stiff: motor side is link side, joint torque is motor torque."""
-    for joint in range(2):
-        state["q_m"][joint] = state["q"][joint]
-        state["dq_m"][joint] = state["dq"][joint]
-        state["q_encoder"][joint] = state["q"][joint]
-        state["tau_J"][joint] = state["tau_m"][joint]
-
-
-@compiled
-def _runge_kutta(
-    state: np.void,
-    arm: np.void,
-    contact: Structured,
-    elapsed_s: float,
-    slip1: int,
-    slip2: int,
-    target1: float,
-    target2: float,
-    tau1: float,
-    tau2: float,
-    q1: float,
-    q2: float,
-    dq1: float,
-    dq2: float,
-    step_s: float,
-) -> tuple[float, float, float, float, float, float]:
-    """Advance q1, q2, dq1, dq2, tau1, tau2 by one step of classical RK4 with constant slips."""
-    half_s = 0.5 * step_s
-    mid1, end1 = follow_target(tau1, target1, arm["current_loop_rad_s"][0] * step_s)
-    mid2, end2 = follow_target(tau2, target2, arm["current_loop_rad_s"][1] * step_s)
-
-    ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
-    a1, a2, _, _ = accelerate(state, arm, slip1, slip2, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
-
-    v1, v2 = dq1 + half_s * a1, dq2 + half_s * a2
-    p1, p2 = q1 + half_s * dq1, q2 + half_s * dq2
-    ext1, ext2 = external_torque(arm, contact, elapsed_s + half_s, p1, p2, v1, v2)
-    b1, b2, _, _ = accelerate(state, arm, slip1, slip2, mid1 + ext1, mid2 + ext2, p2, v1, v2)
-
-    w1, w2 = dq1 + half_s * b1, dq2 + half_s * b2
-    p1, p2 = q1 + half_s * v1, q2 + half_s * v2
-    ext1, ext2 = external_torque(arm, contact, elapsed_s + half_s, p1, p2, w1, w2)
-    c1, c2, _, _ = accelerate(state, arm, slip1, slip2, mid1 + ext1, mid2 + ext2, p2, w1, w2)
-
-    x1, x2 = dq1 + step_s * c1, dq2 + step_s * c2
-    p1, p2 = q1 + step_s * w1, q2 + step_s * w2
-    ext1, ext2 = external_torque(arm, contact, elapsed_s + step_s, p1, p2, x1, x2)
-    d1, d2, _, _ = accelerate(state, arm, slip1, slip2, end1 + ext1, end2 + ext2, p2, x1, x2)
-
-    sixth_s = step_s / 6.0
-    return (
-        q1 + sixth_s * (dq1 + 2.0 * (v1 + w1) + x1),
-        q2 + sixth_s * (dq2 + 2.0 * (v2 + w2) + x2),
-        dq1 + sixth_s * (a1 + 2.0 * (b1 + c1) + d1),
-        dq2 + sixth_s * (a2 + 2.0 * (b2 + c2) + d2),
-        end1,
-        end2,
-    )
-
-
-@compiled
-def _margin(
-    state: np.void,
-    arm: np.void,
-    contact: Structured,
-    elapsed_s: float,
-    slip1: int,
-    slip2: int,
-    after: tuple[float, float, float, float, float, float],
-) -> float:
-    """Say how well the slips still fit after a step: negative when a joint ought to have stopped or broken away."""
-    q1, q2, dq1, dq2, tau1, tau2 = after
-    margin = np.inf
-    if slip1 != 0:
-        margin = dq1 * slip1
-    if slip2 != 0:
-        margin = min(margin, dq2 * slip2)
-    if slip1 == 0 or slip2 == 0:
-        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
-        _, _, friction1, friction2 = accelerate(state, arm, slip1, slip2, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
-        if slip1 == 0:
-            margin = min(margin, arm["coulomb_Nm"][0] - abs(friction1))
-        if slip2 == 0:
-            margin = min(margin, arm["coulomb_Nm"][1] - abs(friction2))
-    return margin
-
-
-@compiled
-def integrate(
-    state: np.void, arm: np.void, contact: Structured, elapsed_s: float, target1: float, target2: float, step_s: float
-) -> None:
-    """Advance the mechanical state by `step_s`, cutting the step where a joint stops, reverses or breaks away.
-
-    contact: one row of the contact table, or none. elapsed_s: time since that contact's onset at the start of the step.
-    target: what the drive's torque loops are asked for, Nm, constant over the step.
-    """
-    left_s = step_s
-    for cut in range(_LARGEST_CUTS):
-        q1, q2, dq1, dq2 = state["q"][0], state["q"][1], state["dq"][0], state["dq"][1]
-        tau1, tau2 = state["tau_m"][0], state["tau_m"][1]
-        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
-        slip1, slip2 = decide_slips(state, arm, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
-        advanced_s = left_s
-        after = _runge_kutta(
-            state, arm, contact, elapsed_s, slip1, slip2, target1, target2, tau1, tau2, q1, q2, dq1, dq2, left_s
-        )
-        margin = _margin(state, arm, contact, elapsed_s + left_s, slip1, slip2, after)
-        if margin < 0.0 and cut < _LARGEST_CUTS - 1:
-            fits_s = 0.0
-            for _ in range(_BISECTIONS):
-                middle_s = 0.5 * (fits_s + advanced_s)
-                trial = _runge_kutta(
-                    state, arm, contact, elapsed_s, slip1, slip2, target1, target2,
-                    tau1, tau2, q1, q2, dq1, dq2, middle_s,
-                )  # fmt: skip
-                if _margin(state, arm, contact, elapsed_s + middle_s, slip1, slip2, trial) < 0.0:
-                    advanced_s = middle_s
-                    after = trial
-                else:
-                    fits_s = middle_s
-        state["q"][0], state["q"][1] = after[0], after[1]
-        # A velocity that has passed zero is zero: the joint stands, for this instant at least.
-        state["dq"][0] = after[2] if after[2] * slip1 > 0.0 else 0.0
-        state["dq"][1] = after[3] if after[3] * slip2 > 0.0 else 0.0
-        state["tau_m"][0], state["tau_m"][1] = after[4], after[5]
-        elapsed_s += advanced_s
-        left_s -= advanced_s
-        if left_s <= 0.0:
-            return

@@ -1,7 +1,6 @@
-"""The nodes of a bench, two drives and two torque sensors around one arm, and what they exchange on the bus."""
+"""The nodes of a bench, two drives and two torque sensors around one arm, and their frames."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
 
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
@@ -11,6 +10,7 @@ from firmware_sim.arm.hardware_settings import HabitSettings
 from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.bench.injector import Handler, Injector
+from firmware_sim.body.body import MovableArm
 from firmware_sim.body.sensors import converter_ends, count_Nm
 from firmware_sim.canopen.object_dictionary import Abort, EmulatedContract, longest_pdo, refuse
 from firmware_sim.nodes.device import EmulatedDevice, SyncListeners
@@ -20,12 +20,6 @@ from firmware_sim.nodes.sensor_node import SensorNode
 from firmware_sim.scenario.faults import device_ids, own_messages
 from firmware_sim.scenario.scenario import Scenario
 
-if TYPE_CHECKING:
-    from firmware_sim.bench.recorded_bench import RecordedBody
-    from firmware_sim.body.body import Body
-
-Movable: TypeAlias = "Body | RecordedBody"
-"""The arm as its devices use it."""
 TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
@@ -34,7 +28,7 @@ _UNTOLD_PERIOD_NS = 1_000_000
 
 
 class BenchNodes:
-    """All nodes of one bench: which frames each takes and sends, and what is due by time."""
+    """All nodes of one bench: the frames that each takes and sends, and their timers."""
 
     def __init__(
         self,
@@ -42,7 +36,7 @@ class BenchNodes:
         codec: Codec,
         contract: EmulatedContract,
         injector: Injector,
-        arm: Movable,
+        arm: MovableArm,
         is_free_running: bool,
     ) -> None:
         """Build the nodes around an arm. `is_free_running`: time passes without SYNC, so drives watch for it.
@@ -50,7 +44,7 @@ class BenchNodes:
         Raises CodecError when the DBC lacks a message, OSError when an EDS can't be read.
         """
         self.senders: tuple[tuple[int, Callable[[], None]], ...] = ()
-        """What answers SYNC: place of a node, and how it sends."""
+        """Senders of the answers to SYNC: place of a node, and its function."""
         self.commands: dict[int, tuple[tuple[int, Handler], ...]] = {}
         """By identifier, the nodes that take a frame of the host, and how."""
         self.has_all_answers = False
@@ -119,13 +113,13 @@ class BenchNodes:
         self.commands = commands
 
     def poll(self, t_ns: int) -> int:
-        """Do what is due by time; return when to look again."""
+        """Act on timers that are due; return when to look again."""
         drive1, drive2 = self.drives
         sensor1, sensor2 = self.sensors
         return min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
 
     def move_arm(self, tick_count: int) -> None:
-        """Let the arm move with what its motors are told."""
+        """Let the arm move with the set-points of its motors."""
         drive1, drive2 = self.drives
         torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
         modes = (drive1.motor_mode, drive2.motor_mode)
@@ -173,7 +167,7 @@ class BenchNodes:
 
     def _set_period(self, period_us: int) -> None:
         self.told_period_ns = period_us * 1000
-        if period_us:  # 0 is written to change 0x1019; what a SYNC is worth stays
+        if period_us:  # 0 is written to change 0x1019; the time of a SYNC stays
             self.period_ns = self.told_period_ns
 
 

@@ -1,14 +1,14 @@
-"""The emulated arm as one thing: its state, what it is made of, and what its devices measure.
+"""The emulated arm: its state, its properties, and the measurements of its devices.
 
 Per SYNC k the device nodes `sample` (and record the `truth` of the same instant), then `advance` to SYNC k + 1 with
 the set-point that was latched at SYNC k; inside a period the body runs on the drives' 100 µs ticks
-(`firmware_sim.body.body_ticks`). All state lies in one vector, so a body is its state, scenario and seed. What touches
-the arm is a table for compiled code: bodies, hands and walls, and how fast they make the arm swing.
+(`firmware_sim.body.body_ticks`). All state lies in one vector, so a body is its state, scenario and seed. Bodies,
+hands and walls are a table for compiled code, with the rates at which they make the arm swing.
 """
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import Structured
 from adacd_hil.records import TRUTH_LAYOUT, Vector
 from firmware_sim.arm.arms import ArmProfile
-from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.mechanics import work_space
-from firmware_sim.arm.plant import fit_payload, mirror_stiff_joints
+from firmware_sim.arm.plant import fit_payload
 from firmware_sim.arm.sensing import Measurement, TorqueNoise
 from firmware_sim.arm.touch_forces import BODY, HAND, THING, THING_PLACES, TOUCH_HEADER, TOUCH_TRUTH, WALL
 from firmware_sim.arm.touch_settings import (
@@ -167,10 +166,6 @@ def fade_rate_rad_s(scenario: Scenario) -> float:
     )
 
 
-SUBSTEPS: Final = 1
-"""Integration steps per tick: RK4 at 10 kHz. Halving the step changes a period's velocity by less than 2e-10 rad/s, and
-by up to 2e-8 rad/s where a joint brushes against standstill (profile M in the paper's experiment)."""
-
 # Each source of chance has a stream of its own beside the sensors' noise, which has the seed itself.
 _WALK_STREAM: Final = (1,)
 _ENCODER_STREAM: Final = (2,)
@@ -182,12 +177,43 @@ def payload_table(payloads: tuple[PayloadSettings, ...]) -> Structured:
     return np.array(rows, dtype=PAYLOAD_CHANGE)
 
 
+class MovableArm(Protocol):
+    """An arm as its devices use it; the members mean the same as those of `Body`."""
+
+    @property
+    def has_ideal_motors(self) -> bool: ...  # noqa: D102
+
+    @property
+    def is_torque_limited(self) -> tuple[bool, bool]: ...  # noqa: D102
+
+    @property
+    def motor_error_code(self) -> tuple[int, int]: ...  # noqa: D102
+
+    @property
+    def motor_torque_Nm(self) -> tuple[float, float]: ...  # noqa: D102
+
+    @property
+    def joint_temperature_C(self) -> tuple[float, float]: ...  # noqa: D102
+
+    @property
+    def drive_velocity_rad_s(self) -> tuple[float, float]: ...  # noqa: D102
+
+    def start_scenario(self) -> None: ...  # noqa: D102
+
+    def advance(  # noqa: D102
+        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int | None = None
+    ) -> None: ...
+
+    def sample(self) -> Measurement: ...  # noqa: D102
+
+    def truth(self, out: Vector) -> None: ...  # noqa: D102
+
+
 class BodyParts(NamedTuple):
-    """What `body_ticks.advance_body` takes beside set-points, modes and ticks; the arrays are the body's own."""
+    """Arguments of `body_ticks.advance_body` beside set-points, modes and ticks; the arrays are the body's own."""
 
     state: Vector
     numbers: Vector
-    mechanics: Structured | None
     contacts: Structured
     things: Structured
     touch_state: Vector
@@ -198,10 +224,11 @@ class BodyParts(NamedTuple):
 
 
 def _pack_numbers(scenario: Scenario) -> Vector:
-    """Pack what the arm and its devices are made of, by the names in BODY_NUMBERS."""
+    """Pack the properties of the arm and its devices, by the names in BODY_NUMBERS."""
     vector = np.zeros(BODY_NUMBERS.itemsize // 8)
     numbers: np.void = vector.view(BODY_NUMBERS)[0]
     numbers["arm"] = scenario.mechanics.arm_numbers(scenario.arm)
+    numbers["mechanics"] = scenario.mechanics.numbers(scenario.arm)
     numbers["motor"] = motor_numbers(scenario.drives, scenario.arm.rated_torque_Nm)
     numbers["encoder"] = encoder_numbers(scenario.sensors)
     numbers["transducer"] = transducer_numbers(scenario.sensors, scenario.torque_offset_Nm)
@@ -226,14 +253,8 @@ class Body:
         self._things = touch_table(scenario)
         self._touch_state = initial_touch_state(self._things)
         self._touch_truth = np.zeros(TOUCH_TRUTH.itemsize // 8)
-        is_rigid = scenario.mechanics.is_rigid and self._things.size == 0
-        self._mechanics: Structured | None = None
-        self._substeps = SUBSTEPS
         touch_rad_s = largest_rate_rad_s(self._things) + fade_rate_rad_s(scenario)
-        if not is_rigid:
-            self._mechanics = np.array([scenario.mechanics.numbers(scenario.arm)])
-        if not is_rigid or touch_rad_s > 0.0:
-            self._substeps = scenario.mechanics.substeps(scenario.arm, scenario.payload_bodies, touch_rad_s)
+        self._substeps = scenario.mechanics.substeps(scenario.arm, scenario.payload_bodies, touch_rad_s)
         self._work = work_space(self._touch_state.size)
         self._number_vector = _pack_numbers(scenario)
         self._numbers: np.void = self._number_vector.view(BODY_NUMBERS)[0]
@@ -268,18 +289,18 @@ class Body:
         self._tau_m: Vector = self._arm["tau_m"]
         self._temperature_C: Vector = self._arm["temperature_C"]
         self._velocity_rad_s: Vector = self._course["velocity_rad_s"]
-        self._put_at_start(REFERENCE_C if is_rigid else scenario.mechanics.ambient_C)
+        self._put_at_start()
         self._compile()
 
-    def _put_at_start(self, temperature_C: float) -> None:
+    def _put_at_start(self) -> None:
         """Fill the state at power-on."""
         state: np.void = self._state_vector.view(BODY_STATE)[0]
-        self._arm["q"] = self.scenario.start_rad
+        for name in ("q", "q_m", "q_encoder"):
+            self._arm[name] = self.scenario.start_rad
         state["motor"] = motor_state(self.scenario.drives)
         self._course["start_tick"] = -1.0
-        self._arm["temperature_C"] = temperature_C
+        self._arm["temperature_C"] = self.scenario.mechanics.ambient_C
         fit_payload(self._arm, self._numbers["arm"], self.scenario.payload_kg)
-        mirror_stiff_joints(self._arm)
         encoder_rad = [read_angle(self._numbers["encoder"], i, self._arm["q_encoder"][i], 0.0) for i in range(2)]
         self._course["encoder_rad"] = self._course["estimate_rad"] = encoder_rad
         settle_transducer(
@@ -288,9 +309,9 @@ class Body:
 
     @property
     def parts(self) -> BodyParts:
-        """What the compiled functions take, for who plays many cycles without a call for each."""
+        """Arguments of the compiled functions, for a caller that plays many cycles at once."""
         return BodyParts(
-            self._state_vector, self._number_vector, self._mechanics, self._contacts, self._things, self._touch_state,
+            self._state_vector, self._number_vector, self._contacts, self._things, self._touch_state,
             self._payloads, self._encoder_noise.table, self._substeps, self._work,
         )  # fmt: skip
 
@@ -301,12 +322,12 @@ class Body:
         """Run every compiled function once, on a copy of the state."""
         state = self._state_vector.copy()
         advance_body(
-            state, self._number_vector, self._mechanics, self._contacts, self._things, self._touch_state.copy(),
+            state, self._number_vector, self._contacts, self._things, self._touch_state.copy(),
             self._payloads, self._encoder_noise.table, 0.0, 0.0, 0, 0, 1, self._substeps, self._work,
         )  # fmt: skip
         sample_body(state, self._number_vector, np.zeros(2), np.zeros(2), self._counts)
         fill_truth(
-            state, self._number_vector, self._mechanics, self._contacts, self._things, self._touch_state.copy(),
+            state, self._number_vector, self._contacts, self._things, self._touch_state.copy(),
             self._payloads, self._work, self._touch_truth, np.zeros(TRUTH_LAYOUT.size),
         )  # fmt: skip
 
@@ -384,7 +405,6 @@ class Body:
             advance_body(
                 self._state_vector,
                 self._number_vector,
-                self._mechanics,
                 self._contacts,
                 self._things,
                 self._touch_state,
@@ -406,11 +426,10 @@ class Body:
         return Measurement((q1, q2), (dq1, dq2), (tau1, tau2))
 
     def truth(self, out: Vector) -> None:
-        """Fill a block laid out by TRUTH_LAYOUT with what is true now; changes nothing that is measured."""
+        """Fill a block laid out by TRUTH_LAYOUT with the present true values; changes no measurement."""
         fill_truth(
             self._state_vector,
             self._number_vector,
-            self._mechanics,
             self._contacts,
             self._things,
             self._touch_state,

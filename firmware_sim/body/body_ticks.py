@@ -4,8 +4,8 @@ In each tick of 100 µs
 
     the person's and the payload's change of this tick → torque target of each drive → integrate → encoder → velocity
 
-Callers hold state and numbers as plain vectors, which cost less to hand over; BODY_STATE and BODY_NUMBERS name what is
-in them.
+Callers hold state and numbers as plain vectors, which cost less to hand over; BODY_STATE and BODY_NUMBERS name their
+fields.
 """
 
 from typing import Final
@@ -15,16 +15,12 @@ from numpy.typing import NDArray
 
 from adacd_hil.compiled import Structured, compiled, float_fields
 from adacd_hil.records import TRUTH_LAYOUT, Vector
+from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS
 from firmware_sim.arm.mechanics import integrate_mechanics, observe
 from firmware_sim.arm.plant import (
     ARM_NUMBERS,
     MECHANICAL_STATE,
-    accelerate,
-    decide_slips,
-    external_torque,
     fit_payload,
-    integrate,
-    mirror_stiff_joints,
 )
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, VELOCITY_LSB_RAD_S, DriveMode, to_counts, track
 from firmware_sim.arm.touch_forces import TOUCH_TRUTH, add_prescribed_work, change_touch, describe_touch
@@ -56,7 +52,13 @@ BODY_STATE: Final = np.dtype(
     [("arm", MECHANICAL_STATE), ("course", _COURSE), ("motor", MOTOR_STATE), ("transducer", TRANSDUCER_STATE)]
 )
 BODY_NUMBERS: Final = np.dtype(
-    [("arm", ARM_NUMBERS), ("motor", MOTOR_NUMBERS), ("encoder", ENCODER_NUMBERS), ("transducer", TRANSDUCER_NUMBERS)]
+    [
+        ("arm", ARM_NUMBERS),
+        ("mechanics", MECHANICS_NUMBERS),
+        ("motor", MOTOR_NUMBERS),
+        ("encoder", ENCODER_NUMBERS),
+        ("transducer", TRANSDUCER_NUMBERS),
+    ]
 )
 PAYLOAD_CHANGE: Final = float_fields(
     {
@@ -103,7 +105,7 @@ def _elapsed_s(course: np.void, contact: Structured) -> float:
 
 @compiled
 def _change_payload(state: np.void, arm: np.void, payloads: Structured) -> None:
-    """Fit or take off what the scenario says for this tick; payloads: rows of PAYLOAD_CHANGE."""
+    """Apply the payload changes of this tick; payloads: rows of PAYLOAD_CHANGE."""
     course = state["course"]
     if course["start_tick"] < 0.0:
         return
@@ -126,7 +128,7 @@ def _scenario_s(course: np.void) -> float:
 
 @compiled
 def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velocity_rad_s: float) -> float:
-    """Say what a drive asks of its torque loop, Nm, within its rated torque."""
+    """Return a drive's set-point for its torque loop, Nm, within its rated torque."""
     limit_Nm = arm["torque_limit_Nm"][joint]
     if mode == _TORQUE:
         return float(min(max(setpoint_Nm, -limit_Nm), limit_Nm))
@@ -177,7 +179,6 @@ def _measure_tick(state: np.void, numbers: np.void, encoder_noise: NDArray[np.fl
 def advance_body(
     state_vector: Vector,
     number_vector: Vector,
-    mechanics: Structured | None,
     contacts: Structured,
     things: Structured,
     touch_state: Vector,
@@ -191,11 +192,10 @@ def advance_body(
     substeps: int,
     work: Vector,
 ) -> None:
-    """Advance the body by `tick_count` ticks; without mechanics the rigid arm, and numba then compiles nothing else."""
+    """Advance the body by `tick_count` ticks."""
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     now, course, motors = state["arm"], state["course"], state["motor"]
-    arm, motor = numbers["arm"], numbers["motor"]
-    step_s = TICK_S / substeps
+    arm, mechanics, motor = numbers["arm"], numbers["mechanics"], numbers["motor"]
     for _ in range(tick_count):
         _change_payload(state, arm, payloads)
         contact = find_contact(course, contacts)
@@ -206,18 +206,12 @@ def advance_body(
         wanted2 = _torque_target(arm, 1, mode2, setpoint2_Nm, course["velocity_rad_s"][1])
         target1 = command_torque(motor, motors, 0, wanted1, now["tau_m"][0], mode1 != _OFF)
         target2 = command_torque(motor, motors, 1, wanted2, now["tau_m"][1], mode2 != _OFF)
-        if mechanics is None:
-            for substep in range(substeps):
-                integrate(now, arm, contact, elapsed_s + substep * step_s, target1, target2, step_s)
-            mirror_stiff_joints(now)
-        else:
-            brake_Nm = mechanics[0]["holding_brake_Nm"]
-            now["brake_Nm"][0] = brake_Nm[0] if mode1 == _OFF else 0.0
-            now["brake_Nm"][1] = brake_Nm[1] if mode2 == _OFF else 0.0
-            integrate_mechanics(
-                now, arm, mechanics[0], contact, things, touch_state,
-                _scenario_s(course), elapsed_s, target1, target2, TICK_S, substeps, work,
-            )  # fmt: skip
+        now["brake_Nm"][0] = mechanics["holding_brake_Nm"][0] if mode1 == _OFF else 0.0
+        now["brake_Nm"][1] = mechanics["holding_brake_Nm"][1] if mode2 == _OFF else 0.0
+        integrate_mechanics(
+            now, arm, mechanics, contact, things, touch_state,
+            _scenario_s(course), elapsed_s, target1, target2, TICK_S, substeps, work,
+        )  # fmt: skip
         add_prescribed_work(
             contact, elapsed_s, TICK_S, arm["length_m"][0], before1, before2, now["q"][0], now["q"][1], touch_state
         )
@@ -229,7 +223,7 @@ def advance_body(
 def sample_body(
     state_vector: Vector, number_vector: Vector, noise: Vector, walk: Vector, out: NDArray[np.int64]
 ) -> None:
-    """Quantise what the devices measure now: position, velocity, torque counts, two each (6,)."""
+    """Quantise the devices' measurements: position, velocity, torque counts, two each (6,)."""
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     arm, course, transducers = state["arm"], state["course"], state["transducer"]
     tick = course["tick"]
@@ -247,7 +241,6 @@ def sample_body(
 def fill_truth(
     state_vector: Vector,
     number_vector: Vector,
-    mechanics: Structured | None,
     contacts: Structured,
     things: Structured,
     touch_state: Vector,
@@ -256,9 +249,9 @@ def fill_truth(
     touch_truth: Vector,
     block: Vector,
 ) -> None:
-    """Fill a block laid out by TRUTH_LAYOUT with what is true at this instant. touch_truth: room for TOUCH_TRUTH."""
-    state, arm = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]["arm"]
-    now, course = state["arm"], state["course"]
+    """Fill a block laid out by TRUTH_LAYOUT with the true values of this instant. touch_truth: room for TOUCH_TRUTH."""
+    state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
+    now, course, arm = state["arm"], state["course"], numbers["arm"]
     touched, out = touch_truth.view(TOUCH_TRUTH)[0], block.view(_TRUTH)[0]
     block[:] = 0.0
     _change_payload(state, arm, payloads)
@@ -271,19 +264,9 @@ def fill_truth(
         things, time_s, q1, q2, dq1, dq2, touch_state,
         contact, course["contact"], elapsed_s, arm["length_m"][0], touched,
     )  # fmt: skip
-    if mechanics is None:
-        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
-        torque1 = now["tau_m"][0] + ext1
-        torque2 = now["tau_m"][1] + ext2
-        slip1, slip2 = decide_slips(now, arm, torque1, torque2, q2, dq1, dq2)
-        _, _, friction1, friction2 = accelerate(now, arm, slip1, slip2, torque1, torque2, q2, dq1, dq2)
-        friction1 += arm["viscous_Nm_s"][0] * dq1
-        friction2 += arm["viscous_Nm_s"][1] * dq2
-        held1, held2 = 0.0, 0.0
-    else:
-        ext1, ext2, friction1, friction2, held1, held2 = observe(
-            now, arm, mechanics[0], contact, things, touch_state, time_s, elapsed_s, work
-        )
+    ext1, ext2, friction1, friction2, held1, held2 = observe(
+        now, arm, numbers["mechanics"], contact, things, touch_state, time_s, elapsed_s, work
+    )
     out["tau_ext"][0], out["tau_ext"][1] = ext1, ext2
     out["tau_friction"][0], out["tau_friction"][1] = friction1, friction2
     out["tau_gravity"][0], out["tau_gravity"][1] = held1, held2

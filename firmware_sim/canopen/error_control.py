@@ -20,9 +20,9 @@ the SYNC before, less the lateness of earlier SYNCs: a master that stalls may co
 waited for a busy receiver may come in a row. That lateness is forgotten with a time constant of 100 SYNCs, so that a
 master whose clock is slow gathers none.
 
-CAN itself may deliver a frame twice: if the last bit of its end-of-frame is disturbed, the sender repeats a frame that
-receivers have accepted already (ISO 11898-1). So a single odd SYNC is a warning. More than `TOLERATED` without
-`CLEAN_SYNCS` right ones in a row between them mean that SYNC is no time base.
+CAN itself may deliver a frame twice: if the last bit of its end-of-frame is disturbed, the sender repeats a frame
+that receivers have taken already (ISO 11898-1). So a single odd SYNC is a warning. More than `TOLERATED` before
+`CLEAN_SYNCS` in a row were right mean that SYNC is no time base.
 """
 
 import struct
@@ -86,7 +86,7 @@ class ErrorReporter:
         self._allowed_ns = 0
 
     def poll(self, t_ns: int) -> int:
-        """Send messages that the inhibit time held back; return the time of the next call."""
+        """Send messages that the inhibit time held back; return when to look again."""
         while self._waiting and t_ns >= self._allowed_ns:
             self._allowed_ns = t_ns + self._inhibit_ns
             self._send(self._cob_id, self._waiting.popleft())
@@ -127,7 +127,7 @@ class HeartbeatProducer:
         self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
 
     def poll(self, t_ns: int) -> int:
-        """Send the heartbeat if it is due; return the time of the next one."""
+        """Send a heartbeat that is due; return when the next one is."""
         if t_ns >= self._due_ns:
             self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
             self._send(self._can_id, bytes([self._state()]))
@@ -176,7 +176,7 @@ class HeartbeatConsumer:
         self._node_id = (value >> 16) & 0x7F
         self._timeout_ns = (value & 0xFFFF) * 1_000_000
         self._due_ns = NEVER_NS
-        self._find(self._now_ns())  # a node that is no longer monitored can't be missing
+        self._find(self._now_ns())  # a node that isn't monitored any more isn't missing
 
     def _find(self, t_ns: int) -> None:
         if self.is_lost:
@@ -297,6 +297,10 @@ class SyncOrder:
         """Take the next SYNC for the first."""
         self.counter = 0
 
+    def periods_to(self, counter: int, overflow: int) -> int:
+        """Return by how many periods a SYNC with this counter goes on, 1 where a counter is missing."""
+        return (counter - self.counter) % overflow if counter and self.counter else 1
+
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:
         """Judge a SYNC of the right length.
 
@@ -312,8 +316,8 @@ class SyncOrder:
         elif counter == last:
             self.kind, self.is_taken = SyncKind.REPEATED, False
             return
-        elif last:
-            self.periods = (counter - last) % overflow
+        else:
+            self.periods = self.periods_to(counter, overflow)
         self.counter = counter
         if self._is_timed:
             self._judge_time(t_ns, period_ns, is_first=last == 0)

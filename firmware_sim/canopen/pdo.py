@@ -75,7 +75,7 @@ class TransmitPdo(PdoRecord):
         self._timer_due_ns = NEVER_NS
 
     def _make_sender(self) -> Callable[[], None]:
-        """Return a function that sends the PDO, its references bound, so that a frame costs little."""
+        """Bind everything that sending needs, so that a frame costs little more than reading its values."""
         pdos, can_id, layout, reads, sender = self._pdos, self.can_id, self.layout, self._reads, self._sender
         send, header_bytes, length = pdos.send, layout.header_bytes, layout.length
         pack, pack_into = layout.packing.pack, layout.packing.pack_into
@@ -112,7 +112,7 @@ class TransmitPdo(PdoRecord):
         return send_pair
 
     def on_sync(self) -> None:
-        """Send if this SYNC is due: every n-th, or if an event waits."""
+        """Send the frame of this SYNC: every n-th, or an event that waited."""
         if self.type == 0:
             self.compare()
             if self.is_due:
@@ -216,12 +216,12 @@ class Pdos:
         self.send = send
         self.longest = longest
         self.message_ids = frozenset(messages)
-        """Identifiers of the contract, which are received in addition to those of PDOs."""
+        """Identifiers of the contract, which the device hears besides those that any PDO may have."""
         self.user: PdoUser
         self.header = bytes(4)
         """Header of the last protected frame, received or sent."""
         self.header_status: Callable[[], int] = int
-        """Returns the status field of a sent header."""
+        """Status field of a header that is sent."""
         self.events: frozenset[tuple[int, int]] = frozenset()
         """Objects whose changes the device announces by `notify`."""
         self._is_commanded = False  # a command has acted since the last SYNC, without waiting for one
@@ -265,11 +265,11 @@ class Pdos:
         self._writers[index, subindex] = write
 
     def writer(self, index: int, subindex: int) -> Callable[[int], object]:
-        """Return the function that takes received values of an object; it drops values that the object refuses."""
+        """Return the function that takes received values of an object. It drops a value that the object can't take."""
         return self._writers.get((index, subindex)) or (lambda value: self.dictionary.take_over(index, subindex, value))
 
     def handlers(self) -> list[tuple[int, Callable[[bytes, int], None]]]:
-        """Return the identifiers that are received now, with the handlers of their frames."""
+        """List the identifiers that are received now, with the functions that take their frames."""
         return [(pdo.can_id, pdo.on_frame) for pdo in self._receiving]
 
     def set_operational(self, is_operational: bool, t_ns: int) -> None:
@@ -315,7 +315,7 @@ class Pdos:
             pdo.restart()
 
     def act_on_sync(self, t_ns: int) -> bool:
-        """Apply values that waited for SYNC; tell whether a command has acted since the previous SYNC."""
+        """Let the frames that waited for SYNC act; return whether a command has acted since the SYNC before."""
         is_commanded, self._is_commanded = self._is_commanded, False
         return self._act(self._waiting, t_ns) or is_commanded
 
@@ -326,7 +326,7 @@ class Pdos:
 
     @staticmethod
     def _act(pdos: Iterable[ReceivePdo], t_ns: int) -> bool:
-        """Write pending values; tell whether a command was among them."""
+        """Write the waiting values; return whether a command was among them."""
         is_commanded = False
         for pdo in pdos:
             values = pdo.pending
@@ -367,7 +367,7 @@ class Pdos:
         return any(pdo.is_due for pdo in self._compared)
 
     def poll(self, t_ns: int) -> int:
-        """Send PDOs that are due by event or time; return the time of the next call."""
+        """Send frames that are due by event or time; return when to look again."""
         due_ns = NEVER_NS
         for pdo in self._asynchronous:
             due_ns = min(due_ns, pdo.poll(t_ns))

@@ -1,4 +1,4 @@
-"""`firmware-sim`: plays the arm on a CAN interface until it is stopped."""
+"""`firmware-sim`: plays the arm on a CAN interface until a signal ends it."""
 
 import json
 import logging
@@ -222,8 +222,8 @@ def play(
 ) -> int:
     """Play the devices of a recording: on each SYNC its recorded answers; all other requests are answered live.
 
-    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. Commands of the host move nothing. After the recording's last
-    cycle SYNC is no longer answered. Prints "ready" on stderr once the nodes have announced themselves.
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. Commands of the host move nothing. After the recording's
+    last cycle SYNC is no longer answered. Prints "ready" on stderr once the nodes have announced themselves.
     """
     chosen = CONTRACTS[contract]
     codec = move_contract(load_codec(chosen.path), node_offset, host_node)
@@ -251,7 +251,7 @@ def play(
 @cli.command("list", epilog=EPILOG)
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def list_scenarios(as_json: bool) -> int:
-    """List the scenarios that come with the package: name, group, description."""
+    """List the scenarios that come with the package: name, group, content."""
     described = describe_all()
     if as_json:
         print(json.dumps(described, indent=2, ensure_ascii=False))
@@ -265,7 +265,7 @@ def list_scenarios(as_json: bool) -> int:
 @cli.command("truths", epilog=EPILOG)
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def list_truths(as_json: bool) -> int:
-    """List the truths that come with the package: name, and the mistake in the host's configuration."""
+    """List the truths that come with the package: name, and the host's wrong assumption."""
     rows = [{"name": name, "about": load_truth(name)[0].about} for name in truth_names()]
     if as_json:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
@@ -281,7 +281,7 @@ def list_truths(as_json: bool) -> int:
 @click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of the sensor noise; default: the scenario's.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON in place of TOML.")
 def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int | None, as_json: bool) -> int:
-    """Print a scenario, resolved, as TOML that loads to the same scenario: the differences from the defaults."""
+    """Print a scenario, resolved, as TOML that loads to the same: all differences from the defaults."""
     resolved = load_scenario(scenario, profile, seed)
     if as_json:
         print(json.dumps(tomllib.loads(show(resolved, is_whole)), indent=2, ensure_ascii=False))
@@ -369,7 +369,7 @@ def _report(
 
 
 def _check_contract(log: Path, codec: Codec) -> None:
-    """Raise LogError if one of our logs was recorded with another contract."""
+    """Raise LogError when the metadata of a log of ours name another contract."""
     digest = run_metadata(log).get("layout_digest", "") if log.suffix.lower() == ".mcap" else ""
     own = f"0x{codec.layout_digest:08X}"
     if digest and digest.casefold() != own.casefold():

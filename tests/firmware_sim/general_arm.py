@@ -8,7 +8,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.hardware_settings import MechanicsSettings
-from firmware_sim.arm.joint_forces import gravity_torque
+from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS, gravity_torque
 from firmware_sim.arm.mechanics import integrate_mechanics, observe, work_space
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
 from firmware_sim.arm.touch_forces import THING
@@ -32,6 +32,26 @@ def run_arm(
             time_s, time_s, target1[index], target2[index], TICK_S, substeps, work,
         )  # fmt: skip
         history[index] = state
+
+
+@compiled
+def integrate(state, arm, mechanics, contact, things, touch_state, elapsed_s, target1, target2, step_s, count, work):
+    """Integrate `count` steps of a rigid arm that nothing but the contact touches."""
+    for index in range(count):
+        integrate_mechanics(
+            state, arm, mechanics, contact, things, touch_state,
+            0.0, elapsed_s + index * step_s, target1, target2, step_s, 1, work,
+        )  # fmt: skip
+
+
+def run_rigid(state, numbers, contact, target1, target2, step_s, count=1, elapsed_s=0.0) -> None:
+    """Integrate `count` steps of a rigid arm; `numbers`: an element of ARM_NUMBERS."""
+    mechanics = np.zeros(1, MECHANICS_NUMBERS)[0]
+    mechanics["is_free"] = numbers["coulomb_Nm"] == 0.0
+    integrate(
+        state, numbers, mechanics, contact, NO_TOUCH, NO_STATE,
+        elapsed_s, target1, target2, step_s, count, work_space(0),
+    )  # fmt: skip
 
 
 def without_friction(name: str = "S") -> ArmProfile:

@@ -1,4 +1,4 @@
-"""The general integrator: energy, gravity, stops, payloads, brake, truth, and the rigid plant as its limit."""
+"""The general integrator: energy, gravity, stops, payloads, brake, and truth."""
 
 import dataclasses
 import math
@@ -10,23 +10,22 @@ from pathlib import Path
 import numpy as np
 import pinocchio
 import pytest
-from general_arm import LOCKED_NM, NOBODY, GeneralArm, one_joint, without_friction
+from general_arm import LOCKED_NM, GeneralArm, one_joint, without_friction
 from long_cases import long_but
 
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import ConfigError, parse
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import LARGEST_SUBSTEPS, MechanicsSettings
-from firmware_sim.arm.plant import MECHANICAL_STATE, accelerate, fit_payload, integrate
+from firmware_sim.arm.plant import MECHANICAL_STATE, accelerate, fit_payload
 from firmware_sim.arm.sensing import DriveMode
-from firmware_sim.arm.touch_settings import TICK_S, ContactSettings
+from firmware_sim.arm.touch_settings import ContactSettings
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 ELASTIC = {"stiffness_Nm_rad": (6000.0, 2000.0), "rotor_inertia_kg_m2": (0.3, 0.05)}
-AS_RIGID = MechanicsSettings(heat_capacity_J_K=(1e9, 1e9))
-"""The general integrator with nothing to do: the joints never warm."""
+RIGID = MechanicsSettings()
 PAYLOAD = (1.5, (0.05, 0.08), 0.01)
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
 OFF = (DriveMode.OFF, DriveMode.OFF)
@@ -44,7 +43,7 @@ def truth_of(body: Body) -> dict[str, np.ndarray]:
     long_but(
         2,
         [
-            (AS_RIGID, None, False, None, 1e-9),
+            (RIGID, None, False, None, 1e-9),
             (MechanicsSettings(tilt_deg=30.0, tilt_direction_deg=50.0), None, False, None, 1e-9),
             (MechanicsSettings(tilt_deg=90.0, tilt_direction_deg=-20.0), PAYLOAD, False, None, 1e-9),
             (MechanicsSettings(**ELASTIC), None, False, None, 1e-7),
@@ -68,28 +67,6 @@ def test_energy_stays_for_a_minute_without_friction_torque_and_contact(settings,
     assert moving_J > 0.5
     print(f"energy changed by {(arm.energy_J() - before_J) / moving_J:.1e}, {arm.substeps} substeps")
     assert abs(arm.energy_J() - before_J) < bound * moving_J
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_the_general_integrator_with_nothing_to_do_is_the_rigid_plant(name):
-    """Friction, stops and reversals included, under a torque that swings about the breakaway torque."""
-    arm = ARMS[name]
-    general = GeneralArm(arm, AS_RIGID, q=(0.3, -0.7))
-    assert general.substeps == 1
-    state = np.zeros(1, MECHANICAL_STATE)[0]
-    fit_payload(state, arm.numbers(), 0.0)
-    state["q"][:] = 0.3, -0.7
-    times_s = np.arange(5_000) * TICK_S
-    target1 = 2.0 * arm.coulomb_Nm[0] * np.sin(9.0 * times_s)
-    target2 = 2.0 * arm.coulomb_Nm[1] * np.sin(7.0 * times_s)
-    history = general.run(times_s.size, target1, target2)
-    rigid = np.zeros((times_s.size, 4))
-    for index in range(times_s.size):
-        integrate(state, arm.numbers(), NOBODY, 0.0, target1[index], target2[index], TICK_S)
-        rigid[index] = *state["q"], *state["dq"]
-    assert np.abs(rigid).max() > 0.1
-    assert (rigid[:, 2] == 0.0).sum() > 100
-    assert np.abs(np.hstack([history["q"], history["dq"]]) - rigid).max() < 1e-9
 
 
 @pytest.mark.slow
@@ -443,7 +420,7 @@ def test_things_with_a_state_of_their_own_are_integrated_with_the_arm():
 
 def test_a_locked_elbow_of_these_tests_does_not_move():
     arm, _ = one_joint()
-    locked = GeneralArm(dataclasses.replace(arm), AS_RIGID)
+    locked = GeneralArm(dataclasses.replace(arm), RIGID)
     locked.run(100, 5.0, 5.0)
     assert locked.dq[1] == 0.0
     assert LOCKED_NM > 1e5

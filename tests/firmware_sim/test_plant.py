@@ -7,8 +7,8 @@ import os
 import numpy as np
 import pinocchio
 import pytest
+from general_arm import run_rigid as run
 
-from adacd_hil.compiled import compiled
 from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import (
     MECHANICAL_STATE,
@@ -16,7 +16,6 @@ from firmware_sim.arm.plant import (
     decide_slips,
     external_torque,
     fit_payload,
-    integrate,
     mass_matrix,
 )
 from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_table
@@ -36,13 +35,6 @@ def state_of(arm: ArmProfile, q=(0.0, 0.0), dq=(0.0, 0.0), payload_kg=0.0, tau=(
 def without_friction(arm: ArmProfile) -> ArmProfile:
     """Nor any stops in its way."""
     return dataclasses.replace(arm, viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0), stop_deg=(1e6, 1e6))
-
-
-@compiled
-def run(state, arm, contact, target1, target2, step_s, count):
-    """Integrate `count` steps."""
-    for index in range(count):
-        integrate(state, arm, contact, index * step_s, target1, target2, step_s)
 
 
 def kinetic_energy_J(state: np.ndarray) -> float:
@@ -192,7 +184,7 @@ def test_work_done_on_the_arm_is_kinetic_energy_plus_heat():
             )
         )
         if index < count:
-            integrate(state, numbers, contact, index * step_s, -0.6, 0.25, step_s)
+            run(state, numbers, contact, -0.6, 0.25, step_s, elapsed_s=index * step_s)
     work_J, heat_J = np.trapezoid(np.array(samples), dx=step_s, axis=0)
     assert heat_J > 0.005
     assert work_J - heat_J == pytest.approx(kinetic_energy_J(state) - before_J, abs=2e-7)
@@ -293,7 +285,7 @@ def test_a_resting_arm_shows_no_chatter_when_torque_swings_below_friction():
     arm = ARMS["M"]
     state = state_of(arm, q=(0.2, -0.4))
     for index in range(500):
-        integrate(state, arm.numbers(), NOBODY, 0.0, 0.14 * (-1) ** index, 0.07 * (-1) ** index, TICK_S)
+        run(state, arm.numbers(), NOBODY, 0.14 * (-1) ** index, 0.07 * (-1) ** index, TICK_S)
         assert [*state["q"], *state["dq"]] == [0.2, -0.4, 0.0, 0.0]
 
 

@@ -5,11 +5,12 @@ import math
 
 import numpy as np
 import pytest
+from general_arm import run_rigid
 from touched_arm import TouchedArm
 
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, integrate, mass_matrix
+from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
 from firmware_sim.arm.touch_forces import (
     ENERGY,
     THING_STATE,
@@ -259,7 +260,7 @@ def test_a_prescribed_force_gives_the_arm_the_energy_that_is_logged(changes):
         assert out["force_N"] == asked_N
         assert (out["link"], out["index"]) == (changes["link"], 4.0)
         before = tuple(state["q"])
-        integrate(state, numbers, row, elapsed_s, 0.0, 0.0, TICK_S)
+        run_rigid(state, numbers, row, 0.0, 0.0, TICK_S, elapsed_s=elapsed_s)
         add_prescribed_work(row, elapsed_s, TICK_S, 0.35, *before, *state["q"], touched)
     kinetic_J = kinetic_energy_J(state)
     assert kinetic_J > 0.01
@@ -288,7 +289,7 @@ def test_a_hand_that_helps_gives_the_moving_arm_energy_and_one_that_drags_takes_
         assert sign * out["power_W"] < 0.0
         before = tuple(state["q"])
         for part in range(4):
-            integrate(state, numbers, row, elapsed_s + part * TICK_S / 4, 0.0, 0.0, TICK_S / 4)
+            run_rigid(state, numbers, row, 0.0, 0.0, TICK_S / 4, elapsed_s=elapsed_s + part * TICK_S / 4)
         add_prescribed_work(row, elapsed_s, TICK_S, 0.35, *before, *state["q"], touched)
     gained_J = kinetic_energy_J(state) - before_J
     assert sign * gained_J > 0.01
@@ -307,7 +308,7 @@ def test_the_strongest_hand_that_drags_brings_the_arm_to_rest_without_a_tremor()
     state["q"][:], state["dq"][:] = (0.3, 1.5), (0.3, -1.0)
     energies_J = [kinetic_energy_J(state)]
     for step in range(500 * substeps):
-        integrate(state, numbers, row, step * TICK_S / substeps, 0.0, 0.0, TICK_S / substeps)
+        run_rigid(state, numbers, row, 0.0, 0.0, TICK_S / substeps, elapsed_s=step * TICK_S / substeps)
         energies_J.append(kinetic_energy_J(state))
     assert np.diff(energies_J).max() <= 0.0
     assert energies_J[-1] < 1e-9 * energies_J[0]

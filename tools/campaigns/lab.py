@@ -117,7 +117,6 @@ def _limit(tau_d: Vector, limit_Nm: Vector, step_Nm: Vector, quantum_Nm: Vector,
 def play_loop(
     state_vector: Vector,
     number_vector: Vector,
-    mechanics: Structured | None,
     contacts: Structured,
     things: Structured,
     touch_state: Vector,
@@ -184,7 +183,7 @@ def play_loop(
             now["tau_m"][0] += push1
             now["tau_m"][1] += push2
             advance_body(
-                state_vector, number_vector, mechanics, contacts, things, touch_state, payloads,
+                state_vector, number_vector, contacts, things, touch_state, payloads,
                 encoder_noise, latched[0] + push1, latched[1] + push2, _POWERED, _POWERED, 1 if is_fine else TICKS,
                 substeps, work,
             )  # fmt: skip
