@@ -12,8 +12,8 @@ the difference is. A variance of inf: the source says nothing. Of c P c' the uni
 samples say, and not what the prior does (`split`).
 
 Two questions are no rows, since no column is known beforehand: whether one model explains the whole of a fit
-(`fit_check`), and whether the model lacks columns (`missing_torque`). `docs/what-a-certificate-sees.md` lists which
-touch each of them sees.
+(`fit_check`), and whether the model lacks columns (`missing_torque`). `docs/scheme.md` lists which touch each row sees,
+and which touches none.
 
 Shapes: Q quantities, S sources, p parameters; columns (Q, p), columns_prior, torque_Nm (Q,); sigmas (S,), less_counts
 (S, Q); said, said_variance, said_floor, said_slack, difference, limit (S, Q); said_age_s (S,); fitted, fitted_variance
