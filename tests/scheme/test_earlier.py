@@ -249,6 +249,23 @@ def test_an_offset_counts_both_ways_and_where_something_anchors_it_shows_that_wh
     assert not earlier.is_keeping(compared.m)
 
 
+def test_of_two_joints_only_the_one_without_an_anchor_is_judged_by_its_earlier_offset():
+    compared = Compared(std=1e-5)
+    compared.m["limit"][: anchor.KINDS, evidence.OFFSETS + 1] = np.inf
+    assert not compared.agrees_with("offset2", 0.05)
+    assert earlier.is_keeping(compared.m)
+    assert earlier.describe_more(compared.m)[0].startswith("torque offset of joint 2 is 0.050 Nm more than 0.0 s ago")
+    assert compared.agrees_with("offset1", 0.05)
+
+
+def test_a_fit_that_is_not_a_number_agrees_with_nothing_that_was_kept():
+    for settings in (FREE, UNKNOWN):
+        compared = Compared(settings)
+        compared.m["belief"] = np.nan
+        assert not compared.agrees()
+        assert earlier.is_keeping(compared.m)
+
+
 def test_what_the_prior_alone_says_judges_nothing():
     prior = Compared()
     earlier.forget(prior.m)
