@@ -42,7 +42,7 @@ SIZES = {
 }  # fmt: skip
 """Nm, N, Nm, Nm s/rad, N/m, kg m², kg, Nm/s, Nm; log-uniform. A hand that helps pushes along the motion, as friction
 pulls against it."""
-RULES = ("one model of the whole fit", "borne out by what came later", "no more than before")
+RULES = ("one model of the whole fit", "each sample explained", "borne out by what came later", "no more than before")
 LIKE_A_JOINT = ("drag", "viscous", "inertia", "payload", "help")
 """Whose torque is a change of the arm's parameters."""
 KNOWN_S = 0.5
@@ -214,13 +214,15 @@ def rule_shares(constants: Structured, memory: Structured) -> tuple[float, ...]:
     memory = memory.copy()
     k, m = constants[0], memory[0]
     steps = range(min(int(m["steps_used"]), fit_check.STEPS))
+    places = [(s, i) for s in range(int(m["samples_kept"])) for i in range(2)]
     changed = max((fit_check.changed_share(m, s) for s in steps), default=0.0)
+    explained = max((abs(fit_check.residual(m, *place)) for place in places), default=0.0) / fit_check.limit_Nm(m)
     later = max((fit_check.later_share(k, m, s) for s in steps), default=0.0)
     earlier.forget(m)
     earlier.keep(k, m)
     earlier.is_no_more(k, m)
     more = np.max(m["difference"][evidence.KEPT :] / m["limit"][evidence.KEPT :])
-    return float(changed), float(later), float(more)
+    return float(changed), float(explained), float(later), float(more)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The samples of a fit that are kept, and a touch among them that is too short for the thresholds."""
+"""A fit's model must explain each of its samples: a short touch among them bends it, and stands out."""
 
 import numpy as np
 import pytest
@@ -21,28 +21,48 @@ class Fit:
         self.W = random.standard_normal((learnt, 2, len(NAMES)))
         self.tau = self.W @ self.m["belief"] + 0.01 * random.standard_normal((learnt, 2))
 
-    def learn(self):
+    @property
+    def first(self):
         for W, tau in zip(self.W, self.tau, strict=True):
             fit_check.follow(self.k, self.m, W, tau)
+        return fit_check.first_unexplained(self.m)
 
 
-def test_the_residual_of_the_better_half_is_not_raised_by_a_touch_of_the_other():
+def test_a_fit_that_explains_its_samples_has_none_that_stands_out():
+    assert Fit().first == -1
+
+
+@pytest.mark.parametrize(("share", "is_explained"), [(0.9, True), (1.15, False)])
+def test_a_sample_stands_out_by_the_residual_of_the_better_half(share, is_explained):
     fit = Fit()
-    fit.tau[:100] += 1.0
-    fit.learn()
-    assert fit_check.better_rms(fit.m) == pytest.approx(0.01, rel=0.2)
+    limit_Nm = fit_check.LIMIT_NM + fit_check.LIMIT_SHARE * 0.01
+    fit.tau[29, 1] = fit.W[29, 1] @ fit.m["belief"] - share * limit_Nm
+    assert (fit.first == -1) is is_explained
+
+
+def test_the_first_of_a_touchs_samples_is_named():
+    fit = Fit()
+    fit.tau[100:150] += 1.0
+    assert fit.first == pytest.approx(100, abs=fit_check.FIRST_EVERY)
 
 
 def test_a_long_fit_is_kept_in_the_same_room_from_its_beginning_to_its_end():
     fit = Fit(learnt=3000)
-    fit.learn()
+    fit.tau[:90] += 1.0
+    assert fit.first == 0
     kept, every = int(fit.m["samples_kept"]), fit.m["samples_every"]
     assert fit_check.ROOM // 2 <= kept <= fit_check.ROOM
     assert kept * every == pytest.approx(3000, abs=2 * every)
-    places = [int(np.argmin(np.abs(fit.tau - tau).sum(axis=1))) for tau in fit.m["samples_tau"][:kept]]
-    assert places[0] < fit_check.FIRST_EVERY
-    assert places[-1] > 3000 - 2 * every
-    np.testing.assert_array_equal(np.diff(places), every)
+    fit = Fit(learnt=3000)
+    fit.tau[2900:] += 1.0
+    assert fit.first == pytest.approx(2900, abs=2 * every)
+
+
+def test_a_payloads_fit_is_not_asked():
+    fit = Fit()
+    fit.m["is_payload"] = 1.0
+    fit.tau[98:104] += 5.0
+    assert fit.first == -1
 
 
 def test_a_lean_at_the_start_too_short_for_the_thresholds_is_named_and_not_certified():

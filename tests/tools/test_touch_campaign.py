@@ -69,9 +69,9 @@ def test_an_arm_that_nobody_touches_is_certified_and_is_within_the_bounds(is_for
 
 
 def test_how_near_untouched_fits_come_to_what_would_refuse_them_is_listed_by_rule():
-    trials = [replace(GOOD, rule_shares=((0.1, 0.2, 0.3), (0.3, 0.2, 0.5)))]
+    trials = [replace(GOOD, rule_shares=((0.1, 0.2, 0.3, 0.4), (0.3, 0.2, 0.5, 0.4)))]
     shares = [value for name, value, _, _ in touch_campaign.untouched_figures(trials) if "share of its limit" in name]
-    assert shares == ["0.20, 0.30", "0.20, 0.20", "0.40, 0.50"]
+    assert shares == ["0.20, 0.30", "0.20, 0.20", "0.40, 0.50", "0.40, 0.40"]
 
 
 @pytest.mark.parametrize("profile", ["P", "S", "M"])

@@ -89,7 +89,7 @@ def keep(k: Any, m: Any) -> None:
     m["refused_fits"] = 0.0
     if is_keeping(m) or m["steps_used"] <= YOUNG_STEPS:
         return
-    changed = fit_check.last_unsteady_step(m)
+    changed = fit_check.last_step_before_contradiction(k, m)
     keep_steps(k, m, int(m["steps_used"]) - 1 if changed == fit_check.NONE else changed)
     if changed == fit_check.NONE:
         _keep(k, m, m["belief"], m["P_belief"], fit_check.unit_of(m["fit_square"], m["fit_rows"]), 0.0)

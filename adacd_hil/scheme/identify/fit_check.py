@@ -4,9 +4,10 @@ A touch that begins or ends while the arm learns changes what the samples say; w
 So a fit counts only if one model explains all of it. With theta_0, P_0 what the fit had come to some time ago, a step,
 
     steady       (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' <= STEADY u
+    explained    |tau_f - W_f theta| <= LIMIT_NM + LIMIT_SHARE rms
     borne out    |W_f (theta_late - theta)| <= LATER_NM + RMS_SHARE rms + LEARNT_SHARE sqrt(u) residual_Nm + sigma
 
-for each step, the second on all samples. theta_late is what came after the step, from the two beliefs alone:
+for each step, the last two on all samples. theta_late is what came after the step, from the two beliefs alone:
 
     theta_late - theta = P (P_0 - P)^-1 (theta - theta_0),   of covariance P (P_0 - P)^-1 P
 
@@ -16,8 +17,8 @@ the standard deviation of that difference, by the beliefs; else 0. A part of the
 tells gravity from an offset, so later samples may not know the torque of earlier poses: by sigma = 0.03 to 0.05 Nm of a
 level arm, which differed by 0.033 to 0.045 Nm and got no certificate.
 
-The second sees a weak touch of the beginning, when theta_0 is not known well enough to differ. It is not asked of a
-payload's fit.
+The last sees a weak touch of the beginning, when theta_0 is not known well enough to differ. The last two are not asked
+of a payload's fit.
 
 Shapes: p parameters, n joints, s samples of room, t steps; samples_W (s, n, p), samples_tau (s, n); steps_theta (t, p),
 steps_P (t, p, p), steps_square, steps_rows (t,); factor (p, p), apart, later (p,). When there is no room left every
@@ -41,6 +42,9 @@ FIRST_EVERY = 3.0
 STEADY = 400.0
 """Squared distance over u at which a fit has changed. Fits of 400 untouched arms, wide ones included, came to 0.06 of
 it in the middle and to 0.18 at most. What the model doesn't know is in it too: cross-talk of 2 % comes to 680."""
+LIMIT_NM = 0.045
+LIMIT_SHARE = 9.0
+"""Of 400 untouched arms, wide ones included, the worst came to 0.63 of the limit, half of them to 0.16."""
 SMALLEST_SQUARE = 0.015
 """Least u of a fit that is asked whether it has changed."""
 LATER_NM = 0.02
@@ -51,7 +55,7 @@ LEARNT_SHARE = 2.5
 """How many times the rms of the learnt residuals, of their better part, it may differ beside that."""
 REGULAR = 0.01
 """Share of P_0 that is added to P_0 - P, so that what no sample has shown since is no difference."""
-NONE = -1
+NONE = -2
 """Number of no step."""
 STEP_S = 0.2
 STEPS = 8
@@ -165,16 +169,50 @@ def _better_square(m: Any, s: int) -> float:
 def last_step_before_change(k: Any, m: Any) -> int:
     """Return the number of the last step, from 0, of which the whole fit is no continuation; NONE if it is of all.
 
-    Where only its later samples don't bear it out, that is the last step of all.
+    Where only its later samples don't bear it out, that is the last step of all. -1: no step is old enough.
     """
     used, oldest = int(m["steps_used"]), max(int(m["steps_used"]) - m["steps_rows"].shape[0], 0)
-    changed = last_unsteady_step(m)
+    changed = last_step_before_contradiction(k, m)
     if changed != NONE or m["is_payload"] != 0.0:
         return changed
     for number in range(oldest, used):
         if not later_share(k, m, number % m["steps_rows"].shape[0]) <= 1.0:
             return used - 1
     return NONE
+
+
+@compiled
+def last_step_before_contradiction(k: Any, m: Any) -> int:
+    """Return the number of the last step before the fit changed, or a sample stands out; NONE where neither does."""
+    changed = last_unsteady_step(m)
+    first = first_unexplained(m)
+    return changed if changed != NONE or first < 0 else int(first // k["step_samples"]) - 1
+
+
+@compiled
+def first_unexplained(m: Any) -> int:
+    """Return which of the fit's learnt samples, from 0, is the first that its belief doesn't explain; -1: none is."""
+    kept, first = int(m["samples_kept"]), -1
+    if m["is_payload"] != 0.0 or kept < 2:
+        return first
+    limit = limit_Nm(m)
+    for s in range(kept - 1, -1, -1):
+        for i in range(m["samples_tau"].shape[1]):
+            if not abs(residual(m, s, i)) <= limit:
+                first = s
+    return first if first < 0 else int(first * m["samples_every"])
+
+
+@compiled
+def limit_Nm(m: Any) -> float:
+    """Return the largest residual that the fit explains."""
+    return float(LIMIT_NM + LIMIT_SHARE * better_rms(m))
+
+
+@compiled
+def residual(m: Any, s: int, joint: int) -> float:
+    """Return what the belief leaves of sample s, Nm."""
+    return float(-linalg.misfit(m["samples_W"][s, joint], m["belief"], m["samples_tau"][s, joint]))
 
 
 @compiled
@@ -217,7 +255,7 @@ def better_rms(m: Any) -> float:
     squares, half = np.zeros(2), int(m["samples_kept"]) // 2
     for s in range(2 * half):
         for i in range(m["samples_tau"].shape[1]):
-            squares[s // half] += linalg.misfit(m["samples_W"][s, i], m["belief"], m["samples_tau"][s, i]) ** 2
+            squares[s // half] += residual(m, s, i) ** 2
     return float(np.sqrt(np.min(squares) / max(half * m["samples_tau"].shape[1], 1)))
 
 
