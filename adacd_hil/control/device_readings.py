@@ -29,6 +29,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.model.regressor import A1, A2, A3, A4, A5, is_positive_definite, regressor
@@ -211,22 +212,13 @@ def solve_readings(normals: Vector, count: int, blocks: int, shares: Vector, sol
         for a in range(size):
             unit[a] = math.sqrt(max(N[a, a], 1e-12))
         for a in range(size):
+            x[a] = N[a, size] / unit[a]
             for b in range(a + 1):
-                value = N[a, b] / (unit[a] * unit[b])
-                for c in range(b):
-                    value -= L[a, c] * L[b, c]
-                L[a, b] = math.sqrt(max(value + RIDGE, 1e-15)) if a == b else value / L[b, b]
-        explained = 0.0
-        for a in range(size):
-            value = N[a, size] / unit[a]
-            for c in range(a):
-                value -= L[a, c] * x[c]
-            x[a] = value / L[a, a]
-            explained += x[a] * x[a]
-        for a in range(size - 1, -1, -1):
-            for c in range(a + 1, size):
-                x[a] -= L[c, a] * x[c]
-            x[a] /= L[a, a]
+                L[a, b] = N[a, b] / (unit[a] * unit[b]) + (RIDGE if a == b else 0.0)
+        linalg.factor(L, 1e-15)
+        linalg.solve_lower(L, x)
+        explained = linalg.dot(x, x)
+        linalg.solve_upper(L, x)
         solutions[h] = x / unit
         spread = N[size, size]
         for i in range(JOINTS):

@@ -11,7 +11,7 @@ from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.scheme.detect import margin
-from adacd_hil.scheme.identify import anchor
+from adacd_hil.scheme.identify import anchor, evidence
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
@@ -332,14 +332,14 @@ class Judged:
 
     def bound_Nm(self, kind=anchor.REST):
         anchor.is_within(self.k, self.m, self.theta, self.P)
-        return float(self.m["bound_Nm"][kind, 0])
+        return float(self.m["limit"][kind, evidence.OFFSETS])
 
 
 def test_the_bound_is_four_deviations_of_all_that_is_not_known():
     assert Judged().bound_Nm() == pytest.approx(4.0 * np.sqrt(0.01**2 + 0.004**2 + 0.005**2))
     assert Judged(friction_Nm=0.2).bound_Nm() == pytest.approx(4.0 * np.sqrt(0.01**2 + 0.004**2 + 0.005**2 + 0.02**2))
     judged = Judged()
-    judged.m["anchor_age_s"] = 3600.0
+    judged.m["said_age_s"] = 3600.0
     drift_Nm = FREE.tare.drift_Nm_sqrt_s * 60.0
     assert judged.bound_Nm() == pytest.approx(4.0 * np.sqrt(0.01**2 + 0.004**2 + 0.005**2 + drift_Nm**2))
     assert Judged().bound_Nm(anchor.TARE) == np.inf

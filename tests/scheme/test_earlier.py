@@ -10,7 +10,7 @@ from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme.identify import anchor, certificate, earlier, fit_check
+from adacd_hil.scheme.identify import anchor, certificate, earlier, evidence, fit_check
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD, CertificateWatch
 
@@ -45,10 +45,6 @@ class HeldLoop(TouchedLoop):
     def error_of(self, name):
         place = NAMES.index(name)
         return abs(self.pipeline.numbers.memory[0]["theta"][place] - self.theta[place])
-
-
-def distance_to_step(m, s):
-    return fit_check.distance(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
 
 
 def states(outputs):
@@ -174,9 +170,9 @@ def test_a_certificate_forgets_what_was_kept():
     loop = HeldLoop(FREE)
     loop.learn(1.0)
     loop.lean(0, 1.0, 0.2)
-    assert loop.pipeline.numbers.memory[0]["has_kept"] == 1.0
+    assert earlier.is_keeping(loop.pipeline.numbers.memory[0])
     loop.recover()
-    assert loop.pipeline.numbers.memory[0]["has_kept"] == 0.0
+    assert not earlier.is_keeping(loop.pipeline.numbers.memory[0])
 
 
 @pytest.mark.parametrize("profile", ["P", "S", "M"])
@@ -184,8 +180,8 @@ def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound(profile):
     loop = HeldLoop(FREE, theta=THETA[profile], seed=5)
     outputs = loop.run_until(SchemeState.CERTIFY)
     m = loop.pipeline.numbers.memory[0]
-    furthest = max(distance_to_step(m, s) for s in range(int(m["steps_used"])))
-    assert furthest < 0.5 * earlier.STEADY * earlier.SMALLEST_SQUARE
+    furthest = max(fit_check.distance(m, s) for s in range(int(m["steps_used"])))
+    assert furthest < 0.5 * fit_check.STEADY * fit_check.SMALLEST_SQUARE
     outputs += loop.run_until(SchemeState.MONITOR)
     learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
     assert learnt_s == pytest.approx(2.0, abs=0.01)
@@ -199,18 +195,32 @@ class Compared:
         self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
         self.m["P_belief"] = std**2 * np.eye(len(NAMES))
         self.m["belief"] = 0.1
-        self.m["fit_square"], self.m["fit_rows"] = 1.0, earlier.HARD  # u = 1
-        earlier._keep(self.m, self.m["belief"], self.m["P_belief"], 1.0, 0.0)
-        self.m["bound_Nm"] = np.inf if settings is UNKNOWN else 0.04
+        self.m["fit_square"], self.m["fit_rows"] = 1.0, fit_check.HARD  # u = 1
+        self.keep(self.m["belief"], std)
+        self.m["limit"][: anchor.KINDS] = np.inf if settings is UNKNOWN else 0.04
+
+    def keep(self, theta, std, unit=1.0, age_s=0.0):
+        """Keep one more belief."""
+        earlier._keep(self.k, self.m, theta, std**2 * np.eye(len(NAMES)), unit, age_s)
+
+    def keep_only(self, theta, std):
+        """Keep one belief in place of all."""
+        earlier.forget(self.m)
+        self.keep(theta, std)
 
     def agrees_with(self, name, change):
         self.m["belief"] = 0.1
         self.m["belief"][NAMES.index(name)] += change
+        return self.agrees()
+
+    def agrees(self):
+        unit = fit_check.unit_of(self.m["fit_square"], self.m["fit_rows"])
+        evidence.fit(self.k, self.m, self.m["belief"], self.m["P_belief"], unit)
         return earlier.is_no_more(self.k, self.m)
 
 
 def test_friction_counts_both_ways_and_of_an_inertia_less_is_the_arms():
-    limit_Nm = earlier.SIGMAS * 0.01 * np.sqrt(2.0 * (1.0 + 0.2**2))
+    limit_Nm = evidence.BELIEF_SIGMAS * 0.01 * np.sqrt(2.0 * (1.0 + 0.2**2))
     compared = Compared()
     assert limit_Nm > earlier.FRICTION_NM
     assert compared.agrees_with("F_c1", 0.99 * limit_Nm)
@@ -232,17 +242,35 @@ def test_less_than_the_floor_is_nothing_however_well_all_is_known(name, floor):
 def test_an_offset_counts_both_ways_and_where_something_anchors_it_shows_that_what_was_kept_was_leant_on():
     compared = Compared(std=1e-5)
     assert compared.agrees_with("offset1", 0.0)
-    compared.m["bound_Nm"] = np.inf
+    compared.m["limit"][: anchor.KINDS] = np.inf
     assert not compared.agrees_with("offset1", -0.05)
-    compared.m["bound_Nm"][0] = 0.04
+    compared.m["limit"][0] = 0.04
     assert compared.agrees_with("offset1", -0.05)
-    assert compared.m["has_kept"] == 0.0
+    assert not earlier.is_keeping(compared.m)
+
+
+def test_of_two_joints_only_the_one_without_an_anchor_is_judged_by_its_earlier_offset():
+    compared = Compared(std=1e-5)
+    compared.m["limit"][: anchor.KINDS, evidence.OFFSETS + 1] = np.inf
+    assert not compared.agrees_with("offset2", 0.05)
+    assert earlier.is_keeping(compared.m)
+    assert earlier.describe_more(compared.m)[0].startswith("torque offset of joint 2 is 0.050 Nm more than 0.0 s ago")
+    assert compared.agrees_with("offset1", 0.05)
+
+
+def test_a_fit_that_is_not_a_number_agrees_with_nothing_that_was_kept():
+    for settings in (FREE, UNKNOWN):
+        compared = Compared(settings)
+        compared.m["belief"] = np.nan
+        assert not compared.agrees()
+        assert earlier.is_keeping(compared.m)
 
 
 def test_what_the_prior_alone_says_judges_nothing():
     prior = Compared()
-    prior.m["P_kept"][0] = np.diag(certified_memory.new_memory(FREE)[0]["P_belief"].diagonal())
-    prior.m["kept_unit"][0] = earlier.SMALLEST_UNIT
+    earlier.forget(prior.m)
+    P = np.diag(certified_memory.new_memory(FREE)[0]["P_belief"].diagonal())
+    earlier._keep(prior.k, prior.m, prior.m["belief"], P, fit_check.SMALLEST_UNIT, 0.0)
     assert prior.agrees_with("F_c1", 1.0)
     assert prior.agrees_with("a1", 1.0)
 
@@ -251,15 +279,16 @@ def test_what_the_prior_alone_says_judges_nothing():
 def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share, is_steady):
     compared = Compared(std=0.01)
     m = compared.m
-    m["has_kept"], m["kept"], m["steps_used"], m["steps_theta"][:2] = 0.0, 0.0, 2.0, 0.1
+    earlier.forget(m)
+    m["steps_used"], m["steps_theta"][:2] = 2.0, 0.1
     m["steps_P"][:2] = 0.02**2 * np.eye(len(NAMES))
     m["steps_square"][:2], m["steps_rows"][:2], m["fit_square"], m["fit_rows"] = 0.0, 50.0, 0.0, 100.0
     added_variance = (1.0 + fit_check.REGULAR) * 0.02**2 - 0.01**2
-    m["belief"][INERTIA] += share * np.sqrt(earlier.STEADY * earlier.SMALLEST_SQUARE * added_variance)
-    assert earlier.is_steady(m) is is_steady
-    assert bool(m["has_kept"]) is not is_steady
-    if not is_steady:
-        assert (m["kept"][0] == 0.1).all()
+    m["belief"][INERTIA] += share * np.sqrt(fit_check.STEADY * fit_check.SMALLEST_SQUARE * added_variance)
+    assert (fit_check.last_unsteady_step(m) == fit_check.NONE) is is_steady
+    earlier.keep(compared.k, m)
+    assert m["kept_count"] == (2.0 if is_steady else 1.0)
+    assert m["said"][evidence.KEPT, evidence.FRICTIONS] == 0.1
 
 
 UPRIGHT = replace(
@@ -293,13 +322,17 @@ class Halves:
         return alone - self.m["belief"]
 
 
+def is_whole(fit):
+    return fit_check.last_step_before_change(fit.k, fit.m) == fit_check.NONE
+
+
 def test_the_model_of_the_later_samples_is_that_of_their_own_information():
     fit = Halves()
     root = 0.005 * np.random.default_rng(6).standard_normal((len(NAMES), 4))
     fit.m["steps_P"][0] += root @ root.T
     alone = fit.differ(0, np.linspace(-0.02, 0.03, len(NAMES)))
     m = fit.m
-    assert fit_check.find_later(m, m["steps_theta"][0], m["steps_P"][0], m["belief"], m["P_belief"])
+    assert fit_check.find_later(m, 0)
     assert m["later"] == pytest.approx(alone, rel=1e-6)
 
 
@@ -310,11 +343,13 @@ def test_later_samples_that_come_to_another_torque_do_not_bear_the_fit_out(share
     unit = np.zeros(len(NAMES))
     unit[1] = 1.0
     far = np.abs(Halves().differ(0, unit)[:2]).max()
-    fit.differ(0, share * earlier.LATER_NM / far * unit)
-    assert earlier.is_borne_out(fit.k, fit.m) is is_borne_out
-    assert fit.m["kept_count"] == (0.0 if is_borne_out else min(steps_used - earlier.YOUNG_STEPS, earlier.STEPS))
+    fit.differ(0, share * fit_check.LATER_NM / far * unit)
+    step = fit_check.last_step_before_change(fit.k, fit.m)
+    assert step == (fit_check.NONE if is_borne_out else steps_used - 1)
+    earlier.keep_steps(fit.k, fit.m, steps_used - 1)
+    assert fit.m["kept_count"] == min(steps_used - earlier.YOUNG_STEPS, fit_check.STEPS)
     fit.m["is_payload"] = 1.0
-    assert earlier.is_borne_out(fit.k, fit.m)
+    assert fit_check.last_step_before_change(fit.k, fit.m) == fit_check.NONE
 
 
 @pytest.mark.parametrize(("share", "is_borne_out"), [(0.97, True), (1.03, False)])
@@ -322,12 +357,12 @@ def test_where_gravity_acts_later_samples_may_differ_by_what_they_do_not_know(sh
     fit, count = Halves(settings=UPRIGHT), len(certified_memory.parameter_names(UPRIGHT))
     P, P_0 = fit.m["P_belief"], (1.0 + fit_check.REGULAR) * fit.m["steps_P"][0]
     variance = np.diag(np.linalg.inv(np.linalg.inv(P) - np.linalg.inv(P_0)) - P)[:2]
-    unknown_Nm = np.sqrt(earlier.SMALLEST_UNIT * variance)
+    unknown_Nm = np.sqrt(fit_check.SMALLEST_UNIT * variance)
     far = np.abs(Halves(settings=UPRIGHT).differ(0, np.eye(count)[1])[:2])
-    room = np.min((earlier.LATER_NM + unknown_Nm) / far)
-    assert room * far.max() > 1.2 * earlier.LATER_NM
+    room = np.min((fit_check.LATER_NM + unknown_Nm) / far)
+    assert room * far.max() > 1.2 * fit_check.LATER_NM
     fit.differ(0, share * room * np.eye(count)[1])
-    assert earlier.is_borne_out(fit.k, fit.m) is is_borne_out
+    assert is_whole(fit) is is_borne_out
 
 
 @pytest.mark.parametrize(("settings", "has_mounting"), [(FREE, False), (UPRIGHT, True)], ids=["flat", "upright"])
@@ -342,10 +377,10 @@ def test_a_fit_that_no_model_explains_names_the_mounting_where_gravity_acts(sett
 def test_a_fit_with_noise_may_differ_by_more():
     fit = Halves()
     unit = np.eye(len(NAMES))[1]
-    fit.differ(0, 1.4 * earlier.LATER_NM / np.abs(Halves().differ(0, unit)[:2]).max() * unit)
-    assert not earlier.is_borne_out(fit.k, fit.m)
-    fit.m["samples_tau"][:3] += 0.25 * earlier.LATER_NM
-    assert earlier.is_borne_out(fit.k, fit.m)
+    fit.differ(0, 1.4 * fit_check.LATER_NM / np.abs(Halves().differ(0, unit)[:2]).max() * unit)
+    assert not is_whole(fit)
+    fit.m["samples_tau"][:3] += 0.25 * fit_check.LATER_NM
+    assert is_whole(fit)
 
 
 @pytest.mark.parametrize(("share", "is_borne_out"), [(0.97, True), (1.03, False)])
@@ -353,10 +388,10 @@ def test_a_fit_whose_learnt_residuals_are_large_may_differ_by_a_share_of_the_bet
     fit = Halves(steps_used=1)
     m, unit = fit.m, np.eye(len(NAMES))[1]
     m["steps_square"][0], m["steps_rows"][0], m["fit_square"], m["fit_rows"] = 2.0, 50.0, 2.5, 100.0
-    noise_Nm = earlier.LEARNT_SHARE * FREE.certified.residual_Nm * np.sqrt(0.5 / 50.0)
+    noise_Nm = fit_check.LEARNT_SHARE * FREE.certified.residual_Nm * np.sqrt(0.5 / 50.0)
     far = np.abs(Halves().differ(0, unit)[:2]).max()
-    fit.differ(0, share * (earlier.LATER_NM + noise_Nm) / far * unit)
-    assert earlier.is_borne_out(fit.k, m) is is_borne_out
+    fit.differ(0, share * (fit_check.LATER_NM + noise_Nm) / far * unit)
+    assert is_whole(fit) is is_borne_out
 
 
 def test_what_is_kept_is_from_before_the_contact():
@@ -366,11 +401,12 @@ def test_what_is_kept_is_from_before_the_contact():
     steps, of_steps = int(m["steps_used"]), m["steps_theta"].copy()
     kept = steps - earlier.YOUNG_STEPS
     loop.lean(0, 3.0, 0.05)
-    assert m["has_kept"] == 1.0
     assert m["kept_count"] == kept + 1 > 3
-    assert (m["kept"][:kept] == of_steps[earlier.YOUNG_STEPS : steps]).all()
-    friction = [abs(m["kept"][n][NAMES.index("F_c1")] - THETA["P"][5]) for n in range(kept + 1)]
-    assert friction[-1] < 0.02  # what it had come to at the contact, with nothing of the lean
+    said = m["said"][evidence.KEPT : evidence.KEPT + kept + 1]
+    a1 = of_steps[earlier.YOUNG_STEPS : steps, NAMES.index("a1")]
+    np.testing.assert_array_equal(said[:kept, evidence.FRICTIONS], a1)
+    friction = said[-1, 0] - (THETA["P"][5] + evidence.SPEEDS_RAD_S[0] * THETA["P"][3])
+    assert abs(friction) < 0.02  # what it had come to at the contact, with nothing of the lean
 
 
 def test_nothing_is_kept_of_a_fit_that_is_as_young_as_a_touch_of_its_beginning():
@@ -380,22 +416,21 @@ def test_nothing_is_kept_of_a_fit_that_is_as_young_as_a_touch_of_its_beginning()
     assert m["steps_used"] == 1.0
     outputs = loop.lean(0, 5.0, 0.05)
     assert any(output.contact is not None for output in outputs)
-    assert m["has_kept"] == 0.0
+    assert not earlier.is_keeping(m)
 
 
 @pytest.mark.parametrize(("offset_Nm", "is_kept"), [(0.12, True), (0.2, False)])
 def test_a_kept_belief_whose_offset_an_anchor_excludes_was_leant_on_however_wide_the_anchor_is(offset_Nm, is_kept):
     compared = Compared()
     m = compared.m
-    m["bound_Nm"][:] = np.inf
-    m["bound_Nm"][anchor.REST] = 0.15  # wider than `beta_Nm`
-    m["anchor_Nm"][anchor.REST] = m["judged_Nm"] = m["belief"][OFFSETS]
+    m["limit"][: anchor.KINDS] = np.inf
+    m["limit"][anchor.REST] = 0.15  # wider than `beta_Nm`
+    m["anchor_Nm"][anchor.REST] = m["belief"][OFFSETS]
     kept = m["belief"].copy()
     kept[OFFSETS] += (offset_Nm, 0.0)
-    m["kept_count"], m["has_kept"] = 0.0, 0.0
-    earlier._keep(m, kept, 0.01**2 * np.eye(len(NAMES)), 1.0, 1.0)
-    earlier.is_no_more(compared.k, m)
-    assert bool(m["has_kept"]) is is_kept
+    compared.keep_only(kept, 0.01)
+    compared.agrees()
+    assert earlier.is_keeping(m) is is_kept
 
 
 def test_of_several_kept_beliefs_the_one_that_knew_the_arm_untouched_judges():
@@ -403,8 +438,8 @@ def test_of_several_kept_beliefs_the_one_that_knew_the_arm_untouched_judges():
     m, compared_with = compared.m, compared.m["belief"].copy()
     for touched, std in ((0.3, 0.01), (0.0, 1.0)):  # one that has learnt the hand, one that knows nothing
         compared_with[NAMES.index("F_c1")] = 0.1 + touched
-        earlier._keep(m, compared_with, std**2 * np.eye(len(NAMES)), 1.0, 1.0)
-    m["kept_age_s"][0] = 7.0
+        compared.keep(compared_with, std, age_s=1.0)
+    m["said_age_s"][evidence.KEPT] = 7.0
     assert not compared.agrees_with("F_c1", 0.3)
     (line,) = earlier.describe_more(m)
     assert line.startswith("friction of joint 1 at 0.2 rad/s is 0.300 Nm more than 7.0 s ago, bound 0.05")
@@ -412,12 +447,15 @@ def test_of_several_kept_beliefs_the_one_that_knew_the_arm_untouched_judges():
 
 def test_no_arm_has_less_friction_than_none_whatever_a_touched_belief_says():
     compared = Compared(std=1e-5)
-    compared.m["kept"][0, NAMES.index("F_c1")] = -0.025
-    assert not compared.agrees_with("F_c1", 0.04)  # as one of none, 0.04 Nm more
-    compared = Compared(std=1e-5)
-    compared.m["kept"][0, NAMES.index("F_c1")] = -0.06  # who pushed the arm on was there
-    assert compared.agrees_with("F_c1", 0.2)
-    assert compared.m["has_kept"] == 0.0
+    none = np.full(len(NAMES), 0.1)
+    none[[VISCOUS, COULOMB]] = 0.0, -0.025
+    compared.keep_only(none, 1e-5)
+    compared.m["belief"][[VISCOUS, COULOMB]] = 0.0, 0.04
+    assert not compared.agrees()  # as one of none, 0.04 Nm more
+    none[COULOMB] = -0.06  # who pushed the arm on was there
+    compared.keep_only(none, 1e-5)
+    assert compared.m["kept_count"] == 0.0
+    assert compared.agrees()
 
 
 def test_less_friction_lapses_what_was_kept_after_more_fits_than_more_of_it_does():
@@ -426,8 +464,8 @@ def test_less_friction_lapses_what_was_kept_after_more_fits_than_more_of_it_does
     assert agreed == [False] * (int(earlier.LESS_FITS) - 1) + [True]
     leant = Compared(UNKNOWN, std=1e-5)
     leant.m["belief"][OFFSETS] -= 0.09
-    leant.m["kept"][0] += 0.09 * (np.arange(len(NAMES)) == COULOMB)
-    assert not any(earlier.is_no_more(leant.k, leant.m) for _ in range(10))
+    leant.keep_only(leant.m["belief"] + 0.09 * np.isin(np.arange(len(NAMES)), [COULOMB, *OFFSETS]), 1e-5)
+    assert not any(leant.agrees() for _ in range(10))
     more = Compared(std=1e-5)
     assert not any(more.agrees_with("F_c1", 0.09) for _ in range(10))
 
@@ -456,10 +494,9 @@ def test_a_kept_belief_that_was_leant_on_is_forgotten_and_the_others_go_on_judgi
     compared = Compared(std=1e-5)
     leant = compared.m["belief"].copy()
     leant[NAMES.index("offset1")] += 0.3
-    earlier._keep(compared.m, leant, 1e-10 * np.eye(len(NAMES)), 1.0, 0.0)
+    compared.keep(leant, 1e-5)
     assert not compared.agrees_with("F_c1", 0.04)
-    assert compared.m["kept_unit"][:2].tolist() == [1.0, 0.0]
-    assert compared.m["has_kept"] == 1.0
+    assert np.isinf(compared.m["said_variance"][evidence.KEPT : evidence.KEPT + 2, 0]).tolist() == [False, True]
 
 
 @pytest.mark.parametrize(("begins_s", "drag_Nm"), long_but(1, [(0.87, 0.14), (0.55, 0.27)]))

@@ -15,7 +15,7 @@ class Fit:
     """A kernel's memory with a fit that explains what it has learnt, but for noise of 0.01 Nm."""
 
     def __init__(self, learnt=300):
-        self.m = certified_memory.new_memory(FREE)[0]
+        self.k, self.m = certified_memory.constants_of(FREE)[0], certified_memory.new_memory(FREE)[0]
         fit_check.begin(self.m)
         random = np.random.default_rng(1)
         self.W = random.standard_normal((learnt, 2, len(NAMES)))
@@ -24,7 +24,7 @@ class Fit:
     @property
     def first(self):
         for W, tau in zip(self.W, self.tau, strict=True):
-            fit_check.keep(self.m, W, tau)
+            fit_check.follow(self.k, self.m, W, tau)
         return fit_check.first_unexplained(self.m)
 
 

@@ -11,7 +11,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from test_earlier import FREE, HeldLoop, added, states
 
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.scheme.identify import certificate, earlier
+from adacd_hil.scheme.identify import certificate, evidence, fit_check
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD, THIS_RUN_ONLY
 
@@ -19,7 +19,7 @@ DATE = "2026-11-22T10:00:00Z"
 
 
 def friction_of(theta):
-    return [theta[5 + i] + v * theta[3 + i] for i in range(2) for v in earlier.SPEEDS_RAD_S]
+    return [theta[5 + i] + v * theta[3 + i] for i in range(2) for v in evidence.SPEEDS_RAD_S]
 
 
 def known(theta, settings=FREE):
@@ -150,6 +150,8 @@ class Asked:
     def agrees_with(self, name, change):
         self.m["belief"] = 0.1
         self.m["belief"][NAMES.index(name)] += change
+        unit = fit_check.unit_of(self.m["fit_square"], self.m["fit_rows"])
+        evidence.fit(self.k, self.m, self.m["belief"], self.m["P_belief"], unit)
         return certificate.is_no_more(self.k, self.m)
 
 

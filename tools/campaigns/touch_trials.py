@@ -23,7 +23,7 @@ from adacd_hil.compiled import Structured
 from adacd_hil.control.controller import Controller
 from adacd_hil.control.reference import Reference
 from adacd_hil.records import ArmState, Request, SchemeOutput, SchemeState, Vector
-from adacd_hil.scheme.identify import earlier, fit_check
+from adacd_hil.scheme.identify import earlier, evidence, fit_check
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model.regressor import payload_direction
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
@@ -213,15 +213,16 @@ def rule_shares(constants: Structured, memory: Structured) -> tuple[float, ...]:
     """Return how much of its limit each of RULES is of the fit that has just ended."""
     memory = memory.copy()
     k, m = constants[0], memory[0]
-    steps = range(min(int(m["steps_used"]), earlier.STEPS))
+    steps = range(min(int(m["steps_used"]), fit_check.STEPS))
     places = [(s, i) for s in range(int(m["samples_kept"])) for i in range(2)]
-    changed = max((earlier.changed_share(m, s) for s in steps), default=0.0)
+    changed = max((fit_check.changed_share(m, s) for s in steps), default=0.0)
     explained = max((abs(fit_check.residual(m, *place)) for place in places), default=0.0) / fit_check.limit_Nm(m)
-    later = max((earlier.later_share(k, m, s) for s in steps), default=0.0)
+    later = max((fit_check.later_share(k, m, s) for s in steps), default=0.0)
     earlier.forget(m)
-    earlier.keep(constants[0], m)
+    earlier.keep(k, m)
     earlier.is_no_more(k, m)
-    return float(changed), float(explained), float(later), float(np.max(m["change"] / m["change_limit"]))
+    more = np.max(m["difference"][evidence.KEPT :] / m["limit"][evidence.KEPT :])
+    return float(changed), float(explained), float(later), float(more)
 
 
 @cache

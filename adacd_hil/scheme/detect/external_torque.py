@@ -22,8 +22,11 @@ begins where |y| was last below half of its threshold, which is before it is det
 Shapes: joint vectors (2,); history (WIDE_SAMPLES + 1, 2), newest first.
 """
 
+from typing import Any
+
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
 
 SMALLEST_UNIT = 0.05
 LARGEST_UNIT = 9.0
@@ -34,9 +37,7 @@ LARGEST_UNIT = 9.0
 def predict(W_f: Vector, theta: Vector, tau_f_hat: Vector) -> None:
     """Fill tau_f_hat (2,) = W_f theta, eq. (7), in filtered Nm."""
     for i in range(W_f.shape[0]):
-        tau_f_hat[i] = 0.0
-        for j in range(W_f.shape[1]):
-            tau_f_hat[i] += W_f[i, j] * theta[j]
+        tau_f_hat[i] = linalg.dot(W_f[i], theta)
 
 
 @compiled
@@ -77,6 +78,17 @@ WIDE_SAMPLES = 5
 
 ONSET_FRACTION = 0.5
 """Part of the threshold below which a joint counts as untouched; above what a frozen model leaves (0.07 of 0.15 Nm)."""
+
+
+def shapes_of() -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    return {"history": (WIDE_SAMPLES + 1, JOINTS)}
+
+
+@compiled
+def forget(m: Any) -> None:
+    """Forget the samples of the mean."""
+    m["history"][:] = 0.0
 
 
 @compiled

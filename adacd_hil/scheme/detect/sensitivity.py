@@ -41,6 +41,7 @@ from typing import Any
 
 import numpy as np
 
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import external_torque
@@ -241,10 +242,7 @@ def follow_unit(k: Any, m: Any, fit: int, share: float, is_monitored: bool) -> N
         w = m["W_f"][fit, i]
         believed = k["residual_Nm"] ** 2 + m["held"][fit, i] ** 2
         for j in range(w.shape[0]):
-            row = 0.0
-            for n in range(w.shape[0]):
-                row += m["P"][j, n] * w[n]
-            believed += w[j] * row
+            believed += w[j] * linalg.dot(m["P"][j], w)
         if not np.isfinite(believed):
             continue
         square = UNIT_PEAK * m["r"][fit, i] ** 2 / believed
@@ -360,10 +358,7 @@ def _doubt(k: Any, m: Any, w: Vector, unit: float) -> float:
     """Return w (u P + D) w'."""
     total = 0.0
     for j in range(w.shape[0]):
-        row = 0.0
-        for n in range(w.shape[0]):
-            row += m["P"][j, n] * w[n]
-        total += unit * w[j] * row + (k["model_error"][j] * m["theta"][j] * w[j]) ** 2
+        total += unit * w[j] * linalg.dot(m["P"][j], w) + (k["model_error"][j] * m["theta"][j] * w[j]) ** 2
     return max(total, 0.0)
 
 
@@ -396,9 +391,45 @@ MOST_FILLED = 8
 """Missing samples that are put on the line between their neighbours."""
 
 
-def shapes_of(filters: int) -> dict[str, tuple[int, ...]]:
+_ONES = ("roughness", "roughness_now", "roughness_kept", "velocity_roughness", "unit", "strain")
+_STEPS = ("torque_changes", "torque_change_Nm", "torque_step_Nm", "torque_pull_Nm")
+_OTHERS = ("used", "peak_share", "hold", "dq_old", "ddq_old", "rest_tau", "rest_square", "wide_sigma", "wide_threshold")
+
+
+def shapes_of(filters: int, channels: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the memory, by name."""
-    return {"lost": (filters, JOINTS), "low_speed": (filters, JOINTS), "unit_by_sign": (2, JOINTS)}
+    return {
+        **dict.fromkeys(("still", "still_smooth", "low_speed", "doubt", "held", "lost"), (filters, JOINTS)),
+        **dict.fromkeys(("h", "h_model"), (channels, JOINTS)),
+        **dict.fromkeys((*_ONES, *_STEPS, *_OTHERS), (JOINTS,)),
+        "unit_by_sign": (2, JOINTS),
+        "rest_samples": (),
+    }
+
+
+def begin(m: Any) -> None:
+    """Begin with an arm that is as the settings say."""
+    for name in _ONES:
+        m[name] = 1.0
+
+
+@compiled
+def begin_fit(m: Any) -> None:
+    """Begin with a belief whose residuals are what the settings call a good model's."""
+    m["unit"][:] = 1.0
+
+
+@compiled
+def lift(m: Any) -> None:
+    """Watch nothing: no torque is over its threshold."""
+    m["wide_threshold"][:] = np.inf
+
+
+def take_peak_shares(m: Any) -> Vector:
+    """Return the largest share of its threshold that each joint (n,) has come to since the last call."""
+    shares = np.array(m["peak_share"])
+    m["peak_share"][:] = 0.0
+    return shares
 
 
 @compiled

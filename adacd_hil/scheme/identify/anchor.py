@@ -10,15 +10,14 @@ knowledge from elsewhere. An anchor judges the fitted offset and never pulls it:
     ACCEPTED  what the user has accepted in place of all.
     LAST      what the arm's last certificate found, asked of a joint that no other anchor bounds.
 
-The fitted offset o must keep to each anchor a that there is:
+The fitted offset o must keep to each anchor a that there is, a row of `evidence`:
 
     |o - a| <= SIGMAS sqrt(u P_oo + sigma_a² + b² t + (0.1 F_c)² + 0.005²) + holding_Nm (of REST)
 
 u P_oo: the belief's variance in the unit of its residuals; b² t: drift since; 0.1 F_c: friction that differs by
 direction looks like an offset. Before the drives are enabled the reading at rest must keep to the tare likewise.
 
-Shapes: anchor_Nm, anchor_std, bound_Nm (4, n), inf where there is none; judged_Nm (n,): what was compared last with
-them; holding_Nm (n,), inf where not known.
+Shapes: anchor_Nm, anchor_std (4, n), inf where there is none; holding_Nm (n,), inf where not known.
 
 **Torque by place.** Its columns (`regressor`) are in the model only where `arm.position_torque_Nm` says that the arm
 has one, and how much at most. A hand's spring that is held from before the start looks the same, and so does a lean to
@@ -36,15 +35,15 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.identify import evidence
+from adacd_hil.scheme.identify.evidence import OFFSETS
 from adacd_hil.settings.configuration import Settings
 
 REST, TARE, ACCEPTED, LAST = range(4)
-KINDS = 4
+KINDS = evidence.ANCHORS
 NAMES = ("the reading at rest", "the tare", "the user's word", "the last certificate")
 _HELD = "the sensor has moved, a cable pulls on it, or the motor holds more at rest than `arm.holding_torque_Nm` says"
 _MOVED = "the sensor has moved, or a cable pulls on it"
-SIGMAS = 4.0
-"""Two joints, two-sided: 1.3e-4 of clean arms, each time that it is asked."""
 REST_STD_NM = 0.004
 """Of the reading at rest beside its noise: the sensor's hysteresis, and its warming until the certificate."""
 MODEL_STD_NM = 0.005
@@ -77,9 +76,9 @@ def unanchored_joints(settings: Settings) -> list[int]:
     """
     arm, history = settings.arm, settings.history
     bounds_Nm = (
-        SIGMAS * _or_unknown(arm.torque_offset_std_Nm),
-        SIGMAS * _or_unknown(history.offset_std_Nm if history.is_known else None),
-        SIGMAS * REST_STD_NM + _or_unknown(arm.holding_torque_Nm),
+        evidence.ANCHOR_SIGMAS * _or_unknown(arm.torque_offset_std_Nm),
+        evidence.ANCHOR_SIGMAS * _or_unknown(history.offset_std_Nm if history.is_known else None),
+        evidence.ANCHOR_SIGMAS * REST_STD_NM + _or_unknown(arm.holding_torque_Nm),
     )
     tightest_Nm = np.min(bounds_Nm, axis=0)
     return [i for i in range(JOINTS) if not tightest_Nm[i] <= settings.certified.beta_Nm]
@@ -91,10 +90,10 @@ def _or_unknown(values: tuple[float, ...] | None) -> Vector:
 
 def shapes_of() -> dict[str, tuple[int, ...]]:
     """Return the shapes of what is remembered, by name."""
-    each = (KINDS, JOINTS)
     return {
-        **dict.fromkeys(("anchor_Nm", "anchor_std", "bound_Nm"), each),
-        **dict.fromkeys(("judged_Nm", "by_place_Nm"), (JOINTS,)),
+        **dict.fromkeys(("anchor_Nm", "anchor_std"), (KINDS, JOINTS)),
+        "rest_count": (),
+        "by_place_Nm": (JOINTS,),
     }
 
 
@@ -113,7 +112,7 @@ def measure(k: Any, m: Any, tau_J: Vector, is_resting: bool) -> None:
     A mean over the last `rest_cycles` samples or so: who leaned before and has gone is forgotten.
     """
     m["rest_count"] = min(m["rest_count"] + 1.0, k["rest_cycles"]) if is_resting else 0.0
-    m["anchor_age_s"] = 0.0
+    evidence.date(m, 0, KINDS, 0.0)
     for i in range(tau_J.shape[0]):
         if not is_resting:
             m["anchor_std"][REST, i] = np.inf
@@ -138,33 +137,47 @@ def is_rest_refused(k: Any, m: Any) -> bool:
     if m["rest_count"] < k["rest_cycles"]:
         return False
     is_refused = False
-    for i in range(m["judged_Nm"].shape[0]):
-        std, slack = m["anchor_std"][TARE, i], k["holding_Nm"][i]
-        m["judged_Nm"][i] = m["anchor_Nm"][REST, i]
-        m["bound_Nm"][:, i] = np.inf
-        if np.isfinite(std + slack):
-            m["bound_Nm"][TARE, i] = SIGMAS * np.sqrt(std**2 + _rest_variance(k, m, i)) + slack
-        off = abs(m["judged_Nm"][i] - m["anchor_Nm"][TARE, i])
-        is_refused = is_refused or not (off <= m["bound_Nm"][TARE, i])
+    for i in range(m["anchor_Nm"].shape[1]):
+        q, std, slack = OFFSETS + i, m["anchor_std"][TARE, i], k["holding_Nm"][i]
+        variance = std**2 if np.isfinite(std + slack) else np.inf
+        for kind in range(KINDS):
+            evidence.pass_over(m, kind, q)
+        evidence.put_fitted(m, q, m["anchor_Nm"][REST, i], _rest_variance(k, m, i))
+        evidence.say(m, TARE, q, m["anchor_Nm"][TARE, i], variance, 0.0, slack)
+        excess = abs(evidence.weigh(k, m, TARE, q))
+        is_refused = is_refused or not excess <= 1.0
     return is_refused
 
 
 @compiled
 def is_within(k: Any, m: Any, theta: Vector, P: Vector) -> bool:
     """Tell whether a model's offsets are within the bounds of all anchors. theta (p,), P (p, p)."""
-    base, first_coulomb = int(k["base"]), int(k["first_coulomb"])
-    drift = k["zero_drift_Nm2_s"] * m["anchor_age_s"]
-    is_within = True
-    for i in range(m["judged_Nm"].shape[0]):
-        m["judged_Nm"][i] = theta[base + i]
-        friction = ASYMMETRY * max(theta[first_coulomb + i], 0.0)
-        fitted = min(m["unit"][i], 1.0) * P[base + i, base + i] + friction**2 + MODEL_STD_NM**2
+    first_coulomb, is_within = int(k["first_coulomb"]), True
+    evidence.fit(k, m, theta, P, min(np.max(m["unit"]), 1.0))
+    for i in range(m["anchor_Nm"].shape[1]):
+        q, friction = OFFSETS + i, ASYMMETRY * max(theta[first_coulomb + i], 0.0)
         for kind in range(KINDS):
-            std, slack = m["anchor_std"][kind, i], k["holding_Nm"][i] if kind == REST else 0.0
-            is_asked = std != np.inf and (kind != LAST or np.min(m["bound_Nm"][:LAST, i]) > k["beta_Nm"])
-            m["bound_Nm"][kind, i] = SIGMAS * np.sqrt(fitted + std**2 + drift) + slack if is_asked else np.inf
-            is_within = is_within and abs(theta[base + i] - m["anchor_Nm"][kind, i]) <= m["bound_Nm"][kind, i]
+            variance = _variance(k, m, kind, i) + friction**2 + MODEL_STD_NM**2
+            if kind == LAST and np.min(m["limit"][:LAST, q]) <= k["beta_Nm"]:
+                variance = np.inf
+            slack = k["holding_Nm"][i] if kind == REST else 0.0
+            evidence.say(m, kind, q, m["anchor_Nm"][kind, i], variance, 0.0, slack)
+            excess = abs(evidence.weigh(k, m, kind, q))
+            is_within = is_within and excess <= 1.0
     return bool(is_within)
+
+
+@compiled
+def _variance(k: Any, m: Any, kind: int, joint: int) -> float:
+    """Return sigma_a² + b² t."""
+    return float(m["anchor_std"][kind, joint] ** 2 + k["zero_drift_Nm2_s"] * m["said_age_s"][kind])
+
+
+@compiled
+def is_excluded(m: Any, joint: int, offset_Nm: float) -> bool:
+    """Tell whether an anchor excludes another offset of a joint, by the bounds of the fit that was judged last."""
+    bounds_Nm = m["limit"][:KINDS, OFFSETS + joint]
+    return not bool(np.all(np.abs(offset_Nm - m["anchor_Nm"][:, joint]) <= bounds_Nm))
 
 
 @compiled
@@ -174,19 +187,12 @@ def innovation(k: Any, m: Any, joint: int, offset_Nm: float, variance_Nm2: float
     theta less P_o times this is the model corrected by the anchor as by a measurement of its offset.
     """
     kind = int(np.argmin(m["anchor_std"][:, joint]))
-    std = m["anchor_std"][kind, joint]
-    if std == np.inf:
+    known = _variance(k, m, kind, joint)
+    if known == np.inf:
         return 0.0
-    known = std**2 + k["zero_drift_Nm2_s"] * m["anchor_age_s"]
     if kind == REST:
         known += k["holding_Nm"][joint] ** 2
     return float((offset_Nm - m["anchor_Nm"][kind, joint]) / (variance_Nm2 + known))
-
-
-@compiled
-def is_excluded(m: Any, joint: int, offset_Nm: float) -> bool:
-    """Tell whether an anchor excludes another offset of a joint, by the bounds of the fit that was judged last."""
-    return not bool(np.all(np.abs(offset_Nm - m["anchor_Nm"][:, joint]) <= m["bound_Nm"][:, joint]))
 
 
 def accept(m: Any, offset_Nm: Vector, std_Nm: Vector) -> None:
@@ -194,7 +200,7 @@ def accept(m: Any, offset_Nm: Vector, std_Nm: Vector) -> None:
     m["anchor_std"][:] = np.inf
     m["anchor_Nm"][ACCEPTED] = offset_Nm
     m["anchor_std"][ACCEPTED] = std_Nm
-    m["anchor_age_s"] = 0.0
+    evidence.date(m, 0, KINDS, 0.0)
 
 
 def accept_reading(m: Any) -> None:
@@ -205,17 +211,17 @@ def accept_reading(m: Any) -> None:
 @compiled
 def is_open(k: Any, m: Any, joint: int) -> bool:
     """Tell whether no anchor bounds the offset that was judged last as closely as a test does, to `beta_Nm`."""
-    return bool(not (np.min(m["bound_Nm"][:, joint]) <= k["beta_Nm"]))
+    return bool(not (np.min(m["limit"][:KINDS, OFFSETS + joint]) <= k["beta_Nm"]))
 
 
 def tightest(k: Any, m: Any, joint: int) -> int | None:
     """Return the anchor that bounds the offset that was judged last most closely; None where none does."""
-    return None if is_open(k, m, joint) else int(np.argmin(m["bound_Nm"][:, joint]))
+    return None if is_open(k, m, joint) else int(np.argmin(m["limit"][:KINDS, OFFSETS + joint]))
 
 
 def open_joints(k: Any, m: Any) -> list[int]:
     """List the joints whose offset that was judged last has no anchor, from 0."""
-    return [i for i in range(m["judged_Nm"].shape[0]) if tightest(k, m, i) is None]
+    return [i for i in range(JOINTS) if tightest(k, m, i) is None]
 
 
 def is_anchored(k: Any, m: Any) -> bool:
@@ -223,15 +229,20 @@ def is_anchored(k: Any, m: Any) -> bool:
     return not open_joints(k, m)
 
 
+def judged_Nm(m: Any) -> Vector:
+    """Return the offsets, or readings at rest, that were judged last (n,)."""
+    return np.array(m["fitted"][OFFSETS : OFFSETS + JOINTS])
+
+
 def describe(k: Any, m: Any) -> str:
     """Say of each joint what anchors the offset that was judged last, and how closely, Nm."""
     texts = []
-    for i in range(m["judged_Nm"].shape[0]):
+    for i in range(JOINTS):
         kind = tightest(k, m, i)
         texts.append(
             f"joint {i + 1} not at all: who has leaned on it since before the start is in its torque offset"
             if kind is None
-            else f"joint {i + 1} to ± {m['bound_Nm'][kind, i]:.3f} Nm by {NAMES[kind]}"
+            else f"joint {i + 1} to ± {m['limit'][kind, OFFSETS + i]:.3f} Nm by {NAMES[kind]}"
         )
     return f"torque offsets anchored: {'; '.join(texts)}"
 
@@ -242,10 +253,9 @@ def describe_refused(m: Any, is_reading: bool) -> list[str]:
     is_reading: it was the reading at rest; else the offsets of a fit.
     """
     lines = []
-    for i in range(m["judged_Nm"].shape[0]):
-        value = float(m["judged_Nm"][i])
+    for i, value in enumerate(judged_Nm(m).tolist()):
         for kind in range(KINDS):
-            expected, limit = float(m["anchor_Nm"][kind, i]), float(m["bound_Nm"][kind, i])
+            expected, limit = float(m["anchor_Nm"][kind, i]), float(m["limit"][kind, OFFSETS + i])
             if not abs(value - expected) <= limit:
                 what = (
                     f"reads {value:.3f} Nm at rest" if is_reading else f"has a fitted torque offset of {value:.3f} Nm"

@@ -33,10 +33,11 @@ from typing import Any
 
 import numpy as np
 
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import sensitivity
-from adacd_hil.scheme.identify import anchor, estimator, missing_torque
+from adacd_hil.scheme.identify import anchor, estimator, fit_check, missing_torque
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.model.regressor import is_positive_definite
 
@@ -44,6 +45,95 @@ _SWEEPS = 200
 """Most sweeps over the parameters that must not be negative; a handful will do unless P ties them together closely."""
 _SETTLED = 1e-9
 """Nm or Nm s/rad that the last sweep may still have moved one of them by."""
+
+
+def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name, of a model with this many parameters and a ring so long.
+
+    theta: model in use; certified: that of the certificate; recovering_cycles: for which nothing is learnt.
+    """
+    numbers = (
+        "promotions", "candidate_cycles", "candidate_square", "frozen_square", "candidate_worst", "ring_used",
+        "ring_next", "since_learnt", "are_lags_held", "recovering_cycles", "is_payload",
+    )  # fmt: skip
+    return {
+        **dict.fromkeys(numbers, ()),
+        **dict.fromkeys(("theta", "certified", "belief", "candidate", "v", "K"), (count,)),
+        **dict.fromkeys(("P", "P_certified", "P_belief", "P_candidate"), (count, count)),
+        "ring_W": (waiting, JOINTS, count),
+        **dict.fromkeys(("ring_tau", "ring_R", "ring_still"), (waiting, JOINTS)),
+    }
+
+
+@compiled
+def begin_fit(k: Any, m: Any, is_payload: bool) -> None:
+    """Begin to learn and use what is believed: the prior, or the certified arm with a payload."""
+    m["is_payload"] = 1.0 if is_payload else 0.0
+    if is_payload:
+        m["belief"][:] = m["certified"]
+        m["P_belief"][:] = m["P_certified"]
+        add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_rest_std"], m["P_belief"])
+    else:
+        begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
+    _use(m)
+    discard(m)
+    m["are_lags_held"] = 0.0
+    m["recovering_cycles"] = 0.0
+
+
+@compiled
+def freeze(k: Any, m: Any) -> None:
+    """Take the belief, as far as it is physically possible, for the model in use."""
+    first_coulomb = int(k["first_coulomb"])
+    keep_non_negative(first_coulomb - JOINTS, first_coulomb + JOINTS, m["belief"], m["P_belief"])
+    _use(m)
+    discard(m)
+
+
+@compiled
+def certify(k: Any, m: Any) -> None:
+    """Take the model in use for the certified one, and begin to refine it."""
+    m["promotions"] = 0.0
+    _certify(m)
+    hold_lags(k, m)
+    restart_candidate(m)
+
+
+@compiled
+def _certify(m: Any) -> None:
+    m["certified"][:] = m["theta"]
+    m["P_certified"][:] = m["P"]
+
+
+@compiled
+def _use(m: Any) -> None:
+    m["theta"][:] = m["belief"]
+    m["P"][:] = m["P_belief"]
+
+
+@compiled
+def pause(m: Any, cycles: float) -> None:
+    """Learn nothing for so many cycles, at least: something touches the arm, or a filter has to settle."""
+    m["recovering_cycles"] = max(m["recovering_cycles"], cycles)
+
+
+@compiled
+def is_free(k: Any, m: Any, is_touched: bool) -> bool:
+    """Count a cycle; tell whether the arm has been left alone for long enough to learn."""
+    if is_touched:
+        pause(m, k["recover_cycles"])
+    elif m["recovering_cycles"] > 0.0:
+        m["recovering_cycles"] -= 1.0
+    return bool(m["recovering_cycles"] == 0.0)
+
+
+@compiled
+def learn_and_use(k: Any, m: Any) -> bool:
+    """Take this sample in as `learn` does, and use what is believed at once; return whether the belief has changed."""
+    has_learnt = learn(k, m)
+    if has_learnt:
+        _use(m)
+    return has_learnt
 
 
 @compiled
@@ -100,8 +190,7 @@ def learn(k: Any, m: Any) -> bool:
                 continue
             missing_torque.add(k, m, place, i)
             epsilon, s = estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
-            m["fit_square"] += epsilon * epsilon / (s - R + R / k["correlated"])
-            m["fit_rows"] += 1.0
+            fit_check.add_residual(m, epsilon * epsilon / (s - R + R / k["correlated"]))
     else:
         m["ring_used"] += 1.0
     m["ring_W"][place] = W
@@ -189,9 +278,7 @@ def test_candidate(k: Any, m: Any) -> bool:
     m["candidate_cycles"] += 1.0
     for c in range(m["W_f"].shape[0]):
         for i in range(m["W_f"].shape[1]):
-            residual = -m["tau_f"][c, i]
-            for j in range(m["candidate"].shape[0]):
-                residual += m["W_f"][c, i, j] * m["candidate"][j]
+            residual = linalg.misfit(m["W_f"][c, i], m["candidate"], m["tau_f"][c, i])
             if c == filter_bank.SLOW and m["still"][c, i] < sensitivity.MOVING:
                 m["candidate_square"] += residual * residual
                 m["frozen_square"] += m["r"][c, i] ** 2
@@ -205,8 +292,7 @@ def test_candidate(k: Any, m: Any) -> bool:
     if is_anchored:
         m["theta"][:] = m["candidate"]
         m["P"][:] = m["P_candidate"]
-        m["certified"][:] = m["theta"]
-        m["P_certified"][:] = m["P"]
+        _certify(m)
         m["promotions"] += 1.0
     restart_candidate(m)
     return bool(is_fit and not is_anchored)

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from adacd_hil import linalg
 from adacd_hil.compiled import Structured, compiled
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect import sensitivity
@@ -121,9 +122,10 @@ def _clear(m: Any) -> None:
 
 
 @compiled
-def begin(k: Any, m: Any) -> None:
-    """Begin a contact, with the samples that were held back."""
+def begin(k: Any, m: Any, least_peak: float) -> None:
+    """Begin a contact, with the samples that were held back. least_peak: what its peak counts as at least."""
     _clear(m)
+    m["contact_peak"] = least_peak
     _follow_peak(m)
     for s in range(int(m["ring_used"])):
         for i in range(m["ring_tau"].shape[1]):
@@ -150,17 +152,13 @@ def _follow_peak(m: Any) -> None:
 @compiled
 def _add(k: Any, m: Any, i: int, w: Vector, tau: float, still: float, weight: float) -> None:
     """Take in one row w (p,) of joint i."""
-    r = -tau
-    for j in range(w.shape[0]):
-        r += w[j] * m["theta"][j]
+    r = linalg.misfit(w, m["theta"], tau)
     m["contact_rr"] += weight * r * r
     m["contact_rows"] += weight
     m["contact_rs"][i] += weight * r * still
     m["contact_ss"][i] += weight * still * still
     for h in range(m["cause_rw"].shape[0]):
-        left = 0.0
-        for j in range(w.shape[0]):
-            left -= w[j] * k["causes"][h, j]
+        left = -linalg.dot(w, k["causes"][h])
         m["cause_rw"][h] += weight * r * left
         m["cause_ww"][h] += weight * left * left
         m["cause_ws"][h, i] += weight * left * still

@@ -18,6 +18,7 @@ The gradient law leaves P as it is. In this implicit form it is stable at any ga
 Shapes: W_f (2, p), theta_hat (p,), P (p, p), epsilon = tau_f - W_f theta_hat (2,) in filtered Nm.
 """
 
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 
@@ -40,14 +41,11 @@ def correct(
     Return epsilon and its variance s, with theta_hat and P as they were.
     """
     count = theta_hat.shape[0]
-    epsilon = tau
+    epsilon = -linalg.misfit(w, theta_hat, tau)
     s = R
     for j in range(count):
-        v[j] = 0.0
-        for k in range(count):
-            v[j] += P[j, k] * w[k]
+        v[j] = linalg.dot(P[j], w)
         s += w[j] * v[j]
-        epsilon -= w[j] * theta_hat[j]
     for j in range(count):
         K[j] = v[j] / s
         theta_hat[j] += K[j] * epsilon

@@ -1,67 +1,129 @@
 """Whether one model explains the whole of a fit: its kept samples, and the beliefs that it passed on the way.
 
-**Samples.** Samples of a fit, kept so that the model it has come to is asked whether it explains each of them.
+A touch that begins or ends while the arm learns changes what the samples say; which column it looks like is not known.
+So a fit counts only if one model explains all of it. With theta_0, P_0 what the fit had come to some time ago, a step,
 
-A touch that came and went while little was known is a small part of a fit, and its model passes a test on new motion:
-what the touch has bent shows elsewhere. But the samples of that time don't agree with the model. So a fit counts only
-if
+    steady       (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' <= STEADY u
+    explained    |tau_f - W_f theta| <= LIMIT_NM + LIMIT_SHARE rms
+    borne out    |W_f (theta_late - theta)| <= LATER_NM + RMS_SHARE rms + LEARNT_SHARE sqrt(u) residual_Nm + sigma
 
-    |tau_f - W_f theta| <= LIMIT_NM + LIMIT_SHARE rms
-
-of every sample and joint, rms: of the residuals of its better half. Not asked of a payload's fit. They are also the
-motion on which other models are compared with the fit's, see `earlier`.
-
-Shapes: p parameters, n joints, s samples of room; samples_W (s, n, p), samples_tau (s, n). When there is no room left
-every second sample goes, and half as many come.
-
-**Later samples.** The model of the samples that came between two beliefs, from the two beliefs alone.
-
-With theta_0, P_0 the earlier and theta, P the later one, what came between them says by itself theta_late:
+for each step, the last two on all samples. theta_late is what came after the step, from the two beliefs alone:
 
     theta_late - theta = P (P_0 - P)^-1 (theta - theta_0),   of covariance P (P_0 - P)^-1 P
 
-(P_0 a little larger than it was, see `REGULAR`.)
+(P_0 a little larger than it was, see `REGULAR`.) u: mean square of the fit's residuals over that of the settings, up to
+the step or after it, the smaller; rms: of the residuals of the better half of its samples. sigma: where gravity acts,
+the standard deviation of that difference, by the beliefs; else 0. A part of the motion of an arm in gravity hardly
+tells gravity from an offset, so later samples may not know the torque of earlier poses: by sigma = 0.03 to 0.05 Nm of a
+level arm, which differed by 0.033 to 0.045 Nm and got no certificate.
 
-Shapes: p parameters, n joints; theta (p,), P (p, p); scratch (p, p); v, later (p,).
+The last sees a weak touch of the beginning, when theta_0 is not known well enough to differ. The last two are not asked
+of a payload's fit.
+
+Shapes: p parameters, n joints, s samples of room, t steps; samples_W (s, n, p), samples_tau (s, n); steps_theta (t, p),
+steps_P (t, p, p), steps_square, steps_rows (t,); factor (p, p), apart, later (p,). When there is no room left every
+second sample goes, and half as many come.
 """
 
 from typing import Any
 
 import numpy as np
 
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.detect.external_torque import LARGEST_UNIT
+from adacd_hil.scheme.model.regressor import A5
+from adacd_hil.settings.configuration import Settings
 
 ROOM = 128
 FIRST_EVERY = 3.0
 """Of the samples that are learnt, every 4 ms: 1.5 s fill the room."""
+STEADY = 400.0
+"""Squared distance over u at which a fit has changed. Fits of 400 untouched arms, wide ones included, came to 0.06 of
+it in the middle and to 0.18 at most. What the model doesn't know is in it too: cross-talk of 2 % comes to 680."""
 LIMIT_NM = 0.045
 LIMIT_SHARE = 9.0
 """Of 400 untouched arms, wide ones included, the worst came to 0.63 of the limit, half of them to 0.16."""
+SMALLEST_SQUARE = 0.015
+"""Least u of a fit that is asked whether it has changed."""
+LATER_NM = 0.02
+"""With the rest of the limit: the same fits came to 0.31 of it in the middle, to 0.94 at most, in MuJoCo to 0.98."""
+RMS_SHARE = 2.0
+"""How many times rms a torque may differ beside that."""
+LEARNT_SHARE = 2.5
+"""How many times the rms of the learnt residuals, of their better part, it may differ beside that."""
+REGULAR = 0.01
+"""Share of P_0 that is added to P_0 - P, so that what no sample has shown since is no difference."""
+NONE = -2
+"""Number of no step."""
+STEP_S = 0.2
+STEPS = 8
+"""The fit's own earlier beliefs: how far apart, and how many."""
+HARD = 2.0
+"""Mean square of the learnt residuals in their hard moments over that of all: much of them is noise of the velocity."""
+SMALLEST_UNIT = 0.1
+"""Least unit of the variances; the rest of it as `sensitivity` has it."""
+
+
+def constants_of(settings: Settings) -> dict[str, Vector]:
+    """Return `step_samples`: learnt samples from one step to the next."""
+    learn_s = settings.bus.period_s * settings.certified.learn_every
+    return {"step_samples": np.array(max(round(STEP_S / learn_s), 1))}
 
 
 def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of what is remembered, by name, of a model with this many parameters."""
+    of_samples = ("samples_kept", "samples_every", "samples_left_out")
     return {
+        **dict.fromkeys(("fit_square", "fit_rows", "fit_samples", "steps_used", *of_samples), ()),
         "samples_W": (ROOM, JOINTS, count),
         "samples_tau": (ROOM, JOINTS),
-        "samples_kept": (),
-        "samples_every": (),
-        "samples_left_out": (),
+        "steps_theta": (STEPS, count),
+        "steps_P": (STEPS, count, count),
+        "steps_square": (STEPS,),
+        "steps_rows": (STEPS,),
+        "factor": (count, count),
+        **dict.fromkeys(("apart", "later"), (count,)),
     }
 
 
 @compiled
 def begin(m: Any) -> None:
     """Begin a fit."""
+    m["steps_used"] = 0.0
+    m["fit_square"] = 0.0
+    m["fit_rows"] = 0.0
+    m["fit_samples"] = 0.0
     m["samples_kept"] = 0.0
     m["samples_every"] = FIRST_EVERY
     m["samples_left_out"] = 0.0
 
 
 @compiled
-def keep(m: Any, W_f: Vector, tau_f: Vector) -> None:
-    """Take in a sample that is learnt. W_f (n, p), tau_f (n,)."""
+def add_residual(m: Any, square: float) -> None:
+    """Take in the residual of a row that is learnt, squared, over its variance."""
+    m["fit_square"] += square
+    m["fit_rows"] += 1.0
+
+
+@compiled
+def follow(k: Any, m: Any, W_f: Vector, tau_f: Vector) -> None:
+    """Take in that the fit has learnt a sample, W_f (n, p), tau_f (n,) of the filter by which it is tested."""
+    _keep_sample(m, W_f, tau_f)
+    m["fit_samples"] += 1.0
+    if m["fit_samples"] % k["step_samples"] != 0.0:
+        return
+    s = int(m["steps_used"]) % m["steps_rows"].shape[0]
+    m["steps_theta"][s] = m["belief"]
+    m["steps_P"][s] = m["P_belief"]
+    m["steps_square"][s] = m["fit_square"]
+    m["steps_rows"][s] = m["fit_rows"]
+    m["steps_used"] += 1.0
+
+
+@compiled
+def _keep_sample(m: Any, W_f: Vector, tau_f: Vector) -> None:
     m["samples_left_out"] += 1.0
     if m["samples_left_out"] < m["samples_every"]:
         return
@@ -76,6 +138,55 @@ def keep(m: Any, W_f: Vector, tau_f: Vector) -> None:
     m["samples_W"][kept] = W_f
     m["samples_tau"][kept] = tau_f
     m["samples_kept"] = kept + 1.0
+
+
+@compiled
+def unit_of(square: float, rows: float) -> float:
+    """Return u of residuals whose squares, over their variances, have this sum, in their hard moments."""
+    return min(max(HARD * square / max(rows, 1.0), SMALLEST_UNIT), LARGEST_UNIT)
+
+
+@compiled
+def late_square(m: Any) -> float:
+    """Return u of the later half of the fit, so that what touched its beginning doesn't count; 1 of a short one."""
+    used = int(m["steps_used"])
+    if used < 2:
+        return 1.0
+    steps = m["steps_rows"].shape[0]
+    s = max(used // 2 - 1, used - steps) % steps
+    return float((m["fit_square"] - m["steps_square"][s]) / max(m["fit_rows"] - m["steps_rows"][s], 1.0))
+
+
+@compiled
+def _better_square(m: Any, s: int) -> float:
+    """Return u of the residuals up to step s, or of those after it, the smaller."""
+    early = m["steps_square"][s] / max(m["steps_rows"][s], 1.0)
+    late = (m["fit_square"] - m["steps_square"][s]) / max(m["fit_rows"] - m["steps_rows"][s], 1.0)
+    return float(min(early, late))
+
+
+@compiled
+def last_step_before_change(k: Any, m: Any) -> int:
+    """Return the number of the last step, from 0, of which the whole fit is no continuation; NONE if it is of all.
+
+    Where only its later samples don't bear it out, that is the last step of all. -1: no step is old enough.
+    """
+    used, oldest = int(m["steps_used"]), max(int(m["steps_used"]) - m["steps_rows"].shape[0], 0)
+    changed = last_step_before_contradiction(k, m)
+    if changed != NONE or m["is_payload"] != 0.0:
+        return changed
+    for number in range(oldest, used):
+        if not later_share(k, m, number % m["steps_rows"].shape[0]) <= 1.0:
+            return used - 1
+    return NONE
+
+
+@compiled
+def last_step_before_contradiction(k: Any, m: Any) -> int:
+    """Return the number of the last step before the fit changed, or a sample stands out; NONE where neither does."""
+    changed = last_unsteady_step(m)
+    first = first_unexplained(m)
+    return changed if changed != NONE or first < 0 else int(first // k["step_samples"]) - 1
 
 
 @compiled
@@ -99,6 +210,46 @@ def limit_Nm(m: Any) -> float:
 
 
 @compiled
+def residual(m: Any, s: int, joint: int) -> float:
+    """Return what the belief leaves of sample s, Nm."""
+    return float(-linalg.misfit(m["samples_W"][s, joint], m["belief"], m["samples_tau"][s, joint]))
+
+
+@compiled
+def last_unsteady_step(m: Any) -> int:
+    """Return the number of the last step, from 0, since which the fit has changed; NONE if it hasn't."""
+    used, steps = int(m["steps_used"]), m["steps_rows"].shape[0]
+    for number in range(used - 1, max(used - steps, 0) - 1, -1):
+        if not changed_share(m, number % steps) <= 1.0:
+            return number
+    return NONE
+
+
+@compiled
+def changed_share(m: Any, s: int) -> float:
+    """Return how much of its limit the distance of step s from the whole fit is."""
+    return float(distance(m, s) / (STEADY * max(_better_square(m, s), SMALLEST_SQUARE)))
+
+
+@compiled
+def later_share(k: Any, m: Any, s: int) -> float:
+    """Return how much of its limit the torque is by which what came after step s differs from the fit."""
+    if not find_later(m, s):
+        return np.inf
+    limit_Nm = LATER_NM + RMS_SHARE * better_rms(m)
+    limit_Nm += LEARNT_SHARE * k["residual_Nm"] * np.sqrt(_better_square(m, s))
+    has_gravity, unit, largest = int(k["base"]) > A5, unit_of(m["fit_square"], m["fit_rows"]), 0.0
+    for sample in range(int(m["samples_kept"])):
+        for i in range(m["samples_tau"].shape[1]):
+            w, allowed_Nm = m["samples_W"][sample, i], limit_Nm
+            torque = abs(linalg.dot(w, m["later"]))
+            if has_gravity and torque > limit_Nm:
+                allowed_Nm += np.sqrt(unit * _later_variance(m, s, w))
+            largest = max(largest, torque / allowed_Nm)
+    return float(largest)
+
+
+@compiled
 def better_rms(m: Any) -> float:
     """Return the root mean square of the residuals, Nm, of the earlier or later half of the samples, the smaller."""
     squares, half = np.zeros(2), int(m["samples_kept"]) // 2
@@ -109,107 +260,43 @@ def better_rms(m: Any) -> float:
 
 
 @compiled
-def largest_torque(m: Any, theta: Vector) -> float:
-    """Return the largest |W_f theta| over the samples and joints, Nm. theta (p,)."""
-    largest = 0.0
-    for s in range(int(m["samples_kept"])):
-        for i in range(m["samples_tau"].shape[1]):
-            torque = 0.0
-            for j in range(theta.shape[0]):
-                torque += m["samples_W"][s, i, j] * theta[j]
-            largest = max(largest, abs(torque))
-    return float(largest)
+def distance(m: Any, s: int) -> float:
+    """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of step s and the fit; inf if there is none.
 
-
-@compiled
-def residual(m: Any, s: int, joint: int) -> float:
-    """Return what the belief leaves of sample s, Nm."""
-    w, r = m["samples_W"][s, joint], m["samples_tau"][s, joint]
-    for j in range(w.shape[0]):
-        r -= w[j] * m["belief"][j]
-    return float(r)
-
-
-REGULAR = 0.01
-"""Share of P_0 that is added to P_0 - P, so that what no sample has shown since is no difference."""
-RMS_SHARE = 2.0
-"""How many times rms a torque may differ beside a bound in Nm."""
-
-
-@compiled
-def distance(m: Any, theta_0: Vector, P_0: Vector, theta: Vector, P: Vector) -> float:
-    """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of two beliefs, the earlier first; inf if there is none.
-
-    By a Cholesky decomposition, in units of the square roots of P_0's diagonal. Leaves its lower half in `scratch`, and
-    in `v` the vector whose square the distance is.
+    In units of the square roots of P_0's diagonal. Leaves the Cholesky factor in `factor`, and in `apart` the vector
+    whose square the distance is.
     """
-    L, x = m["scratch"], m["v"]
+    P_0, P, L, x = m["steps_P"][s], m["P_belief"], m["factor"], m["apart"]
     for j in range(x.shape[0]):
         scale = np.sqrt(P_0[j, j])
-        x[j] = (theta[j] - theta_0[j]) / scale
+        x[j] = (m["belief"][j] - m["steps_theta"][s, j]) / scale
         for n in range(j + 1):
-            V = (1.0 + REGULAR) * P_0[j, n] - P[j, n]
-            V /= scale * np.sqrt(P_0[n, n])
-            for i in range(n):
-                V -= L[j, i] * L[n, i]
-            if n < j:
-                L[j, n] = V / L[n, n]
-            elif V > 0.0:
-                L[j, j] = np.sqrt(V)
-            else:
-                return np.inf
-        for n in range(j):
-            x[j] -= L[j, n] * x[n]
-        x[j] /= L[j, j]
+            L[j, n] = ((1.0 + REGULAR) * P_0[j, n] - P[j, n]) / (scale * np.sqrt(P_0[n, n]))
+    if not linalg.factor(L, 0.0):
+        return np.inf
+    linalg.solve_lower(L, x)
     return float(np.sum(x * x))
 
 
 @compiled
-def find_later(m: Any, theta_0: Vector, P_0: Vector, theta: Vector, P: Vector) -> bool:
-    """Fill `later` (p,): the model of what came between two beliefs less the second; False if there is none."""
-    if not distance(m, theta_0, P_0, theta, P) < np.inf:
+def find_later(m: Any, s: int) -> bool:
+    """Fill `later` (p,): the model of what came after step s less that of the fit; False if there is none."""
+    if not distance(m, s) < np.inf:
         return False
-    L, x, later = m["scratch"], m["v"], m["later"]
-    for j in range(x.shape[0] - 1, -1, -1):
-        for n in range(j + 1, x.shape[0]):
-            x[j] -= L[n, j] * x[n]
-        x[j] /= L[j, j]
+    x, P_0 = m["apart"], m["steps_P"][s]
+    linalg.solve_upper(m["factor"], x)
     for j in range(x.shape[0]):
-        later[j] = 0.0
-        for n in range(x.shape[0]):
-            later[j] += P[j, n] * x[n] / np.sqrt(P_0[n, n])
+        x[j] /= np.sqrt(P_0[j, j])
+    for j in range(x.shape[0]):
+        m["later"][j] = linalg.dot(m["P_belief"][j], x)
     return True
 
 
 @compiled
-def later_share(m: Any, P_0: Vector, P: Vector, limit_Nm: float, unit: float) -> float:
-    """Return the largest |W_f later| of the samples over limit_Nm, beyond which its standard deviation is allowed, too.
-
-    After `find_later` of the same beliefs. unit: of their variances.
-    """
-    largest = 0.0
-    for s in range(int(m["samples_kept"])):
-        for i in range(m["samples_tau"].shape[1]):
-            w, torque, allowed_Nm = m["samples_W"][s, i], 0.0, limit_Nm
-            for j in range(w.shape[0]):
-                torque += w[j] * m["later"][j]
-            if abs(torque) > limit_Nm:
-                allowed_Nm += np.sqrt(unit * _later_variance(m, w, P_0, P))
-            largest = max(largest, abs(torque) / allowed_Nm)
-    return float(largest)
-
-
-@compiled
-def _later_variance(m: Any, w: Vector, P_0: Vector, P: Vector) -> float:
-    """Return w P (P_0 - P)^-1 P w', with what `distance` has left in `scratch`."""
-    L, x, variance = m["scratch"], m["v"], 0.0
-    for j in range(w.shape[0]):
-        x[j] = 0.0
-        for n in range(w.shape[0]):
-            x[j] += P[j, n] * w[n]
-        x[j] /= np.sqrt(P_0[j, j])
-        for n in range(j):
-            x[j] -= L[j, n] * x[n]
-        x[j] /= L[j, j]
-        variance += x[j] * x[j]
-    return float(variance)
+def _later_variance(m: Any, s: int, w: Vector) -> float:
+    """Return w P (P_0 - P)^-1 P w', with what `distance` has left in `factor`."""
+    x = m["apart"]
+    for j in range(x.shape[0]):
+        x[j] = linalg.dot(m["P_belief"][j], w) / np.sqrt(m["steps_P"][s, j, j])
+    linalg.solve_lower(m["factor"], x)
+    return float(np.sum(x * x))

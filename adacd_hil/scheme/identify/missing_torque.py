@@ -29,10 +29,11 @@ from typing import Any
 
 import numpy as np
 
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.model import filter_bank
-from adacd_hil.scheme.model.regressor import PLACE_TERMS, fill_position
+from adacd_hil.scheme.model.regressor import PLACE_TERMS
 from adacd_hil.settings.configuration import Settings
 
 EXPECTED_NM = 0.06
@@ -64,7 +65,7 @@ def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
     full = count + JOINTS * PLACE_TERMS
     columns = (JOINTS, PLACE_TERMS)
     return {
-        "X": columns, "X_old": columns, "X_f": columns, "X_learnt": columns, "ring_X": (waiting, *columns),
+        "X_old": columns, "X_f": columns, "X_learnt": columns, "ring_X": (waiting, *columns),
         "evidence_L": (JOINTS, full, full), "evidence_M": (full, full),
         "evidence_b": (full,), "evidence_basic": (full,), "evidence_full": (full,), "evidence_row": (full,),
         "evidence_scale": (full,),
@@ -76,15 +77,27 @@ def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
 
 
 @compiled
-def follow(m: Any, q: Vector, rates: Vector, smoothing: float, is_seen: bool) -> None:
-    """Take the columns (n, PLACE_TERMS) over one period to what is learnt from; after a gap the filter resumes.
+def forget(m: Any) -> None:
+    """Forget the columns that were filtered."""
+    m["X_f"][:] = 0.0
+    m["X_learnt"][:] = 0.0
+
+
+@compiled
+def rest(m: Any) -> None:
+    """Begin with a filter that has seen this pose for ever."""
+    m["X_f"][:] = m["X"]
+
+
+@compiled
+def follow(m: Any, rates: Vector, smoothing: float, is_seen: bool) -> None:
+    """Take the columns X (n, PLACE_TERMS) over one period to what is learnt from; after a gap the filter resumes.
 
     rates (3,): what one period does to the filter, see `filter_bank.FirstOrderHold`; smoothing: to the pole behind it.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
     X, X_old, X_f, X_learnt = m["X"], m["X_old"], m["X_f"], m["X_learnt"]
-    fill_position(q, X)
-    for i in range(q.shape[0]):
+    for i in range(X.shape[0]):
         for term in range(PLACE_TERMS):
             if is_seen:
                 X_f[i, term] = decay * X_f[i, term] + (weight_old * X_old[i, term] + weight_new * X[i, term])
@@ -127,9 +140,7 @@ def add(k: Any, m: Any, slot: int, joint: int) -> None:
     v[:] = 0.0
     v[:count] = m["ring_W"][slot, joint]
     v[count + PLACE_TERMS * joint : count + PLACE_TERMS * (joint + 1)] = m["ring_X"][slot, joint]
-    r = m["ring_tau"][slot, joint]
-    for j in range(count):
-        r -= v[j] * k["prior"][j]
+    r = -linalg.misfit(v, k["prior"], m["ring_tau"][slot, joint])
     L, b = m["evidence_L"][joint], m["evidence_b"]
     for j in range(v.shape[0]):
         if v[j] != 0.0:
@@ -235,63 +246,38 @@ def _rms_Nm(m: Any, joint: int) -> float:
     apart = m["evidence_row"]
     for j in range(apart.shape[0]):
         apart[j] = m["evidence_full"][j] - m["evidence_basic"][j]
-    square = _quadratic(m["evidence_L"][joint], apart)
+    square = linalg.quadratic(m["evidence_L"][joint], apart)
     return float(np.sqrt(square / max(m["evidence_weight"][joint], 1e-12)))
 
 
 @compiled
 def _log_evidence(m: Any, b: Vector, s: Vector, x: Vector) -> float:
     """Return the log evidence of the columns with a deviation s (f,) above 0, up to what all have; fill x (f,)."""
-    M, joints, count = m["evidence_M"], m["evidence_L"].shape[0], s.shape[0]
-    log_det, square = 0.0, 0.0
+    M, count, log_det = m["evidence_M"], s.shape[0], 0.0
     for j in range(count):
         x[j] = s[j] * b[j]
-        if s[j] == 0.0:
-            M[j, :j] = 0.0
-            M[j, j] = 1.0
-            continue
         for n in range(j + 1):
             total = 0.0
-            for i in range(joints):
+            for i in range(m["evidence_L"].shape[0]):
                 total += m["evidence_L"][i, j, n]
-            total = s[j] * total * s[n] + (1.0 if n == j else 0.0)
-            for i in range(n):
-                total -= M[j, i] * M[n, i]
-            M[j, n] = total / M[n, n] if n < j else np.sqrt(max(total, 1e-12))
+            M[j, n] = s[j] * total * s[n] + (1.0 if n == j else 0.0)
+    linalg.factor(M, 1e-12)
+    for j in range(count):
         log_det += 2.0 * math.log(M[j, j])
-        for n in range(j):
-            x[j] -= M[j, n] * x[n]
-        x[j] /= M[j, j]
-        square += x[j] * x[j]
-    for j in range(count - 1, -1, -1):
-        for n in range(j + 1, count):
-            x[j] -= M[n, j] * x[n]
-        x[j] /= M[j, j]
+    linalg.solve_lower(M, x)
+    square = linalg.dot(x, x)
+    linalg.solve_upper(M, x)
     for j in range(count):
         x[j] *= s[j]
-    return 0.5 * (square - log_det)
+    return float(0.5 * (square - log_det))
 
 
 @compiled
 def _squares_left(m: Any, x: Vector) -> float:
     """Return Σ (r - v x)² / R."""
-    total = m["evidence_yy"]
-    for j in range(x.shape[0]):
-        total -= 2.0 * x[j] * m["evidence_b"][j]
+    total = m["evidence_yy"] - 2.0 * linalg.dot(x, m["evidence_b"])
     for i in range(m["evidence_L"].shape[0]):
-        total += _quadratic(m["evidence_L"][i], x)
-    return float(max(total, 0.0))
-
-
-@compiled
-def _quadratic(L: Vector, x: Vector) -> float:
-    """Return x' L x of which L (f, f) holds the lower half."""
-    total = 0.0
-    for j in range(x.shape[0]):
-        if x[j] != 0.0:
-            total += L[j, j] * x[j] * x[j]
-            for n in range(j):
-                total += 2.0 * L[j, n] * x[j] * x[n]
+        total += linalg.quadratic(m["evidence_L"][i], x)
     return float(max(total, 0.0))
 
 

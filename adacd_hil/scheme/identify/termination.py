@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
 
 EXCITATION_EVERY = 64
 """Samples between two looks at the smallest eigenvalue: it takes 4 µs, the rest of a step less than 1 µs."""
@@ -43,9 +43,19 @@ _SWEEPS = 12
 """Most sweeps of Jacobi's method. Convergence is quadratic; 6 sweeps reach rounding for 9 x 9."""
 
 
+def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name, of the certified scheme with this many parameters."""
+    return {
+        **dict.fromkeys(("samples", "tested", "test_limit_Nm", "excitation", "condition"), ()),
+        **dict.fromkeys(("q_low", "q_high", "dq_low", "dq_high"), (JOINTS,)),
+        **dict.fromkeys(("information", "scratch"), (count, count)),
+    }
+
+
 @compiled
 def begin(m: Any) -> None:
     """Forget the evidence: where and how fast the joints have been, and what motion has shown."""
+    m["samples"] = 0.0
     m["q_low"][:] = np.inf
     m["q_high"][:] = -np.inf
     m["dq_low"][:] = np.inf
@@ -93,9 +103,13 @@ def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
 
 
 @compiled
-def smallest_eigenvalue(information: Vector, scale: Vector, scratch: Vector) -> float:
-    """Return the smallest eigenvalue of D I D, D = diag(scale), from the lower triangle of I (p, p)."""
-    return eigenvalue_range(information, scale, scratch)[0]
+def gather(m: Any, q: Vector, dq: Vector, W_f: Vector, period_s: float) -> bool:
+    """Take a sample into the ranges of motion and the information; tell whether a look at its eigenvalues is due."""
+    widen(q, m["q_low"], m["q_high"])
+    widen(dq, m["dq_low"], m["dq_high"])
+    add_information(W_f, period_s, m["information"])
+    m["samples"] += 1.0
+    return bool(m["samples"] % EXCITATION_EVERY == 0.0)
 
 
 @compiled
@@ -149,6 +163,51 @@ def _rotate(matrix: Vector, j: int, k: int) -> None:
         at_j, at_k = matrix[j, i], matrix[k, i]
         matrix[j, i] = cosine * at_j - sine * at_k
         matrix[k, i] = sine * at_j + cosine * at_k
+
+
+@compiled
+def begin_fit(m: Any) -> None:
+    """Begin a fit of the certified scheme."""
+    begin(m)
+    m["excitation"] = 0.0
+    m["condition"] = np.inf
+
+
+@compiled
+def follow(k: Any, m: Any, q: Vector, dq: Vector, W_f: Vector) -> bool:
+    """Take a sample, W_f (n, p), into the evidence of a fit; tell whether that is complete."""
+    if gather(m, q, dq, W_f, k["period_s"]):
+        smallest, largest = eigenvalue_range(m["information"], k["scale"], m["scratch"])
+        m["excitation"] = smallest
+        m["condition"] = largest / smallest if smallest > 0.0 else np.inf
+    return is_complete(k, m)
+
+
+@compiled
+def begin_test(k: Any, m: Any, square: float) -> None:
+    """Begin the test of a frozen model. square: mean square of the fit's residuals over that of the settings."""
+    m["tested"] = 0.0
+    m["test_limit_Nm"] = test_limit_Nm(k, square)
+    m["dq_low"][:] = np.inf
+    m["dq_high"][:] = -np.inf
+
+
+@compiled
+def test(k: Any, m: Any, dq: Vector, tau_ext_hat: Vector) -> int:
+    """Take a sample into the test; return whether it is refuted, -1, passed, 1, or goes on, 0.
+
+    Where a joint rests nothing is proven.
+    """
+    m["tested"] += 1.0
+    widen(dq, m["dq_low"], m["dq_high"])
+    has_moved = True
+    for i in range(dq.shape[0]):
+        if not (abs(tau_ext_hat[i]) <= m["test_limit_Nm"]):
+            return -1
+        fastest = max(m["dq_high"][i], -m["dq_low"][i])
+        has_moved = has_moved and fastest >= k["velocity_rad_s"]
+    is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
+    return 1 if is_long and has_moved else 0
 
 
 TEST_NM = 0.03

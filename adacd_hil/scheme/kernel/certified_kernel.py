@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import Structured, compiled, released
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import Vector
 from adacd_hil.scheme.contact import contact_report
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import (
@@ -29,6 +29,7 @@ from adacd_hil.scheme.identify import (
     certificate,
     doubt,
     earlier,
+    evidence,
     fit_check,
     missing_torque,
     termination,
@@ -85,80 +86,35 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     if is_first:
         missing_torque.clear(k, m)
     m["has_gap"] = 1.0
-    m["W_f"][:] = 0.0
-    m["tau_f"][:] = 0.0
-    m["X_f"][:] = 0.0
-    m["W_learnt"][:] = 0.0
-    m["X_learnt"][:] = 0.0
-    m["tau_learnt"][:] = 0.0
-    m["history"][:] = 0.0
-    m["is_payload"] = 1.0 if is_payload else 0.0
-    if is_payload:
-        m["belief"][:] = m["certified"]
-        m["P_belief"][:] = m["P_certified"]
-        belief.add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_rest_std"], m["P_belief"])
-        if int(k["base"]) > regressor.A5:
-            _begin_at_rest(m)
-    else:
-        belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
-    _use_belief(m)
-    belief.discard(m)
-    m["are_lags_held"] = 0.0
-    earlier.begin(m)
+    filter_bank.forget(m)
+    missing_torque.forget(m)
+    external_torque.forget(m)
+    belief.begin_fit(k, m, is_payload)
+    if is_payload and int(k["base"]) > regressor.A5:
+        filter_bank.rest(m)
+        missing_torque.rest(m)
     fit_check.begin(m)
     margin.begin_tail(m)
-    m["unit"][:] = 1.0
-    m["samples"] = 0.0
-    m["recovering_cycles"] = 0.0
-    termination.begin(m)
-    m["excitation"] = 0.0
-    m["condition"] = np.inf
-
-
-@compiled
-def _begin_at_rest(m: Any) -> None:
-    """Begin with filters that have seen this pose, and the torque that gravity makes there, for ever.
-
-    From 0, that torque would be a step: the columns of the lag would have its derivative.
-    """
-    m["X_f"][:] = m["X"]
-    for c in range(m["tau_f"].shape[0]):
-        m["W_f"][c] = m["Y_h"]
-        m["tau_f"][c] = m["tau_old"][c]
+    sensitivity.begin_fit(m)
+    termination.begin_fit(m)
 
 
 @compiled
 def begin_test(constants: Structured, memory: Structured) -> None:
     """Freeze the belief, as far as it is physically possible, as the model in use, and begin its test."""
     k, m = constants[0], memory[0]
-    first_viscous, last_coulomb = int(k["first_coulomb"]) - JOINTS, int(k["first_coulomb"]) + JOINTS
-    belief.keep_non_negative(first_viscous, last_coulomb, m["belief"], m["P_belief"])
-    _use_belief(m)
-    belief.discard(m)
-    m["tested"] = 0.0
+    belief.freeze(k, m)
     margin.begin_sight(m)
-    m["test_limit_Nm"] = termination.test_limit_Nm(k, earlier.late_square(m))
-    m["dq_low"][:] = np.inf
-    m["dq_high"][:] = -np.inf
+    termination.begin_test(k, m, fit_check.late_square(m))
 
 
 @compiled
 def begin_refinement(constants: Structured, memory: Structured) -> None:
     """Begin to refine the model that has just been certified."""
     k, m = constants[0], memory[0]
-    m["promotions"] = 0.0
-    m["certified"][:] = m["theta"]
-    m["P_certified"][:] = m["P"]
-    belief.hold_lags(k, m)
+    belief.certify(k, m)
     earlier.forget(m)
     missing_torque.clear(k, m)
-    belief.restart_candidate(m)
-
-
-@compiled
-def _use_belief(m: Any) -> None:
-    m["theta"][:] = m["belief"]
-    m["P"][:] = m["P_belief"]
 
 
 @compiled
@@ -171,8 +127,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     observation = observe(k, out, steps, OVER_SPEED)
     is_fresh = is_complete != 0 and observation & NOT_A_NUMBER == 0
     if is_fresh:
-        m["anchor_age_s"] += out["period_s"][0]
-        m["kept_age_s"][:] += out["period_s"][0]
+        evidence.follow(m, out["period_s"][0])
         if mode & MEASURE:
             sensitivity.measure_noise(k, m, out["tau_J"])
             anchor.measure(k, m, out["tau_J"], observation & AT_REST != 0)
@@ -183,14 +138,14 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     elif is_complete != 0:
         m["has_gap"] = 1.0
     if mode & MEASURE and anchor.is_rest_refused(k, m):
-        m["withheld_by"] = certificate.ANCHOR
+        certificate.withhold(m, certificate.ANCHOR)
         observation |= WITHHELD
     if mode & WATCH:
         observation |= _watch(k, m, out, is_fresh)
     else:
         out["threshold"][:] = np.inf
         out["threshold_bank"][:] = np.inf
-        m["wide_threshold"][:] = np.inf
+        sensitivity.lift(m)
     if mode & WEIGH and not observation & UNSEEN:
         doubt.weigh(k, m)
     if is_fresh and mode & (LEARN | TEST | REFINE):
@@ -210,7 +165,7 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
     is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
     each_s = period_s / steps if is_seen else period_s
     if is_seen:
-        _choose_rates(k, m, each_s)
+        filter_bank.choose_rates(k, m, each_s)
         for between in range(1, steps):
             put_between(m["last"], out["q"], out["dq"], out["tau_J"], between / steps, m["between"])
             m["is_steady"] = 0.0
@@ -219,7 +174,7 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
     sensitivity.follow_lost(k, m, out["dq"], max(steps, 1), period_s, is_seen)
     sensitivity.follow_torque_step(k, m, out["tau_J"])
     if not is_seen and np.max(np.abs(out["dq"])) > regressor.SLOW_RAD_S:
-        m["recovering_cycles"] = max(m["recovering_cycles"], k["settle_cycles"])
+        belief.pause(m, k["settle_cycles"])
     m["is_steady"] = 1.0 if is_seen and steps == 1 else 0.0
     q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays as those above: it is compiled once
     _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
@@ -235,18 +190,6 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
 
 
 @compiled
-def _choose_rates(k: Any, m: Any, period_s: float) -> None:
-    """Fill what one period does to each filter."""
-    decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
-    if period_s == k["period_s"]:
-        decay[:] = k["decay"]
-        old[:] = k["weight_old"]
-        new[:] = k["weight_new"]
-    else:
-        filter_bank.discretise(k["cutoff"], period_s, decay, old, new)
-
-
-@compiled
 def _take_sample(
     k: Any,
     m: Any,
@@ -259,10 +202,9 @@ def _take_sample(
 ) -> None:
     """Take the bank over one period to a sample, or let it resume from there, and compare with the model in use."""
     cutoff = k["cutoff"]
-    regressor.bend_bristles(dq, period_s, k["still_rad_s"], k["dahl_rad"], m["bent"])
-    _fill_regressor(k, m, q, dq, tau_J)
+    regressor.fill(k, m, q, dq, tau_J, period_s)
     filter_bank.take_sample(k, m, tau_J, is_seen)
-    missing_torque.follow(m, q, m["rates"][:, filter_bank.LEARNT], k["smoothing"], is_seen)
+    missing_torque.follow(m, m["rates"][:, filter_bank.LEARNT], k["smoothing"], is_seen)
     filter_bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
     if k["has_cross_talk"] != 0.0:
         filter_bank.fill_cross_talk(m["tau_f"], int(k["first_cross_talk"]), m["W_f"])
@@ -276,23 +218,6 @@ def _take_sample(
     sensitivity.follow_velocity_noise(k, m, dq, m["is_steady"] != 0.0)
     sensitivity.follow_friction(k, m, tau_J)
     external_torque.undo_filter(m["r"][filter_bank.WIDE], k["decay"][filter_bank.WIDE], m["history"], tau_ext_wide_hat)
-
-
-@compiled
-def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> None:
-    """Fill Y_p, Y_h (2, p) and M (2, 2) of the 2R arm, offsets and further friction included."""
-    base, first_coulomb, count = int(k["base"]), int(k["first_coulomb"]), q.shape[0]
-    regressor.fill_momentum(q, dq, m["Y_p"][:, :base])
-    regressor.fill_remainder(q, dq, k["level_rad"], m["Y_h"][:, :base])
-    for i in range(count):
-        m["Y_h"][i, first_coulomb + i] = regressor.smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
-        m["Y_h"][i, base + i] = 1.0
-    speeds = k["still_rad_s"], k["width_rad_s"], k["stribeck_rad_s"]
-    regressor.fill_terms(dq, tau_J, k["terms"], speeds, m["bent"], base + 2 * count, m["Y_h"])
-    if k["position_torque_Nm"] != 0.0:
-        regressor.fill_position(q, m["X"])
-        regressor.put_position_columns(m["X"], int(k["first_position"]), m["Y_h"])
-    regressor.fill_mass_matrix(q, m["theta"], m["M"])
 
 
 @compiled
@@ -316,29 +241,25 @@ def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
 @compiled
 def improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     """Learn, test or refine by this sample; return what that has come to."""
-    is_free_before = m["recovering_cycles"] == 0.0
-    if is_touched:
-        m["recovering_cycles"] = k["recover_cycles"]
-    elif m["recovering_cycles"] > 0.0:
-        m["recovering_cycles"] -= 1.0
-    is_free = m["recovering_cycles"] == 0.0
-    if is_touched and is_free_before and mode & (LEARN | TEST):
+    was_free = m["recovering_cycles"] == 0.0
+    is_free = belief.is_free(k, m, is_touched)
+    if is_touched and was_free and mode & (LEARN | TEST):
         sensitivity.strain(m, sensitivity.LARGEST_STRAIN)
         earlier.keep(k, m)
     if is_touched and mode & REFINE:
-        doubt.begin(k, m)
+        doubt.begin(k, m, 0.0)
     _follow_noise(k, m, is_free, mode)
     if mode & TEST:
         return _test(k, m, out["dq"])
     if mode & REFINE:
         return _refine(k, m) if is_free else 0
-    if is_free and belief.learn(k, m):
-        _use_belief(m)
-        earlier.follow(k, m)
-        fit_check.keep(m, m["W_f"][filter_bank.SLOW], m["tau_f"][filter_bank.SLOW])
-    if not (is_free and _gather_evidence(k, m, out)):
+    W_f, tau_f = m["W_f"][filter_bank.SLOW], m["tau_f"][filter_bank.SLOW]
+    if is_free and belief.learn_and_use(k, m):
+        fit_check.follow(k, m, W_f, tau_f)
+    is_complete = is_free and termination.follow(k, m, out["q"], out["dq"], W_f)
+    if not (is_complete and regressor.is_positive_definite(m["belief"])):
         return 0
-    m["withheld_by"] = certificate.contradicted_by(k, m)
+    certificate.withhold(m, certificate.contradicted_by(k, m))
     return FITTED if m["withheld_by"] == certificate.NOTHING else WITHHELD
 
 
@@ -356,26 +277,17 @@ def _follow_noise(k: Any, m: Any, is_free: bool, mode: int) -> None:
 
 @compiled
 def _test(k: Any, m: Any, dq: Vector) -> int:
-    """Take this sample into the test of the frozen model; return what that has come to.
-
-    Where a joint rests nothing is proven.
-    """
-    m["tested"] += 1.0
-    termination.widen(dq, m["dq_low"], m["dq_high"])
+    """Take this sample into the test of the frozen model; return what that has come to."""
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_test_share"], False)
     margin.follow_test(k, m)
-    has_moved = True
-    for i in range(dq.shape[0]):
-        if not (abs(m["r"][filter_bank.SLOW, i]) <= m["test_limit_Nm"]):
-            if m["is_payload"] == 0.0:  # of a new one hands have been on the arm, and friction may depend on it
-                earlier.keep(k, m)
-            is_by_place = missing_torque.is_found(k, m)
-            m["withheld_by"] = certificate.BY_PLACE if is_by_place else certificate.NOTHING
-            return REFUTED | WITHHELD if is_by_place else REFUTED
-        fastest = max(m["dq_high"][i], -m["dq_low"][i])
-        has_moved = has_moved and fastest >= k["velocity_rad_s"]
-    is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
-    return CERTIFIED if is_long and has_moved else 0
+    result = termination.test(k, m, dq, m["r"][filter_bank.SLOW])
+    if result >= 0:
+        return CERTIFIED if result > 0 else 0
+    if m["is_payload"] == 0.0:  # of a new one hands have been on the arm, and friction may depend on it
+        earlier.keep(k, m)
+    is_by_place = missing_torque.is_found(k, m)
+    certificate.withhold(m, certificate.BY_PLACE if is_by_place else certificate.NOTHING)
+    return REFUTED | WITHHELD if is_by_place else REFUTED
 
 
 @compiled
@@ -383,28 +295,15 @@ def _refine(k: Any, m: Any) -> int:
     """Learn on beside the model in use, and let what was learnt take over after its test; return what is against it."""
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_share"], True)
     sensitivity.relax(k, m)
-    m["withheld_by"] = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
+    cause = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
     if belief.learn(k, m):
         belief.wander(k["drift_std"], m["W_learnt"], k["period_s"] * k["learn_every"], m["P_belief"])
         if missing_torque.is_found_in_time(k, m):
-            m["withheld_by"] = certificate.BY_PLACE
+            cause = certificate.BY_PLACE
     if belief.test_candidate(k, m):
-        m["withheld_by"] = certificate.ANCHOR
-    return 0 if m["withheld_by"] == certificate.NOTHING else WITHHELD
-
-
-@compiled
-def _gather_evidence(k: Any, m: Any, out: Any) -> bool:
-    """Take this sample into the evidence and tell whether it is complete and the model can be an arm's."""
-    termination.widen(out["q"], m["q_low"], m["q_high"])
-    termination.widen(out["dq"], m["dq_low"], m["dq_high"])
-    termination.add_information(m["W_f"][filter_bank.SLOW], k["period_s"], m["information"])
-    if m["samples"] % termination.EXCITATION_EVERY == termination.EXCITATION_EVERY - 1:
-        smallest, largest = termination.eigenvalue_range(m["information"], k["scale"], m["scratch"])
-        m["excitation"] = smallest
-        m["condition"] = largest / smallest if smallest > 0.0 else np.inf
-    m["samples"] += 1.0
-    return bool(termination.is_complete(k, m) and regressor.is_positive_definite(m["belief"]))
+        cause = certificate.ANCHOR
+    certificate.withhold(m, cause)
+    return 0 if cause == certificate.NOTHING else WITHHELD
 
 
 @compiled

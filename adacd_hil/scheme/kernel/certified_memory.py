@@ -12,7 +12,17 @@ import numpy as np
 from adacd_hil.compiled import Structured, packed, zeroed
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector, certified_layout
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
-from adacd_hil.scheme.identify import anchor, belief, certificate, doubt, earlier, fit_check, missing_torque
+from adacd_hil.scheme.identify import (
+    anchor,
+    belief,
+    certificate,
+    doubt,
+    earlier,
+    evidence,
+    fit_check,
+    missing_torque,
+    termination,
+)
 from adacd_hil.scheme.kernel.kernel_samples import Numbers, block_dtype, limits_of
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.configuration import Settings
@@ -101,7 +111,6 @@ def constants_of(settings: Settings) -> Structured:
     inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
     correlated = 2.0 / (cutoff[filter_bank.LEARNT] * period_s * certified.learn_every)
     prior_std = prior_std_of(settings)
-    kept = earlier.constants_of(settings, prior_std)
     values: dict[str, Any] = {
         "period_s": period_s,
         "level_rad": settings.level_rad,
@@ -147,8 +156,10 @@ def constants_of(settings: Settings) -> Structured:
         **sensitivity.noise_constants(certified, period_s),
         **anchor.constants_of(settings),
         **doubt.constants_of(settings, len(names)),
-        **kept,
-        **certificate.constants_of(settings, kept["compared"], prior_std),
+        **evidence.constants_of(settings, prior_std),
+        **fit_check.constants_of(settings),
+        **earlier.constants_of(),
+        **certificate.constants_of(settings),
         **margin.constants_of(settings),
         **missing_torque.constants_of(settings, prior_std),
         "model_sigmas": certified.model_sigmas,
@@ -169,62 +180,35 @@ def new_memory(settings: Settings) -> Structured:
     count = len(parameter_names(settings))
     learn_s = settings.bus.period_s * certified.learn_every
     waiting = max(round(certified.hold_back_s / learn_s), 1)
-    joint, parameter = (JOINTS,), (count,)
-    columns, square = (JOINTS, count), (count, count)
-    each_filter, each_channel = (filter_count, JOINTS), (channel_count, JOINTS)
-    ones = ("roughness", "roughness_now", "roughness_kept", "velocity_roughness", "unit", "strain")
     shapes: dict[str, tuple[int, ...]] = {
+        # of the kernel
         **dict.fromkeys(("has_gap", "is_steady"), ()),
-        # bank
-        **dict.fromkeys(("Y_p", "Y_h", "W_learnt"), columns),
-        **dict.fromkeys(("input_old", "S", "W_f"), (filter_count, *columns)),
-        **dict.fromkeys(("tau_f", "tau_old"), each_filter),
         **dict.fromkeys(("last", "between"), (3, JOINTS)),
-        "rates": (3, filter_count),
-        "tau_learnt": joint,
-        # model in use, the certified one, belief, candidate
-        **dict.fromkeys(("theta", "certified", "belief", "candidate", "v", "K"), parameter),
-        **dict.fromkeys(("P", "P_certified", "P_belief", "P_candidate"), square),
-        **dict.fromkeys(("promotions", "candidate_cycles", "candidate_square", "frozen_square", "candidate_worst"), ()),
-        "M": (JOINTS, JOINTS),
-        # samples that wait
-        "ring_W": (waiting, *columns),
-        **dict.fromkeys(("ring_tau", "ring_R", "ring_still"), (waiting, JOINTS)),
-        **dict.fromkeys(("ring_used", "ring_next", "since_learnt", "are_lags_held", "recovering_cycles"), ()),
-        # evidence
-        **dict.fromkeys(("is_payload", "samples", "tested", "test_limit_Nm", "excitation", "condition"), ()),
-        **dict.fromkeys(("q_low", "q_high", "dq_low", "dq_high"), joint),
-        **dict.fromkeys(("information", "scratch"), square),
-        "withheld_by": (),
-        # detection
-        **dict.fromkeys(("r", "still", "still_smooth", "doubt", "held"), each_filter),
-        **dict.fromkeys(("y", "h", "h_model"), each_channel),
-        **dict.fromkeys((*ones, "used", "peak_share", "hold", "dq_old", "ddq_old"), joint),
-        **dict.fromkeys(("torque_changes", "torque_change_Nm", "torque_step_Nm", "torque_pull_Nm"), joint),
-        **dict.fromkeys(("rest_tau", "rest_square", "wide_sigma", "wide_threshold"), joint),
-        **dict.fromkeys(("rest_samples", "rest_count", "anchor_age_s"), ()),
-        "bent": (2, JOINTS),
-        "history": (external_torque.WIDE_SAMPLES + 1, JOINTS),
-        # of the modules that judge
+        # each the module's own
+        **regressor.shapes_of(count),
+        **filter_bank.shapes_of(filter_count, channel_count, count),
+        **external_torque.shapes_of(),
+        **sensitivity.shapes_of(filter_count, channel_count),
+        **margin.shapes_of(channel_count),
+        **belief.shapes_of(count, waiting),
+        **termination.shapes_of(count),
+        **evidence.shapes_of(),
         **anchor.shapes_of(),
-        **earlier.shapes_of(count),
         **fit_check.shapes_of(count),
+        **earlier.shapes_of(),
         **certificate.shapes_of(),
         **doubt.shapes_of(),
-        **margin.shapes_of(channel_count),
         **missing_torque.shapes_of(count, waiting),
-        **sensitivity.shapes_of(filter_count),
     }
     memory = zeroed(shapes)
     memory["has_gap"] = 1.0
     memory["last"] = np.nan
-    for name in ones:
-        memory[name] = 1.0
-    state = memory[0]
+    state, constants = memory[0], constants_of(settings)[0]
     prior, prior_std = prior_of(settings), prior_std_of(settings)
     belief.begin(prior, prior_std, state["belief"], state["P_belief"])
     belief.begin(prior, prior_std, state["theta"], state["P"])
-    constants = constants_of(settings)[0]
+    sensitivity.begin(state)
+    evidence.begin(state)
     anchor.begin(constants, state)
     missing_torque.clear(constants, state)
     certificate.begin(constants, state)

@@ -113,7 +113,7 @@ def new_memory(parameter_count: int) -> Structured:
         **dict.fromkeys(("samples", "quiet_cycles"), ()),
         # contact
         **dict.fromkeys(("standstill", "integral", "peak"), joint),
-        "history": (external_torque.WIDE_SAMPLES + 1, JOINTS),
+        **external_torque.shapes_of(),
     }
     memory = zeroed(shapes)
     memory["has_gap"] = 1.0
@@ -144,10 +144,9 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     m["has_gap"] = 1.0
     m["W_f"][:] = 0.0
     out["tau_f"][:] = 0.0
-    m["history"][:] = 0.0
+    external_torque.forget(m)
     estimator.reset_gain(c["P0"], m["P"])
     termination.begin(m)
-    m["samples"] = 0.0
     m["quiet_cycles"] = 0.0
     out["quiet_s"][0] = 0.0
     out["excitation"][0] = 0.0
@@ -241,12 +240,8 @@ def _compare(c: Any, m: Any, dq: Vector, decay: float, out: Any) -> None:
 @compiled
 def _learn(c: Any, m: Any, out: Any, period_s: float) -> int:
     """Judge the estimate of this sample by eq. (15), then correct it; return ADAPTED if the adaptation is over."""
-    termination.widen(out["q"], m["q_low"], m["q_high"])
-    termination.widen(out["dq"], m["dq_low"], m["dq_high"])
-    termination.add_information(m["W_f"], period_s, m["information"])
-    if m["samples"] % termination.EXCITATION_EVERY == termination.EXCITATION_EVERY - 1:
-        out["excitation"][0] = termination.smallest_eigenvalue(m["information"], c["scale"], m["scratch"])
-    m["samples"] += 1.0
+    if termination.gather(m, out["q"], out["dq"], m["W_f"], period_s):
+        out["excitation"][0] = termination.eigenvalue_range(m["information"], c["scale"], m["scratch"])[0]
     m["quiet_cycles"] = m["quiet_cycles"] + 1.0 if termination.is_quiet(out["tau_ext_hat"], c["beta_Nm"]) else 0.0
     out["quiet_s"][0] = m["quiet_cycles"] * c["period_s"]
     is_over = (

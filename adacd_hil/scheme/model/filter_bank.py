@@ -53,8 +53,9 @@ tau_f (C, n); S, W_f, input_old (C, n, p); W_learnt (n, p), tau_learnt (n,). Uni
 import math
 from typing import Any, NamedTuple
 
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.settings.configuration import Settings
 
 
@@ -153,6 +154,51 @@ def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> floa
     return 1.0 - (b * math.exp(-a * after_s) - a * math.exp(-b * after_s)) / (b - a)
 
 
+def shapes_of(filters: int, channels: int, count: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name, of a model with this many parameters."""
+    columns = (JOINTS, count)
+    return {
+        **dict.fromkeys(("input_old", "S", "W_f"), (filters, *columns)),
+        **dict.fromkeys(("tau_f", "tau_old", "r"), (filters, JOINTS)),
+        "rates": (3, filters),
+        "W_learnt": columns,
+        "tau_learnt": (JOINTS,),
+        "y": (channels, JOINTS),
+    }
+
+
+@compiled
+def forget(m: Any) -> None:
+    """Forget the torque and the motion that were filtered."""
+    m["W_f"][:] = 0.0
+    m["tau_f"][:] = 0.0
+    m["W_learnt"][:] = 0.0
+    m["tau_learnt"][:] = 0.0
+
+
+@compiled
+def rest(m: Any) -> None:
+    """Begin with filters that have seen this pose, and the torque that gravity makes there, for ever.
+
+    From 0, that torque would be a step: the columns of the lag would have its derivative.
+    """
+    for c in range(m["tau_f"].shape[0]):
+        m["W_f"][c] = m["Y_h"]
+        m["tau_f"][c] = m["tau_old"][c]
+
+
+@compiled
+def choose_rates(k: Any, m: Any, period_s: float) -> None:
+    """Fill what one period does to each filter."""
+    decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
+    if period_s == k["period_s"]:
+        decay[:] = k["decay"]
+        old[:] = k["weight_old"]
+        new[:] = k["weight_new"]
+    else:
+        discretise(k["cutoff"], period_s, decay, old, new)
+
+
 @compiled
 def discretise(cutoff_rad_s: Vector, period_s: float, decay: Vector, weight_old: Vector, weight_new: Vector) -> None:
     """Fill what one period does to each filter (C,)."""
@@ -211,10 +257,7 @@ def estimate_external(tau_f: Vector, W_f: Vector, theta: Vector, tau_ext_hat: Ve
     """Fill the external torque (C, n) that each filter sees, Nm: eq. (13) with our sign, for filters with DC gain 1."""
     for c in range(W_f.shape[0]):
         for i in range(W_f.shape[1]):
-            total = -tau_f[c, i]
-            for j in range(W_f.shape[2]):
-                total += W_f[c, i, j] * theta[j]
-            tau_ext_hat[c, i] = total
+            tau_ext_hat[c, i] = linalg.misfit(W_f[c, i], theta, tau_f[c, i])
 
 
 @compiled

@@ -125,7 +125,7 @@ class CertificateWatch:
             return BY_WORD + self._vouched_against
         if self._memory["has_lapsed"]:
             return BY_FITS_THAT_AGREE
-        is_compared = self._memory["is_last_believed"] and not self._memory["is_payload"]
+        is_compared = certificate.is_compared(self._memory)
         return f"friction and inertia: within what {self._last} allows" if is_compared else THIS_RUN_ONLY
 
     def refuse(self, is_reading: bool) -> Event | None:
@@ -135,7 +135,7 @@ class CertificateWatch:
         offsets = slice(int(self._constants["base"]), int(self._constants["base"]) + JOINTS)
         self._refusal = _Refusal(
             cause,
-            self._memory["judged_Nm"].copy(),
+            anchor.judged_Nm(self._memory),
             np.sqrt(np.diag(self._memory["P_belief"])[offsets]),
             self._describe(cause),
             1 if before is None else before.times + 1,
@@ -155,7 +155,7 @@ class CertificateWatch:
 
     def revoke(self) -> Event:
         """Take in, before what was kept is forgotten, that the user takes the certificate back."""
-        if self._memory["has_kept"]:
+        if earlier.is_keeping(self._memory):
             self._vouched_against = _THE_RUN
         self._take_back()
         return Event("warning", "revoked", "at the user's word the arm is learnt anew")
@@ -189,11 +189,11 @@ class CertificateWatch:
             case _Cause.READING:
                 lines = anchor.describe_refused(m, is_reading=True)
             case _Cause.ANCHOR:
-                lines = [*anchor.describe_refused(m, is_reading=False), *missing_torque.describe(m)]
+                lines = anchor.describe_refused(m, is_reading=False)
             case _Cause.CHANGED:
                 lines = [_CHANGED + (_OR_MOUNTING if k["base"] > A5 else "")]
             case _Cause.MORE:
-                lines = [*earlier.describe_more(m), *missing_torque.describe(m)]
+                lines = earlier.describe_more(m)
             case _Cause.BY_PLACE:
                 lines = missing_torque.describe(m)
             case _Cause.TOO_MUCH_BY_PLACE:

@@ -6,12 +6,12 @@ alarms are in the block; it decides nothing.
 
 import numpy as np
 
-from adacd_hil.records import PARAMETER_UNITS, ContactReport, Event, Request, SchemeState
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, Event, Request, SchemeState
 from adacd_hil.scheme.contact.contact_report import RecalledContact
 from adacd_hil.scheme.contact.reaction import ContactCourse, ReactionChoice
-from adacd_hil.scheme.detect import margin
+from adacd_hil.scheme.detect import margin, sensitivity
 from adacd_hil.scheme.detect.margin import MarginWatch
-from adacd_hil.scheme.identify import anchor, earlier, termination
+from adacd_hil.scheme.identify import anchor, belief, certificate, earlier, termination
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import WEAK, Doubt
 from adacd_hil.scheme.identify.doubt import begin as begin_doubt
@@ -62,8 +62,7 @@ class CertifiedPolicy(SchemePolicy):
         self._is_payload = False
         self._has_forgotten = False
         self._refined = 0.0
-        self._peak_share = m["peak_share"]
-        self._margin = MarginWatch(self._peak_share.size)
+        self._margin = MarginWatch(JOINTS)
         self._period_s = settings.bus.period_s
         self._second = round(1.0 / self._period_s)
         self._monitored = 0
@@ -90,8 +89,12 @@ class CertifiedPolicy(SchemePolicy):
         certified_kernel.step(constants, memory, block, 1, 1, _WATCH | certified_kernel.LEARN)
         certified_kernel.begin_test(constants, memory)
         certified_kernel.begin_refinement(constants, memory)
+        earlier.is_keeping(memory[0])
         earlier.forget(memory[0])
-        begin_doubt(constants[0], memory[0])
+        certificate.forget(memory[0])
+        anchor.accept(memory[0], np.zeros(JOINTS), np.ones(JOINTS))
+        belief.pause(memory[0], constants[0]["recover_cycles"])
+        begin_doubt(constants[0], memory[0], 0.0)
         anchor.tightest(constants[0], memory[0], 0)
         self._doubt.compile()
         self._paper.compile(self.numbers.block)
@@ -184,10 +187,9 @@ class CertifiedPolicy(SchemePolicy):
     def touch(self) -> None:
         """Learn nothing of the touch, and weigh it as a contact that is not weak, however little the kernel sees."""
         k, m = self.numbers.constants[0], self.numbers.memory[0]
-        m["recovering_cycles"] = k["recover_cycles"]
+        belief.pause(m, k["recover_cycles"])
         if self.supervisor.state is SchemeState.MONITOR:
-            begin_doubt(k, m)
-            m["contact_peak"] = WEAK
+            begin_doubt(k, m, WEAK)
 
     def follow(self, previous: SchemeState, cycle: int, observation: int) -> SchemeState:
         """Take in what the kernel has found, and begin what a new state begins with."""
@@ -222,8 +224,7 @@ class CertifiedPolicy(SchemePolicy):
         if self._monitored < self._second:
             return
         self._monitored = 0
-        self._margin.add(self._peak_share.copy())
-        self._peak_share[:] = 0.0
+        self._margin.add(sensitivity.take_peak_shares(self.numbers.memory[0]))
         dim = "; ".join(margin.describe_dim(self.numbers.memory[0]))
         for name, warning in (("margin", self._margin.warning), ("sight", dim)):
             if warning and name not in self._warned:

@@ -1,0 +1,76 @@
+"""Linear algebra of small matrices for compiled code: the same bits on every machine, which LAPACK doesn't promise.
+
+Shapes: a, b, w, x, theta (p,); matrices (p, p), of symmetric ones and of Cholesky factors the lower half is read.
+"""
+
+import math
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import Vector
+
+
+@compiled
+def dot(a: Vector, b: Vector) -> float:
+    """Return a b."""
+    total = 0.0
+    for j in range(b.shape[0]):
+        total += a[j] * b[j]
+    return total
+
+
+@compiled
+def misfit(w: Vector, theta: Vector, tau: float) -> float:
+    """Return w theta - tau: predicted less measured torque of one row."""
+    total = -tau
+    for j in range(theta.shape[0]):
+        total += w[j] * theta[j]
+    return total
+
+
+@compiled
+def quadratic(A: Vector, x: Vector) -> float:
+    """Return x' A x of a symmetric A; 0 where rounding makes it negative."""
+    total = 0.0
+    for j in range(x.shape[0]):
+        if x[j] != 0.0:
+            total += A[j, j] * x[j] * x[j]
+            for n in range(j):
+                total += 2.0 * A[j, n] * x[j] * x[n]
+    return max(total, 0.0)
+
+
+@compiled
+def factor(A: Vector, least: float) -> bool:
+    """Put the Cholesky factor L, A = L L', into the lower half of A; False if A is not positive definite.
+
+    least: a squared pivot below this counts as this; 0: it makes A not positive definite.
+    """
+    for j in range(A.shape[0]):
+        for n in range(j + 1):
+            for i in range(n):
+                A[j, n] -= A[j, i] * A[n, i]
+            if n < j:
+                A[j, n] /= A[n, n]
+        pivot = least if A[j, j] < least else A[j, j]  # nan stays nan
+        if not pivot > 0.0:
+            return False
+        A[j, j] = math.sqrt(pivot)
+    return True
+
+
+@compiled
+def solve_lower(L: Vector, x: Vector) -> None:
+    """Replace x by L^-1 x."""
+    for j in range(x.shape[0]):
+        for n in range(j):
+            x[j] -= L[j, n] * x[n]
+        x[j] /= L[j, j]
+
+
+@compiled
+def solve_upper(L: Vector, x: Vector) -> None:
+    """Replace x by L'^-1 x."""
+    for j in range(x.shape[0] - 1, -1, -1):
+        for n in range(j + 1, x.shape[0]):
+            x[j] -= L[n, j] * x[n]
+        x[j] /= L[j, j]

@@ -1,0 +1,216 @@
+"""What contradicts a certificate, as a table: what each source says of each quantity, against what a fit says.
+
+A *quantity* is a column c of parameters that a touch can look like: a joint's friction at some speed, an inertia, a
+torque offset, a viscous friction. A *source* knows of quantities apart from the fit: an anchor of the offsets
+(`anchor`), a belief from before a touch (`earlier`), the last certificate (`certificate`). One function weighs each
+row, what a source says of a quantity:
+
+    difference = c theta - value,    limit = slack + max(floor, sigmas sqrt(variance + c P c'))
+
+and the source contradicts the fit where |difference| is over the limit; of a quantity of which less is the arm's, where
+the difference is. A variance of inf: the source says nothing. Of c P c' the unit of the fit's residuals scales what the
+samples say, and not what the prior does (`split`).
+
+Two questions are no rows, since no column is known beforehand: whether one model explains the whole of a fit
+(`fit_check`), and whether the model lacks columns (`missing_torque`). `docs/scheme.md` lists which touch each row sees,
+and which touches none.
+
+Shapes: Q quantities, S sources, p parameters; columns (Q, p), columns_prior, torque_Nm (Q,); sigmas (S,), less_counts
+(S, Q); said, said_variance, said_floor, said_slack, difference, limit (S, Q); said_age_s (S,); fitted, fitted_variance
+(Q,).
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from adacd_hil import linalg
+from adacd_hil.compiled import compiled
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.settings.configuration import Settings
+
+SPEEDS_RAD_S = (0.2, 0.6, 1.2)
+"""At which friction is compared: what viscous and Coulomb friction hide from each other shows in their sum."""
+_INERTIAS = ("a1", "a2", "a3")
+FRICTIONS, INERTIAS = JOINTS * len(SPEEDS_RAD_S), len(_INERTIAS)
+OFFSETS = FRICTIONS + INERTIAS
+VISCOUS = OFFSETS + JOINTS
+QUANTITIES = VISCOUS + JOINTS
+"""First offset, first viscous friction, and how many quantities there are; frictions and inertias come before."""
+ANCHORS, BELIEFS = 4, 9
+LAST, REFUSED, KEPT = ANCHORS, ANCHORS + 1, ANCHORS + 2
+SOURCES = KEPT + BELIEFS
+"""Sources, in order: anchors, the last certificate, the fit that was refused before, beliefs from before a touch."""
+ANCHOR_SIGMAS, LAST_SIGMAS = 4.0, 4.0
+"""Two joints, two-sided: 1.3e-4 of clean arms, each time that it is asked."""
+BELIEF_SIGMAS = 3.5
+"""With the floors of `earlier`: fits of 400 untouched arms had 0.23 of what is allowed more in the middle, 0.73 at
+most."""
+PEAK_ACCELERATION = 10.0 / math.sqrt(3.0)
+"""Of a rest-to-rest quintic, over travel / duration²."""
+
+
+def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
+    """Return `columns`, `columns_prior`, `torque_Nm`, `sigmas` and `less_counts`. prior_std (p,).
+
+    torque_Nm: torque that one unit of the quantity makes at most on the trajectory; of viscous friction nothing, which
+    the friction at its speeds has already.
+    """
+    unit = np.eye(prior_std.size)
+    base = len(settings.estimator.parameter_names)
+    viscous, coulomb = PARAMETER_NAMES.index("F_v1"), PARAMETER_NAMES.index("F_c1")
+    friction = [v * unit[viscous + i] + unit[coulomb + i] for i in range(JOINTS) for v in SPEEDS_RAD_S]
+    inertia = [unit[PARAMETER_NAMES.index(name)] for name in _INERTIAS]
+    offset = [unit[base + i] for i in range(JOINTS)]
+    columns = np.array([*friction, *inertia, *offset, *(unit[viscous + i] for i in range(JOINTS))])
+    less_counts = np.ones((SOURCES, QUANTITIES))
+    less_counts[LAST] = 0.0
+    less_counts[KEPT:, FRICTIONS:OFFSETS] = 0.0
+    return {
+        "columns": columns,
+        "columns_prior": columns**2 @ prior_std**2,
+        "torque_Nm": np.concatenate([np.ones(FRICTIONS), _accelerations(settings), np.ones(JOINTS), np.zeros(JOINTS)]),
+        "sigmas": np.repeat((ANCHOR_SIGMAS, LAST_SIGMAS, BELIEF_SIGMAS), (ANCHORS, 1, 1 + BELIEFS)),
+        "less_counts": less_counts,
+    }
+
+
+def _accelerations(settings: Settings) -> tuple[float, ...]:
+    """Return the largest accelerations on the trajectory that go with a1, a2, a3, rad/s²."""
+    travel_rad = 2.0 * np.radians(settings.trajectory.amplitude_deg)
+    first, second = PEAK_ACCELERATION * travel_rad / np.square(settings.trajectory.half_period_s)
+    return first, 2.0 * first + second, first + second
+
+
+def shapes_of() -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    rows = ("said", "said_variance", "said_floor", "said_slack", "difference", "limit")
+    return {
+        **dict.fromkeys(rows, (SOURCES, QUANTITIES)),
+        "said_age_s": (SOURCES,),
+        **dict.fromkeys(("fitted", "fitted_variance"), (QUANTITIES,)),
+    }
+
+
+def begin(m: Any) -> None:
+    """Begin with sources that say nothing."""
+    m["said_variance"][:] = np.inf
+    m["limit"][:] = np.inf
+
+
+def say_all(m: Any, s: int, said: Vector, variance: Vector, slack: Vector) -> None:
+    """Fill all rows of a source (Q,), without a floor."""
+    m["said"][s], m["said_variance"][s], m["said_slack"][s] = said, variance, slack
+
+
+@compiled
+def follow(m: Any, period_s: float) -> None:
+    """Let a period pass."""
+    for s in range(m["said_age_s"].shape[0]):
+        m["said_age_s"][s] += period_s
+
+
+@compiled
+def date(m: Any, first: int, last: int, age_s: float) -> None:
+    """Say how old the knowledge of the sources first .. last - 1 is."""
+    m["said_age_s"][first:last] = age_s
+
+
+@compiled
+def say(m: Any, s: int, q: int, value: float, variance: float, floor: float, slack: float) -> None:
+    """Fill a row: what source s says of quantity q."""
+    m["said"][s, q] = value
+    m["said_variance"][s, q] = variance
+    m["said_floor"][s, q] = floor
+    m["said_slack"][s, q] = slack
+
+
+@compiled
+def retract(m: Any, s: int) -> None:
+    """Let a source say nothing."""
+    m["said_variance"][s] = np.inf
+    m["difference"][s] = 0.0
+    m["limit"][s] = np.inf
+
+
+@compiled
+def pass_over(m: Any, s: int, q: int) -> None:
+    """Leave a row unasked this time."""
+    m["difference"][s, q] = 0.0
+    m["limit"][s, q] = np.inf
+
+
+@compiled
+def fit(k: Any, m: Any, theta: Vector, P: Vector, unit: float) -> None:
+    """Fill what a model theta (p,), P (p, p) says of each quantity; unit: of its residuals."""
+    for q in range(m["fitted"].shape[0]):
+        value, variance = of_belief(k, q, theta, P, unit)
+        put_fitted(m, q, value, variance)
+
+
+@compiled
+def put_fitted(m: Any, q: int, value: float, variance: float) -> None:
+    """Fill what is weighed of one quantity."""
+    m["fitted"][q] = value
+    m["fitted_variance"][q] = variance
+
+
+@compiled
+def of_belief(k: Any, q: int, theta: Vector, P: Vector, unit: float) -> tuple[float, float]:
+    """Return what a belief says of a quantity, c theta, and its variance."""
+    column = k["columns"][q]
+    return linalg.dot(column, theta), split(linalg.quadratic(P, column), k["columns_prior"][q], unit)
+
+
+@compiled
+def split(variance: float, prior: float, unit: float) -> float:
+    """Return a variance of which `unit` scales what the samples say, and not what the prior does."""
+    return 1.0 / (1.0 / prior + max(1.0 / variance - 1.0 / prior, 0.0) / unit)
+
+
+@compiled
+def weigh(k: Any, m: Any, s: int, q: int) -> float:
+    """Return how many times its limit the fit has more of a quantity than a source says; fill `difference`, `limit`.
+
+    Negative: less. 0 where less doesn't count, or nothing is said.
+    """
+    difference = m["fitted"][q] - m["said"][s, q]
+    if m["said_variance"][s, q] == np.inf or (difference < 0.0 and k["less_counts"][s, q] == 0.0):
+        difference = 0.0 if np.isfinite(difference) else difference
+    std = np.sqrt(m["said_variance"][s, q] + m["fitted_variance"][q])
+    m["difference"][s, q] = difference
+    m["limit"][s, q] = m["said_slack"][s, q] + max(m["said_floor"][s, q], k["sigmas"][s] * std)
+    return float(difference / m["limit"][s, q])
+
+
+@compiled
+def excess(m: Any, s: int, q: int) -> float:
+    """Return the same of a row as it was weighed last."""
+    return float(m["difference"][s, q] / m["limit"][s, q])
+
+
+@compiled
+def foremost(m: Any, first: int, last: int, q: int) -> int:
+    """Return which of the sources first .. last - 1 contradicts a quantity most, as weighed last."""
+    worst = first
+    for s in range(first, last):
+        if not abs(excess(m, s, q)) <= abs(excess(m, worst, q)):
+            worst = s
+    return worst
+
+
+def named(excesses: Vector) -> list[tuple[int, str, str]]:
+    """Return place, name and unit of each quantity whose excess (Q,) is over 1; of a joint's friction only the largest.
+
+    A viscous friction is named after the others.
+    """
+    speeds = len(SPEEDS_RAD_S)
+    found = []
+    for i in range(JOINTS):
+        q = speeds * i + int(np.argmax(excesses[speeds * i : speeds * (i + 1)]))
+        found.append((q, f"friction of joint {i + 1} at {SPEEDS_RAD_S[q - speeds * i]:g} rad/s", "Nm"))
+    found += [(q, name, "kg m²") for q, name in enumerate(_INERTIAS, FRICTIONS)]
+    found += [(OFFSETS + i, f"torque offset of joint {i + 1}", "Nm") for i in range(JOINTS)]
+    found += [(VISCOUS + i, f"viscous friction of joint {i + 1}", "Nm s/rad") for i in range(JOINTS)]
+    return [(q, what, unit) for q, what, unit in found if excesses[q] > 1.0]
