@@ -236,7 +236,7 @@ class FaultReason(IntEnum):
     TORQUE = 13  # a drive's torque is not the one that was commanded
     FOLLOWING = 14  # the arm doesn't follow the desired motion
     TAMPERED = 15  # a parameter of a device is no longer what the host has written
-    DETECTOR = 16  # a live detector has raised, or given no finite statistic per joint
+    DETECTOR = 16  # only in older logs: a detector of the user's in the loop had failed
     MISCONFIGURED = 17  # the first motion contradicts an order, a sign or a scale of the configuration
 
 
@@ -439,10 +439,5 @@ class BriefedEvent(Event):
         return self.brief
 
 
-DETECTOR_EVENT: Final = "detector"
-"""Name of the events that say which live detector has found a contact."""
-CERTIFICATE_EVENTS: Final = frozenset(
-    ("anchor", "touch", "position", "certificate", "revoked", "sight", DETECTOR_EVENT)
-)
-"""Names of what the scheme says of its certificates and its live detectors: the user is told as it happens, and a
-replay must say it again."""
+CERTIFICATE_EVENTS: Final = frozenset(("anchor", "touch", "position", "certificate", "revoked", "sight"))
+"""Names of what the scheme says of its certificates: the user is told as it happens, and a replay must say it again."""

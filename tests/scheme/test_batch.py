@@ -11,7 +11,6 @@ from adacd_hil.control.motions import Excitation
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme.detect.margin import MarginWatch
 from adacd_hil.scheme.pipeline.pipeline import CalmStretch, Pipeline, arm_at, layout_of
-from adacd_hil.settings.scheme_settings import LiveDetectorSettings
 
 REST = 60
 """Cycles at rest, the first of them without drives."""
@@ -341,23 +340,3 @@ def test_what_monitors_is_looked_at_once_a_second_and_when_a_model_takes_over(li
 def test_the_layout_is_that_of_the_scheme():
     assert layout_of(settings_of("paper")) == scheme_layout(7)
     assert layout_of(settings_of("certified")) == certified_layout(7, SETTINGS.further_count, SETTINGS.channel_count)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["paper", "certified"])
-def test_live_detectors_decide_the_same_at_once_and_cycle_by_cycle(life, scheme):
-    arms, requests = life
-    rows = LiveDetectorSettings("cusum", (0.02, 0.01)), LiveDetectorSettings("observer 25", (0.25, 0.2), "contact")
-    settings = settings_of(scheme)
-    settings = replace(settings, detector=replace(settings.detector, live=rows))
-    at_once, single = Pipeline(settings), Pipeline(settings)
-    batch = at_once.run(arms, requests)
-    outputs = stepped(single, arms, requests)
-    for name in ("state", "fault", "reaction", "contact_joints"):
-        np.testing.assert_array_equal(getattr(batch, name), [getattr(output, name) for output in outputs])
-    assert batch.block.tobytes() == np.array([output.block for output in outputs]).tobytes()
-    assert batch.contacts == [output.contact for output in outputs if output.contact is not None]
-    events = single.take_events()
-    assert at_once.take_events() == events
-    found = [event.message for event in events if event.name == "detector"]
-    assert any("observer 25" in message for message in found)

@@ -13,7 +13,7 @@ from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.detect.margin import MarginWatch
 from adacd_hil.scheme.identify import anchor, earlier, termination
 from adacd_hil.scheme.identify.certificate import Certificate
-from adacd_hil.scheme.identify.doubt import WEAK, Doubt
+from adacd_hil.scheme.identify.doubt import Doubt
 from adacd_hil.scheme.identify.doubt import begin as begin_doubt
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory, paper_kernel
 from adacd_hil.scheme.kernel.kernel_samples import Recorded, Samples
@@ -42,8 +42,6 @@ _MODES = {
 
 class CertifiedPolicy(SchemePolicy):
     """Adaptation with a certificate. A model is valid while it has one, while another payload is learnt on it too."""
-
-    armed_in = frozenset((SchemeState.MONITOR, SchemeState.PAYLOAD))
 
     def __init__(self, settings: Settings, supervisor: Supervisor) -> None:
         self.numbers = certified_memory.numbers_of(settings)
@@ -180,14 +178,6 @@ class CertifiedPolicy(SchemePolicy):
             observation &= ~WITHHELD if self._watch.is_refusing else ~0
             self._events.append(self._watch.accept())
         return observation
-
-    def touch(self) -> None:
-        """Learn nothing of the touch, and weigh it as a contact that is not weak, however little the kernel sees."""
-        k, m = self.numbers.constants[0], self.numbers.memory[0]
-        m["recovering_cycles"] = k["recover_cycles"]
-        if self.supervisor.state is SchemeState.MONITOR:
-            begin_doubt(k, m)
-            m["contact_peak"] = WEAK
 
     def follow(self, previous: SchemeState, cycle: int, observation: int) -> SchemeState:
         """Take in what the kernel has found, and begin what a new state begins with."""

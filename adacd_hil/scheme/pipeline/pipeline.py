@@ -2,13 +2,12 @@
 
 A cycle: the state reached so far says what the kernel does, the kernel says where the supervisor goes, and the new
 state leaves its traces: an adaptation begins or ends, a contact's report begins or becomes final. Where the schemes
-differ, a policy says what is done: `PaperPolicy`, `CertifiedPolicy`. Detectors that the settings add (`live_detectors`)
-look at each cycle after the kernel; their alarms are the kernel's to all that follows.
+differ, a policy says what is done: `PaperPolicy`, `CertifiedPolicy`.
 
 **Calm cycles.** The supervisor changes its state rarely, and its numbers don't depend on it in between. Every cycle is
 asked whether something could happen in it (`Calm`); where nothing could, it is only counted. `step` asks cycle by
 cycle; recorded cycles go through a compiled loop up to the first that isn't calm, with the same bits. That one is
-concluded, by the same code. Where a live detector is armed, every cycle is concluded.
+concluded, by the same code.
 
 **The interval** between two samples is that between the SYNCs on which they were taken: a sample that comes late was
 still taken in time. It is 0 where it is unknown or not to be used.
@@ -33,17 +32,14 @@ from adacd_hil.records import (
     certified_layout,
     scheme_layout,
 )
-from adacd_hil.scheme.detect.live_detectors import LiveDetectors, LiveSample
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.kernel.kernel_samples import Numbers, Recorded, samples_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.pipeline.certified_policy import CertifiedPolicy
 from adacd_hil.scheme.pipeline.scheme_policy import PaperPolicy, SchemePolicy
-from adacd_hil.scheme.supervisor.supervisor import REACTING, Supervisor
+from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.scheme.supervisor.transitions import (
-    ANY_CONTACT,
     CONTACT_SHIFT,
-    NOT_A_NUMBER,
     Calm,
     finding_of,
     findings_of,
@@ -176,10 +172,6 @@ class Pipeline:
     """Adaptation and contact detection for one run, by the scheme that the settings ask for."""
 
     def __init__(self, settings: Settings) -> None:
-        """Begin. Raises DetectorError for a live detector that can't run here."""
-        self.detectors = LiveDetectors(settings) if settings.detector.live else None
-        """Detectors beside the scheme's own thresholds; None without."""
-        self._events: list[Event] = []
         self._supervisor = Supervisor(settings)
         self._policy: SchemePolicy = (
             CertifiedPolicy(settings, self._supervisor)
@@ -203,8 +195,6 @@ class Pipeline:
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._policy.theta_ff, 0.0)
         self._policy.contacts.compile()
         self._policy.compile()
-        if self.detectors is not None:
-            self.detectors.compile()
 
     @property
     def compiled_functions(self) -> tuple[object, ...]:
@@ -223,19 +213,14 @@ class Pipeline:
         """Say what contradicts a certificate that is withheld, a line each."""
         return self._policy.describe_withheld()
 
-    def describe_detector(self) -> list[str]:
-        """Say which live detector has failed, and by what, in a line."""
-        return [] if self.detectors is None else [self.detectors.failure]
-
     @property
     def certificates(self) -> tuple[Certificate, ...]:
         """The certificates of the run that were not taken back, in order; the paper has none."""
         return self._policy.certificates
 
     def take_events(self) -> list[Event]:
-        """Return what is worth a line since the last call: a margin that has shrunk, a certificate, who has found."""
-        events, self._events = [*self._events, *self._policy.take_events()], []
-        return events
+        """Return what is worth a line since the last call: a margin that has shrunk, a certificate."""
+        return self._policy.take_events()
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
@@ -286,16 +271,11 @@ class Pipeline:
         """Do what comes after the numbers in a cycle in which something could happen."""
         policy, supervisor, contacts = self._policy, self._supervisor, self._policy.contacts
         previous = supervisor.state
-        own_joints = observation >> CONTACT_SHIFT
-        if self.detectors is not None:
-            observation |= self._detect(self.detectors, arm, observation)
         observation = policy.take(request, observation)
         block = self.numbers.values.copy()
         supervisor.step(arm, request, observation, contacts.is_reporting, contacts.goes_on)
         policy.follow(previous, arm.cycle, observation)
         contact = policy.report(arm.cycle, observation)
-        if self.detectors is not None:
-            self._events += [*policy.take_events(), *self.detectors.tell(supervisor.state in REACTING, own_joints)]
         return self._output(arm.cycle, previous, observation, contact, block)
 
     def _output(
@@ -316,24 +296,6 @@ class Pipeline:
             block=block,
             reaction=policy.contacts.reaction,
         )
-
-    @property
-    def _is_armed(self) -> bool:
-        """Whether live detectors watch in the state reached so far."""
-        supervisor = self._supervisor
-        state = supervisor.origin if supervisor.state in REACTING else supervisor.state
-        return state in self._policy.armed_in
-
-    def _detect(self, detectors: LiveDetectors, arm: ArmState, observation: int) -> int:
-        """Let the live detectors look at this cycle; return the bits that they add to the kernel's."""
-        sample = LiveSample(
-            arm.cycle, self._q, self._dq, self._tau_J, self.numbers.values[self._theta_hat], float(self._period_s[0])
-        )
-        is_fresh = arm.is_complete and not observation & NOT_A_NUMBER
-        added = detectors.step(sample, is_fresh, self._is_armed)
-        if added & ANY_CONTACT and not observation & ANY_CONTACT:
-            self._policy.touch()
-        return added
 
     def run(self, arms: ArmBatch, requests: NDArray[np.uint8]) -> SchemeBatch:
         """Take in n cycles, as `step` does one by one. requests (n,): of `Request`."""
@@ -382,8 +344,6 @@ class Pipeline:
 
     def _calm(self, cycle: int) -> Calm:
         """Return bounds within which the next cycles, from this one on, need not be concluded."""
-        if self.detectors is not None and self._is_armed:
-            return Calm(0, 0, 0)
         contacts = self._policy.contacts
         calm = self._supervisor.calm(contacts.is_reporting, contacts.goes_on)
         return self._policy.calm(contacts.calm(calm, cycle))

@@ -25,7 +25,7 @@ class SchemePolicy(ABC):
 
     supervisor: of the pipeline. contacts: of the arm. tau_ext_hat (2,): external torque that is reported in each cycle,
     Nm, a view. theta_ff: what the last finished adaptation left, for the feedforward, zeros before. is_model_valid:
-    theta_ff may be fed forward. armed_in: where live detectors watch, and in the reactions to what they find there.
+    theta_ff may be fed forward.
     """
 
     supervisor: Supervisor
@@ -34,7 +34,6 @@ class SchemePolicy(ABC):
     tau_ext_hat: Vector
     theta_ff: Vector
     is_model_valid: bool
-    armed_in: frozenset[SchemeState] = frozenset((SchemeState.MONITOR,))
 
     compiled_functions: tuple[object, ...]
     """The largest that `compile` runs."""
@@ -67,9 +66,6 @@ class SchemePolicy(ABC):
     def take(self, request: Request, observation: int) -> int:  # noqa: ARG002
         """Take in a request before the supervisor does; return the observation as it stands then."""
         return observation
-
-    def touch(self) -> None:
-        """Take in that a live detector has found a contact that the kernel has not; before the supervisor's step."""
 
     def report(self, cycle: int, observation: int) -> ContactReport | None:
         """Return the contact's report that is due, after all else in each cycle."""

@@ -28,7 +28,6 @@ from adacd_hil.scheme.supervisor.transitions import (
     CERTIFIED,
     COLLISION,
     CONTACT,
-    DETECTOR_FAILED,
     FITTED,
     NEVER,
     NOT_A_NUMBER,
@@ -112,8 +111,7 @@ _RAISED_BY = MappingProxyType(
     }
 )
 """Findings without which an event doesn't come. Those that are not here come by counting, or by a request."""
-_UNRELIABLE = NOT_A_NUMBER | DETECTOR_FAILED
-_NOT_WELL = int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | _UNRELIABLE | OVER_LIMIT | OVER_SPEED | UNSEEN
+_NOT_WELL = int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | NOT_A_NUMBER | OVER_LIMIT | OVER_SPEED | UNSEEN
 """Findings without which `_check` finds nothing in an arm that is enabled."""
 
 
@@ -458,8 +456,6 @@ class Supervisor:
         if fault is not FaultReason.NONE:
             return fault
         is_thrown = self._state is SchemeState.REACT and self._phase_cycles <= self._rebound_cycles
-        if observation & DETECTOR_FAILED:
-            return FaultReason.DETECTOR
         if observation & OVER_LIMIT or (observation & OVER_SPEED and not is_thrown):
             return FaultReason.LIMIT
         if self._state in POWERED and not arm.is_enabled:

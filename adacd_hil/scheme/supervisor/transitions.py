@@ -163,7 +163,6 @@ class Observation(IntFlag):
     OVER_SPEED = 1024  # |dq| beyond the arm's limit, which a blow may do for a moment
     UNSEEN = 2048  # the filters took no sample in: the residual is not of now
     WITHHELD = 4096  # an anchor, a touch or a torque by place excludes what would be certified, or what is
-    DETECTOR_FAILED = 8192  # a live detector can't be relied on any more; no kernel sets it
 
 
 (
@@ -180,7 +179,6 @@ class Observation(IntFlag):
     OVER_SPEED,
     UNSEEN,
     WITHHELD,
-    DETECTOR_FAILED,
 ) = (int(bit) for bit in Observation)
 """The same bits as plain numbers, which compiled code can read."""
 ANY_CONTACT = CONTACT | COLLISION
