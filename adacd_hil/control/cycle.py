@@ -160,12 +160,11 @@ class Cycle:
             turn = self._exchange.turn()
             arm = self._watch.judge(turn.arm)
             request = self._checks.judge(arm, self._state) or self._request(arm.cycle)
-            output = self._pipeline.decide(arm, request)
+            output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
             self._follow(arm, output)
             command, flags = self._limit(arm, output, self._exchange.leave())
             record = self._exchange.end(turn, command, recorder.waiting_bytes)
-            self._pipeline.complete()  # the commands are out: from here on, what none of them depends on
             self._data.note(arm)
             self._faults.note(self._state, arm)
             self._first_motion.note(arm, self._state, self._tau_c)

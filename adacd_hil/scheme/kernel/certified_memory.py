@@ -104,6 +104,7 @@ def constants_of(settings: Settings) -> Structured:
     kept = earlier.constants_of(settings, prior_std)
     values: dict[str, Any] = {
         "period_s": period_s,
+        "second_cycles": round(1.0 / period_s),
         "level_rad": settings.level_rad,
         "cutoff": cutoff,
         "decay": decay,
@@ -196,6 +197,8 @@ def new_memory(settings: Settings) -> Structured:
         **dict.fromkeys(("q_low", "q_high", "dq_low", "dq_high"), joint),
         **dict.fromkeys(("information", "scratch"), square),
         "withheld_by": (),
+        # beside the numbers: what is asked of Python once in a while
+        **dict.fromkeys(("has_forgotten", "monitored_cycles", "until_push_cycles"), ()),
         # detection
         **dict.fromkeys(("r", "still", "still_smooth", "doubt", "held"), each_filter),
         **dict.fromkeys(("y", "h", "h_model"), each_channel),
