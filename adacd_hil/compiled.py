@@ -336,3 +336,8 @@ def float_fields(shapes: Mapping[str, tuple[int, ...]]) -> np.dtype[np.void]:
 @cache
 def _float_fields(shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> np.dtype[np.void]:
     return np.dtype([(name, np.float64, shape) for name, shape in shapes])
+
+
+def record_of(*fields: tuple[Any, ...]) -> np.dtype[np.void]:
+    """Describe an element with these fields: name, type and, of an array, shape. They are read as attributes."""
+    return np.dtype((np.record, list(fields)))

@@ -236,7 +236,7 @@ class FaultReason(IntEnum):
     TORQUE = 13  # a drive's torque is not the one that was commanded
     FOLLOWING = 14  # the arm doesn't follow the desired motion
     TAMPERED = 15  # a parameter of a device differs from the value that the host wrote
-    DETECTOR = 16  # a live detector has raised, or given no finite statistic per joint
+    DETECTOR = 16  # in older logs only: a user's detector in the loop had failed
     MISCONFIGURED = 17  # the first motion contradicts an order, a sign or a scale of the configuration
 
 
@@ -439,10 +439,5 @@ class BriefedEvent(Event):
         return self.brief
 
 
-DETECTOR_EVENT: Final = "detector"
-"""Name of the events that report which live detector has found a contact."""
-CERTIFICATE_EVENTS: Final = frozenset(
-    ("anchor", "touch", "position", "certificate", "revoked", "sight", DETECTOR_EVENT)
-)
-"""Names of the events about certificates and live detectors: shown to the operator at once; a replay must repeat
-them."""
+CERTIFICATE_EVENTS: Final = frozenset(("anchor", "touch", "position", "certificate", "revoked", "sight"))
+"""Names of the events about certificates: shown to the operator at once; a replay must repeat them."""

@@ -34,7 +34,7 @@ def test_the_total_is_a_function_and_all_that_it_calls() -> None:
     assert list(functions_below([quarter], is_all=True)) == [f"{__name__}.quarter", f"{__name__}.halve"]
     below = functions_below([paper_kernel.step], is_all=True).values()
     assert {paper_kernel.step, regressor.fill_momentum} < set(below)
-    assert paper_kernel.run_paper not in set(below)
+    assert paper_kernel.step_beside not in set(below)
 
 
 @needs_compiler

@@ -55,7 +55,7 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
     settings = parse(Settings, table)
     if problems := motion_problems(settings):
         return ConfigurationFindings([*problems, *_radians(settings)], [], None)
-    if problems := [*_device_problems(settings), *_detector_problems(settings)]:
+    if problems := _device_problems(settings):
         return ConfigurationFindings(problems, [], None)
     try:
         codec = load_contract(settings)
@@ -143,14 +143,6 @@ def _device_problems(settings: Settings) -> list[str]:
             except ConfigError as error:
                 problems[str(error)] = None
     return list(problems)
-
-
-def _detector_problems(settings: Settings) -> list[str]:
-    if not settings.detector.live:
-        return []
-    from adacd_hil.scheme.detect.live_detectors import live_problems
-
-    return live_problems(settings)
 
 
 _BOUNDS = (

@@ -17,7 +17,7 @@ from adacd_hil.control.fault_recovery import FaultReport, SelfChecks, StopEscala
 from adacd_hil.control.first_motion import FirstMotion, is_shown
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator, RunNarration
-from adacd_hil.control.pacing import DetectorTiming, Pacer
+from adacd_hil.control.pacing import Pacer
 from adacd_hil.control.reference import MOTION, Reference
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import DataShares, DataWatch
@@ -93,7 +93,6 @@ class Cycle:
         self._data = DataWatch(settings, arm)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = Pipeline(settings)
-        self._timing = DetectorTiming(self._pipeline.detectors, settings.bus.period_ns, clock)
         self._controller = Controller(settings)
         self._floating = Floating(settings)
         self._gate = Gate(settings.arm, self._period_s)
@@ -113,7 +112,6 @@ class Cycle:
             master.parameters,
             self._escalation,
             self._exchange.events,
-            self._timing,
             self._first_motion,
             self._reference,
             self._pipeline,
@@ -141,9 +139,8 @@ class Cycle:
         return self._pipeline.certificates
 
     def compile(self) -> None:
-        """Compile everything the loop calls; to be done before the drives are enabled. Raises DetectorError."""
+        """Compile everything the loop calls; to be done before the drives are enabled."""
         self._pipeline.compile()
-        self._timing.measure(self._progress)
         self._reference.compile()
         self._controller.compile()
         self._first_motion.compile()
@@ -163,17 +160,15 @@ class Cycle:
             turn = self._exchange.turn()
             arm = self._watch.judge(turn.arm)
             request = self._checks.judge(arm, self._state) or self._request(arm.cycle)
-            output = self._pipeline.decide(arm, request)
+            output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
             self._follow(arm, output)
             command, flags = self._limit(arm, output, self._exchange.leave())
             record = self._exchange.end(turn, command, recorder.waiting_bytes)
-            self._pipeline.complete()  # the commands are out: from here on, what none of them depends on
             self._data.note(arm)
             self._faults.note(self._state, arm)
             self._first_motion.note(arm, self._state, self._tau_c)
             self._look_after_devices(arm, output)
-            self._timing.step(arm.cycle, arm.t_ns)
             self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
         if self._is_finishing and self._state in POWERED and not self._reference.is_parked(self._arm.cycle):

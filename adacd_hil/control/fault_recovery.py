@@ -158,7 +158,6 @@ class FaultReport:
             ),
             FaultReason.ENABLE_TIMEOUT: (report.describe_disabled,),
             FaultReason.ADAPT_TIMEOUT: (pipeline.describe_missing,),
-            FaultReason.DETECTOR: (pipeline.describe_detector,),
         }
 
     def note(self, state: SchemeState, arm: ArmState) -> None:

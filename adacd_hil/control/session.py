@@ -32,7 +32,6 @@ from adacd_hil.log.types.topics import CERTIFIED_MODEL
 from adacd_hil.log.viewer_layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import Event, FaultReason, SchemeState
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
-from adacd_hil.scheme.detect.live_detectors import describe_code
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import to_toml
@@ -315,7 +314,6 @@ class Session:
             "clock": "lockstep" if self.is_lockstep else "realtime",
             **grant.describe(),
             "period_us": str(settings.bus.period_us),
-            **({"detectors": describe_code(settings)} if settings.detector.live else {}),
             "operator": "script" if isinstance(self.operator, ScriptedOperator) else "console",
             **arithmetic(),
             **(self.tare.metadata() if self.tare is not None else {}),

@@ -43,7 +43,7 @@ from adacd_hil.settings.run_settings import (
     TareSettings,
     TrajectorySettings,
 )
-from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse, setting
+from adacd_hil.settings.schema import WITHDRAWN, ConfigError, describe_gone, parse, setting
 from adacd_hil.settings.scheme_settings import (
     CROSS_TALK,
     CertifiedSettings,
@@ -181,6 +181,9 @@ def renewed(table: dict[str, Any]) -> dict[str, Any]:
     certified = table.get("certified")
     if isinstance(certified, dict) and "cross_talk_std" not in certified:
         table = table | {"certified": certified | {"cross_talk_std": 0.0}}
+    detector = table.get("detector")
+    if isinstance(detector, dict):
+        table = table | {"detector": {key: detector[key] for key in detector if f"detector.{key}" not in WITHDRAWN}}
     safety = table.get("safety")
     if not isinstance(safety, dict) or "commission_cycles" not in safety:
         return table
@@ -367,8 +370,8 @@ def explain_unknown(key: str) -> str:
     below = [known for known in keys if known.startswith(f"{key}.")]
     if below:
         return f"`{key}` is a section; its keys are {', '.join(below)}"
-    if key in SUCCESSORS:
-        return f"unknown key `{key}`; its successor is {SUCCESSORS[key]}"
+    if gone := describe_gone(key):
+        return gone
     section, _, last = key.rpartition(".")
     by_name = {known.rpartition(".")[2]: known for known in reversed(keys)}
     found = nearest_name(key, keys) or by_name.get(nearest_name(last, by_name) or "")

@@ -18,7 +18,7 @@ class ConfigError(ValueError):
 
 
 class DetectorError(ConfigError):
-    """A live detector that can't run here: it isn't registered, breaks the detectors' contract, or is too slow."""
+    """A package's detector that can't be used: it can't be imported, or breaks the detectors' contract."""
 
 
 SUCCESSORS = {
@@ -28,6 +28,9 @@ SUCCESSORS = {
     "safety.commission_cycles": "`safety.commission_s`",
 }
 """Removed keys, and the keys that replace them, as an error prints them."""
+_OFFLINE = "no detector runs in the loop any more; `adacd-hil thresholds LOG... --report FOLDER` compares them on logs"
+WITHDRAWN = {"detector.live": _OFFLINE, "detector.live_lag_s": _OFFLINE}
+"""Removed keys without a successor, and the remedy."""
 
 
 def setting(
@@ -119,11 +122,18 @@ def _read_value(hint: Any, value: Any, key: str, metadata: Any, problems: list[C
 
 def _unknown(key: str, known: Iterable[str], where: str) -> str:
     known = list(known)
-    if successor := SUCCESSORS.get(f"{where}{key}"):
-        return f"unknown key `{where}{key}`; its successor is {successor}"
+    if gone := describe_gone(f"{where}{key}"):
+        return gone
     nearest = nearest_name(key, known)
     hint = f"; did you mean `{where}{nearest}`?" if nearest else f"; known: {', '.join(known)}"
     return f"unknown key `{where}{key}`{hint}"
+
+
+def describe_gone(key: str) -> str:
+    """Say in one line what there is in place of a key of older versions; "" for one that never was."""
+    if key in WITHDRAWN:
+        return f"unknown key `{key}`: {WITHDRAWN[key]}"
+    return f"unknown key `{key}`; its successor is {SUCCESSORS[key]}" if key in SUCCESSORS else ""
 
 
 def _is_required(field: "dataclasses.Field[Any]") -> bool:

@@ -73,23 +73,8 @@ class TerminationSettings:
 
 
 @dataclass(frozen=True)
-class LiveDetectorSettings:
-    """One detector that runs live beside the scheme's own thresholds."""
-
-    name: str = setting(meaning="a channel of `thresholds`, or a registered detector")
-    threshold: tuple[float, float] = setting(
-        low=1e-9, high=1e9, meaning="per joint, in the unit of the detector's statistic: above it is an alarm"
-    )
-    level: str = setting(
-        "collision",
-        choices=("contact", "collision"),
-        meaning="an alarm clears itself, or is latched; `paper`: any contact is a collision",
-    )
-
-
-@dataclass(frozen=True)
 class DetectorSettings:
-    """Eq. (14), and detectors that run live beside it."""
+    """Eq. (14)."""
 
     threshold_Nm: tuple[float, float] = setting((0.15, 0.15), unit="Nm", low=0.001, high=100.0, meaning="per joint")
     standstill_rad_s: float = setting(
@@ -101,16 +86,6 @@ class DetectorSettings:
     collision_Nm: tuple[float, float] = setting(
         (2.0, 1.0), unit="Nm", low=0.01, high=1000.0, meaning="upper threshold; `paper`: any contact is a collision"
     )
-    live: tuple[LiveDetectorSettings, ...] = setting((), meaning="detectors that run live, beside the scheme's own")
-    live_lag_s: float = setting(
-        1.25e-3, unit="s", low=0.0, high=5e-3, meaning="lag of the velocity in their stream; `thresholds` identifies it"
-    )
-
-    def __post_init__(self) -> None:
-        rows = [(row.name, row.level) for row in self.live]
-        for name, level in rows:
-            if rows.count((name, level)) > 1:
-                raise ConfigError(f"`detector.live` has {name} twice with level {level!r}")
 
 
 FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")

@@ -130,14 +130,6 @@ def test_devices_and_contract_are_looked_at(tmp_path: Path) -> None:
     assert "Drive1" in config("check", str(path)).stdout
 
 
-def test_a_detector_that_nobody_knows_is_an_error_with_the_nearest_name(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text('extends = "certified"\n[[detector.live]]\nname = "cusums"\nthreshold = [1.0, 1.0]\n')
-    result = config("check", str(path))
-    assert result.exit_code == USAGE
-    assert "no detector cusums is registered here; did you mean cusum?" in result.stdout
-
-
 def test_the_guesses_of_a_device_s_profile_are_those_of_the_configuration(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text('extends = "certified"\n[devices]\ndrive = ["geared.toml", "maxon-epos4"]\ncontract = ""\n')

@@ -4,9 +4,7 @@ import numpy as np
 
 from adacd_hil.records import scheme_layout
 from adacd_hil.scheme.kernel import paper_kernel
-from adacd_hil.scheme.kernel.kernel_samples import Recorded, Samples
 from adacd_hil.scheme.model.regressor import inverse_dynamics
-from adacd_hil.scheme.supervisor.transitions import Calm
 from adacd_hil.settings.configuration import Settings, load_settings, merge
 from adacd_hil.settings.schema import parse
 
@@ -40,19 +38,15 @@ def torque_of(q, dq, ddq, theta, tau_ext=None):
 def run_kernel(settings, q, dq, tau_J, theta_hat, mode, is_complete=None, periods=None, period_s=None):
     """Run the compiled step over a record; return blocks (n, size)."""
     count = q.shape[0]
-    ones = np.ones(count, dtype=np.int64)
     numbers = paper_kernel.numbers_of(settings)
     paper_kernel.begin_adaptation(numbers.constants, numbers.memory, numbers.block)
     numbers.block["theta_hat"] = theta_hat
-    samples = Samples(
-        np.arange(count),
-        *(np.ascontiguousarray(column) for column in (q, dq, tau_J)),
-        period_s=np.zeros(count) if period_s is None else period_s,
-        is_complete=ones if is_complete is None else is_complete,
-        periods=ones,
-        steps=ones if periods is None else periods,
-        findings=np.zeros(count, dtype=np.int64),
-    )
-    recorded = Recorded(np.zeros(count, dtype=np.int64), np.zeros((count, numbers.values.size)))
-    paper_kernel.run_paper(numbers, samples, recorded, 0, count - 1, mode, Calm(watched=0, expected=0))
-    return recorded.blocks
+    blocks = np.zeros((count, numbers.values.size))
+    out = numbers.block[0]
+    for k in range(count):
+        out["q"][:], out["dq"][:], out["tau_J"][:] = q[k], dq[k], tau_J[k]
+        out["period_s"][0] = 0.0 if period_s is None else period_s[k]
+        is_fresh = 1 if is_complete is None else int(is_complete[k])
+        paper_kernel.step(*numbers[:3], is_fresh, 1 if periods is None else int(periods[k]), mode)
+        blocks[k] = numbers.values
+    return blocks

@@ -220,7 +220,7 @@ def test_the_shortest_reading_is_compared_with_the_tare_too():
 def test_the_user_may_let_the_reading_stand_in_place_of_the_tare():
     loop = TouchedLoop(BOTH, (0.5, 0.0))
     loop.run(300)
-    assert loop.pipeline._supervisor.state is SchemeState.COMMISSION
+    assert loop.pipeline._policy.supervisor.state is SchemeState.COMMISSION
     loop.request = Request.ACCEPT
     loop.run_until(SchemeState.MONITOR)
     assert re.fullmatch(

@@ -1,4 +1,4 @@
-"""Calm cycles, stepped or run at once: the bits of concluding each, wherever the runs are split."""
+"""Live is replay: cycles taken in at once decide as one by one, wherever they are split."""
 
 from dataclasses import replace
 
@@ -8,10 +8,9 @@ from excited_arm import PERIOD_S, SETTINGS, record
 from planar_arm import PAYLOAD_1KG, THETA
 
 from adacd_hil.control.motions import Excitation
-from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState, certified_layout, scheme_layout
+from adacd_hil.records import ArmBatch, Request, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme.detect.margin import MarginWatch
-from adacd_hil.scheme.pipeline.pipeline import CalmStretch, Pipeline, arm_at, layout_of
-from adacd_hil.settings.scheme_settings import LiveDetectorSettings
+from adacd_hil.scheme.pipeline.pipeline import Pipeline, arm_at, layout_of
 
 REST = 60
 """Cycles at rest, the first of them without drives."""
@@ -126,26 +125,16 @@ def state_of(thing):
     """Return everything that a pipeline remembers, in a form that compares bit by bit."""
     if isinstance(thing, np.ndarray | np.void):
         return thing.tobytes()
-    if isinstance(thing, Pipeline):
-        thing._count_calm()
-    if isinstance(thing, CalmStretch):
-        return thing.count
+    if isinstance(thing, tuple | list):
+        return [state_of(each) for each in thing]
     if type(thing).__module__.startswith("adacd_hil.scheme") and hasattr(thing, "__dict__"):
-        return {name: state_of(value) for name, value in vars(thing).items()}
+        own = ("_sample", "_decision", "_block")  # of the last single step
+        return {name: state_of(value) for name, value in vars(thing).items() if name not in own}
     return repr(thing)
 
 
 def stepped(pipeline, arms, requests):
     return [pipeline.step(arm_at(arms, k), Request(requests[k])) for k in range(len(requests))]
-
-
-def concluded(pipeline, arms, requests):
-    """Step as if no cycle were calm."""
-    outputs = []
-    for k in range(len(requests)):
-        pipeline._count_calm()
-        outputs += stepped(pipeline, part(arms, k, k + 1), requests[k : k + 1])
-    return outputs
 
 
 def rows_of(outputs):
@@ -173,9 +162,9 @@ SCHEMES = ("paper", "certified")
 
 @pytest.fixture(scope="module", params=SCHEMES)
 def lived(request, life):
-    """The scheme's name, its pipeline after the life, and its outputs, each cycle concluded."""
+    """The scheme's name, its pipeline after the life, and its outputs, cycle by cycle."""
     pipeline = pipeline_for(request.param)
-    outputs = concluded(pipeline, *life)
+    outputs = stepped(pipeline, *life)
     return request.param, pipeline, outputs
 
 
@@ -190,19 +179,7 @@ def test_the_life_has_all_of_it(lived):
         assert [event.name for event in pipeline._policy._events] == ["certificate", "margin", "touch"]
 
 
-def test_step_gives_the_bits_of_concluding_each_cycle(life, lived):
-    scheme, pipeline, outputs = lived
-    again = pipeline_for(scheme)
-    looks = []
-    conclude = again._conclude
-    again._conclude = lambda arm, *rest: looks.append(arm.cycle) or conclude(arm, *rest)
-    assert rows_of(stepped(again, *life)) == rows_of(outputs)
-    del again._conclude
-    assert state_of(again) == state_of(pipeline)
-    assert len(looks) < 0.1 * len(outputs)
-
-
-def test_run_gives_the_bits_of_concluding_each_cycle(life, lived):
+def test_a_batch_decides_as_single_steps_do(life, lived):
     scheme, pipeline, outputs = lived
     again = pipeline_for(scheme)
     batch = again.run(*life)
@@ -229,135 +206,6 @@ def test_it_may_be_split_anywhere_and_mixed_with_single_steps(life, lived, seed)
     assert state_of(again) == state_of(pipeline)
 
 
-def changed(column, value):
-    """Return a disturbance that sets a column of an ArmBatch."""
-
-    def change(arms, begin, end):
-        getattr(arms, column)[begin:end] = value
-
-    return change
-
-
-def pushed(torque):
-    def change(arms, begin, end):
-        arms.tau_J[begin:end] += torque
-
-    return change
-
-
-def one_joint_then_the_other(arms, begin, end):
-    arms.tau_J[begin:end, 0] -= 1.0
-    arms.tau_J[begin + 20 : begin + 40, 1] -= 1.5
-
-
-def at_rest(arms, begin, end):
-    arms.q[begin:end] = arms.q[begin]
-    arms.dq[begin:end] = 0.0
-
-
-DISTURBANCES = {
-    **{f"fault {reason.name}": (changed("fault", reason), 1) for reason in FaultReason},
-    "q not a number": (changed("q", np.nan), 1),
-    "torque infinite in a cycle that is not complete": (
-        lambda *at: (changed("tau_J", np.inf)(*at), changed("is_complete", False)(*at)),
-        1,
-    ),
-    "beyond the position limit": (changed("q", 1.6), 1),
-    "beyond the velocity limit": (changed("dq", 30.0), 3),
-    "old position": (changed("age_q", 4), 1),
-    "old torque": (changed("age_tau_J", 4), 1),
-    "as old as may be": (changed("age_q", 3), 20),
-    "a drive drops out": (changed("is_enabled", False), 2),
-    "late once": (changed("is_late", True), 1),
-    "late for long": (changed("is_late", True), 90),
-    "incomplete": (changed("is_complete", False), 30),
-    "many periods": (changed("periods", 7), 5),
-    "a timeout of periods": (changed("periods", 100_000), 1),
-    "pushed along": (pushed((-2.0, -0.5)), 60),
-    "pushed against": (pushed((6.0, 1.0)), 150),
-    "pushed on one joint, then on the other for a moment": (one_joint_then_the_other, 80),
-    "touched": (pushed((-0.5, 0.0)), 120),
-    "at rest": (at_rest, 140),
-    "stamps stand still": (changed("t_ns", 0), 2),
-    **{request.name: (request, 1) for request in Request},
-}
-PLACES_S = {
-    "INIT": -0.06,
-    "COMMISSION": -0.055,
-    "ENABLE": -0.045,
-    "ADAPT": 0.7,
-    "CERTIFY": 1.7,
-    "MONITOR": 3.0,
-    "REACT": 4.575,
-    "STOPPED": 4.9,
-    "PAYLOAD": 7.22,
-}
-TAIL = 240
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("place", PLACES_S)
-def test_whatever_disturbs_a_state_is_seen_as_if_each_cycle_were_concluded(life, scheme, place):
-    """Four rows of the table at a time, drawn so that each comes in each state."""
-    arms, requests = life
-    begin = REST + round(PLACES_S[place] / PERIOD_S)
-    random = np.random.default_rng(sorted(PLACES_S).index(place))
-    names = random.permutation(list(DISTURBANCES)).tolist()
-    alone = [], ["pushed against"], ["pushed on one joint, then on the other for a moment"]
-    for few in (*alone, *(names[k : k + 4] for k in range(0, len(names), 4))):
-        tail = ArmBatch(*(column[begin : begin + TAIL].copy() for column in arms))
-        asked = requests[begin : begin + TAIL].copy()
-        for name in few:
-            change, cycles = DISTURBANCES[name]
-            at = int(random.integers(0, 100))
-            if isinstance(change, Request):
-                asked[at] = change
-            else:
-                change(tail, at, at + cycles)
-        one, two, three = (pipeline_for(scheme) for _ in range(3))
-        for pipeline in (one, two, three):
-            pipeline.run(part(arms, 0, begin), requests[:begin])
-        rows = rows_of(concluded(three, tail, asked))
-        assert rows_of_batches([one.run(tail, asked)]) == rows, few
-        assert rows_of(stepped(two, tail, asked)) == rows, few
-        assert state_of(one) == state_of(two) == state_of(three), few
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_what_monitors_is_looked_at_once_a_second_and_when_a_model_takes_over(life, scheme):
-    arms, requests = life
-    pipeline = pipeline_for(scheme)
-    pipeline.run(part(arms, 0, 2400), requests[:2400])
-    looks = []
-    conclude = pipeline._conclude
-    pipeline._conclude = lambda arm, *rest: looks.append(arm.cycle) or conclude(arm, *rest)
-    batch = pipeline.run(part(arms, 2400, 4400), requests[2400:4400])
-    assert set(batch.state) == {SchemeState.MONITOR}
-    promotions = batch.block[:, layout_of(settings_of(scheme)).slices["promotions"]] if scheme == "certified" else [0]
-    unseen = np.count_nonzero(~arms.is_complete[2400:4400]) + np.count_nonzero(arms.periods[2400:4400] > 1)
-    assert len(looks) - unseen <= (3 + np.ptp(promotions) if scheme == "certified" else 1)
-
-
 def test_the_layout_is_that_of_the_scheme():
     assert layout_of(settings_of("paper")) == scheme_layout(7)
     assert layout_of(settings_of("certified")) == certified_layout(7, SETTINGS.further_count, SETTINGS.channel_count)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["paper", "certified"])
-def test_live_detectors_decide_the_same_at_once_and_cycle_by_cycle(life, scheme):
-    arms, requests = life
-    rows = LiveDetectorSettings("cusum", (0.02, 0.01)), LiveDetectorSettings("observer 25", (0.25, 0.2), "contact")
-    settings = settings_of(scheme)
-    settings = replace(settings, detector=replace(settings.detector, live=rows))
-    at_once, single = Pipeline(settings), Pipeline(settings)
-    batch = at_once.run(arms, requests)
-    outputs = stepped(single, arms, requests)
-    for name in ("state", "fault", "reaction", "contact_joints"):
-        np.testing.assert_array_equal(getattr(batch, name), [getattr(output, name) for output in outputs])
-    assert batch.block.tobytes() == np.array([output.block for output in outputs]).tobytes()
-    assert batch.contacts == [output.contact for output in outputs if output.contact is not None]
-    events = single.take_events()
-    assert at_once.take_events() == events
-    found = [event.message for event in events if event.name == "detector"]
-    assert any("observer 25" in message for message in found)

@@ -12,6 +12,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from adacd_hil.records import ContactLevel, FaultReason, Reaction, Request, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme.detect.margin import MarginWatch
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
+from adacd_hil.scheme.pipeline.cycle import SECOND
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 
@@ -359,9 +360,8 @@ def test_a_margin_that_shrinks_is_said_once():
     pipeline._policy._margin = MarginWatch(2, memory_blocks=5.0)
     said = []
     for share in (0.4,) * 10 + (0.9,) * 10:
-        for _ in range(1000):
-            pipeline.numbers.memory[0]["peak_share"][1] = share
-            pipeline._policy._watch_margin(SchemeState.MONITOR)
+        pipeline.numbers.memory[0]["peak_share"][1] = share
+        pipeline._policy.attend(SECOND, 0)
         said.append([event.message for event in pipeline.take_events()])
     lines = [line for second in said for line in second]
     assert (len(lines), said[:10]) == (1, [[]] * 10)

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from contact_course import Course
 from smooth_motion import PLACES, run_kernel, settings_with
 
-from adacd_hil.scheme.contact.contact_report import ContactReporter, IntegratedContact
+from adacd_hil.records import SchemeState
+from adacd_hil.scheme.contact.contact_report import IntegratedContact, report_of
 from adacd_hil.scheme.detect.external_torque import follow_contact
 from adacd_hil.scheme.kernel import paper_kernel
 
@@ -43,31 +45,29 @@ def test_the_strength_does_not_depend_on_the_filter(a, b):
 
 
 class Touch:
-    """An arm at rest in MONITOR that is touched; steps the compiled kernel and the reporter together."""
+    """An arm at rest in MONITOR that is touched; steps the compiled kernel and the contact's course together."""
 
     def __init__(self, window_cycles=50):
         settings = settings_with(detector={"isolation_window_s": window_cycles * T})
         self.constants, self.memory, self.block, _ = paper_kernel.numbers_of(settings)
         memory, block = self.memory[0], self.block[0]
-        evidence = IntegratedContact(settings, block["tau_ext_hat"], memory["integral"], memory["peak"])
-        self.reporter = ContactReporter(evidence)
+        self.tau_ext_hat = block["tau_ext_hat"]
+        self.evidence = IntegratedContact(settings, self.tau_ext_hat, memory["integral"], memory["peak"])
+        self.course = Course(settings, self.evidence.due_cycles)
         self.reports = []
 
     def run(self, tau_ext):
         has_begun = False
         for cycle, torque in enumerate(tau_ext):
             self.block[0]["tau_J"][:] = -torque
-            mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.reporter.is_open else 0)
+            mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.course.m["is_open"] else 0)
             joints = (
                 paper_kernel.step(self.constants, self.memory, self.block, 1, 1, mode) >> paper_kernel.CONTACT_SHIFT
             )
-            if joints and not has_begun:
-                has_begun = True
-                self.reporter.begin(cycle)
-            if self.reporter.is_open:
-                report = self.reporter.report(cycle, joints)
-                if report is not None:
-                    self.reports.append(report)
+            has_begun = has_begun or joints != 0
+            state = SchemeState.REACT if has_begun else SchemeState.MONITOR
+            if self.course.step(joints, self.tau_ext_hat, state=state):
+                self.reports.append(report_of(self.evidence, self.course.m, cycle))
         return self.reports
 
 
@@ -147,13 +147,6 @@ def test_the_impulse_of_a_short_touch_is_kept_until_the_window_ends():
     push = half_sine(0.02 / (0.004 * 2.0 / np.pi), 0.004)
     reports = Touch(window_cycles=200).run(on_joints(push, 0.0 * push))
     assert abs(reports[-1].impulse[0] / 0.02 - 1.0) < 0.06
-
-
-def test_a_cancelled_isolation_has_no_open_report():
-    reporter = Touch().reporter
-    reporter.begin(3)
-    reporter.cancel()
-    assert not reporter.is_open
 
 
 def test_the_direction_is_that_of_the_first_contact_of_the_joint():

@@ -1,18 +1,16 @@
 """The contact report, made from a hand-written course of torques."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from contact_course import Course
 from smooth_motion import settings_with
 
 from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction, SchemeState
-from adacd_hil.scheme.contact.contact_report import ContactHistory, ContactReporter, RecalledContact
-from adacd_hil.scheme.contact.reaction import ContactCourse, ReactionChoice
-from adacd_hil.scheme.supervisor.transitions import COLLISION, CONTACT, CONTACT_SHIFT
+from adacd_hil.scheme.contact.contact_report import RecalledContact, last_rows, put_row, report_of
 
-SETTINGS = settings_with(reaction={"collision": ["stop", "stop"]})
+SETTINGS = settings_with(scheme="certified", reaction={"collision": ["stop", "stop"]})
 SIGMA, THRESHOLD = np.array([0.03, 0.015]), np.array([0.15, 0.08])
 Q = np.array([0.3, 0.4])
 L1 = SETTINGS.arm.link_length_m[0]
@@ -27,24 +25,25 @@ def course(force_N=20.0, lever_m=0.2, duration=40, onset=50, length=400):
 
 def play(tau, detected, joints=3, level=ContactLevel.COLLISION):
     """Return the reports of a contact that is detected in a cycle."""
-    seen = np.zeros(2)
-    course = ContactCourse(RecalledContact(SETTINGS, Q, seen, SIGMA, THRESHOLD), ReactionChoice(SETTINGS), seen)
+    touch = Course(SETTINGS)
+    evidence = RecalledContact(SETTINGS, touch.m)
+    touch.fill(SETTINGS, evidence.due_cycles)
     reports = []
     for cycle, row in enumerate(tau):
-        seen[:] = row
-        is_begun = cycle >= detected
+        put_row(evidence.rows, int(touch.m["kept_rows"]), Q, row, SIGMA, THRESHOLD)
+        touch.m["kept_rows"] += 1
         over = joints if cycle - detected >= 5 else joints & 1
-        found = COLLISION if level is ContactLevel.COLLISION else CONTACT
-        arm = SimpleNamespace(state=SchemeState.REACT if is_begun else SchemeState.MONITOR, is_latched=True)
-        reports.append(course.step(cycle, arm, over << CONTACT_SHIFT | found if is_begun else 0, True))
-    return [report for report in reports if report is not None], course
+        state = SchemeState.REACT if cycle >= detected else SchemeState.MONITOR
+        if touch.step(over if cycle >= detected else 0, row, level, state, is_latched=True):
+            reports.append(report_of(evidence, touch.m, cycle))
+    return reports, touch
 
 
 def test_a_contact_is_reported_at_once_after_ten_and_after_a_hundred_milliseconds():
     reports, touch = play(course(), 55)
     assert [report.is_final for report in reports] == [False, False, True]
     assert {report.cycle for report in reports} == {55}
-    assert not touch.is_reporting
+    assert not touch.m["is_open"]
 
 
 def test_a_final_report_says_all_that_can_be_known():
@@ -104,17 +103,17 @@ def test_the_peak_of_a_blow_is_that_of_its_half_sine_however_short_it_is(duratio
 
 
 def test_a_fault_ends_the_report():
-    reporter = ContactReporter(RecalledContact(SETTINGS, Q, np.ones(2), SIGMA, THRESHOLD))
-    reporter.evidence.observe()
-    reporter.begin(0)
-    reporter.cancel()
-    assert not reporter.is_open
+    touch = Course(SETTINGS, due_cycles=(0, 10, 100))
+    assert touch.step(1, np.ones(2))
+    assert touch.m["is_open"]
+    assert not touch.step(1, np.ones(2), state=SchemeState.FAULT)
+    assert not touch.m["is_open"]
 
 
 def test_the_history_gives_its_last_rows_in_order():
-    history = ContactHistory(5)
+    rows = np.zeros((10, 7))
     for number in range(13):
-        history.put(np.array([0.0, number]), np.zeros(2), SIGMA, THRESHOLD)
+        put_row(rows, number, np.array([0.0, number]), np.zeros(2), SIGMA, THRESHOLD)
         expected = list(range(max(0, number - 3), number + 1))
-        assert history.last(4)[:, 0].tolist() == expected
-    assert history.last(99)[:, 0].tolist() == [8, 9, 10, 11, 12]
+        assert last_rows(rows, number + 1, 4)[:, 0].tolist() == expected
+    assert last_rows(rows, 13, 99)[:, 0].tolist() == [8, 9, 10, 11, 12]

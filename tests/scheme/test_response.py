@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from contact_course import Course
 from smooth_motion import settings_with
 
-from adacd_hil.records import ContactLevel, Reaction
-from adacd_hil.scheme.contact.reaction import BLIND_S, TURNED_CYCLES, ReactionChoice
+from adacd_hil.records import ContactLevel, Reaction, SchemeState
+from adacd_hil.scheme.contact.course import BLIND_S, TURNED_CYCLES
 
 SETTINGS = settings_with(
+    scheme="certified",
     reaction={"contact": ["slow_down", "stop"], "collision": ["admittance", "withdraw"]},
     detector={"collision_Nm": [2.0, 1.0]},
 )
@@ -19,15 +21,16 @@ class Contact:
     """A contact followed cycle by cycle."""
 
     def __init__(self, level, link, is_model_valid=True, settings=SETTINGS):
-        self.response = ReactionChoice(settings)
+        self.response = Course(settings)
         self.is_model_valid = is_model_valid
-        self.response.begin(level, link, PUSH, is_model_valid)
         self.level, self.link = level, link
+        self.response.step(link, PUSH, level, is_valid=is_model_valid)
 
     def step(self, tau=PUSH, cycles=1, level=None, link=None, is_latched=False):
         self.level, self.link = level or self.level, link or self.link
+        self.response.m["link"] = self.link
         for _ in range(cycles):
-            self.response.step(self.level, self.link, is_latched, tau, self.is_model_valid)
+            self.response.step(self.link, tau, self.level, is_latched=is_latched, is_valid=self.is_model_valid)
         return self.response.reaction
 
 
@@ -46,7 +49,7 @@ def test_each_level_and_link_has_its_reaction(level, link, reaction):
 
 def test_unless_configured_a_contact_stops_the_arm_and_a_collision_is_withdrawn_from():
     for link in (1, 2):
-        settings = settings_with()
+        settings = settings_with(scheme="certified")
         assert Contact(ContactLevel.CONTACT, link, settings=settings).response.reaction is Reaction.STOP
         assert Contact(ContactLevel.COLLISION, link, settings=settings).response.reaction is Reaction.WITHDRAW
 
@@ -55,7 +58,7 @@ def test_a_contact_that_grows_gets_the_reaction_of_a_collision_and_keeps_it():
     contact = Contact(ContactLevel.CONTACT, 2)
     assert contact.step(level=ContactLevel.COLLISION) is Reaction.WITHDRAW
     assert contact.step(level=ContactLevel.CONTACT) is Reaction.WITHDRAW
-    assert contact.response.level is ContactLevel.COLLISION
+    assert contact.response.m["level"] == ContactLevel.COLLISION
 
 
 def test_a_link_that_turns_out_to_be_another_gets_its_own_reaction():
@@ -73,7 +76,7 @@ def test_a_withdrawal_from_what_lets_go_goes_on():
     contact = Contact(ContactLevel.COLLISION, 2)
     contact.step(cycles=30)
     assert contact.step(tau=0.0 * PUSH, cycles=300) is Reaction.WITHDRAW
-    assert not contact.response.is_two_sided
+    assert not contact.response.m["is_two_sided"]
 
 
 def test_a_withdrawal_that_pushes_something_on_the_other_side_floats():
@@ -81,7 +84,7 @@ def test_a_withdrawal_that_pushes_something_on_the_other_side_floats():
     contact.step(cycles=BLIND)
     assert contact.step(tau=-PUSH, cycles=TURNED_CYCLES - 1) is Reaction.WITHDRAW
     assert contact.step(tau=-PUSH) is Reaction.FLOAT
-    assert contact.response.is_two_sided
+    assert contact.response.m["is_two_sided"]
 
 
 def test_what_a_blow_leaves_in_the_estimate_is_no_second_contact():
@@ -106,8 +109,18 @@ def test_without_a_model_an_arm_stops_instead_of_floating():
 
 
 def test_a_late_host_stops_the_arm_and_the_end_of_it_asks_for_nothing():
-    response = ReactionChoice(SETTINGS)
-    response.hold()
+    response = Course(SETTINGS)
+    assert not response.step(0, PUSH)
     assert response.reaction is Reaction.STOP
-    response.end()
+    response.step(0, PUSH, state=SchemeState.MONITOR)
     assert response.reaction is Reaction.NONE
+
+
+def test_the_paper_s_scheme_withdraws_from_each_contact_and_gives_no_withdrawal_up():
+    paper = settings_with(reaction={"contact": ["slow_down", "stop"], "collision": ["stop", "stop"]})
+    contact = Contact(ContactLevel.COLLISION, 1, settings=paper)
+    assert contact.response.reaction is Reaction.WITHDRAW
+    contact.step(cycles=BLIND)
+    assert contact.step(tau=-PUSH, cycles=10 * TURNED_CYCLES) is Reaction.WITHDRAW
+    contact.response.step(0, PUSH, state=SchemeState.MONITOR)
+    assert contact.response.reaction is Reaction.WITHDRAW  # until the next contact

@@ -4,6 +4,7 @@ It begins where an adaptation would have ended: the model is the arm's own, dete
 trajectory. Estimates come from the paper's kernel with a faster filter; contacts and collisions have two thresholds.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,16 +17,19 @@ from adacd_hil.records import (
     ArmState,
     ContactReport,
     FaultReason,
+    Reaction,
     Request,
     SchemeOutput,
     SchemeState,
     Vector,
 )
-from adacd_hil.scheme.contact.contact_report import RecalledContact
-from adacd_hil.scheme.contact.reaction import ContactCourse, ReactionChoice
+from adacd_hil.scheme.contact import course
+from adacd_hil.scheme.contact.contact_report import RecalledContact, put_row, report_of
 from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
+from adacd_hil.scheme.pipeline.cycle import DECISION, decide, follow_contact, new_course
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.supervisor.transitions import Observation
 from adacd_hil.settings.configuration import Settings, load_settings, merge
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.sensing import DriveMode
@@ -80,16 +84,20 @@ class Rig:
         paper_kernel.begin_adaptation(self._constants, self._memory, self._block)
         self._block[0]["theta_hat"][:] = self._theta
         self._collision_Nm = np.array(settings.detector.collision_Nm)
-        block = self._block[0]
-        evidence = RecalledContact(settings, block["q"], block["tau_ext_wide_hat"], SIGMA_NM, block["threshold"])
-        self._touch = ContactCourse(evidence, ReactionChoice(settings), block["tau_ext_hat"])
+        self._course_constants, self._course_memory = new_course(settings)
+        self._course_memory["is_model_valid"] = 1
+        self._contact = self._course_memory["contact"][0]
+        self._evidence = RecalledContact(settings, self._contact)
+        certified = dataclasses.replace(settings, scheme="certified")
+        course.fill_constants(certified, self._evidence.due_cycles, self._course_constants["contact"][0])
+        self._sample, self._decision = np.zeros(1, SAMPLE), np.zeros(1, DECISION)
         self._q_d, self._dq_d, self._ddq_d = np.zeros(2), np.zeros(2), np.zeros(2)
         self._tau_d, self._tau_c = np.zeros(2), np.zeros(2)
         self._reference = Reference(settings, self._q_d, self._dq_d, self._ddq_d)
         self._controller, self._floating = Controller(settings), Floating(settings)
         self._controller.feed_forward(self._theta)
         self._gate = Gate(settings.arm, settings.bus.period_s)
-        self._supervisor = Supervisor(settings)
+        self._supervisor = Supervisor(self._course_memory["supervisor"])
         self._cycle = 0
         self._state = SchemeState.INIT
         self._stopped_cycles = 0
@@ -100,7 +108,22 @@ class Rig:
         rest = int(Observation.AT_REST | Observation.UNLOADED)
         while self._supervisor.state is not SchemeState.MONITOR:
             is_late = self._supervisor.state is SchemeState.ADAPT
-            self._supervisor.step(arm, Request.NONE, rest | (int(Observation.ADAPTED) if is_late else 0), False)
+            self._decide(arm, Request.NONE, rest | (int(Observation.ADAPTED) if is_late else 0))
+
+    def _decide(self, arm: ArmState, request: Request, observation: int) -> None:
+        fill_sample(self._sample, arm, request)
+        decide(self._course_constants[0], self._course_memory[0], self._sample[0], observation, self._decision[0])
+
+    def _follow_contact(self) -> ContactReport | None:
+        """Take the contact on; return its report that is due."""
+        block, contact = self._block[0], self._contact
+        rows, kept = self._evidence.rows, int(contact["kept_rows"])
+        put_row(rows, kept, block["q"], block["tau_ext_wide_hat"], SIGMA_NM, block["threshold"])
+        contact["kept_rows"] += 1
+        torques = block["tau_ext_hat"], block["tau_ext_wide_hat"]
+        of_run = self._course_constants[0], self._course_memory[0]
+        is_due = follow_contact(*of_run, self._sample[0], self._decision[0], *torques)
+        return report_of(self._evidence, contact, self._cycle) if is_due else None
 
     def _theta_of(self) -> Vector:
         truth = np.zeros(TRUTH_LAYOUT.size)
@@ -138,13 +161,13 @@ class Rig:
         self._stopped_cycles = self._stopped_cycles + 1 if previous is SchemeState.STOPPED else 0
         is_asked = self._acknowledge_cycles and self._stopped_cycles >= self._acknowledge_cycles
         request = Request.ACKNOWLEDGE if is_asked else Request.NONE
-        state = self._supervisor.step(arm, request, observation, self._touch.is_reporting, self._touch.goes_on)
-        block = self._block[0]
-        tau_ext_hat = block["tau_ext_hat"].copy()
-        contact = self._touch.step(self._cycle, self._supervisor, observation, True)
+        self._decide(arm, request, observation)
+        tau_ext_hat = self._block[0]["tau_ext_hat"].copy()
+        contact = self._follow_contact()
+        decision, state = self._decision[0], self._supervisor.state
         output = SchemeOutput(
-            self._cycle, state, previous, self._supervisor.fault, observation >> CONTACT_SHIFT, True, self._theta,
-            self._theta, tau_ext_hat, contact, self._values.copy(), self._touch.reaction,
+            self._cycle, state, previous, FaultReason(decision["fault"]), int(decision["contact_joints"]), True,
+            self._theta, self._theta, tau_ext_hat, contact, self._values.copy(), Reaction(decision["reaction"]),
         )  # fmt: skip
         self._reference.step(arm, output)
         if self._reference.is_floating:

@@ -71,7 +71,7 @@ def _as_text(found: "LogComparison") -> str:
         ]
         lines += ["", format_table(("field", "differs from", "cycle", "cycles", "by at most"), rows, (1, 2, 3, 4))]
     if found.contacts:
-        rows3 = [(_contact(first), _contact(second)) for first, second in found.contacts]
+        rows3 = [(contact_in_words(first), contact_in_words(second)) for first, second in found.contacts]
         lines += ["", format_table(("contact in 1", "in 2"), rows3)]
     lines += ["", format_table(("state", "1", "2"), _states(found))]
     lines += ["", format_table(("parameter", "1", "2"), _parameters(found))]

@@ -42,7 +42,7 @@ from adacd_hil.lab.report.timeline import (
 )
 from adacd_hil.lab.score.verdict import LISTED, headlines
 from adacd_hil.log.logged_run import Run
-from adacd_hil.records import DETECTOR_EVENT, Location, Vector
+from adacd_hil.records import Location, Vector
 from adacd_hil.score.judge import row_at
 from adacd_hil.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.score.wording import (
@@ -193,7 +193,7 @@ _PLACES: Final = {
 
 def _card(contact: ReportedContact, run: Run, strongest_N: float) -> ContactCard:
     entries = _found(contact) if contact.detected_s is not None else [("found", _why_not(contact))]
-    entries += _finders(contact, run) + _torques(contact)
+    entries += _torques(contact)
     if contact.link is not None:
         force = number_text(contact.true_force_N, 1, "N") if contact.true_force_N is not None else NONE
         entries.append(("truth", f"link {contact.link}, {force}"))
@@ -230,19 +230,6 @@ def _found(contact: ReportedContact) -> list[tuple[str, str]]:
         ("lever arm", lever),
         ("place", _PLACES.get(contact.location or "", NONE)),
         ("blind within", number_text(contact.blind_deg, 1, "°")),
-    ]
-
-
-def _finders(contact: ReportedContact, run: Run) -> list[tuple[str, str]]:
-    """Name the live detectors that found a contact, by their events in the cycle of its detection."""
-    if contact.detected_s is None:
-        return []
-    said = [(t_ns, event.message) for t_ns, event in run.events if event.name == DETECTOR_EVENT]
-    period_s = run.settings.bus.period_s
-    return [
-        ("found by", message.partition(" by ")[2])
-        for t_ns, message in said
-        if abs((t_ns - run.zero_ns) * 1e-9 - contact.detected_s) < 0.5 * period_s
     ]
 
 

@@ -1,13 +1,13 @@
 """The contact report: what is told of a contact, from a short memory of the external torques around it.
 
 A contact begins with the last sample before its detection that is below half of its joints' thresholds. It is
-reported three times: when it is detected, when the link is decided, and when the window has ended, which is also when
-push and hit can be told apart.
+reported three times, `contact.course` says when: at its detection, when the link is decided, and when the window has
+ended, which is also when push and hit can be told apart.
 
 **Link.** A force on link 1 loads joint 1 only. So it is link 2 if the mean torque of joint 2 since the beginning stands
 out of the noise further than chance does, and of what a blow on link 1 leaves there for a few samples.
 
-Per cycle it only writes one row; everything else happens three times in a contact.
+Per cycle only one row is written; everything else happens three times in a contact.
 
 **Kind.** Push or hit: by what is left of a contact when 100 ms have passed since it was detected.
 
@@ -25,14 +25,14 @@ report is given at once and becomes final when the window ends.
 """
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, ContactKind, ContactReport, Vector
+from adacd_hil.records import JOINTS, ContactKind, ContactLevel, ContactReport, Reaction, Vector
 from adacd_hil.scheme.contact import localisation
 from adacd_hil.scheme.detect.external_torque import ONSET_FRACTION
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm
 from adacd_hil.settings.configuration import Settings
 
 LINK_S = 0.01
@@ -60,40 +60,25 @@ Q2, TAU, SIGMA, THRESHOLD = 0, slice(1, 3), slice(3, 5), slice(5, 7)
 _COLUMNS = 7
 
 
-class ContactHistory:
-    """The last samples of elbow angle, external torques, their uncertainty and their thresholds, in order of time."""
-
-    def __init__(self, rows: int) -> None:
-        self.rows = np.zeros((2 * rows, _COLUMNS))  # each row twice, so that any window is one piece
-        self._size = rows
-        self.count = 0
-
-    def put(self, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector) -> None:
-        """Take in one cycle; vectors (2,)."""
-        self.put_ahead(0, q, tau_ext_wide_hat, sigma, threshold)
-        self.count += 1
-
-    def put_ahead(self, passed: int, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector) -> None:
-        """Take in a cycle without counting it, behind so many others that aren't counted either; vectors (2,)."""
-        put_row(self.rows, (self.count + passed) % self._size, q, tau_ext_wide_hat, sigma, threshold)
-
-    def last(self, count: int) -> Vector:
-        """Return up to `count` rows, the newest last; a view, good until the next cycle."""
-        count = min(count, self.count, self._size)
-        end = self._size + (self.count - 1) % self._size + 1
-        return self.rows[end - count : end]
-
-
 @compiled
-def put_row(rows: Vector, place: int, q: Vector, tau: Vector, sigma: Vector, threshold: Vector) -> None:
-    """Take one cycle into the rows of a `ContactHistory`."""
+def put_row(rows: Vector, kept: int, q: Vector, tau: Vector, sigma: Vector, threshold: Vector) -> None:
+    """Write one cycle behind so many others. rows (2 m, 7): the last m cycles, each twice: any window is one piece."""
     half = rows.shape[0] // 2
+    place = kept % half
     for row in (place, place + half):
         rows[row, 0] = q[1]
         for i in range(2):
             rows[row, 1 + i] = tau[i]
             rows[row, 3 + i] = sigma[i]
             rows[row, 5 + i] = threshold[i]
+
+
+def last_rows(rows: Vector, kept: int, count: int) -> Vector:
+    """Return up to `count` rows, the newest last; a view, good until the next cycle. kept: so many were written."""
+    half = rows.shape[0] // 2
+    count = min(count, kept, half)
+    end = half + (kept - 1) % half + 1
+    return rows[end - count : end]
 
 
 @compiled
@@ -119,71 +104,27 @@ class ContactEvidence(ABC):
 
     due_cycles: tuple[int, ...]
     """When it is reported, in cycles after its detection: at once first, finally last."""
-    tau_ext: Vector
-    """External torque (2,) of this cycle, Nm: gives the direction of a joint when it crosses its threshold."""
 
     def compile(self) -> None:
         """Run every compiled function once."""
-
-    def observe(self) -> None:
-        """Take in one cycle, whatever the state is."""
-
-    def observe_calm(self, passed: int) -> None:
-        """Take in a cycle that `pass_by` will count, behind so many others."""
-
-    def pass_by(self, cycles: int) -> None:
-        """Count cycles that were taken in."""
-
-    def begin(self) -> None:
-        """Take in that a contact is detected in this cycle."""
 
     @abstractmethod
     def report(self, detected: int, elapsed: int, direction: tuple[int, int], is_final: bool) -> ContactReport:
         """Report the contact that was detected in a cycle, so many cycles ago."""
 
 
-class ContactReporter:
-    """Makes the reports of one contact after the other."""
+def report_of(evidence: ContactEvidence, m: Any, cycle: int) -> ContactReport:
+    """Make the report that is due in this cycle, and let the contact's course go by its link.
 
-    def __init__(self, evidence: ContactEvidence) -> None:
-        self.evidence = evidence
-        self._detected_cycle = 0
-        self._direction = [0] * JOINTS
-        self.is_open = False
-        """Whether a report is out that is not final yet."""
-
-    def calm(self, calm: Calm, cycle: int) -> Calm:
-        """Narrow the bounds to those within which, from this cycle on, no report is due and no direction is new."""
-        if not self.is_open:
-            return calm
-        last = self.evidence.due_cycles[-1]
-        due = next((due for due in self.evidence.due_cycles if due >= cycle - self._detected_cycle), last)
-        new = sum(1 << i for i in range(JOINTS) if self._direction[i] == 0)
-        return calm._replace(watched=calm.watched | new << CONTACT_SHIFT, due=self._detected_cycle + due)
-
-    def begin(self, cycle: int) -> None:
-        """Open the window: a contact is detected in this cycle."""
-        self._detected_cycle = cycle
-        self.evidence.begin()
-        self._direction = [0] * JOINTS
-        self.is_open = True
-
-    def cancel(self) -> None:
-        """Close the window without a final report, as a fault does."""
-        self.is_open = False
-
-    def report(self, cycle: int, joints: int) -> ContactReport | None:
-        """Return the report that is due in this cycle, if one is. joints: bits of those over their threshold."""
-        elapsed = cycle - self._detected_cycle
-        is_final = elapsed >= self.evidence.due_cycles[-1]
-        for i in range(JOINTS):
-            if joints >> i & 1 and self._direction[i] == 0:
-                self._direction[i] = int(np.sign(self.evidence.tau_ext[i]))
-        if elapsed not in self.evidence.due_cycles and not is_final:
-            return None
-        self.is_open = not is_final
-        direction = self._direction[0], self._direction[1]
-        return self.evidence.report(self._detected_cycle, elapsed, direction, is_final)
+    m: a record of `course.MEMORY`.
+    """
+    direction = int(m.direction[0]), int(m.direction[1])
+    detected = int(m.detected_cycle)
+    report = evidence.report(detected, cycle - detected, direction, not m.is_open)
+    m.link = report.link
+    return report._replace(
+        level=ContactLevel(m.level), reaction=Reaction(m.reaction), is_two_sided=bool(m.is_two_sided)
+    )
 
 
 class IntegratedContact(ContactEvidence):
@@ -194,7 +135,7 @@ class IntegratedContact(ContactEvidence):
 
     def __init__(self, settings: Settings, tau_ext_hat: Vector, integral: Vector, peak: Vector) -> None:
         self.due_cycles = (0, round(settings.detector.isolation_window_s / settings.bus.period_s))
-        self.tau_ext = tau_ext_hat
+        self._tau_ext = tau_ext_hat
         self._integral, self._peak = integral, peak
         self._a_rad_s = settings.filter.a_rad_s
 
@@ -211,7 +152,7 @@ class IntegratedContact(ContactEvidence):
             link=2 if direction[1] else 1,
             direction=direction,
             tau_ext_peak=_pair(self._peak),
-            impulse=_pair(self._integral + self.tau_ext / self._a_rad_s),
+            impulse=_pair(self._integral + self._tau_ext / self._a_rad_s),
             is_final=is_final,
         )
 
@@ -219,57 +160,41 @@ class IntegratedContact(ContactEvidence):
 class RecalledContact(ContactEvidence):
     """The certified scheme's: the last samples, at detection, when the link is decided and when the kind is.
 
-    q, tau_ext_wide_hat, sigma, threshold: of the kernel (2,), views; the torque with the filter undone, its standard
-    deviation, the lower thresholds in force, finite or inf.
+    m: a record of `course.MEMORY`.
     """
 
-    def __init__(
-        self, settings: Settings, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector
-    ) -> None:
+    def __init__(self, settings: Settings, m: Any) -> None:
         period_s = settings.bus.period_s
         window_cycles = round(KIND_S / period_s)
         self.due_cycles = (0, round(LINK_S / period_s), window_cycles)
-        self.tau_ext = tau_ext_wide_hat
-        self._q, self._sigma, self._threshold = q, sigma, threshold
+        self._m = m
         self._period_s = period_s
         self._length_m = settings.arm.link_length_m
         self._before_cycles = round(BEFORE_S / period_s)
-        self.history = ContactHistory(self._before_cycles + 2 * window_cycles)
+        self.rows = np.zeros((2 * (self._before_cycles + 2 * window_cycles), _COLUMNS))
         self._since = 0
 
     def compile(self) -> None:
         """Run every compiled function, for one row and for several: numpy calls the columns of one row contiguous."""
-        zeros, ones = np.zeros(JOINTS), np.ones(JOINTS)
-        history = ContactHistory(4)
+        every = np.ones((8, _COLUMNS))
         for count in (1, 2):
-            history.put(zeros, ones, ones, ones)
-            rows = history.last(count)
+            rows = last_rows(every, count, count)
             tau, sigma = rows[:, TAU], rows[-1, SIGMA]
             localisation.on_link2(tau, rows[:, Q2], sigma, self._length_m)
             classify(tau, sigma, self._period_s)
             _peak(tau[:, 0], sigma[0])
 
-    def observe(self) -> None:
-        """Take in one cycle, whatever the state is."""
-        self.history.put(self._q, self.tau_ext, self._sigma, self._threshold)
-
-    def observe_calm(self, passed: int) -> None:
-        """Take in a cycle that `pass_by` will count, behind so many others."""
-        self.history.put_ahead(passed, self._q, self.tau_ext, self._sigma, self._threshold)
-
-    def pass_by(self, cycles: int) -> None:
-        """Count cycles whose samples are in the history."""
-        self.history.count += cycles
-
-    def begin(self) -> None:
+    def _begin(self) -> None:
         """Find how many cycles ago the contact began that is detected in this one."""
-        rows = self.history.last(self._before_cycles)
+        rows = last_rows(self.rows, int(self._m.kept_rows), self._before_cycles)
         below = np.all(np.abs(rows[:, TAU]) <= np.maximum(ONSET_FRACTION * rows[:, THRESHOLD], rows[:, SIGMA]), axis=1)
         self._since = rows.shape[0] - int(np.flatnonzero(below)[-1]) - 1 if np.any(below) else rows.shape[0]
 
     def report(self, detected: int, elapsed: int, direction: tuple[int, int], is_final: bool) -> ContactReport:
         """Report the contact from the samples since it began."""
-        rows = self.history.last(max(elapsed + self._since, 1))
+        if elapsed == 0:
+            self._begin()
+        rows = last_rows(self.rows, int(self._m.kept_rows), max(elapsed + self._since, 1))
         tau, sigma, threshold = rows[:, TAU], rows[-1, SIGMA], rows[-1, THRESHOLD]
         peaks = np.array([_peak(tau[:, i], sigma[i]) for i in range(JOINTS)])
         impulse = self._period_s * np.sum(tau, axis=0)

@@ -2,36 +2,24 @@
 
 A detector is registered by `register`, or by an entry point of the group `adacd_hil.detectors` in a lab's own package:
 the entry point's name is the detector's, its object what begins one, as for `register`. Entry points are loaded when a
-detector is first looked up; a run without live detectors loads none.
+detector is first looked up; a run loads none.
 
-**Contract of every detector** (`StreamDetector`): `take` returns one finite statistic per sample and joint, which
-depends on this sample and on those before it.
-
-**Contract of a live one** (`LiveDetector`): all that it remembers is in `state`, arrays of a fixed size by name, which
-it changes in place. So it is reset by writing their first values back, in a cycle, and a log replays to the same
-decisions. A detector without `state` runs offline only.
-
-What of this can be found out is found out before a detector is taken: the stream whole, cut, and sample by sample in
-arrays that are used again; two detectors beside each other; one again after a reset.
+**Contract** (`StreamDetector`): `take` returns one finite statistic per sample and joint, which depends on this sample
+and on those before it. `check_contract` plays noise before a detector is taken: whole, and cut in two.
 """
 
-import hashlib
 import importlib.metadata
-import inspect
 from collections.abc import Callable, Collection, Mapping
-from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.settings.schema import DetectorError
 
 ENTRY_POINTS: Final = "adacd_hil.detectors"
 """Group of the entry points by which a package registers detectors."""
-_CHECK_SAMPLES, _CHECK_CUT, _CHECK_AGAIN = 400, 137, 100
-_DIGITS = 16
+_CHECK_SAMPLES, _CHECK_CUT = 400, 137
 _LONGEST_TEXT = 200
 
 
@@ -46,26 +34,15 @@ class StreamDetector(Protocol):
         """
 
 
-@runtime_checkable
-class LiveDetector(Protocol):
-    """A `StreamDetector` that also runs in the cycle. state: all that it remembers, changed in place."""
-
-    state: Mapping[str, NDArray[Any]]
-
-    def take(self, z: Vector, held_Nm: Vector) -> Vector:
-        """Take in samples, in a cycle one; as for `StreamDetector`."""
-
-
 Maker = Callable[[float], StreamDetector]
 """Begins a detector on a stream of a period, s."""
 
 
 class Registered(NamedTuple):
-    """A detector that was registered. origin: where it is from, in words; is_live: it may run in the cycle."""
+    """A detector that was registered. origin: where it is from, in words."""
 
     make: Maker
     origin: str
-    is_live: bool
 
 
 _REGISTERED: dict[str, Registered] = {}
@@ -112,7 +89,8 @@ def add(name: str, make: Maker, reserved: Collection[str], origin: str = "") -> 
         known = _REGISTERED.get(name)
         where = f", of {known.origin}" if known is not None and known.origin else ""
         raise ValueError(f"there is a detector or channel {name} already{where}")
-    _REGISTERED[name] = Registered(make, origin, check_contract(name, make))
+    check_contract(name, make)
+    _REGISTERED[name] = Registered(make, origin)
 
 
 def remove(name: str) -> None:
@@ -120,8 +98,8 @@ def remove(name: str) -> None:
     del _REGISTERED[name]
 
 
-def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> bool:
-    """Return whether a detector may run live. Raises ValueError if it breaks the contract, saying in what."""
+def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:
+    """Play noise to a detector. Raises ValueError if it breaks the contract, saying in what."""
     z = np.random.default_rng(0).standard_normal((_CHECK_SAMPLES, JOINTS))
     held_Nm = np.where(z > 1.0, 0.1, 0.0)
     first, parts = make(period_s), make(period_s)
@@ -138,71 +116,6 @@ def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> bool:
         raise ValueError(
             f"detector {name} gives sample {sample} another statistic where the stream is cut at {_CHECK_CUT}"
         )
-    if not hasattr(first, "state"):
-        return False
-    _check_live(name, make(period_s), z, held_Nm, whole)
-    return True
-
-
-def _check_live(name: str, detector: Any, z: Vector, held_Nm: Vector, whole: Vector) -> None:
-    """Play the stream as the cycle does, reset the detector and play again. Raises ValueError."""
-    state = detector.state
-    if not (isinstance(state, Mapping) and all(isinstance(each, np.ndarray) for each in state.values())):
-        raise ValueError(f"detector {name}: state must be numpy arrays by name")
-    arrays, first = dict(state), first_values(detector)
-    half = _CHECK_SAMPLES // 2
-    _compare_singly(name, detector, z[:half], held_Nm[:half], whole, "fed sample by sample")
-    sizes = _sizes(detector)
-    _compare_singly(name, detector, z[half:], held_Nm[half:], whole[half:], "fed sample by sample", half)
-    for what, size in _sizes(detector).items():
-        if sizes.get(what) != size:
-            raise ValueError(
-                f"detector {name} grows: {what} has {sizes.get(what, 'no size')}, {half} samples on {size}"
-            )
-    for key, values in arrays.items():
-        if detector.state.get(key) is not values:
-            raise ValueError(f"detector {name} replaces its state {key}: it must be changed in place")
-    reset(detector, first)
-    again = slice(_CHECK_AGAIN)
-    _compare_singly(name, detector, z[again], held_Nm[again], whole, "reset: it keeps something beside its state")
-
-
-def _compare_singly(
-    name: str, detector: StreamDetector, z: Vector, held_Nm: Vector, whole: Vector, how: str, first: int = 0
-) -> None:
-    sample, held = np.empty((1, JOINTS)), np.empty((1, JOINTS))
-    for k in range(len(z)):
-        sample[0], held[0] = z[k], held_Nm[k]
-        statistic = np.array(detector.take(sample, held))
-        if statistic.shape != (1, JOINTS) or not np.array_equal(statistic[0], whole[k]):
-            raise ValueError(f"detector {name} gives sample {first + k} another statistic when it is {how}")
-
-
-def _sizes(detector: StreamDetector) -> dict[str, int]:
-    """Return the size of each array of the state, and of all else that has a length."""
-    held = {f"state {name}": values.size for name, values in getattr(detector, "state", {}).items()}
-    others = {name: value for name, value in getattr(detector, "__dict__", {}).items() if hasattr(value, "__len__")}
-    return held | {name: len(value) for name, value in others.items() if not isinstance(value, np.ndarray)}
-
-
-def first_values(detector: LiveDetector) -> dict[str, NDArray[Any]]:
-    """Copy the state of a detector that has just begun."""
-    return {name: values.copy() for name, values in detector.state.items()}
-
-
-def reset(detector: LiveDetector, first: Mapping[str, NDArray[Any]]) -> None:
-    """Begin anew: write the first values into the state, in place."""
-    for name, values in first.items():
-        detector.state[name][...] = values
-
-
-def source_digest(make: Maker) -> str:
-    """Digest the file that a detector's class is written in; "unknown" where it is in none. Its imports don't count."""
-    try:
-        file = inspect.getsourcefile(inspect.unwrap(make))
-        return "unknown" if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()[:_DIGITS]
-    except (TypeError, OSError):
-        return "unknown"
 
 
 def describe_error(error: BaseException) -> str:

@@ -37,14 +37,13 @@ Sources: De Luca and Mattone, "Sensorless robot collision detection and hybrid f
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
 
 from adacd_hil.compiled import Structured, compiled, packed, zeroed
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import detector_registry
 from adacd_hil.scheme.detect.detector_registry import Maker, Registered
 from adacd_hil.scheme.model import regressor
@@ -309,41 +308,6 @@ class DetectorBank:
         starts = np.arange(0, count, block_samples)
         further = [np.maximum.reduceat(detector.take(z, held_Nm), starts) for detector in self._registered]
         return np.concatenate((own, np.stack(further, axis=1)), axis=1)
-
-
-class BankChannel:
-    """One channel of the bank by itself, by the same compiled step: a built-in detector that runs live.
-
-    The likelihood ratio is none: its weights come from recorded motion.
-    """
-
-    def __init__(self, channel: str, period_s: float) -> None:
-        settings = DetectorBankSettings(onset_samples=(1,))
-        self._constants = constants_of(settings, np.zeros((JOINTS, 1, 1)), period_s)
-        self._memory = new_memory(self._constants)
-        self._channels = len(settings.own_channels)
-        self._place = settings.own_channels.index(channel)
-        self.state = {name: self._memory[name] for name in self._memory.dtype.names or ()}
-
-    def take(self, z: Vector, held_Nm: Vector) -> Vector:
-        """Take in samples (N, n); return the channel's statistic of each (N, n)."""
-        statistics = np.empty((len(z), self._channels, JOINTS))
-        record(self._constants, self._memory, z, held_Nm, 1, statistics)
-        return statistics[:, self._place]
-
-
-def live_makers() -> dict[str, Maker]:
-    """Return what begins each detector that can run live, by name: channels, detectors of one channel, registered ones.
-
-    Raises DetectorError.
-    """
-    settings = DetectorBankSettings()
-    channels = {name: name for name in settings.own_channels if not name.startswith(LIKELIHOOD)}
-    for name, places in settings.own_detectors.items():
-        if len(places) == 1:
-            channels[name] = settings.own_channels[places[0]]
-    makers: dict[str, Maker] = {name: partial(BankChannel, channel) for name, channel in channels.items()}
-    return makers | {name: found.make for name, found in settings.registered.items() if found.is_live}
 
 
 @compiled

@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled, released
+from adacd_hil.compiled import Structured, compiled
 from adacd_hil.records import Vector
-from adacd_hil.scheme.contact import contact_report
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import (
     anchor,
@@ -34,17 +33,11 @@ from adacd_hil.scheme.identify import (
     missing_torque,
     termination,
 )
-from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.kernel.kernel_samples import (
-    Numbers,
-    Recorded,
-    Samples,
     is_filled,
     keep_sample,
     observe,
     put_between,
-    put_sample,
-    take_out,
 )
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.supervisor.transitions import (
@@ -59,8 +52,6 @@ from adacd_hil.scheme.supervisor.transitions import (
     REFUTED,
     UNSEEN,
     WITHHELD,
-    Calm,
-    is_calm,
 )
 
 # What a cycle does, as bits.
@@ -325,51 +316,3 @@ def _fill_model(k: Any, m: Any, out: Any) -> None:
     out["condition"][0] = m["condition"]
     out["promotions"][0] = m["promotions"]
     out["quiet_s"][0] = m["tested"] * k["period_s"]
-
-
-@released
-def run_certified(
-    numbers: Numbers,
-    paper: Numbers,
-    samples: Samples,
-    recorded: Recorded,
-    first: int,
-    last: int,
-    mode: int,
-    paper_mode: int,
-    calm: Calm,
-    rows: Vector,
-    written: int,
-    judged: tuple[tuple[float, float], float],
-    promotions: float,
-) -> tuple[int, int]:
-    """Run both schemes as `run_paper` does; return the sample and the paper's next mode.
-
-    rows: of `ContactHistory`; written: how many have been. judged: a way, and the external torque along it, Nm, below
-    which a withdrawal has to be judged. That is not calm, nor is a model that has taken over, so that there are not
-    that many promotions any more.
-    """
-    constants, memory, block, values = numbers
-    m, out = memory[0], block[0]
-    (way_1, way_2), least_Nm = judged
-    passed = 0
-    for k in range(first, last + 1):
-        is_complete, steps = samples.is_complete[k], samples.steps[k]
-        put_sample(block, samples, k)
-        observation = step(constants, memory, block, is_complete, steps, mode)
-        paper_mode = paper_kernel.step_shadow(paper, paper_mode, block, is_complete, steps)
-        take_out(recorded, k, observation, values)
-        passed += samples.periods[k]
-        y = m["y"][filter_bank.WIDE]
-        along_Nm = y[0] * way_1 + y[1] * way_2
-        if (
-            not is_calm(calm, observation | samples.findings[k], passed, samples.cycle[k])
-            or out["promotions"][0] != promotions
-            or not (along_Nm >= least_Nm)
-            or k == last
-        ):
-            return k, paper_mode
-        place = written % (rows.shape[0] // 2)
-        contact_report.put_row(rows, place, out["q"], out["tau_ext_wide_hat"], m["wide_sigma"], m["wide_threshold"])
-        written += 1
-    return last, paper_mode

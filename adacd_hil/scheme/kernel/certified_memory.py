@@ -113,6 +113,7 @@ def constants_of(settings: Settings) -> Structured:
     prior_std = prior_std_of(settings)
     values: dict[str, Any] = {
         "period_s": period_s,
+        "second_cycles": round(1.0 / period_s),
         "level_rad": settings.level_rad,
         "cutoff": cutoff,
         "decay": decay,
@@ -193,6 +194,8 @@ def new_memory(settings: Settings) -> Structured:
         **belief.shapes_of(count, waiting),
         **termination.shapes_of(count),
         **evidence.shapes_of(),
+        # beside the numbers: the work that is left to Python
+        **dict.fromkeys(("has_forgotten", "monitored_cycles", "until_push_cycles"), ()),
         **anchor.shapes_of(),
         **fit_check.shapes_of(count),
         **earlier.shapes_of(),

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured, compiled, float_fields
-from adacd_hil.records import ArmBatch, Layout, Vector
+from adacd_hil.compiled import Structured, compiled, float_fields, record_of
+from adacd_hil.records import JOINTS, ArmBatch, ArmState, Layout, Vector
 from adacd_hil.scheme.supervisor.transitions import AT_REST, NOT_A_NUMBER, OVER_LIMIT, UNLOADED, UNSEEN
 from adacd_hil.settings.configuration import Settings
 
@@ -30,53 +30,58 @@ class Numbers(NamedTuple):
     values: Vector
 
 
-class Samples(NamedTuple):
-    """What the loops read of n cycles, as columns. period_s: 0 where not measured; steps, findings: of the arm."""
-
-    cycle: NDArray[np.int64]
-    q: Vector
-    dq: Vector
-    tau_J: Vector
-    period_s: Vector
-    is_complete: NDArray[np.int64]
-    periods: NDArray[np.int64]
-    steps: NDArray[np.int64]
-    findings: NDArray[np.int64]
+SAMPLE = record_of(
+    *((name, np.int64) for name in ("cycle", "periods", "steps", "sampled_ns", "age", "fault", "request")),
+    *((name, np.int64) for name in ("is_complete", "is_enabled", "is_late")),
+    *((name, np.float64, (JOINTS,)) for name in ("q", "dq", "tau_J")),
+)
+"""What a cycle takes in: an ArmState, `age` that of its oldest value, and what is asked in this cycle."""
+INTERVAL = record_of(("is_measured", np.int64), ("is_known", np.int64), ("sampled_ns", np.int64))
+"""Whether intervals are measured, and when the last fresh sample was taken, if there was one."""
 
 
-class Recorded(NamedTuple):
-    """What the loops write: bits of `Observation` (n,), blocks (n, size)."""
+def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
+    """Put a cycle into one element of SAMPLE (1,)."""
+    age = max(*arm.age_q, *arm.age_tau_J)
+    sampled_ns = arm.t_ns if arm.sampled_ns is None else arm.sampled_ns
+    counts = arm.cycle, arm.periods, arm.steps, sampled_ns, age, arm.fault, request
+    samples[0] = (*counts, arm.is_complete, arm.is_enabled, arm.is_late, arm.q, arm.dq, arm.tau_J)
 
-    observations: NDArray[np.int64]
-    blocks: Vector
 
-
-def samples_of(arms: ArmBatch, period_s: Vector, findings: NDArray[np.int64]) -> Samples:
-    """Lay out the columns as the compiled loops read them."""
-    columns = (arms.cycle, arms.is_complete, arms.periods, arms.steps)
-    integers = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
-    q, dq, tau_J = (np.ascontiguousarray(column, dtype=np.float64) for column in (arms.q, arms.dq, arms.tau_J))
-    cycle, is_complete, periods, steps = integers
-    return Samples(cycle, q, dq, tau_J, period_s, is_complete, periods, steps, findings)
+def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
+    """Lay out n cycles as SAMPLE (n,)."""
+    samples = np.zeros(arms.cycle.size, SAMPLE)
+    for name in ("cycle", "periods", "steps", "sampled_ns", "fault", "is_complete", "is_enabled", "is_late"):
+        samples[name] = getattr(arms, name)
+    for name in ("q", "dq", "tau_J"):
+        samples[name] = getattr(arms, name)
+    samples["age"] = np.maximum(arms.age_q.max(axis=1, initial=0), arms.age_tau_J.max(axis=1, initial=0))
+    samples["request"] = requests
+    return samples
 
 
 @compiled
-def put_sample(block: Structured, samples: Samples, k: int) -> None:
-    """Put sample k where the next step of a kernel finds it."""
+def interval_s(m: Any, sample: Any) -> float:
+    """Return the time since the last fresh sample, s; 0 of the first, of none, and where it isn't measured.
+
+    m: a record of INTERVAL.
+    """
+    if m.is_measured == 0 or sample.is_complete == 0:
+        return 0.0
+    period_s = (sample.sampled_ns - m.sampled_ns) * 1e-9 if m.is_known != 0 else 0.0
+    m.is_known, m.sampled_ns = 1, sample.sampled_ns
+    return period_s
+
+
+@compiled
+def put_sample(block: Structured, sample: Any, period_s: float) -> None:
+    """Put a sample where the next step of a kernel finds it."""
     out = block[0]
-    for i in range(samples.q.shape[1]):
-        out["q"][i] = samples.q[k, i]
-        out["dq"][i] = samples.dq[k, i]
-        out["tau_J"][i] = samples.tau_J[k, i]
-    out["period_s"][0] = samples.period_s[k]
-
-
-@compiled
-def take_out(recorded: Recorded, k: int, observation: int, values: Vector) -> None:
-    """Record what a kernel's step on sample k has found, and its block's values (size,)."""
-    recorded.observations[k] = observation
-    for j in range(values.size):
-        recorded.blocks[k, j] = values[j]
+    for i in range(out["q"].shape[0]):
+        out["q"][i] = sample.q[i]
+        out["dq"][i] = sample.dq[i]
+        out["tau_J"][i] = sample.tau_J[i]
+    out["period_s"][0] = period_s
 
 
 def block_dtype(layout: Layout) -> np.dtype[np.void]:

@@ -11,24 +11,20 @@ The measured interval goes into what integrates: filters, estimator, information
 counts: T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is right to a period. Nor does it into
 `external_torque.undo_filter`: of the mean of five derivatives only the ends count, and the five periods between them.
 
-**Shadow.** The paper's scheme beside the certified one: it adapts until eq. (15) holds, then compares with its
-thresholds.
-
-It decides nothing; what it comes to is in the block of the scheme in charge.
+**Beside.** Beside the certified scheme it takes the same samples by the same step (`step_beside`): it adapts until
+eq. (15) holds, then compares with its thresholds. What it comes to is in the block of the scheme in charge.
 """
 
 from typing import Any
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled, packed, released, zeroed
+from adacd_hil.compiled import Structured, compiled, packed, zeroed
 from adacd_hil.records import JOINTS, Vector, scheme_layout
 from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.identify import estimator, termination
 from adacd_hil.scheme.kernel.kernel_samples import (
     Numbers,
-    Recorded,
-    Samples,
     block_dtype,
     is_filled,
     keep_sample,
@@ -36,7 +32,6 @@ from adacd_hil.scheme.kernel.kernel_samples import (
     observe,
     put_between,
     put_sample,
-    take_out,
 )
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.supervisor.transitions import (
@@ -46,8 +41,6 @@ from adacd_hil.scheme.supervisor.transitions import (
     NOT_A_NUMBER,
     OVER_LIMIT,
     UNSEEN,
-    Calm,
-    is_calm,
 )
 from adacd_hil.settings.configuration import Settings
 
@@ -99,7 +92,7 @@ def new_memory(parameter_count: int) -> Structured:
     joint, parameter = (JOINTS,), (parameter_count,)
     columns, square = (JOINTS, parameter_count), (parameter_count, parameter_count)
     shapes: dict[str, tuple[int, ...]] = {
-        "has_gap": (),
+        **dict.fromkeys(("has_gap", "mode"), ()),
         # filters
         **dict.fromkeys(("Y_p", "Y_h", "input_old", "S", "W_f"), columns),
         **dict.fromkeys(("last", "between"), (3, JOINTS)),
@@ -145,6 +138,7 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     m["W_f"][:] = 0.0
     out["tau_f"][:] = 0.0
     external_torque.forget(m)
+    m["mode"] = LEARN  # of a step beside; where it is in charge, the state says it
     estimator.reset_gain(c["P0"], m["P"])
     termination.begin(m)
     m["quiet_cycles"] = 0.0
@@ -275,74 +269,22 @@ def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporti
     return ANY_CONTACT | joints << CONTACT_SHIFT if joints else 0
 
 
-@released
-def run_paper(
-    numbers: Numbers, samples: Samples, recorded: Recorded, first: int, last: int, mode: int, calm: Calm
-) -> int:
-    """Run `step` from sample `first` to the first that isn't calm, at most to `last`; return which it is.
-
-    Compiled at its first call, which no live run makes.
-    """
-    constants, memory, block, values = numbers
-    passed = 0
-    for k in range(first, last + 1):
-        put_sample(block, samples, k)
-        observation = step(constants, memory, block, samples.is_complete[k], samples.steps[k], mode)
-        take_out(recorded, k, observation, values)
-        passed += samples.periods[k]
-        if not is_calm(calm, observation | samples.findings[k], passed, samples.cycle[k]):
-            return k
-    return last
-
-
 @compiled
-def step_shadow(
-    paper: Numbers,
-    mode: int,
-    main: Structured,
-    is_complete: int,
-    steps: int,
-) -> int:
-    """Take in the sample that the main scheme's block has, fill that block's fields, and return the next mode.
+def step_beside(
+    constants: Structured, memory: Structured, block: Structured, sample: Any, period_s: float, main: Any
+) -> None:
+    """Take a sample in beside the scheme in charge, and fill that one's block with what it comes to.
 
-    main: the block, after the main kernel's step.
+    main: the block of the scheme in charge. It learns from `begin_adaptation` until eq. (15) holds, then it is armed.
     """
-    constants, memory, block, _ = paper
-    own, out = block[0], main[0]
-    for i in range(JOINTS):
-        own["q"][i], own["dq"][i], own["tau_J"][i] = out["q"][i], out["dq"][i], out["tau_J"][i]
-    own["period_s"][0] = out["period_s"][0]
-    observation = step(constants, memory, block, is_complete, steps, mode)
+    m, own = memory[0], block[0]
+    put_sample(block, sample, period_s)
+    observation = step(constants, memory, block, sample.is_complete, sample.steps, int(m["mode"]))
     if observation & ADAPTED:
-        mode = ARMED
-    out["paper_is_armed"][0] = 1.0 if mode == ARMED else 0.0
+        m["mode"] = ARMED
+    main["paper_is_armed"][0] = 1.0 if m["mode"] == ARMED else 0.0
     for i in range(JOINTS):
-        out["paper_tau_ext_hat"][i] = own["tau_ext_hat"][i]
-        out["paper_threshold"][i] = own["threshold"][i]
+        main["paper_tau_ext_hat"][i] = own["tau_ext_hat"][i]
+        main["paper_threshold"][i] = own["threshold"][i]
     for j in range(own["theta_hat"].size):
-        out["paper_theta_hat"][j] = own["theta_hat"][j]
-    return mode
-
-
-class PaperShadow:
-    """The paper's scheme on the same stream."""
-
-    def __init__(self, settings: Settings) -> None:
-        self.numbers = numbers_of(settings)
-        self.mode = 0
-
-    def compile(self, main: Structured) -> None:
-        """Run every compiled function once, on copies. main: the block of the scheme in charge."""
-        constants, memory, block, values = self.numbers
-        memory, block = memory.copy(), block.copy()
-        begin_adaptation(constants, memory, block)
-        step_shadow(Numbers(constants, memory, block, values), LEARN, main.copy(), 1, 1)
-
-    def begin_adaptation(self) -> None:
-        """Forget the past, as the scheme does whenever it adapts."""
-        begin_adaptation(self.numbers.constants, self.numbers.memory, self.numbers.block)
-        self.mode = LEARN
-
-    def step(self, main: Structured, is_complete: int, steps: int) -> None:
-        """Take in one cycle, and put what it comes to into the block of the scheme in charge."""
-        self.mode = step_shadow(self.numbers, self.mode, main, is_complete, steps)
+        main["paper_theta_hat"][j] = own["theta_hat"][j]

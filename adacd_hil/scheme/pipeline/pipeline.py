@@ -2,13 +2,10 @@
 
 A cycle: the state reached so far says what the kernel does, the kernel says where the supervisor goes, and the new
 state leaves its traces: an adaptation begins or ends, a contact's report begins or becomes final. Where the schemes
-differ, a policy says what is done: `PaperPolicy`, `CertifiedPolicy`. Detectors that the settings add (`live_detectors`)
-look at each cycle after the kernel; their alarms are the kernel's to all that follows.
+differ, a policy says what is done: `PaperPolicy`, `CertifiedPolicy`.
 
-**Calm cycles.** The supervisor changes its state rarely, and its numbers don't depend on it in between. Every cycle is
-asked whether something could happen in it (`Calm`); where nothing could, it is only counted. `step` asks cycle by
-cycle; recorded cycles go through a compiled loop up to the first that isn't calm, with the same bits. That one is
-concluded, by the same code. Where a live detector is armed, every cycle is concluded.
+The cycle is compiled (`pipeline.cycle`), the same live and in a replay. Once in a while it asks Python for something.
+`_attend` does it, in the same cycle, before the decision is given out.
 
 **The interval** between two samples is that between the SYNCs on which they were taken: a sample that comes late was
 still taken in time. It is 0 where it is unknown or not to be used.
@@ -19,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.compiled import Structured
 from adacd_hil.records import (
     ArmBatch,
     ArmState,
@@ -26,6 +24,7 @@ from adacd_hil.records import (
     Event,
     FaultReason,
     Layout,
+    Reaction,
     Request,
     SchemeOutput,
     SchemeState,
@@ -33,21 +32,12 @@ from adacd_hil.records import (
     certified_layout,
     scheme_layout,
 )
-from adacd_hil.scheme.detect.live_detectors import LiveDetectors, LiveSample
 from adacd_hil.scheme.identify.certificate import Certificate
-from adacd_hil.scheme.kernel.kernel_samples import Numbers, Recorded, samples_of
+from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, Numbers, fill_sample, samples_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.pipeline.certified_policy import CertifiedPolicy
+from adacd_hil.scheme.pipeline.cycle import BEFORE_CONTACT, DECISION
 from adacd_hil.scheme.pipeline.scheme_policy import PaperPolicy, SchemePolicy
-from adacd_hil.scheme.supervisor.supervisor import REACTING, Supervisor
-from adacd_hil.scheme.supervisor.transitions import (
-    ANY_CONTACT,
-    CONTACT_SHIFT,
-    NOT_A_NUMBER,
-    Calm,
-    finding_of,
-    findings_of,
-)
 from adacd_hil.settings.configuration import Settings
 
 
@@ -70,9 +60,8 @@ class SchemeBatch(NamedTuple):
     contact_places: NDArray[np.int64]
 
 
-_LONGEST_CALM = 1024
-"""Cycles that are counted together at most."""
-_NOTHING_CALM, _NOTHING_JUDGED = Calm(0, 0, 0), ((0.0, 0.0), 0.0)
+_STATES, _FAULTS, _REACTIONS = tuple(SchemeState), tuple(FaultReason), tuple(Reaction)
+"""By number."""
 
 
 def layout_of(settings: Settings) -> Layout:
@@ -104,94 +93,16 @@ def arm_at(arms: ArmBatch, row: int) -> ArmState:
     )
 
 
-class SampleIntervals:
-    """Turns the stamps of fresh samples into the intervals that the scheme integrates over, s."""
-
-    def __init__(self, settings: Settings) -> None:
-        self._is_measuring = settings.realtime.sample_period == "measured"
-        self._sampled_ns: int | None = None
-
-    def since_last(self, arm: ArmState) -> float:
-        """Take in one cycle; 0 for one without a fresh sample."""
-        if not (self._is_measuring and arm.is_complete):
-            return 0.0
-        sampled_ns = arm.t_ns if arm.sampled_ns is None else arm.sampled_ns
-        period_s = 0.0 if self._sampled_ns is None else (sampled_ns - self._sampled_ns) * 1e-9
-        self._sampled_ns = sampled_ns
-        return period_s
-
-    def between(self, arms: ArmBatch) -> Vector:
-        """Take in n cycles and return the interval before each (n,); 0 for one without a fresh sample."""
-        periods_s = np.zeros(arms.cycle.size)
-        sampled_ns = arms.sampled_ns[arms.is_complete]
-        if not self._is_measuring or not sampled_ns.size:
-            return periods_s
-        first_ns = sampled_ns[0] if self._sampled_ns is None else self._sampled_ns
-        periods_s[arms.is_complete] = np.diff(sampled_ns, prepend=first_ns) * 1e-9
-        self._sampled_ns = int(sampled_ns[-1])
-        return periods_s
-
-
-class CalmStretch:
-    """The calm cycles since the last one that was concluded, which nobody has counted yet."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._bounds, self._judged = _NOTHING_CALM, _NOTHING_JUDGED
-        self._periods = 0
-        self._observations = np.zeros(_LONGEST_CALM, dtype=np.int64)
-        self._passed = np.zeros(_LONGEST_CALM, dtype=np.int64)
-
-    def begin(self, bounds: Calm, judged: tuple[tuple[float, float], float]) -> None:
-        """Draw the bounds for the cycles that follow. judged: of the contact, a way and the least torque along it."""
-        self.count = self._periods = 0
-        self._bounds, self._judged = bounds, judged
-
-    def holds(self, arm: ArmState, observation: int, tau_ext_hat: Vector) -> bool:
-        """Tell whether a cycle is within the bounds; `take` it then."""
-        watched, expected, cycles, periods, due = self._bounds
-        (way_1, way_2), least_Nm = self._judged
-        torque_1, torque_2 = tau_ext_hat.tolist()
-        return (
-            self.count < min(cycles, _LONGEST_CALM)
-            and (observation | finding_of(arm)) & watched == expected
-            and self._periods + arm.periods < periods
-            and arm.cycle < due
-            and torque_1 * way_1 + torque_2 * way_2 >= least_Nm
-        )
-
-    def take(self, arm: ArmState, observation: int) -> None:
-        """Keep what is to be counted of a calm cycle."""
-        self._observations[self.count], self._passed[self.count] = observation, arm.periods
-        self.count += 1
-        self._periods += arm.periods
-
-    @property
-    def taken(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Observations and periods of the cycles (n,)."""
-        return self._observations[: self.count], self._passed[: self.count]
-
-
 class Pipeline:
     """Adaptation and contact detection for one run, by the scheme that the settings ask for."""
 
     def __init__(self, settings: Settings) -> None:
-        """Begin. Raises DetectorError for a live detector that can't run here."""
-        self.detectors = LiveDetectors(settings) if settings.detector.live else None
-        """Detectors beside the scheme's own thresholds; None without."""
-        self._events: list[Event] = []
-        self._supervisor = Supervisor(settings)
         self._policy: SchemePolicy = (
-            CertifiedPolicy(settings, self._supervisor)
-            if settings.scheme == "certified"
-            else PaperPolicy(settings, self._supervisor)
+            CertifiedPolicy(settings) if settings.scheme == "certified" else PaperPolicy(settings)
         )
-        self._intervals = SampleIntervals(settings)
-        self._stretch = CalmStretch()
-        self._open: tuple[ArmState, int, Vector] | None = None  # the calm cycle that is to be completed
         self._theta_hat = layout_of(settings).slices["theta_hat"]
-        block = self.numbers.block[0]
-        self._q, self._dq, self._tau_J, self._period_s = (block[name] for name in ("q", "dq", "tau_J", "period_s"))
+        self._sample, self._decision = np.zeros(1, SAMPLE), np.zeros(1, DECISION)
+        self._block = np.zeros((1, self.numbers.values.size))
 
     @property
     def numbers(self) -> Numbers:
@@ -201,10 +112,7 @@ class Pipeline:
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._policy.theta_ff, 0.0)
-        self._policy.contacts.compile()
         self._policy.compile()
-        if self.detectors is not None:
-            self.detectors.compile()
 
     @property
     def compiled_functions(self) -> tuple[object, ...]:
@@ -223,167 +131,66 @@ class Pipeline:
         """Say what contradicts a certificate that is withheld, a line each."""
         return self._policy.describe_withheld()
 
-    def describe_detector(self) -> list[str]:
-        """Say which live detector has failed, and by what, in a line."""
-        return [] if self.detectors is None else [self.detectors.failure]
-
     @property
     def certificates(self) -> tuple[Certificate, ...]:
         """The certificates of the run that were not taken back, in order; the paper has none."""
         return self._policy.certificates
 
     def take_events(self) -> list[Event]:
-        """Return what is worth a line since the last call: a margin that has shrunk, a certificate, who has found."""
-        events, self._events = [*self._events, *self._policy.take_events()], []
-        return events
+        """Return what is worth a line since the last call: a margin that has shrunk, a certificate."""
+        return self._policy.take_events()
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
-        output = self.decide(arm, request)
-        self.complete()
-        return output
-
-    def decide(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
-        """Take in one cycle; `theta_hat` and `block` of the output hold once `complete` has been called."""
-        self.complete()
-        self._q[:] = arm.q
-        self._dq[:] = arm.dq
-        self._tau_J[:] = arm.tau_J
-        self._period_s[0] = self._intervals.since_last(arm)
-        policy, stretch = self._policy, self._stretch
-        observation = policy.step(int(arm.is_complete), int(arm.steps))
-        if request is Request.NONE and stretch.holds(arm, observation, policy.tau_ext_hat) and policy.is_calm:
-            block = np.empty(self.numbers.values.size)
-            self._open = arm, observation, block
-            return self._output(arm.cycle, self._supervisor.state, observation, None, block)
-        policy.step_beside(int(arm.is_complete), int(arm.steps))
-        self._count_calm()
-        output = self._conclude(arm, request, observation)
-        stretch.begin(self._calm(arm.cycle + 1), policy.contacts.judged)
-        return output
-
-    def complete(self) -> None:
-        """Do what no decision of this cycle depends on; again, nothing."""
-        if self._open is None:
-            return
-        (arm, observation, block), self._open = self._open, None
-        policy, stretch = self._policy, self._stretch
-        policy.step_beside(int(arm.is_complete), int(arm.steps))
-        block[:] = self.numbers.values
-        policy.observe_calm(stretch.count)
-        stretch.take(arm, observation)
-
-    def _count_calm(self) -> None:
-        """Let the supervisor and the policy count the calm cycles since the last concluded one."""
-        self.complete()
-        stretch = self._stretch
-        if stretch.count:
-            self._supervisor.pass_by(*stretch.taken)
-            self._policy.pass_by(stretch.count)
-        stretch.begin(_NOTHING_CALM, _NOTHING_JUDGED)
-
-    def _conclude(self, arm: ArmState, request: Request, observation: int) -> SchemeOutput:
-        """Do what comes after the numbers in a cycle in which something could happen."""
-        policy, supervisor, contacts = self._policy, self._supervisor, self._policy.contacts
-        previous = supervisor.state
-        own_joints = observation >> CONTACT_SHIFT
-        if self.detectors is not None:
-            observation |= self._detect(self.detectors, arm, observation)
-        observation = policy.take(request, observation)
-        block = self.numbers.values.copy()
-        supervisor.step(arm, request, observation, contacts.is_reporting, contacts.goes_on)
-        policy.follow(previous, arm.cycle, observation)
-        contact = policy.report(arm.cycle, observation)
-        if self.detectors is not None:
-            self._events += [*policy.take_events(), *self.detectors.tell(supervisor.state in REACTING, own_joints)]
-        return self._output(arm.cycle, previous, observation, contact, block)
-
-    def _output(
-        self, cycle: int, previous: SchemeState, observation: int, contact: ContactReport | None, block: Vector
-    ) -> SchemeOutput:
-        policy, supervisor = self._policy, self._supervisor
+        policy = self._policy
+        fill_sample(self._sample, arm, request)
+        asked = policy.cycle(self._sample, self._decision, self._block)
+        contact = self._attend(asked, self._sample, self._decision, 0) if asked else None
+        state, previous_state, fault, reaction, contact_joints, _, is_model_valid = self._decision.item()
+        block = self._block[0].copy()
         return SchemeOutput(
-            cycle=cycle,
-            state=supervisor.state,
-            previous_state=previous,
-            fault=supervisor.fault,
-            contact_joints=observation >> CONTACT_SHIFT,
-            is_model_valid=policy.is_model_valid,
+            cycle=arm.cycle,
+            state=_STATES[state],
+            previous_state=_STATES[previous_state],
+            fault=_FAULTS[fault],
+            contact_joints=contact_joints,
+            is_model_valid=bool(is_model_valid),
             theta_hat=block[self._theta_hat],
             theta_ff=policy.theta_ff,
             tau_ext_hat=policy.tau_ext_hat.copy(),
             contact=contact,
             block=block,
-            reaction=policy.contacts.reaction,
+            reaction=_REACTIONS[reaction],
         )
-
-    @property
-    def _is_armed(self) -> bool:
-        """Whether live detectors watch in the state reached so far."""
-        supervisor = self._supervisor
-        state = supervisor.origin if supervisor.state in REACTING else supervisor.state
-        return state in self._policy.armed_in
-
-    def _detect(self, detectors: LiveDetectors, arm: ArmState, observation: int) -> int:
-        """Let the live detectors look at this cycle; return the bits that they add to the kernel's."""
-        sample = LiveSample(
-            arm.cycle, self._q, self._dq, self._tau_J, self.numbers.values[self._theta_hat], float(self._period_s[0])
-        )
-        is_fresh = arm.is_complete and not observation & NOT_A_NUMBER
-        added = detectors.step(sample, is_fresh, self._is_armed)
-        if added & ANY_CONTACT and not observation & ANY_CONTACT:
-            self._policy.touch()
-        return added
 
     def run(self, arms: ArmBatch, requests: NDArray[np.uint8]) -> SchemeBatch:
         """Take in n cycles, as `step` does one by one. requests (n,): of `Request`."""
         count = arms.cycle.size
-        policy, supervisor = self._policy, self._supervisor
-        self._count_calm()
-        samples = samples_of(arms, self._intervals.between(arms), findings_of(arms))
-        recorded = Recorded(np.zeros(count, dtype=np.int64), np.empty((count, self.numbers.values.size)))
-        state, previous_state, fault, reaction = (np.zeros(count, dtype=np.uint8) for _ in range(4))
-        is_model_valid = np.zeros(count, dtype=np.bool_)
+        samples, decisions = samples_of(arms, requests), np.zeros(count, DECISION)
+        blocks = np.empty((count, self.numbers.values.size))
         contacts: dict[int, ContactReport] = {}
-        looks = [*np.flatnonzero(requests).tolist(), count - 1]
-        first = 0
-        while first < count:
-            while looks[0] < first:
-                del looks[0]
-            calm = self._calm(int(samples.cycle[first]))
-            last = max(min(looks[0], first + calm.cycles), first)
-            row = policy.run(samples, recorded, first, last, calm)
-            if row > first:
-                past = slice(first, row)
-                supervisor.pass_by(recorded.observations[past], samples.periods[past])
-                policy.pass_by(row - first)
-                state[past] = previous_state[past] = supervisor.state
-                fault[past] = supervisor.fault
-                reaction[past], is_model_valid[past] = policy.contacts.reaction, policy.is_model_valid
-            output = self._conclude(arm_at(arms, row), Request(requests[row]), int(recorded.observations[row]))
-            state[row], previous_state[row], fault[row] = output.state, output.previous_state, output.fault
-            reaction[row], is_model_valid[row] = output.reaction, output.is_model_valid
-            recorded.observations[row] |= output.contact_joints << CONTACT_SHIFT
-            if output.contact is not None:
-                contacts[row] = output.contact
-            first = row + 1
+        place, asked = self._policy.run(samples, decisions, blocks, 0)
+        while place < count:
+            contact = self._attend(asked, samples, decisions, place)
+            if contact is not None:
+                contacts[place] = contact
+            place, asked = self._policy.run(samples, decisions, blocks, place + 1)
+        columns = {
+            name: np.ascontiguousarray(decisions[name]) for name in DECISION.names or () if name != "observation"
+        }
         return SchemeBatch(
-            cycle=samples.cycle,
-            state=state,
-            previous_state=previous_state,
-            fault=fault,
-            reaction=reaction,
-            contact_joints=recorded.observations >> CONTACT_SHIFT,
-            is_model_valid=is_model_valid,
-            block=recorded.blocks,
+            cycle=np.ascontiguousarray(samples["cycle"]),
+            **columns,
+            block=blocks,
             contacts=list(contacts.values()),
             contact_places=np.array(list(contacts), dtype=np.int64),
         )
 
-    def _calm(self, cycle: int) -> Calm:
-        """Return bounds within which the next cycles, from this one on, need not be concluded."""
-        if self.detectors is not None and self._is_armed:
-            return Calm(0, 0, 0)
-        contacts = self._policy.contacts
-        calm = self._supervisor.calm(contacts.is_reporting, contacts.goes_on)
-        return self._policy.calm(contacts.calm(calm, cycle))
+    def _attend(self, asked: int, samples: Structured, decisions: Structured, place: int) -> ContactReport | None:
+        """Do what a cycle asks of Python, and end it; return the contact's report that is due."""
+        policy, cycle = self._policy, int(samples["cycle"][place])
+        if asked & BEFORE_CONTACT:
+            previous, observation = SchemeState(decisions["previous_state"][place]), decisions["observation"][place]
+            policy.follow(asked, previous, cycle, int(observation))
+            asked = policy.end(samples, decisions, place)
+        return policy.attend(asked, cycle)

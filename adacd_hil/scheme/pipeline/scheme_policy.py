@@ -5,92 +5,91 @@ before it.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import numpy as np
 
-from adacd_hil.records import ContactReport, Event, Request, SchemeState, Vector, scheme_layout
-from adacd_hil.scheme.contact.contact_report import IntegratedContact
-from adacd_hil.scheme.contact.reaction import ContactCourse, PaperReaction
+from adacd_hil.compiled import Structured
+from adacd_hil.records import ContactReport, Event, SchemeState, Vector, scheme_layout
+from adacd_hil.scheme.contact import course
+from adacd_hil.scheme.contact.contact_report import ContactEvidence, IntegratedContact, report_of
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.kernel import paper_kernel
-from adacd_hil.scheme.kernel.kernel_samples import Numbers, Recorded, Samples
+from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, Numbers
 from adacd_hil.scheme.model.regressor import is_positive_definite
+from adacd_hil.scheme.pipeline.cycle import DECISION, REPORT, end_paper, new_course, paper_cycle, run_paper
+from adacd_hil.scheme.supervisor import supervisor
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
-from adacd_hil.scheme.supervisor.transitions import Calm, SchemeEvent
+from adacd_hil.scheme.supervisor.transitions import SchemeEvent
 from adacd_hil.settings.configuration import Settings
 
 
 class SchemePolicy(ABC):
-    """What a pipeline asks its scheme: the numbers of a cycle, and what a state begins and ends with.
+    """What a pipeline asks its scheme: the compiled cycle, and what a state begins and ends with.
 
-    supervisor: of the pipeline. contacts: of the arm. tau_ext_hat (2,): external torque that is reported in each cycle,
-    Nm, a view. theta_ff: what the last finished adaptation left, for the feedforward, zeros before. is_model_valid:
-    theta_ff may be fed forward. armed_in: where live detectors watch, and in the reactions to what they find there.
+    numbers: what the kernel works on. tau_ext_hat (2,): external torque that is reported in each cycle, Nm, a view.
+    theta_ff: what the last finished adaptation left, for the feedforward, zeros before.
     """
 
-    supervisor: Supervisor
     numbers: Numbers
-    contacts: ContactCourse
+    evidence: ContactEvidence
     tau_ext_hat: Vector
     theta_ff: Vector
-    is_model_valid: bool
-    armed_in: frozenset[SchemeState] = frozenset((SchemeState.MONITOR,))
 
     compiled_functions: tuple[object, ...]
     """The largest that `compile` runs."""
+    _cycle: Callable[..., int]
+    _end: Callable[..., int]
+    _run: Callable[..., tuple[int, int]]
+    _cycle_arrays: tuple[Vector | Structured, ...]
+    """What the compiled cycle works on, in its order."""
+    _end_arrays: tuple[Vector | Structured, ...]
 
-    @abstractmethod
+    def __init__(self, settings: Settings) -> None:
+        self._course_constants, self._course_memory = new_course(settings)
+        self._contact = self._course_memory["contact"][0]
+        self.supervisor = Supervisor(self._course_memory["supervisor"])
+
+    @property
+    def is_model_valid(self) -> bool:
+        """Whether theta_ff may be fed forward."""
+        return bool(self._course_memory["is_model_valid"][0])
+
+    @is_model_valid.setter
+    def is_model_valid(self, is_valid: bool) -> None:
+        self._course_memory["is_model_valid"] = is_valid
+
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
+        supervisor.doubt(self._course_memory["supervisor"].copy()[0])
+        course.goes_on(self._contact)
+        self.evidence.compile()
+        samples, decisions, blocks = np.zeros(1, SAMPLE), np.zeros(1, DECISION), np.zeros((1, self.numbers.values.size))
+        self._cycle(samples, decisions, blocks, 0, *(array.copy() for array in self._cycle_arrays))
+        self._end(samples, decisions, 0, *(array.copy() for array in self._end_arrays))
 
     def compile_longest(self) -> None:
         """Compile about half of it, what `compile` comes to last; nothing where all of it takes a moment."""
 
-    @abstractmethod
-    def step(self, is_complete: int, steps: int) -> int:
-        """Take in the sample that is in the block; return bits of `Observation`. Arguments as for the kernels."""
+    def cycle(self, samples: Structured, decisions: Structured, blocks: Vector) -> int:
+        """Take in the only cycle of the samples; return bits of what it asks (`pipeline.cycle`)."""
+        return self._cycle(samples, decisions, blocks, 0, *self._cycle_arrays)
+
+    def run(self, samples: Structured, decisions: Structured, blocks: Vector, first: int) -> tuple[int, int]:
+        """Take in cycles up to one that asks for something; return its place and what it asks."""
+        return self._run(samples, decisions, blocks, first, self._cycle_arrays)
+
+    def end(self, samples: Structured, decisions: Structured, place: int) -> int:
+        """End a cycle that `follow` has attended to; return what it still asks."""
+        return self._end(samples, decisions, place, *self._end_arrays)
 
     @abstractmethod
-    def run(self, samples: Samples, recorded: Recorded, first: int, last: int, calm: Calm) -> int:
-        """Run the numbers to the first cycle that isn't calm, at most to `last`; return its row."""
+    def follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
+        """Do what a new state begins with, and what the previous one ends with: after the supervisor's step."""
 
-    @abstractmethod
-    def follow(self, previous: SchemeState, cycle: int, observation: int) -> SchemeState:
-        """Do what a new state begins with, and what the previous one ends with; return where the arm is then.
-
-        After the supervisor's step, in each cycle.
-        """
-
-    def step_beside(self, is_complete: int, steps: int) -> None:
-        """Take the sample in beside what decides; arguments as for `step`, which comes before it."""
-
-    def take(self, request: Request, observation: int) -> int:  # noqa: ARG002
-        """Take in a request before the supervisor does; return the observation as it stands then."""
-        return observation
-
-    def touch(self) -> None:
-        """Take in that a live detector has found a contact that the kernel has not; before the supervisor's step."""
-
-    def report(self, cycle: int, observation: int) -> ContactReport | None:
-        """Return the contact's report that is due, after all else in each cycle."""
-        return self.contacts.step(cycle, self.supervisor, observation, self.is_model_valid)
-
-    def calm(self, calm: Calm) -> Calm:
-        """Narrow the bounds to those within which only `pass_by` is to be called."""
-        return calm
-
-    @property
-    def is_calm(self) -> bool:
-        """Whether the numbers of this cycle, beside its observation, leave everything as it is."""
-        return True
-
-    def observe_calm(self, passed: int) -> None:
-        """Take in a calm cycle that `pass_by` will count; `passed`: calm ones before it, not counted yet."""
-        self.contacts.evidence.observe_calm(passed)
-
-    def pass_by(self, cycles: int) -> None:
-        """Count calm cycles."""
-        self.contacts.pass_by(cycles)
+    def attend(self, asked: int, cycle: int) -> ContactReport | None:
+        """Do what the end of a cycle asks; return the contact's report that is due."""
+        return report_of(self.evidence, self._contact, cycle) if asked & REPORT else None
 
     def describe_missing(self) -> list[str]:
         """Say what an adaptation that takes too long is waiting for, a line each."""
@@ -110,13 +109,6 @@ class SchemePolicy(ABC):
         return []
 
 
-_MODES = {
-    state: (paper_kernel.LEARN if state is SchemeState.ADAPT else 0)
-    | (paper_kernel.ARMED if state in (SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED) else 0)
-    for state in SchemeState
-}
-
-
 class PaperPolicy(SchemePolicy):
     """The paper's scheme: no certificate, and one condition for what an adaptation waits for, eq. (15).
 
@@ -124,42 +116,29 @@ class PaperPolicy(SchemePolicy):
     so during later adaptations.
     """
 
-    def __init__(self, settings: Settings, supervisor: Supervisor) -> None:
+    _cycle, _end, _run = staticmethod(paper_cycle), staticmethod(end_paper), staticmethod(run_paper)
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings)
         self.numbers = paper_kernel.numbers_of(settings)
         places = scheme_layout(len(settings.estimator.parameter_names)).slices
         memory, values = self.numbers.memory[0], self.numbers.values
         self.tau_ext_hat = values[places["tau_ext_hat"]]
-        evidence = IntegratedContact(settings, self.tau_ext_hat, memory["integral"], memory["peak"])
-        self.contacts = ContactCourse(evidence, PaperReaction(settings), self.tau_ext_hat)
+        self.evidence = IntegratedContact(settings, self.tau_ext_hat, memory["integral"], memory["peak"])
+        course.fill_constants(settings, self.evidence.due_cycles, self._course_constants["contact"][0])
         self._theta_hat = values[places["theta_hat"]]
         self.theta_ff = np.zeros(self._theta_hat.size)
-        self.is_model_valid = False
-        self.supervisor = supervisor
+        self._cycle_arrays = *self.numbers, self._course_constants, self._course_memory
+        self._end_arrays = self.numbers.block, self._course_constants, self._course_memory
 
-    compiled_functions = (paper_kernel.begin_adaptation, paper_kernel.step)
+    compiled_functions = (paper_kernel.begin_adaptation, paper_cycle)
 
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies."""
-        constants, memory, block, _ = self.numbers
-        memory, block = memory.copy(), block.copy()
-        paper_kernel.begin_adaptation(constants, memory, block)
-        paper_kernel.step(constants, memory, block, 1, 1, paper_kernel.LEARN)
+        paper_kernel.begin_adaptation(*(array.copy() for array in self.numbers[:3]))
+        super().compile()
 
-    @property
-    def _mode(self) -> int:
-        """What the numbers do in the state reached so far."""
-        return _MODES[self.supervisor.state] | (paper_kernel.REPORTING if self.contacts.is_reporting else 0)
-
-    def step(self, is_complete: int, steps: int) -> int:
-        """Take in the sample that is in the block."""
-        constants, memory, block, _ = self.numbers
-        return paper_kernel.step(constants, memory, block, is_complete, steps, self._mode)
-
-    def run(self, samples: Samples, recorded: Recorded, first: int, last: int, calm: Calm) -> int:
-        """Run the numbers to the first cycle that isn't calm."""
-        return paper_kernel.run_paper(self.numbers, samples, recorded, first, last, self._mode, calm)
-
-    def follow(self, previous: SchemeState, cycle: int, observation: int) -> SchemeState:  # noqa: ARG002
+    def follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:  # noqa: ARG002
         """Begin an adaptation, or take over what it has come to."""
         state = self.supervisor.state
         if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:
@@ -169,5 +148,4 @@ class PaperPolicy(SchemePolicy):
             if self.supervisor.cause is SchemeEvent.REVOKED:
                 self.theta_ff = np.zeros(self.theta_ff.size)
                 self.is_model_valid = False
-            paper_kernel.begin_adaptation(self.numbers.constants, self.numbers.memory, self.numbers.block)
-        return state
+            paper_kernel.begin_adaptation(*self.numbers[:3])

@@ -12,36 +12,35 @@ From CERTIFY that is ADAPT: the fit is forgotten, and an arm that still stands w
 A request is kept until it can be served, but only in the states of `KEPT_IN`; elsewhere it is dropped. No word that was
 given before a stop releases it: an acknowledgement is dropped, and a change of payload waits until the stop has been
 acknowledged, but for one that is announced in STOPPED itself. `KeptRequest` outlives a fault that is acknowledged.
+
+`supervise` is compiled; all that it remembers is one record, `MEMORY`, of whole numbers.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
+from adacd_hil.compiled import Structured, compiled, record_of
+from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.scheme.supervisor.transitions import (
     ADAPTED,
     ANY_CONTACT,
     AT_REST,
     CERTIFIED,
     COLLISION,
-    CONTACT,
-    DETECTOR_FAILED,
     FITTED,
-    NEVER,
     NOT_A_NUMBER,
     OVER_LIMIT,
     OVER_SPEED,
     REFUTED,
-    TRANSITIONS,
     UNLOADED,
     UNSEEN,
     WITHHELD,
-    ArmFinding,
-    Calm,
     SchemeEvent,
+    leads_on,
     next_state,
 )
 from adacd_hil.settings.configuration import Settings
@@ -66,413 +65,380 @@ POWERED = frozenset(
     )
 )
 """Where the drives are enabled and may have torque."""
-_CHECKED = POWERED | {SchemeState.ENABLE}
 LEARNING = frozenset((SchemeState.ADAPT, SchemeState.CERTIFY))
 REACTING = frozenset((SchemeState.REACT, SchemeState.STOPPED))
-_HELD_FROM = frozenset((SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED))
-"""Where a host that is late holds the arm, or does so already; elsewhere there is no way to, and it is a fault."""
 
 KEPT_IN = MappingProxyType(
     {
         Request.ACKNOWLEDGE: frozenset((SchemeState.STOPPED,)),
         Request.PAYLOAD: POWERED - {SchemeState.PAYLOAD},
         Request.PAYLOAD_CHANGED: frozenset((SchemeState.PAYLOAD,)),
-        Request.FINISH: frozenset[SchemeState](),
-        Request.ACCEPT: frozenset[SchemeState](),
         Request.RELEARN: frozenset((SchemeState.STOPPED,)),
-        Request.FAULT_TORQUE: frozenset[SchemeState](),
-        Request.FAULT_FOLLOWING: frozenset[SchemeState](),
-        Request.FAULT_TAMPERED: frozenset[SchemeState](),
-        Request.FAULT_MISCONFIGURED: frozenset[SchemeState](),
     }
 )
 """Where a request waits to be served. FINISH is the control layer's; ACCEPT and a fault are served at once, or
 not at all."""
-_FAULT_ASKED = MappingProxyType(
-    {
-        Request.FAULT_TORQUE: FaultReason.TORQUE,
-        Request.FAULT_FOLLOWING: FaultReason.FOLLOWING,
-        Request.FAULT_TAMPERED: FaultReason.TAMPERED,
-        Request.FAULT_MISCONFIGURED: FaultReason.MISCONFIGURED,
-    }
+
+
+def among(states: Collection[SchemeState]) -> NDArray[np.bool_]:
+    """Tell of each state whether it is one of these."""
+    return np.array([state in states for state in SchemeState])
+
+
+_IS_POWERED = among(POWERED)
+_IS_CHECKED = among(POWERED | {SchemeState.ENABLE})
+_IS_LEARNING = among(LEARNING)
+IS_REACTING = among(REACTING)
+_IS_HELD_FROM = among((SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED))
+"""Where a host that is late holds the arm, or does so already; elsewhere there is no way to, and it is a fault."""
+_IS_KEPT = np.array([among(KEPT_IN.get(request, ())) for request in Request])
+"""Where a request waits (requests, states)."""
+_FAULT_ASKED = np.zeros(len(Request), np.int64)
+_FAULT_ASKED[Request.FAULT_TORQUE] = FaultReason.TORQUE
+_FAULT_ASKED[Request.FAULT_FOLLOWING] = FaultReason.FOLLOWING
+_FAULT_ASKED[Request.FAULT_TAMPERED] = FaultReason.TAMPERED
+_FAULT_ASKED[Request.FAULT_MISCONFIGURED] = FaultReason.MISCONFIGURED
+_OVERDUE = np.zeros(len(SchemeState), np.int64)
+_OVERDUE[[SchemeState.INIT, SchemeState.COMMISSION]] = FaultReason.COMMISSION_TIMEOUT
+_OVERDUE[SchemeState.ENABLE] = FaultReason.ENABLE_TIMEOUT
+_OVERDUE[[SchemeState.ADAPT, SchemeState.CERTIFY]] = FaultReason.ADAPT_TIMEOUT
+"""The fault of a phase that takes too long; NONE of one that may take for ever."""
+
+CONSTANTS = record_of(
+    *((name, np.int64) for name in ("has_gravity", "max_age_cycles", "blind_limit", "commission_cycles")),
+    *((name, np.int64) for name in ("rest_cycles", "unrest_cycles", "clear_cycles", "patience_cycles")),
+    ("rebound_cycles", np.int64),
+    ("limit_periods", np.int64, (len(SchemeState),)),
 )
-
-_RAISED_BY = MappingProxyType(
-    {
-        SchemeEvent.COLLISION: COLLISION,
-        SchemeEvent.CONTACT: CONTACT,
-        SchemeEvent.LATE: int(ArmFinding.LATE),
-        SchemeEvent.COMPLETE: int(ArmFinding.COMPLETE),
-        SchemeEvent.ENABLED: int(ArmFinding.ENABLED),
-        SchemeEvent.ADAPTED: ADAPTED,
-        SchemeEvent.FITTED: FITTED,
-        SchemeEvent.CERTIFIED: CERTIFIED,
-        SchemeEvent.REFUTED: REFUTED,
-        SchemeEvent.CONTRADICTED: WITHHELD,
-    }
+"""limit_periods: by state, of those that may take too long."""
+MEMORY = record_of(
+    *((name, np.int64) for name in ("state", "origin", "cause", "fault", "is_latched", "is_doubted")),
+    *((name, np.int64) for name in ("pending", "is_weight_told", "is_told_here")),
+    *((name, np.int64) for name in ("phase_periods", "learning_periods", "commissioned_cycles", "still_cycles")),
+    *((name, np.int64) for name in ("moving_cycles", "cleared_cycles", "blind_cycles", "stale_cycles")),
 )
-"""Findings without which an event doesn't come. Those that are not here come by counting, or by a request."""
-_UNRELIABLE = NOT_A_NUMBER | DETECTOR_FAILED
-_NOT_WELL = int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | _UNRELIABLE | OVER_LIMIT | OVER_SPEED | UNSEEN
-"""Findings without which `_check` finds nothing in an arm that is enabled."""
+"""origin: where the arm goes on after REACT or STOPPED: where it came from, but from a broken test to learn anew.
+cause: the event by which the state was entered. is_latched: what REACT and STOPPED are about is to be acknowledged.
+is_doubted: the model is wrong. pending: bits of the requests that wait. is_weight_told: of a payload, since REACT.
+is_told_here: of a new payload, in this state. periods, cycles: counts up to now."""
 
 
-def _calm_in(state: SchemeState) -> tuple[int, int]:
-    """Return the findings that matter in a state, and what they have to be to leave it as it is."""
-    watched, expected = 0, 0
-    for event in TRANSITIONS[state]:
-        watched |= _RAISED_BY.get(event, 0)
-    if state in _CHECKED or state is SchemeState.COMMISSION:
-        watched |= _NOT_WELL
-    if state is SchemeState.INIT:
-        watched |= int(ArmFinding.OLD)
-    if state in POWERED:
-        expected |= int(ArmFinding.ENABLED)
-    if state in (SchemeState.COMMISSION, SchemeState.ADAPT):
-        watched |= WITHHELD
-    if state is SchemeState.COMMISSION:
-        expected |= int(ArmFinding.COMPLETE) | _REST_UNLOADED
-    if state is SchemeState.ENABLE:
-        expected |= AT_REST
-    return watched | expected, expected
+def fill_constants(settings: Settings, k: Any) -> None:
+    """Fill a record of CONSTANTS."""
+    period_s, safety = settings.bus.period_s, settings.safety
+    k.has_gravity = settings.estimator.gravity
+    k.max_age_cycles = settings.bus.max_age_cycles
+    k.blind_limit = settings.blind_cycles
+    k.commission_cycles = settings.commission_cycles
+    k.rest_cycles = round(REST_HOLD_S / period_s)
+    k.unrest_cycles = max(round(UNREST_S / period_s), 1)
+    k.clear_cycles = round(settings.reaction.clear_s / period_s)
+    k.patience_cycles = round(settings.reaction.patience_s / period_s)
+    k.rebound_cycles = round(settings.reaction.rebound_s / period_s)
+    limits = k.limit_periods
+    limits[[SchemeState.INIT, SchemeState.COMMISSION]] = round(safety.phase_timeout_s / period_s)
+    limits[SchemeState.ENABLE] = round((safety.enable_timeout_s or safety.phase_timeout_s) / period_s)
+    limits[[SchemeState.ADAPT, SchemeState.CERTIFY]] = round(settings.termination.timeout_s / period_s)
 
 
-_CALM = MappingProxyType({state: _calm_in(state) for state in SchemeState})
+def begin(m: Any) -> None:
+    """Fill a record of MEMORY before the first cycle."""
+    m.state, m.origin = SchemeState.INIT, SchemeState.MONITOR
 
 
-def _run_at_end(holds: NDArray[np.bool_], before: int) -> int:
-    """Count for how many cycles something has held without a break up to the last; `before`: up to the first."""
-    breaks = np.flatnonzero(~holds)
-    return holds.size - int(breaks[-1]) - 1 if breaks.size else before + holds.size
+@compiled
+def supervise(k: Any, m: Any, arm: Any, observation: int, is_reporting: bool, goes_on: bool) -> None:
+    """Take in one cycle and go to the new state.
+
+    arm: a record of `kernel_samples.SAMPLE`. observation: bits of `Observation`. is_reporting: a contact's report is
+    not final yet. goes_on: the reaction in force lets the arm move on, so that a contact clears without rest.
+    """
+    _count(m, arm, observation)
+    if arm.request != Request.NONE:
+        _take(m, arm.request)
+    if m.state == SchemeState.REACT and m.is_latched == 0 and _has_grown(k, m, arm, observation):
+        m.is_latched = 1
+    event = _event(k, m, arm, observation, is_reporting, goes_on)
+    if event != SchemeEvent.NONE:
+        _enter(m, next_state(m.state, event, m.origin), event)
 
 
-def _verdict(state: SchemeState, observation: int) -> SchemeEvent:
+@compiled
+def doubt(m: Any) -> None:
+    """Take in, once a contact is over, that the model is wrong: hold the arm until the user says how to go on.
+
+    An acknowledgement then takes back what is known of the arm; a payload may change without an announcement.
+    """
+    event: int = SchemeEvent.DOUBTED
+    _enter(m, next_state(m.state, event, m.origin), event)
+    m.is_latched = 1
+    m.is_doubted = 1
+
+
+@compiled
+def _count(m: Any, arm: Any, observation: int) -> None:
+    """Count this cycle, and what goes on in it."""
+    m.phase_periods += arm.periods
+    if _IS_LEARNING[m.state]:
+        m.learning_periods += arm.periods
+    m.still_cycles = m.still_cycles + 1 if observation & AT_REST else 0
+    m.moving_cycles = 0 if observation & AT_REST else m.moving_cycles + 1
+    m.cleared_cycles = 0 if observation & ANY_CONTACT else m.cleared_cycles + 1
+    m.blind_cycles = m.blind_cycles + 1 if observation & UNSEEN else 0
+    m.stale_cycles = m.stale_cycles + 1 if arm.age > 1 else 0
+
+
+@compiled
+def _take(m: Any, request: int) -> None:
+    """Keep a request if this state serves it sooner or later."""
+    if _keeps(m, request, m.state):
+        m.pending |= 1 << request
+        if request == Request.PAYLOAD:
+            m.is_told_here = 1
+        if request == Request.PAYLOAD_CHANGED and IS_REACTING[m.state]:
+            m.is_weight_told = 1
+
+
+@compiled
+def _keeps(m: Any, request: int, state: int) -> bool:
+    """Tell whether a request waits in a state; hands that change a payload may touch the arm."""
+    if request == Request.PAYLOAD_CHANGED and IS_REACTING[state]:
+        return bool(m.is_doubted != 0 or m.origin == SchemeState.PAYLOAD)
+    return bool(_IS_KEPT[request, state])
+
+
+@compiled
+def _is_pending(m: Any, request: int) -> bool:
+    return bool(m.pending & 1 << request)
+
+
+@compiled
+def _has_grown(k: Any, m: Any, arm: Any, observation: int) -> bool:
+    """Tell whether a contact that would clear itself has become one to be acknowledged."""
+    is_over = observation & COLLISION != 0 or arm.is_late != 0 or m.phase_periods >= k.patience_cycles
+    return bool(is_over or _is_told_of_payload(k, m))
+
+
+@compiled
+def _is_announced(m: Any) -> bool:
+    """Tell whether a change of payload is to be served in MONITOR or STOPPED; a stop ends only by a word about it."""
+    is_awaited = _is_pending(m, Request.PAYLOAD) and m.state == SchemeState.MONITOR
+    return bool(m.is_told_here != 0 or is_awaited)
+
+
+@compiled
+def _is_told_of_payload(k: Any, m: Any) -> bool:
+    """Tell whether the user has said that what looks like a contact is the payload: its weight, where gravity acts.
+
+    A weight is meant only by a word since the contact began: one of before knows nothing of who touches the arm.
+    """
+    is_weight = k.has_gravity != 0 and m.origin == SchemeState.PAYLOAD and m.is_weight_told != 0
+    return bool((m.is_doubted != 0 or is_weight) and _is_pending(m, Request.PAYLOAD_CHANGED))
+
+
+@compiled
+def _enter(m: Any, state: int, event: int) -> None:
+    """Go to a state, and drop the requests that it has served or that mean nothing there."""
+    if state == m.state:
+        return
+    if state == SchemeState.REACT:
+        m.origin = SchemeState.ADAPT if m.state == SchemeState.CERTIFY else m.state
+        m.is_latched = event != SchemeEvent.CONTACT
+        m.is_weight_told = 0
+    elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED, SchemeEvent.REVOKED):
+        m.learning_periods = 0
+    m.cause = event
+    if state != SchemeState.STOPPED:
+        m.is_doubted = 0
+    m.state = state
+    m.is_told_here = 0
+    m.phase_periods = 0
+    m.commissioned_cycles = 0
+    for request in range(_IS_KEPT.shape[0]):
+        if not _keeps(m, request, state):
+            m.pending &= ~(1 << request)
+
+
+@compiled
+def _event(k: Any, m: Any, arm: Any, observation: int, is_reporting: bool, goes_on: bool) -> int:
+    """Return the first event of this cycle that means something in this state."""
+    fault = 0
+    if _IS_CHECKED[m.state]:
+        fault = _check(k, m, arm, observation)
+        if fault == FaultReason.NONE:
+            fault = _FAULT_ASKED[arm.request]
+    event = _touch(m, arm, observation)
+    if event == SchemeEvent.NONE:
+        event = _progress(k, m, arm, observation, is_reporting, goes_on)
+    if fault == FaultReason.NONE and event == SchemeEvent.NONE:
+        fault = _overdue(k, m)
+    if fault == FaultReason.NONE:
+        return event
+    m.fault = fault
+    return SchemeEvent.FAULT
+
+
+@compiled
+def _touch(m: Any, arm: Any, observation: int) -> int:
+    """Return COLLISION or CONTACT where this state reacts to it, or none; an arm without torque can't react."""
+    if observation & ANY_CONTACT == 0 or arm.is_enabled == 0:
+        return SchemeEvent.NONE
+    event = SchemeEvent.COLLISION if observation & COLLISION else SchemeEvent.CONTACT
+    return event if leads_on(m.state, event) else SchemeEvent.NONE
+
+
+@compiled
+def _progress(k: Any, m: Any, arm: Any, observation: int, is_reporting: bool, goes_on: bool) -> int:
+    """Return the event with which this state is left as it should be, or none."""
+    state = m.state
+    event: int = SchemeEvent.NONE
+    is_still = m.still_cycles >= k.rest_cycles
+    if state == SchemeState.MONITOR and arm.is_late != 0:
+        event = SchemeEvent.LATE
+    elif state == SchemeState.MONITOR and observation & WITHHELD:
+        event = SchemeEvent.CONTRADICTED
+    elif state in (SchemeState.MONITOR, SchemeState.STOPPED) and _is_announced(m):
+        event = SchemeEvent.PAYLOAD_ANNOUNCED
+    elif state == SchemeState.STOPPED:
+        event = _released(k, m, arm, observation, is_still)
+    elif _IS_LEARNING[state]:
+        event = _verdict(state, observation)
+    elif state == SchemeState.REACT and not is_reporting:
+        event = _settled(k, m, is_still, goes_on)
+    elif state == SchemeState.PAYLOAD and is_still and _is_pending(m, Request.PAYLOAD_CHANGED):
+        event = SchemeEvent.PAYLOAD_CHANGED
+    elif not _IS_POWERED[state]:
+        event = _begun(k, m, arm, observation)
+    return event
+
+
+@compiled
+def _released(k: Any, m: Any, arm: Any, observation: int, is_still: bool) -> int:
+    """Return how STOPPED ends in this cycle by a word of the user's, or none."""
+    event: int = SchemeEvent.NONE
+    is_late = arm.is_late != 0
+    if _is_told_of_payload(k, m):
+        if is_still and not is_late:
+            event = SchemeEvent.PAYLOAD_CHANGED
+    elif _is_pending(m, Request.RELEARN):
+        if is_still and not is_late:
+            event = SchemeEvent.REVOKED
+    elif _is_pending(m, Request.ACKNOWLEDGE) and observation & ANY_CONTACT == 0 and not is_late:
+        event = SchemeEvent.REVOKED if m.is_doubted != 0 else SchemeEvent.ACKNOWLEDGED
+    return event
+
+
+@compiled
+def _verdict(state: int, observation: int) -> int:
     """Return what the numbers say of a model that is learnt or tested, or none."""
-    if state is SchemeState.ADAPT:
-        if observation & ADAPTED:
-            return SchemeEvent.ADAPTED
-        return SchemeEvent.FITTED if observation & FITTED else SchemeEvent.NONE
-    if observation & REFUTED:
-        return SchemeEvent.REFUTED
-    return SchemeEvent.CERTIFIED if observation & CERTIFIED else SchemeEvent.NONE
+    event: int = SchemeEvent.NONE
+    if state == SchemeState.ADAPT and observation & ADAPTED:
+        event = SchemeEvent.ADAPTED
+    elif state == SchemeState.ADAPT and observation & FITTED:
+        event = SchemeEvent.FITTED
+    elif state == SchemeState.CERTIFY and observation & REFUTED:
+        event = SchemeEvent.REFUTED
+    elif state == SchemeState.CERTIFY and observation & CERTIFIED:
+        event = SchemeEvent.CERTIFIED
+    return event
+
+
+@compiled
+def _begun(k: Any, m: Any, arm: Any, observation: int) -> int:
+    """Return how a phase before the drives are enabled ends in this cycle, or none."""
+    state = m.state
+    event: int = SchemeEvent.NONE
+    if state == SchemeState.INIT and arm.is_complete != 0:
+        event = SchemeEvent.COMPLETE
+    elif state == SchemeState.COMMISSION and _is_commissioned(k, m, arm, observation):
+        event = SchemeEvent.COMMISSIONED
+    elif state == SchemeState.ENABLE and arm.is_enabled != 0:
+        event = SchemeEvent.ENABLED
+    elif state == SchemeState.ENABLE and m.moving_cycles >= k.unrest_cycles:
+        event = SchemeEvent.MOVED
+    return event
+
+
+@compiled
+def _settled(k: Any, m: Any, is_still: bool, goes_on: bool) -> int:
+    """Return how REACT ends in this cycle, or none."""
+    event: int = SchemeEvent.NONE
+    if m.is_latched != 0:
+        if is_still:
+            event = SchemeEvent.AT_REST
+    elif m.cleared_cycles >= k.clear_cycles and (is_still or goes_on):
+        event = SchemeEvent.CLEARED
+    return event
+
+
+@compiled
+def _is_commissioned(k: Any, m: Any, arm: Any, observation: int) -> bool:
+    """Count this cycle if all is well in it, and tell whether enough have been counted in a row.
+
+    One whose data are not complete doesn't count and breaks nothing: how many may be missing, `_check` says.
+    """
+    is_resting = observation & (_REST_UNLOADED | WITHHELD) == _REST_UNLOADED
+    is_good = is_resting and _check(k, m, arm, observation) == FaultReason.NONE
+    m.commissioned_cycles = m.commissioned_cycles + arm.is_complete if is_good else 0
+    return bool(m.commissioned_cycles >= k.commission_cycles)
+
+
+@compiled
+def _overdue(k: Any, m: Any) -> int:
+    """Return the fault of a phase that has taken too long, or NONE. A learning arm's clock stops in REACT."""
+    spent = m.learning_periods if _IS_LEARNING[m.state] else m.phase_periods
+    is_over = spent >= k.limit_periods[m.state]
+    return int(_OVERDUE[m.state]) if is_over else FaultReason.NONE
+
+
+@compiled
+def _check(k: Any, m: Any, arm: Any, observation: int) -> int:
+    """Return why the arm must not go on, or NONE."""
+    state = m.state
+    fault: int = FaultReason.NONE
+    is_thrown = state == SchemeState.REACT and m.phase_periods <= k.rebound_cycles
+    if arm.fault != FaultReason.NONE:
+        fault = arm.fault
+    elif observation & NOT_A_NUMBER:
+        fault = FaultReason.NOT_A_NUMBER
+    elif arm.age > k.max_age_cycles or m.stale_cycles > k.blind_limit:
+        fault = FaultReason.DATA_AGE
+    elif m.blind_cycles >= k.blind_limit:
+        fault = FaultReason.BLIND
+    elif observation & OVER_LIMIT or (observation & OVER_SPEED and not is_thrown):
+        fault = FaultReason.LIMIT
+    elif _IS_POWERED[state] and arm.is_enabled == 0:
+        fault = FaultReason.DRIVE
+    elif arm.is_late != 0 and not _IS_HELD_FROM[state]:
+        fault = FaultReason.DEADLINE
+    return fault
 
 
 class Supervisor:
-    """Walks through the table, one event per cycle; counts what takes more than one cycle."""
+    """The state machine as the rest of the scheme sees it. memory: (1,) of MEMORY, which `supervise` changes."""
 
-    def __init__(self, settings: Settings) -> None:
-        period_s = settings.bus.period_s
-        self._max_age_cycles = settings.bus.max_age_cycles
-        self._has_gravity = settings.estimator.gravity
-        self._blind_limit = settings.blind_cycles
-        self._commission_cycles = settings.commission_cycles
-        self._rest_cycles = round(REST_HOLD_S / period_s)
-        self._unrest_cycles = max(round(UNREST_S / period_s), 1)
-        self._clear_cycles = round(settings.reaction.clear_s / period_s)
-        self._patience_cycles = round(settings.reaction.patience_s / period_s)
-        self._rebound_cycles = round(settings.reaction.rebound_s / period_s)
-        safety = settings.safety
-        phase_cycles = round(safety.phase_timeout_s / period_s)
-        enable_cycles = round((safety.enable_timeout_s or safety.phase_timeout_s) / period_s)
-        adapt_cycles = round(settings.termination.timeout_s / period_s)
-        self._limits = {
-            SchemeState.INIT: (phase_cycles, FaultReason.COMMISSION_TIMEOUT),
-            SchemeState.COMMISSION: (phase_cycles, FaultReason.COMMISSION_TIMEOUT),
-            SchemeState.ENABLE: (enable_cycles, FaultReason.ENABLE_TIMEOUT),
-            SchemeState.ADAPT: (adapt_cycles, FaultReason.ADAPT_TIMEOUT),
-            SchemeState.CERTIFY: (adapt_cycles, FaultReason.ADAPT_TIMEOUT),
-        }
-        self._state = SchemeState.INIT
-        self._origin = SchemeState.MONITOR
-        self._is_latched = False
-        self._is_doubted = False
-        self._cause = SchemeEvent.NONE
-        self._fault = FaultReason.NONE
-        self._pending: set[Request] = set()
-        self._is_weight_told = False
-        self._is_told_here = False
-        self._phase_cycles = 0
-        self._learning_cycles = 0
-        self._commissioned_cycles = 0
-        self._still_cycles = 0
-        self._moving_cycles = 0
-        self._cleared_cycles = 0
-        self._blind_cycles = 0
-        self._stale_cycles = 0
+    def __init__(self, memory: Structured) -> None:
+        self._m = memory[0]
 
     @property
     def state(self) -> SchemeState:
         """Where the scheme stands."""
-        return self._state
+        return SchemeState(self._m.state)
 
     @property
     def origin(self) -> SchemeState:
-        """Where the arm goes on after REACT or STOPPED: where it came from, but from a broken test to learn anew."""
-        return self._origin
-
-    @property
-    def is_latched(self) -> bool:
-        """Whether what REACT and STOPPED are about is to be acknowledged."""
-        return self._is_latched
+        """Where the arm goes on after REACT or STOPPED."""
+        return SchemeState(self._m.origin)
 
     @property
     def cause(self) -> SchemeEvent:
         """The event by which this state was entered."""
-        return self._cause
+        return SchemeEvent(self._m.cause)
 
     def doubt(self) -> SchemeState:
-        """Take in, once a contact is over, that the model is wrong: hold the arm until the user says how to go on.
-
-        An acknowledgement then takes back what is known of the arm; a payload may change without an announcement.
-        """
-        self._enter(next_state(self._state, SchemeEvent.DOUBTED, self._origin), SchemeEvent.DOUBTED)
-        self._is_latched = self._is_doubted = True
-        return self._state
-
-    @property
-    def fault(self) -> FaultReason:
-        """Why it stands in FAULT; NONE elsewhere."""
-        return self._fault
-
-    def step(
-        self, arm: ArmState, request: Request, observation: int, is_reporting: bool, goes_on: bool = False
-    ) -> SchemeState:
-        """Take in one cycle and return the new state.
-
-        observation: bits of `Observation`. is_reporting: a contact's report is not final yet. goes_on: the reaction in
-        force lets the arm move on, so that a contact clears without rest.
-        """
-        self._phase_cycles += arm.periods
-        self._learning_cycles += arm.periods if self._state in LEARNING else 0
-        self._still_cycles = self._still_cycles + 1 if observation & AT_REST else 0
-        self._moving_cycles = 0 if observation & AT_REST else self._moving_cycles + 1
-        self._cleared_cycles = 0 if observation & ANY_CONTACT else self._cleared_cycles + 1
-        self._blind_cycles = self._blind_cycles + 1 if observation & UNSEEN else 0
-        is_stale = max(*arm.age_q, *arm.age_tau_J) > 1
-        self._stale_cycles = self._stale_cycles + 1 if is_stale else 0
-        if request is not Request.NONE:
-            self._take(request)
-        if self._state is SchemeState.REACT and not self._is_latched:
-            self._is_latched = self._has_grown(arm, observation)
-        asked = _FAULT_ASKED.get(request, FaultReason.NONE)
-        event = self._event(arm, observation, is_reporting, goes_on, asked)
-        if event is not SchemeEvent.NONE:
-            self._enter(next_state(self._state, event, self._origin), event)
-        return self._state
-
-    def calm(self, is_reporting: bool, goes_on: bool = False) -> Calm:
-        """Return bounds within which cycles without a request change nothing here but what `pass_by` counts.
-
-        They may be too narrow: a cycle outside is one for `step`. is_reporting, goes_on: as for `step`, and staying so.
-        """
-        watched, expected = _CALM[self._state]
-        limit = self._limits.get(self._state)
-        periods = NEVER if limit is None else limit[0] - self._spent
-        cycles = NEVER
-        waits_for_rest = False
-        match self._state:
-            case SchemeState.COMMISSION:
-                cycles = self._commission_cycles - self._commissioned_cycles
-            case SchemeState.MONITOR | SchemeState.STOPPED if self._is_announced:
-                cycles = 0
-            case SchemeState.STOPPED if Request.RELEARN in self._pending or self._is_told_of_payload:
-                waits_for_rest = True
-            case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
-                watched |= CONTACT
-                expected |= CONTACT
-            case SchemeState.PAYLOAD:
-                waits_for_rest = bool(self._pending)
-            case SchemeState.REACT if self._is_told_of_payload and not self._is_latched:
-                cycles = 0
-            case SchemeState.REACT if self._is_latched:
-                waits_for_rest = not is_reporting
-            case SchemeState.REACT:
-                watched |= COLLISION
-                periods = self._patience_cycles - self._phase_cycles
-                to_clear = self._clear_cycles - self._cleared_cycles
-                if to_clear > 1 or goes_on:
-                    cycles = NEVER if is_reporting else to_clear
-                else:
-                    waits_for_rest = not is_reporting
-        if waits_for_rest and self._still_cycles:
-            cycles = self._rest_cycles - self._still_cycles
-        elif waits_for_rest:
-            watched |= AT_REST
-        return Calm(watched, expected, cycles - 1, periods)
-
-    def pass_by(self, observations: NDArray[np.int64], periods: NDArray[np.int64]) -> None:
-        """Count calm cycles; observations (n,), periods (n,)."""
-        elapsed = int(periods.sum())
-        self._phase_cycles += elapsed
-        self._learning_cycles += elapsed if self._state in LEARNING else 0
-        self._blind_cycles = _run_at_end(observations & UNSEEN != 0, self._blind_cycles)
-        self._stale_cycles = 0  # where it counts, a stale value is not calm
-        self._still_cycles = _run_at_end(observations & AT_REST != 0, self._still_cycles)
-        self._moving_cycles = _run_at_end(observations & AT_REST == 0, self._moving_cycles)
-        self._cleared_cycles = _run_at_end(observations & ANY_CONTACT == 0, self._cleared_cycles)
-        if self._state is SchemeState.COMMISSION:
-            self._commissioned_cycles += observations.size
-
-    def _has_grown(self, arm: ArmState, observation: int) -> bool:
-        """Tell whether a contact that would clear itself has become one to be acknowledged."""
-        is_over = bool(observation & COLLISION) or arm.is_late or self._phase_cycles >= self._patience_cycles
-        return is_over or self._is_told_of_payload
-
-    def _take(self, request: Request) -> None:
-        """Keep a request if this state serves it sooner or later."""
-        if self._keeps(request, self._state):
-            self._pending.add(request)
-            self._is_told_here |= request is Request.PAYLOAD
-            self._is_weight_told |= request is Request.PAYLOAD_CHANGED and self._state in REACTING
-
-    @property
-    def _is_announced(self) -> bool:
-        """Whether a change of payload is to be served in MONITOR or STOPPED; a stop ends only by a word about it."""
-        return self._is_told_here or (Request.PAYLOAD in self._pending and self._state is SchemeState.MONITOR)
-
-    @property
-    def _is_told_of_payload(self) -> bool:
-        """Whether the user has said that what looks like a contact is the payload: its weight, where gravity acts.
-
-        A weight is meant only by a word since the contact began: one of before knows nothing of who touches the arm.
-        """
-        is_weight = self._has_gravity and self._origin is SchemeState.PAYLOAD and self._is_weight_told
-        return (self._is_doubted or is_weight) and Request.PAYLOAD_CHANGED in self._pending
-
-    def _keeps(self, request: Request, state: SchemeState) -> bool:
-        """Tell whether a request waits in a state; hands that change a payload may touch the arm."""
-        if request is Request.PAYLOAD_CHANGED and state in REACTING:
-            return self._is_doubted or self._origin is SchemeState.PAYLOAD
-        return state in KEPT_IN[request]
-
-    def _enter(self, state: SchemeState, event: SchemeEvent) -> None:
-        """Go to a state, and drop the requests that it has served or that mean nothing there."""
-        if state is self._state:
-            return
-        if state is SchemeState.REACT:
-            self._origin = SchemeState.ADAPT if self._state is SchemeState.CERTIFY else self._state
-            self._is_latched = event is not SchemeEvent.CONTACT
-            self._is_weight_told = False
-        elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED, SchemeEvent.REVOKED):
-            self._learning_cycles = 0
-        self._cause = event
-        self._is_doubted &= state is SchemeState.STOPPED
-        self._state = state
-        self._is_told_here = False
-        self._phase_cycles = 0
-        self._commissioned_cycles = 0
-        self._pending = {request for request in self._pending if self._keeps(request, state)}
-
-    def _event(
-        self, arm: ArmState, observation: int, is_reporting: bool, goes_on: bool, asked: FaultReason
-    ) -> SchemeEvent:
-        """Return the first event of this cycle that means something in this state. asked: a fault that is asked for."""
-        fault = (self._check(arm, observation) or asked) if self._state in _CHECKED else FaultReason.NONE
-        event = self._touch(arm, observation)
-        if event is SchemeEvent.NONE:
-            event = self._progress(arm, observation, is_reporting, goes_on)
-        if fault is FaultReason.NONE and event is SchemeEvent.NONE:
-            fault = self._overdue()
-        if fault is FaultReason.NONE:
-            return event
-        self._fault = fault
-        return SchemeEvent.FAULT
-
-    def _touch(self, arm: ArmState, observation: int) -> SchemeEvent:
-        """Return COLLISION or CONTACT where this state reacts to it, or none; an arm without torque can't react."""
-        if not observation & ANY_CONTACT or not arm.is_enabled:
-            return SchemeEvent.NONE
-        event = SchemeEvent.COLLISION if observation & COLLISION else SchemeEvent.CONTACT
-        return event if event in TRANSITIONS[self._state] else SchemeEvent.NONE
-
-    def _progress(self, arm: ArmState, observation: int, is_reporting: bool, goes_on: bool) -> SchemeEvent:
-        """Return the event with which this state is left as it should be, or none."""
-        event = SchemeEvent.NONE
-        is_still = self._still_cycles >= self._rest_cycles
-        match self._state:
-            case SchemeState.MONITOR if arm.is_late or observation & WITHHELD:
-                event = SchemeEvent.LATE if arm.is_late else SchemeEvent.CONTRADICTED
-            case SchemeState.MONITOR | SchemeState.STOPPED if self._is_announced:
-                event = SchemeEvent.PAYLOAD_ANNOUNCED
-            case SchemeState.STOPPED if self._is_told_of_payload:
-                event = SchemeEvent.PAYLOAD_CHANGED if is_still and not arm.is_late else SchemeEvent.NONE
-            case SchemeState.STOPPED if Request.RELEARN in self._pending:
-                event = SchemeEvent.REVOKED if is_still and not arm.is_late else SchemeEvent.NONE
-            case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
-                if not (observation & ANY_CONTACT or arm.is_late):
-                    event = SchemeEvent.REVOKED if self._is_doubted else SchemeEvent.ACKNOWLEDGED
-            case SchemeState.ADAPT | SchemeState.CERTIFY:
-                event = _verdict(self._state, observation)
-            case SchemeState.REACT if not is_reporting:
-                event = self._settled(is_still, goes_on)
-            case SchemeState.PAYLOAD if is_still and Request.PAYLOAD_CHANGED in self._pending:
-                event = SchemeEvent.PAYLOAD_CHANGED
-            case SchemeState.ENABLE:
-                event = self._enabled(arm)
-            case SchemeState.COMMISSION if self._is_commissioned(arm, observation):
-                event = SchemeEvent.COMMISSIONED
-            case SchemeState.INIT if arm.is_complete:
-                event = SchemeEvent.COMPLETE
-        return event
-
-    def _enabled(self, arm: ArmState) -> SchemeEvent:
-        """Return how ENABLE ends in this cycle, or none."""
-        if arm.is_enabled:
-            return SchemeEvent.ENABLED
-        return SchemeEvent.MOVED if self._moving_cycles >= self._unrest_cycles else SchemeEvent.NONE
-
-    def _settled(self, is_still: bool, goes_on: bool) -> SchemeEvent:
-        """Return how REACT ends in this cycle, or none."""
-        if self._is_latched:
-            return SchemeEvent.AT_REST if is_still else SchemeEvent.NONE
-        has_cleared = self._cleared_cycles >= self._clear_cycles and (is_still or goes_on)
-        return SchemeEvent.CLEARED if has_cleared else SchemeEvent.NONE
-
-    def _is_commissioned(self, arm: ArmState, observation: int) -> bool:
-        """Count this cycle if all is well in it, and tell whether enough have been counted in a row.
-
-        One whose data are not complete doesn't count and breaks nothing: how many may be missing, `_check` says.
-        """
-        is_resting = observation & (_REST_UNLOADED | WITHHELD) == _REST_UNLOADED
-        is_good = is_resting and self._check(arm, observation) is FaultReason.NONE
-        self._commissioned_cycles = self._commissioned_cycles + arm.is_complete if is_good else 0
-        return self._commissioned_cycles >= self._commission_cycles
-
-    def _overdue(self) -> FaultReason:
-        """Return the timeout of a phase that has taken too long, or NONE. A learning arm's clock stops in REACT."""
-        limit = self._limits.get(self._state)
-        if limit is None or self._spent < limit[0]:
-            return FaultReason.NONE
-        return limit[1]
-
-    @property
-    def _spent(self) -> int:
-        """Periods that count towards this phase's timeout."""
-        return self._learning_cycles if self._state in LEARNING else self._phase_cycles
-
-    def _check(self, arm: ArmState, observation: int) -> FaultReason:
-        """Return why the arm must not go on, or NONE."""
-        if arm.fault is not FaultReason.NONE:
-            return arm.fault
-        fault = self._check_data(arm, observation)
-        if fault is not FaultReason.NONE:
-            return fault
-        is_thrown = self._state is SchemeState.REACT and self._phase_cycles <= self._rebound_cycles
-        if observation & DETECTOR_FAILED:
-            return FaultReason.DETECTOR
-        if observation & OVER_LIMIT or (observation & OVER_SPEED and not is_thrown):
-            return FaultReason.LIMIT
-        if self._state in POWERED and not arm.is_enabled:
-            return FaultReason.DRIVE
-        return FaultReason.DEADLINE if arm.is_late and self._state not in _HELD_FROM else FaultReason.NONE
-
-    def _check_data(self, arm: ArmState, observation: int) -> FaultReason:
-        """Return why the data must not be acted on, or NONE."""
-        if observation & NOT_A_NUMBER:
-            return FaultReason.NOT_A_NUMBER
-        if max(*arm.age_q, *arm.age_tau_J) > self._max_age_cycles or self._stale_cycles > self._blind_limit:
-            return FaultReason.DATA_AGE
-        return FaultReason.BLIND if self._blind_cycles >= self._blind_limit else FaultReason.NONE
+        """Hold the arm: the model is wrong."""
+        doubt(self._m)
+        return self.state
 
 
 class KeptRequest:

@@ -1,4 +1,4 @@
-"""What the scheme's state machine goes by: a cycle's findings, the table of its states, and when nothing can change.
+"""What the scheme's state machine goes by: a cycle's findings, and the table of its states.
 
 **Findings.** What one cycle's numbers say, as far as the supervisor needs it: bits that compiled code sets.
 
@@ -7,21 +7,16 @@ Any kernel of the scheme sets them, and only those that it knows: the paper's ne
 **Table.** The table of the scheme's state machine: where each event leads from each state.
 
 A pair that is not in it leaves the state as it is. What raises the events: `adacd_hil.scheme.supervisor.supervisor`.
-
-**Calm.** Conditions under which the supervisor's state cannot change; replay uses them to skip cycles.
-
-A cycle's findings are the kernel's bits of `Observation` and those of the arm, `ArmFinding`, in one number.
 """
 
 from enum import Enum, IntEnum, IntFlag
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import ArmBatch, ArmState, FaultReason, SchemeState
+from adacd_hil.records import SchemeState
 
 
 class SchemeEvent(IntEnum):
@@ -133,13 +128,37 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
 )
 
 
-def next_state(state: SchemeState, event: SchemeEvent, origin: SchemeState) -> SchemeState:
+STAYS, TO_ORIGIN = -1, -2
+
+
+def _numbered() -> NDArray[np.int64]:
+    """Return the table as numbers (states, events): the next state, STAYS or TO_ORIGIN."""
+    table = np.full((len(SchemeState), len(SchemeEvent)), STAYS)
+    for state, row in TRANSITIONS.items():
+        for event, following in row.items():
+            table[state, event] = TO_ORIGIN if following is Back.TO_ORIGIN else int(following)
+    return table
+
+
+_NEXT = _numbered()
+
+
+@compiled
+def next_state(state: int, event: int, origin: int) -> int:
     """Look up the table; a pair that is not in it leaves the state as it is.
 
     origin: the state from which REACT was entered last.
     """
-    following = TRANSITIONS[state].get(event, state)
-    return origin if following is Back.TO_ORIGIN else following
+    following = int(_NEXT[state, event])
+    if following == TO_ORIGIN:
+        return origin
+    return state if following == STAYS else following
+
+
+@compiled
+def leads_on(state: int, event: int) -> bool:
+    """Tell whether the table has this pair."""
+    return bool(_NEXT[state, event] != STAYS)
 
 
 CONTACT_SHIFT = 16
@@ -163,7 +182,6 @@ class Observation(IntFlag):
     OVER_SPEED = 1024  # |dq| beyond the arm's limit, which a blow may do for a moment
     UNSEEN = 2048  # the filters took no sample in: the residual is not of now
     WITHHELD = 4096  # an anchor, a touch or a torque by place excludes what would be certified, or what is
-    DETECTOR_FAILED = 8192  # a live detector can't be relied on any more; no kernel sets it
 
 
 (
@@ -180,70 +198,6 @@ class Observation(IntFlag):
     OVER_SPEED,
     UNSEEN,
     WITHHELD,
-    DETECTOR_FAILED,
 ) = (int(bit) for bit in Observation)
 """The same bits as plain numbers, which compiled code can read."""
 ANY_CONTACT = CONTACT | COLLISION
-
-
-NEVER = 1 << 60
-"""More cycles or periods than any run has."""
-
-
-class ArmFinding(IntFlag):
-    """What an ArmState says beside its measurements; bits that neither `Observation` nor its joints use."""
-
-    ENABLED = 1 << 40
-    COMPLETE = 1 << 41
-    LATE = 1 << 42
-    FAULTY = 1 << 43
-    OLD = 1 << 44  # a value older than a cycle, which is too old if it stays so or exceeds its budget
-
-
-_ENABLED, _COMPLETE, _LATE, _FAULTY, _OLD = (int(bit) for bit in ArmFinding)
-"""The same bits as plain numbers, which cost less to join."""
-
-
-class Calm(NamedTuple):
-    """Bounds within which a cycle only counts; a cycle outside one of them has to be looked at.
-
-    watched, expected: findings & watched is expected. cycles: so many may pass. periods: fewer than these may pass.
-    due: the cycle's number is below.
-    """
-
-    watched: int
-    expected: int
-    cycles: int = NEVER
-    periods: int = NEVER
-    due: int = NEVER
-
-
-def findings_of(arms: ArmBatch) -> NDArray[np.int64]:
-    """Return the bits of `ArmFinding` of each cycle (n,)."""
-    oldest = np.maximum(arms.age_q.max(axis=1, initial=0), arms.age_tau_J.max(axis=1, initial=0))
-    findings = np.zeros(arms.cycle.size, dtype=np.int64)
-    for bit, holds in (
-        (ArmFinding.ENABLED, arms.is_enabled),
-        (ArmFinding.COMPLETE, arms.is_complete),
-        (ArmFinding.LATE, arms.is_late),
-        (ArmFinding.FAULTY, arms.fault != FaultReason.NONE),
-        (ArmFinding.OLD, oldest > 1),
-    ):
-        findings[holds] |= int(bit)
-    return findings
-
-
-def finding_of(arm: ArmState) -> int:
-    """Return the bits of `ArmFinding` of one cycle."""
-    findings = (_ENABLED if arm.is_enabled else 0) | (_COMPLETE if arm.is_complete else 0)
-    if arm.is_late:
-        findings |= _LATE
-    if arm.fault is not FaultReason.NONE:
-        findings |= _FAULTY
-    return findings | _OLD if max(*arm.age_q, *arm.age_tau_J) > 1 else findings
-
-
-@compiled
-def is_calm(calm: Calm, findings: int, periods: int, cycle: int) -> bool:
-    """Tell whether a cycle is within the bounds. periods: that have passed since they were drawn, its own included."""
-    return findings & calm.watched == calm.expected and periods < calm.periods and cycle < calm.due

@@ -1,0 +1,184 @@
+"""A contact's course from detection to its end: when it is reported, and what the arm does about it.
+
+Per cycle, after the kernel and the supervisor: `follow`. It looks at the state reached, so it must see every cycle.
+
+**Reaction.** By level and link. A contact that grows into a collision, or whose link turns out to be another, has its
+reaction chosen anew. A withdrawal is given up for the `two_sided` reaction when something pushes from the other side:
+the external torque along the way of the withdrawal has turned against it by more than the upper thresholds, as in a
+clamp or with a wall behind. Without a valid model there is nothing to float with: the arm stops.
+
+The paper's scheme withdraws from every contact, stops without one, and gives no withdrawal up.
+
+Shapes: tau_ext_hat (2,), Nm.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled, record_of
+from adacd_hil.records import JOINTS, ContactLevel, Reaction, SchemeState, Vector
+from adacd_hil.scheme.supervisor.supervisor import IS_REACTING
+from adacd_hil.scheme.supervisor.transitions import COLLISION, CONTACT_SHIFT
+from adacd_hil.settings.configuration import Settings
+
+TURNED_CYCLES = 5
+"""How many samples in a row the torque must be turned: what a blow leaves in the estimate is shorter."""
+BLIND_S = 0.02
+"""After a withdrawal has begun it is not judged yet: the estimate still rings from the blow."""
+_NEVER = 1 << 60
+_CONTACT, _COLLISION = (int(level) for level in ContactLevel)
+"""As plain numbers, which compiled code can compare with others."""
+
+CONSTANTS = record_of(
+    ("reactions", np.int64, (len(ContactLevel), JOINTS)),
+    *((name, np.int64) for name in ("two_sided", "is_kept", "blind_cycles")),
+    ("due_cycles", np.int64, (3,)),
+    ("collision_Nm", np.float64, (JOINTS,)),
+)
+"""reactions: by level, the lower first, and link. is_kept: a reaction stays in force until the next contact.
+due_cycles: a report is due so long after the detection, the final one last."""
+MEMORY = record_of(
+    *((name, np.int64) for name in ("is_reacting", "link", "is_open", "detected_cycle")),
+    ("direction", np.int64, (JOINTS,)),
+    *((name, np.int64) for name in ("reaction", "level", "cause_link", "is_two_sided", "is_given_up")),
+    *((name, np.int64) for name in ("cycles", "turned_cycles", "kept_rows")),
+    ("way", np.float64, (JOINTS,)),
+)
+"""link: that is touched, 0 of none. is_open: a report is out that is not final yet. level: the highest of this contact.
+cause_link: for which the reaction was chosen. kept_rows: of the history that reports are made from, so far. way: of a
+withdrawal, a unit vector; zeros without one."""
+
+
+def fill_constants(settings: Settings, due_cycles: tuple[int, ...], k: Any) -> None:
+    """Fill a record of CONSTANTS for the scheme of the settings."""
+    wish, is_paper = settings.reaction, settings.scheme == "paper"
+    chosen = (("withdraw",) * JOINTS,) * len(ContactLevel) if is_paper else (wish.contact, wish.collision)
+    k.reactions = [[Reaction[name.upper()] for name in names] for names in chosen]
+    k.two_sided = Reaction[wish.two_sided.upper()]
+    k.is_kept = is_paper
+    k.blind_cycles = _NEVER if is_paper else round(BLIND_S / settings.bus.period_s)
+    k.due_cycles[:] = due_cycles[-1]
+    k.due_cycles[: len(due_cycles)] = due_cycles
+    k.collision_Nm = settings.detector.collision_Nm
+
+
+def begin(m: Any) -> None:
+    """Fill a record of MEMORY before the first cycle."""
+    m.level = ContactLevel.CONTACT
+
+
+@compiled
+def goes_on(m: Any) -> bool:
+    """Tell whether the arm moves on along its path."""
+    return bool(m.reaction in (Reaction.NONE, Reaction.SLOW_DOWN))
+
+
+@compiled
+def follow(
+    k: Any, m: Any, supervisor: Any, cycle: int, observation: int, is_valid: bool, tau_ext_hat: Vector, tau_ext: Vector
+) -> bool:
+    """Take in one cycle and tell whether a report is due in it.
+
+    supervisor: its memory, after its step. is_valid: there is a model to float with. tau_ext_hat: filtered, for the
+    reaction; tau_ext: gives the direction of a joint when it crosses its threshold.
+    """
+    if not IS_REACTING[supervisor.state]:
+        _leave(k, m, supervisor.state)
+        return False
+    joints = observation >> CONTACT_SHIFT
+    level = _COLLISION if observation & COLLISION else _CONTACT
+    if m.is_reacting == 0:
+        m.is_reacting = 1
+        if joints == 0:  # as for a host that is late
+            _react(m, Reaction.STOP, tau_ext_hat, False)
+            m.level, m.cause_link = _COLLISION, 0
+            return False
+        m.is_open, m.detected_cycle = 1, cycle
+        m.direction[:] = 0
+        m.link = 2 if joints & 2 else 1
+        m.is_two_sided = m.is_given_up = 0
+        m.level, m.cause_link = level, m.link
+        _choose(k, m, tau_ext_hat, is_valid)
+    elif m.link != 0:
+        _reconsider(k, m, level, supervisor.is_latched != 0, tau_ext_hat, is_valid)
+    return m.is_open != 0 and _is_due(k, m, cycle, joints, tau_ext)
+
+
+@compiled
+def _leave(k: Any, m: Any, state: int) -> None:
+    """Forget the contact that is over: the arm goes on."""
+    if m.is_reacting != 0:
+        m.is_reacting, m.link = 0, 0
+        if k.is_kept == 0:
+            m.reaction, m.level, m.cause_link = Reaction.NONE, _CONTACT, 0
+    if state == SchemeState.FAULT:
+        m.is_open = 0
+
+
+@compiled
+def _is_due(k: Any, m: Any, cycle: int, joints: int, tau_ext: Vector) -> bool:
+    """Take in which joints are over their threshold; tell whether a report is due. The final one closes the course."""
+    elapsed = cycle - m.detected_cycle
+    for i in range(m.direction.shape[0]):
+        if joints >> i & 1 and m.direction[i] == 0:
+            m.direction[i] = int(np.sign(tau_ext[i]))
+    is_due = False
+    for due in k.due_cycles:
+        is_due = is_due or elapsed == due
+    if elapsed >= k.due_cycles[-1]:
+        m.is_open = 0
+        is_due = True
+    return is_due
+
+
+@compiled
+def _reconsider(k: Any, m: Any, level: int, is_latched: bool, tau_ext_hat: Vector, is_valid: bool) -> None:
+    """Change the reaction if something calls for it."""
+    level = max(level, m.level)
+    is_other = level != m.level or m.link != m.cause_link
+    if is_other and m.cause_link != 0 and m.is_given_up == 0:
+        m.level, m.cause_link = level, m.link
+        _choose(k, m, tau_ext_hat, is_valid)
+    if is_latched and goes_on(m) and m.level == _CONTACT:
+        _react(m, Reaction.STOP, tau_ext_hat, True)
+    if m.reaction == Reaction.WITHDRAW and (m.way[0] != 0.0 or m.way[1] != 0.0):
+        _judge(k, m, tau_ext_hat, is_valid)
+
+
+@compiled
+def _choose(k: Any, m: Any, tau_ext_hat: Vector, is_valid: bool) -> None:
+    reaction = k.reactions[m.level - 1, m.cause_link - 1]
+    if reaction != m.reaction:
+        _react(m, _possible(reaction, is_valid), tau_ext_hat, True)
+
+
+@compiled
+def _possible(reaction: int, is_valid: bool) -> int:
+    return Reaction.STOP if reaction == Reaction.FLOAT and not is_valid else int(reaction)
+
+
+@compiled
+def _react(m: Any, reaction: int, tau_ext_hat: Vector, is_pushed: bool) -> None:
+    """Begin a reaction; is_pushed: away along tau_ext_hat, if it is a withdrawal."""
+    m.reaction = reaction
+    size = np.sqrt(tau_ext_hat[0] * tau_ext_hat[0] + tau_ext_hat[1] * tau_ext_hat[1]) if is_pushed else 0.0
+    for i in range(m.way.shape[0]):
+        m.way[i] = tau_ext_hat[i] / size if size > 0.0 else 0.0
+    m.cycles = m.turned_cycles = 0
+
+
+@compiled
+def _judge(k: Any, m: Any, tau_ext_hat: Vector, is_valid: bool) -> None:
+    """Give a withdrawal up if it pushes something on the other side."""
+    m.cycles += 1
+    if m.cycles <= k.blind_cycles:
+        return
+    along_Nm, bound_Nm = 0.0, 0.0
+    for i in range(m.way.shape[0]):
+        along_Nm += tau_ext_hat[i] * m.way[i]
+        bound_Nm += abs(m.way[i]) * k.collision_Nm[i]
+    m.turned_cycles = m.turned_cycles + 1 if along_Nm < -bound_Nm else 0
+    if m.turned_cycles >= TURNED_CYCLES:
+        m.is_two_sided = m.is_given_up = 1
+        _react(m, _possible(k.two_sided, is_valid), tau_ext_hat, True)

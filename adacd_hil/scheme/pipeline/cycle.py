@@ -1,0 +1,273 @@
+"""One cycle of the scheme, compiled: the numbers, the paper's beside, the supervisor, and a contact's course.
+
+Live calls `certified_cycle` or `paper_cycle` for one sample; a replay calls `run_certified` or `run_paper`, which go
+from one cycle to the next. A cycle returns bits of `Ask`: what Python has to do in it, before its decision is given
+out. That is rare. A state was left, a fit is refused, a model has taken over, the user accepts: these come before the
+contact's course (`BEFORE_CONTACT`), because Python may hold the arm; the cycle is then ended by `end_certified` or
+`end_paper`. A report that is due, a second of monitoring, a push at rest: these come behind.
+
+Samples and decisions are structured arrays with an element per cycle, `kernel_samples.SAMPLE` and `DECISION`; blocks
+(n, size). Course: constants and memory of what is common to both schemes, one element each.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import Structured, compiled, record_of, released
+from adacd_hil.records import Request, SchemeState, Vector
+from adacd_hil.scheme.contact import contact_report, course
+from adacd_hil.scheme.kernel import certified_kernel, paper_kernel
+from adacd_hil.scheme.kernel.kernel_samples import INTERVAL, interval_s, put_sample
+from adacd_hil.scheme.model import filter_bank
+from adacd_hil.scheme.supervisor import supervisor
+from adacd_hil.scheme.supervisor.supervisor import IS_REACTING, LEARNING, among
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, WITHHELD
+from adacd_hil.settings.configuration import Settings
+
+# What Python has to do in a cycle, as bits.
+LEFT = 1  # a state was left
+REFUSED = 2  # a fit, or the reading at rest, is refused
+TOOK_OVER = 4  # a refined model has taken over
+ACCEPTED = 8  # the user accepts what was refused
+REPORT = 16  # a contact's report is due
+FORGET = 32  # the contact that disturbed an adaptation is reported: what was learnt is to be forgotten
+SECOND = 64  # a second of monitoring is over
+PUSHED = 128  # something pushes the arm at rest
+BEFORE_CONTACT = LEFT | REFUSED | TOOK_OVER | ACCEPTED
+
+DECISION = record_of(
+    *((name, np.uint8) for name in ("state", "previous_state", "fault", "reaction")),
+    *((name, np.int64) for name in ("contact_joints", "observation")),
+    ("is_model_valid", np.bool_),
+)
+"""What a cycle comes to. observation: bits of `Observation`."""
+
+_CONSTANTS = record_of(("supervisor", supervisor.CONSTANTS), ("contact", course.CONSTANTS))
+_MEMORY = record_of(
+    ("supervisor", supervisor.MEMORY),
+    ("contact", course.MEMORY),
+    ("interval", INTERVAL),
+    ("is_model_valid", np.int64),
+    ("is_refusing", np.int64),
+)
+"""is_model_valid: the model may be fed forward. is_refusing: there is something that the user may accept."""
+
+_IS_LEARNING = among(LEARNING)
+_CERTIFIED_MODE = np.zeros(len(SchemeState), np.int64)
+for _state, _mode in (
+    (SchemeState.COMMISSION, certified_kernel.MEASURE),
+    (SchemeState.ENABLE, certified_kernel.WATCH),
+    (SchemeState.ADAPT, certified_kernel.WATCH | certified_kernel.LEARN),
+    (SchemeState.CERTIFY, certified_kernel.WATCH | certified_kernel.TEST),
+    (SchemeState.MONITOR, certified_kernel.WATCH | certified_kernel.REFINE),
+    (SchemeState.REACT, certified_kernel.WATCH),
+    (SchemeState.STOPPED, certified_kernel.WATCH),
+    (SchemeState.PAYLOAD, certified_kernel.WATCH),
+):
+    _CERTIFIED_MODE[_state] = _mode
+_PAPER_MODE = np.zeros(len(SchemeState), np.int64)
+_PAPER_MODE[SchemeState.ADAPT] = paper_kernel.LEARN
+_PAPER_MODE[[SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED]] = paper_kernel.ARMED
+
+
+def new_course(settings: Settings) -> tuple[Structured, Structured]:
+    """Return constants and memory (1,) before the first cycle; when reports are due, the policy fills in."""
+    constants, memory = np.zeros(1, _CONSTANTS), np.zeros(1, _MEMORY)
+    supervisor.fill_constants(settings, constants["supervisor"][0])
+    supervisor.begin(memory["supervisor"][0])
+    course.begin(memory["contact"][0])
+    memory["interval"]["is_measured"] = settings.realtime.sample_period == "measured"
+    return constants, memory
+
+
+@compiled
+def certified_cycle(
+    samples: Structured,
+    decisions: Structured,
+    blocks: Vector,
+    place: int,
+    constants: Structured,
+    memory: Structured,
+    block: Structured,
+    values: Vector,
+    paper_constants: Structured,
+    paper_memory: Structured,
+    paper_block: Structured,
+    course_constants: Structured,
+    course_memory: Structured,
+    rows: Vector,
+) -> int:
+    """Take in one cycle of the certified scheme; return bits that ask Python for something, 0 if nothing does.
+
+    place: of the cycle in samples, decisions and blocks. values: the memory of the block (size,). rows: of
+    `contact_report.put_row`.
+    """
+    sample, decision, run = samples[place], decisions[place], course_memory[0]
+    period_s = interval_s(run.interval, sample)
+    mode = _CERTIFIED_MODE[run.supervisor.state]
+    if run.supervisor.state == SchemeState.REACT and run.supervisor.origin == SchemeState.MONITOR:
+        mode |= certified_kernel.WEIGH
+    put_sample(block, sample, period_s)
+    promotions = memory[0]["promotions"]
+    observation = certified_kernel.step(constants, memory, block, sample.is_complete, sample.steps, mode)
+    paper_kernel.step_beside(paper_constants, paper_memory, paper_block, sample, period_s, block[0])
+    for j in range(values.size):
+        blocks[place, j] = values[j]
+    asked = decide(course_constants[0], run, sample, observation, decision)
+    if memory[0]["promotions"] != promotions:
+        asked |= TOOK_OVER
+    if asked:
+        return asked
+    return end_certified(samples, decisions, place, constants, memory, block, course_constants, course_memory, rows)
+
+
+@compiled
+def end_certified(
+    samples: Structured,
+    decisions: Structured,
+    place: int,
+    constants: Structured,
+    memory: Structured,
+    block: Structured,
+    course_constants: Structured,
+    course_memory: Structured,
+    rows: Vector,
+) -> int:
+    """End a cycle of the certified scheme in the state reached; return what it still asks."""
+    k, m, out, run = constants[0], memory[0], block[0], course_memory[0]
+    decision, contact, state = decisions[place], run.contact, run.supervisor.state
+    contact_report.put_row(
+        rows, contact.kept_rows, out["q"], out["tau_ext_wide_hat"], m["wide_sigma"], m["wide_threshold"]
+    )
+    contact.kept_rows += 1
+    asked = follow_contact(
+        course_constants[0], run, samples[place], decision, m["y"][filter_bank.WIDE], out["tau_ext_wide_hat"]
+    )
+    is_disturbed = IS_REACTING[state] and _IS_LEARNING[run.supervisor.origin]
+    is_reported = is_disturbed and contact.is_open == 0
+    if is_reported and m["has_forgotten"] == 0.0:
+        asked |= FORGET
+    m["has_forgotten"] = 1.0 if is_reported else 0.0
+    if state == SchemeState.MONITOR:
+        m["monitored_cycles"] += 1.0
+        if m["monitored_cycles"] >= k["second_cycles"]:
+            m["monitored_cycles"] = 0.0
+            asked |= SECOND
+    if m["until_push_cycles"] > 0.0:
+        m["until_push_cycles"] = m["until_push_cycles"] - 1.0 if state == SchemeState.STOPPED else 0.0
+        if m["until_push_cycles"] == 0.0 and decision.contact_joints != 0 and state == SchemeState.STOPPED:
+            asked |= PUSHED
+    return asked
+
+
+@compiled
+def paper_cycle(
+    samples: Structured,
+    decisions: Structured,
+    blocks: Vector,
+    place: int,
+    constants: Structured,
+    memory: Structured,
+    block: Structured,
+    values: Vector,
+    course_constants: Structured,
+    course_memory: Structured,
+) -> int:
+    """Take in one cycle of the paper's scheme; arguments and result as for `certified_cycle`."""
+    sample, decision, run = samples[place], decisions[place], course_memory[0]
+    period_s = interval_s(run.interval, sample)
+    mode = _PAPER_MODE[run.supervisor.state]
+    if run.contact.is_open != 0:
+        mode |= paper_kernel.REPORTING
+    put_sample(block, sample, period_s)
+    observation = paper_kernel.step(constants, memory, block, sample.is_complete, sample.steps, mode)
+    for j in range(values.size):
+        blocks[place, j] = values[j]
+    asked = decide(course_constants[0], run, sample, observation, decision)
+    if asked:
+        return asked
+    return end_paper(samples, decisions, place, block, course_constants, course_memory)
+
+
+@compiled
+def end_paper(
+    samples: Structured,
+    decisions: Structured,
+    place: int,
+    block: Structured,
+    course_constants: Structured,
+    course_memory: Structured,
+) -> int:
+    """End a cycle of the paper's scheme in the state reached; return what it still asks."""
+    tau_ext_hat = block[0]["tau_ext_hat"]
+    return follow_contact(
+        course_constants[0], course_memory[0], samples[place], decisions[place], tau_ext_hat, tau_ext_hat
+    )
+
+
+@compiled
+def decide(k: Any, m: Any, sample: Any, observation: int, decision: Any) -> int:
+    """Let the supervisor take in what the numbers say; return what asks Python for something before the contact."""
+    asked, previous = 0, m.supervisor.state
+    if sample.request == Request.ACCEPT:
+        asked |= ACCEPTED
+        if m.is_refusing != 0:  # nothing is withheld in this cycle
+            observation &= ~WITHHELD
+    is_reporting = m.contact.is_open != 0
+    supervisor.supervise(k.supervisor, m.supervisor, sample, observation, is_reporting, course.goes_on(m.contact))
+    decision.previous_state = previous
+    decision.observation = observation
+    decision.contact_joints = observation >> CONTACT_SHIFT
+    if m.supervisor.state != previous:
+        asked |= LEFT
+    if observation & WITHHELD and previous != SchemeState.MONITOR:
+        asked |= REFUSED
+    return asked
+
+
+@compiled
+def follow_contact(k: Any, m: Any, sample: Any, decision: Any, tau_ext_hat: Vector, tau_ext: Vector) -> int:
+    """Take the contact's course on, and fill the decision; return REPORT if one is due."""
+    is_due = course.follow(
+        k.contact,
+        m.contact,
+        m.supervisor,
+        sample.cycle,
+        decision.observation,
+        m.is_model_valid != 0,
+        tau_ext_hat,
+        tau_ext,
+    )
+    decision.state = m.supervisor.state
+    decision.fault = m.supervisor.fault
+    decision.reaction = m.contact.reaction
+    decision.is_model_valid = m.is_model_valid != 0
+    return REPORT if is_due else 0
+
+
+@released
+def run_certified(
+    samples: Structured, decisions: Structured, blocks: Vector, first: int, arrays: tuple[Any, ...]
+) -> tuple[int, int]:
+    """Run cycles from `first` on up to one that asks Python for something; return its place and what it asks.
+
+    arrays: what `certified_cycle` works on, in its order.
+    """
+    for place in range(first, samples.size):
+        asked = certified_cycle(samples, decisions, blocks, place, *arrays)
+        if asked:
+            return place, asked
+    return samples.size, 0
+
+
+@released
+def run_paper(
+    samples: Structured, decisions: Structured, blocks: Vector, first: int, arrays: tuple[Any, ...]
+) -> tuple[int, int]:
+    """Run cycles of `paper_cycle` as `run_certified` does."""
+    for place in range(first, samples.size):
+        asked = paper_cycle(samples, decisions, blocks, place, *arrays)
+        if asked:
+            return place, asked
+    return samples.size, 0

@@ -1,0 +1,43 @@
+"""A contact's course by itself: the compiled step, with a state and findings written by hand."""
+
+import numpy as np
+
+from adacd_hil.records import ContactLevel, Reaction, SchemeState
+from adacd_hil.scheme.contact import course
+from adacd_hil.scheme.supervisor import supervisor
+from adacd_hil.scheme.supervisor.transitions import ANY_CONTACT, CONTACT, CONTACT_SHIFT
+
+
+class Course:
+    """The course of contacts under these settings; reports are due so many cycles after a detection."""
+
+    def __init__(self, settings, due_cycles=(0,)):
+        self.k, self.memory = np.zeros(1, course.CONSTANTS), np.zeros(1, course.MEMORY)
+        self.m, self.state = self.memory[0], np.zeros(1, supervisor.MEMORY)
+        course.begin(self.m)
+        self.fill(settings, due_cycles)
+        self.cycle = 0
+
+    def fill(self, settings, due_cycles):
+        course.fill_constants(settings, due_cycles, self.k[0])
+
+    def step(
+        self, joints, tau, level=ContactLevel.COLLISION, state=SchemeState.REACT, is_latched=False, is_valid=True,
+        tau_ext=None,
+    ):  # fmt: skip
+        """Take in a cycle; return whether a report is due. joints: bits of those over their threshold."""
+        self.state["state"], self.state["is_latched"] = state, is_latched
+        found = ANY_CONTACT if level is ContactLevel.COLLISION else CONTACT
+        observation = joints << CONTACT_SHIFT | found if joints else 0
+        wide = tau if tau_ext is None else tau_ext
+        is_due = course.follow(self.k[0], self.m, self.state[0], self.cycle, observation, is_valid, tau, wide)
+        self.cycle += 1
+        return is_due
+
+    @property
+    def reaction(self):
+        return Reaction(self.m["reaction"])
+
+    @property
+    def goes_on(self):
+        return course.goes_on(self.m)

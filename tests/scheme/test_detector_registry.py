@@ -1,0 +1,134 @@
+"""Detectors of a lab's own: added from outside by an entry point, and refused where they break the contract."""
+
+import sys
+import tomllib
+
+import numpy as np
+import pytest
+from documents import ROOT
+
+from adacd_hil.scheme.detect import detector_registry
+from adacd_hil.scheme.detect.detectors import DetectorBankSettings, register
+from adacd_hil.settings.configuration import Settings, apply_settings, load_settings, renewed
+from adacd_hil.settings.schema import ConfigError, DetectorError, parse
+
+EXAMPLE = ROOT / "docs/examples/detector"
+
+
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
+    """The example's package, installed in a folder of its own on the path: nothing of ours is changed."""
+    site = tmp_path / "site"
+    install(site, EXAMPLE / "pyproject.toml", (EXAMPLE / "lab_detectors.py").read_text())
+    monkeypatch.syspath_prepend(str(site))
+    yield from looked_up_anew()
+
+
+def looked_up_anew():
+    detector_registry._LOADED.clear()
+    yield
+    detector_registry._remove_loaded()
+    detector_registry._LOADED[:] = ["adacd_hil.detectors"]
+
+
+def install(site, pyproject, text):
+    """Put down what pip would, of a package of one module."""
+    project = tomllib.loads(pyproject.read_text())["project"]
+    ((group, entries),) = project["entry-points"].items()
+    (module,) = {value.partition(":")[0] for value in entries.values()}
+    info = site / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in entries.items()))
+    (site / f"{module}.py").write_text(text)
+
+
+def test_the_example_passes_its_own_test(lab):
+    names = {}
+    exec(compile((EXAMPLE / "test_lab_detectors.py").read_text(), "example", "exec"), names)
+    for name, test in names.items():
+        if name.startswith("test_"):
+            test()
+
+
+def test_a_package_s_detector_stands_among_those_of_thresholds(lab):
+    settings = DetectorBankSettings()
+    assert settings.detectors["mean of 20"] == (len(settings.channels) - 1,)
+
+
+def test_two_packages_with_one_name_are_refused_by_their_names(tmp_path, monkeypatch):
+    pyproject = tmp_path / "pyproject.toml"
+    for name in ("first-lab", "second-lab"):
+        module = name.replace("-", "_")
+        pyproject.write_text(
+            f'[project]\nname = "{name}"\nversion = "1.0"\n'
+            f'[project.entry-points."adacd_hil.detectors"]\n"twin" = "{module}:MeanOfTwenty"\n'
+        )
+        site = tmp_path / name
+        install(site, pyproject, (EXAMPLE / "lab_detectors.py").read_text())
+        monkeypatch.syspath_prepend(str(site))
+    for _ in looked_up_anew():
+        for _ in range(2):  # said again, not forgotten
+            with pytest.raises(DetectorError, match=r"twin of package .*-lab 1.0 can't be used: .* already, of"):
+                _ = DetectorBankSettings().registered
+
+
+def test_a_package_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
+    install(tmp_path / "site", EXAMPLE / "pyproject.toml", "raise ImportError('no libfoo')\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    monkeypatch.delitem(sys.modules, "lab_detectors", raising=False)
+    for _ in looked_up_anew():
+        with pytest.raises(DetectorError, match=r"mean of 20 of package lab-detectors 1.0 .* ImportError: no libfoo"):
+            _ = DetectorBankSettings().registered
+
+
+class ThreeJoints:
+    def __init__(self, period_s):
+        pass
+
+    def take(self, z, held_Nm):
+        return np.zeros((len(z), 3))
+
+
+class Nan(ThreeJoints):
+    def take(self, z, held_Nm):
+        return np.full(z.shape, np.nan)
+
+
+class ByThePiece(ThreeJoints):
+    """Gives each sample the mean of the piece that it came with."""
+
+    def take(self, z, held_Nm):
+        return np.tile(np.abs(z).mean(axis=0), (len(z), 1))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (ThreeJoints, r"detector odd gives statistics \(400, 3\) for samples \(400, 2\)"),
+        (Nan, "detector odd gives nan for sample 0 of joint 1"),
+        (ByThePiece, "detector odd gives sample 0 another statistic where the stream is cut at 137"),
+    ],
+)
+def test_a_detector_that_breaks_the_contract_is_refused_and_named(make, words):
+    with pytest.raises(ValueError, match=words):
+        register("odd", make)
+    assert "odd" not in DetectorBankSettings().registered
+
+
+OLD = {"detector": {"threshold_Nm": [0.2, 0.2], "live_lag_s": 1.25e-3, "live": [{"name": "cusum"}]}}
+
+
+@pytest.mark.parametrize("key", ["live", "live_lag_s"])
+def test_a_configuration_with_a_detector_in_the_loop_names_the_command_that_compares_them(key):
+    with pytest.raises(ConfigError) as of_file:
+        parse(Settings, {"detector": {key: OLD["detector"][key]}})
+    with pytest.raises(ConfigError) as of_option:
+        apply_settings(load_settings(), {f"detector.{key}": "1"})
+    assert str(of_file.value) == str(of_option.value)
+    assert f"`detector.{key}`" in str(of_file.value)
+    assert "adacd-hil thresholds LOG... --report FOLDER" in str(of_file.value)
+
+
+def test_an_older_log_with_a_detector_in_its_loop_is_read_without_it():
+    assert renewed(OLD) == {"detector": {"threshold_Nm": [0.2, 0.2]}}
