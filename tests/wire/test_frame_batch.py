@@ -37,7 +37,7 @@ def test_every_kind_of_frame_is_read_from_its_structure(pair: tuple[socket.socke
     near.send(CLASSIC.pack(0x80000000 | 0x1ADACD00, 8, b"abcdefgh"))
     near.send(CLASSIC.pack(0x20000000 | 0x40, 8, b"ABCDEFGH"))
     near.send(CLASSIC.pack(0x7FF, 0, b""))
-    assert contents(FrameReceiver(far, MonotonicClock()).take()) == [
+    assert contents(FrameReceiver(far, MonotonicClock()).take_frames()) == [
         (0x201, long, False),
         (0x181, b"\x01\x02\x03", False),
         (0x1ADACD00, b"abcdefgh", False),
@@ -74,7 +74,7 @@ def test_where_time_is_virtual_frames_carry_it(pair: tuple[socket.socket, socket
     clock = VirtualClock()
     clock.sleep_until_ns(42_000)
     near.send(CLASSIC.pack(0x181, 0, b""))
-    (frame,) = FrameReceiver(far, clock).take()
+    (frame,) = FrameReceiver(far, clock).take_frames()
     assert frame.t_ns == 42_000
 
 
