@@ -1,8 +1,8 @@
 """The emulated arm on the bus: one body, two drives, two torque sensors, and what happens at every SYNC.
 
-At SYNC k: latch the commands that came since SYNC k − 1 → sample the body → status frames that are due → feedback and
-torque frames, identifiers ascending → truth of k → integrate to k + 1 with the latched torque. The bench sends the
-cyclic frames last: a host in lockstep goes on when it has them, and then it has all frames of this SYNC.
+At SYNC k: let the arm move to k with the torque that was latched at k − 1 → latch the commands that came since → sample
+the arm → status frames that are due → feedback and torque frames, identifiers ascending → truth of k. The bench sends
+the cyclic frames last: a host in lockstep goes on when it has them, and then it has all frames of this SYNC.
 
 Time: `firmware_sim.bench.bench_time`; nodes: `firmware_sim.bench.bench_nodes`; faults: `firmware_sim.bench.injector`;
 truth: `firmware_sim.bench.bench_time`.
@@ -19,11 +19,11 @@ from adacd_hil.records import TRUTH_LAYOUT, Vector
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import HOST_MARK
-from firmware_sim.bench.bench_nodes import TICK_NS, BenchNodes, Movable
+from firmware_sim.bench.bench_nodes import BenchNodes
 from firmware_sim.bench.bench_time import BenchTime, OnTruth, TruthFeed
 from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS
 from firmware_sim.bench.injector import Handler, Injector, OnEvent, Outbox
-from firmware_sim.body.body import Body
+from firmware_sim.body.body import Body, MovableArm
 from firmware_sim.canopen.error_control import SyncKind, SyncOrder
 from firmware_sim.canopen.object_dictionary import EmulatedContract, contract_of
 from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE
@@ -48,7 +48,7 @@ class Bench:
         contract: EmulatedContract | None = None,
         on_event: OnEvent | None = None,
         on_answer: Callable[[], None] = lambda: None,
-        arm: "Movable | None" = None,
+        arm: MovableArm | None = None,
     ) -> None:
         """Build and compile everything; nothing is sent before `boot`.
 
@@ -146,8 +146,8 @@ class Bench:
         if is_error:
             return
         time = self.time
-        if self._is_wall and t_ns > time.now_ns:
-            time.now_ns = t_ns
+        if self._is_wall:
+            time.reach(t_ns)
         if can_id == self._sync_id:
             if self.injector.has_faults:
                 time.advance_faults(t_ns, self._time_to_sync_ns(data))
@@ -167,11 +167,10 @@ class Bench:
 
     def _time_to_sync_ns(self, data: bytes) -> int:
         """Say by how much this SYNC moves the bench's time, if it is heard."""
-        if self._is_wall or not self.time.has_moved:
+        if self._is_wall or not self.time.has_begun:
             return 0
-        counter, last = data[0] if data else 0, self._order.counter
-        periods = (counter - last) % self._nodes.listeners.overflow if counter and last else 1
-        return periods * self._nodes.period_ns
+        overflow = self._nodes.listeners.overflow
+        return self._order.periods_to(data[0] if data else 0, overflow) * self._nodes.period_ns
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
         for place, device in enumerate(self.devices):
@@ -204,11 +203,7 @@ class Bench:
         if not (any(takers) and self._judge(data, t_ns)):
             self._ignore_sync(data, takers)
             return
-        if self._is_wall:
-            self.time.move_to(self.time.now_ns)
-        elif self.time.has_moved:
-            self.time.live_through_lost_syncs(self._lost_syncs)
-            self.time.now_ns += self._nodes.period_ns
+        self.time.reach_sync(self._lost_syncs)
         late_ns = self.injector.late_ns(self._nodes.period_ns)
         if late_ns and self._is_wall:
             self._outbox.hold(self.time.now_ns + late_ns, lambda: self._answer(data, t_ns, 0))
@@ -243,9 +238,7 @@ class Bench:
     def _answer(self, data: bytes, t_ns: int, late_ns: int) -> None:
         """Sample and answer a SYNC that reaches the devices now, or by SYNC `late_ns` after its time."""
         sync_ns = self.time.now_ns
-        late_ticks = late_ns // TICK_NS
-        if late_ticks:
-            self._nodes.move_arm(late_ticks)
+        self.time.delay_sample(late_ns)
         takers = self._nodes.listeners.takers(data)
         if self._is_wall or (takers == self._nodes.listeners.everybody and self._is_plain):
             self._sample_and_send(data, takers)
@@ -257,27 +250,20 @@ class Bench:
             self._outbox.close(sync_ns, sync_ns + self._nodes.period_ns)
         self.time.note_sent()
         self._on_answer()
-        self._tell_truth(t_ns)
-        if not self._is_wall:
-            self.time.has_moved = True
-            self._nodes.move_arm(self._nodes.period_ns // TICK_NS - late_ticks)
+        self.time.has_begun = True
+        self.time.end_sync(self.cycle, t_ns)
 
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
         """By SYNC, live through one that a fault keeps from all devices; what they send besides goes out."""
         is_counted = self._order.counter != 0 and any(self._nodes.listeners.takers(data)) and self._judge(data, t_ns)
-        if is_counted and self.time.has_moved:
+        if is_counted and self.time.has_begun:
             self._nodes.listeners.miss(self._lost_syncs + 1)
-            self.time.live_through_lost_syncs(self._lost_syncs + 1)
+            self.time.pass_lost_syncs(self._lost_syncs + 1)
         self._outbox.collect(self.time.now_ns)
         self.time.poll(self.time.now_ns)
         self._outbox.close(self.time.now_ns, self.time.now_ns + self._nodes.period_ns)
         self.time.note_sent()
-        self._tell_truth(t_ns)
-
-    def _tell_truth(self, t_ns: int) -> None:
-        """Say what is true at this SYNC, which came at `t_ns`."""
-        self.rows.tell_sync(self.cycle, self.time.host_ns if self.is_paced else t_ns, self.time.now_ns)
-        self.time.has_outlived = False
+        self.time.end_sync(self.cycle, t_ns)
 
     def _fill_truth(self, block: Vector) -> None:
         self._body.truth(block)

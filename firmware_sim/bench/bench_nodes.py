@@ -1,7 +1,6 @@
 """The nodes of a bench, two drives and two torque sensors around one arm, and what they exchange on the bus."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
 
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
@@ -11,6 +10,7 @@ from firmware_sim.arm.hardware_settings import HabitSettings
 from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.bench.injector import Handler, Injector
+from firmware_sim.body.body import MovableArm
 from firmware_sim.body.sensors import converter_ends, count_Nm
 from firmware_sim.canopen.object_dictionary import Abort, EmulatedContract, longest_pdo, refuse
 from firmware_sim.nodes.device import EmulatedDevice, SyncListeners
@@ -20,12 +20,6 @@ from firmware_sim.nodes.sensor_node import SensorNode
 from firmware_sim.scenario.faults import device_ids, own_messages
 from firmware_sim.scenario.scenario import Scenario
 
-if TYPE_CHECKING:
-    from firmware_sim.bench.recorded_bench import RecordedBody
-    from firmware_sim.body.body import Body
-
-Movable: TypeAlias = "Body | RecordedBody"
-"""The arm as its devices use it."""
 TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
@@ -42,7 +36,7 @@ class BenchNodes:
         codec: Codec,
         contract: EmulatedContract,
         injector: Injector,
-        arm: Movable,
+        arm: MovableArm,
         is_free_running: bool,
     ) -> None:
         """Build the nodes around an arm. `is_free_running`: time passes without SYNC, so drives watch for it.
@@ -98,6 +92,7 @@ class BenchNodes:
                     device.serve(*alias, device.reader(*place))
                     device.pdos.accept(*alias, device.pdos.writer(*place))
         injector.attach(self.devices, self.drives, self.sensors)
+        self.latch_motors()
         self.period_ns = contract.period_us * 1000 or _UNTOLD_PERIOD_NS
         """How far one SYNC takes the arm, where time goes by SYNC."""
         self.told_period_ns = 0
@@ -124,8 +119,8 @@ class BenchNodes:
         sensor1, sensor2 = self.sensors
         return min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
 
-    def move_arm(self, tick_count: int) -> None:
-        """Let the arm move with what its motors are told."""
+    def latch_motors(self) -> None:
+        """Take over the drives' present set-points and modes, by joint, until the next call."""
         drive1, drive2 = self.drives
         torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
         modes = (drive1.motor_mode, drive2.motor_mode)
@@ -134,7 +129,11 @@ class BenchNodes:
             torque_Nm = (up1 * torque_Nm[0], up2 * torque_Nm[1])
             if self.wiring.drive_joint == (1, 0):
                 torque_Nm, modes = torque_Nm[::-1], modes[::-1]
-        self._arm.advance(torque_Nm, modes, tick_count)
+        self._motor_Nm, self._motor_modes = torque_Nm, modes
+
+    def move_arm(self, tick_count: int) -> None:
+        """Let the arm move with the latched set-points."""
+        self._arm.advance(self._motor_Nm, self._motor_modes, tick_count)
 
     def lose_sync(self, heard: Sequence[int], t_ns: int) -> None:
         """Let the drives that have not heard a SYNC count its period; `heard`: how often each node has."""

@@ -8,7 +8,7 @@ the arm is a table for compiled code: bodies, hands and walls, and how fast they
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,6 +175,38 @@ def payload_table(payloads: tuple[PayloadSettings, ...]) -> Structured:
     """Pack payload changes (n,), rows of PAYLOAD_CHANGE."""
     rows = [(change.tick, change.mass_kg, *change.center_m, change.inertia_kg_m2) for change in payloads]
     return np.array(rows, dtype=PAYLOAD_CHANGE)
+
+
+class MovableArm(Protocol):
+    """An arm as its devices use it; the members mean the same as those of `Body`."""
+
+    @property
+    def has_ideal_motors(self) -> bool: ...  # noqa: D102
+
+    @property
+    def is_torque_limited(self) -> tuple[bool, bool]: ...  # noqa: D102
+
+    @property
+    def motor_error_code(self) -> tuple[int, int]: ...  # noqa: D102
+
+    @property
+    def motor_torque_Nm(self) -> tuple[float, float]: ...  # noqa: D102
+
+    @property
+    def joint_temperature_C(self) -> tuple[float, float]: ...  # noqa: D102
+
+    @property
+    def drive_velocity_rad_s(self) -> tuple[float, float]: ...  # noqa: D102
+
+    def start_scenario(self) -> None: ...  # noqa: D102
+
+    def advance(  # noqa: D102
+        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int | None = None
+    ) -> None: ...
+
+    def sample(self) -> Measurement: ...  # noqa: D102
+
+    def truth(self, out: Vector) -> None: ...  # noqa: D102
 
 
 class BodyParts(NamedTuple):

@@ -297,6 +297,10 @@ class SyncOrder:
         """Take the next SYNC for the first."""
         self.counter = 0
 
+    def periods_to(self, counter: int, overflow: int) -> int:
+        """Return by how many periods a SYNC with this counter goes on, 1 where a counter is missing."""
+        return (counter - self.counter) % overflow if counter and self.counter else 1
+
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:
         """Judge a SYNC of the right length.
 
@@ -312,8 +316,8 @@ class SyncOrder:
         elif counter == last:
             self.kind, self.is_taken = SyncKind.REPEATED, False
             return
-        elif last:
-            self.periods = (counter - last) % overflow
+        else:
+            self.periods = self.periods_to(counter, overflow)
         self.counter = counter
         if self._is_timed:
             self._judge_time(t_ns, period_ns, is_first=last == 0)
