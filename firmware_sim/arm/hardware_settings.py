@@ -13,7 +13,7 @@ its nominal torque constant. Equations: `firmware_sim.body.motor`, `firmware_sim
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -185,30 +185,15 @@ class MechanicsSettings:
     def numbers(self, arm: ArmProfile) -> np.void:
         """Pack for compiled functions, one element of MECHANICS_NUMBERS."""
         numbers: np.void = np.zeros(1, MECHANICS_NUMBERS)[0]
-
+        own = {field.name for field in fields(self)}
+        for name in own.intersection(MECHANICS_NUMBERS.names or ()):
+            numbers[name] = getattr(self, name)
         surplus = [max(0.0, self.static_Nm[joint] - arm.coulomb_Nm[joint]) for joint in range(2)]
         numbers["surplus_Nm"] = surplus
         numbers["stribeck_rad_s"] = self.stribeck_velocity_rad_s
-        numbers["sigma0_Nm_rad"] = self.sigma0_Nm_rad
-        numbers["sigma1_Nm_s"] = self.sigma1_Nm_s
         numbers["sigma2_Nm_s"] = self._sigma2(arm)
-        numbers["load_friction"] = self.load_friction
-        numbers["viscous_drop_per_K"] = self.viscous_drop_per_K
-        numbers["coulomb_drop_per_K"] = self.coulomb_drop_per_K
         numbers["capacity_J_K"] = self.heat_capacity_J_K
-        numbers["cooling_s"] = self.cooling_s
-        numbers["ambient_C"] = self.ambient_C
-        numbers["stiffness_Nm_rad"] = self.stiffness_Nm_rad
-        numbers["damping_Nm_s"] = self.damping_Nm_s
-        numbers["rotor_inertia_kg_m2"] = self.rotor_inertia_kg_m2
-        numbers["backlash_rad"] = self.backlash_rad
-        numbers["ripple_Nm"] = self.ripple_Nm
-        numbers["ripple_share"] = self.ripple_share
-        numbers["ripple_periods"] = self.ripple_periods
         numbers["ripple_phase_rad"] = np.radians(self.ripple_phase_deg)
-        numbers["motor_viscous_Nm_s"] = self.motor_viscous_Nm_s
-        numbers["motor_coulomb_Nm"] = self.motor_coulomb_Nm
-        numbers["holding_brake_Nm"] = self.holding_brake_Nm
         numbers["is_encoder_on_link"] = self.encoder_side == "link"
         numbers["gravity_m_s2"] = STANDARD_GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))
         numbers["downhill_rad"] = math.radians(self.tilt_direction_deg)
