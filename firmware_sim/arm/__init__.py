@@ -1,1 +1,1 @@
-"""The emulated arm's mechanics, and what its parts are set to."""
+"""The emulated arm's mechanics, and the settings of its parts."""

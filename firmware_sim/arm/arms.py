@@ -15,7 +15,7 @@ n(φ₁)·e(φ₂) = sin q₂ the kinetic energy of the arm is
 The host's a₁ = α + γ, a₂ = β, a₃ = γ appear in the truth record only.
 
 An arm of one's own stands in place of a profile: section `[own_arm]` of a scenario. It also says how its devices are
-wired: which joint each of them is at, which way it counts, and how many counts it makes of what the host was told.
+wired: the joint, the direction and the counts of each, in the counts of the host's configuration.
 Places 1 and 2 are those of the contract's names, Drive1 and Drive2, Sensor1 and Sensor2. Pairs are by joint, or by
 place where they are about devices.
 """
@@ -195,7 +195,7 @@ class OwnArmSettings:
 
 @dataclass(frozen=True)
 class Wiring:
-    """Which joint (0, 1) the device at each place is at, and which way it counts.
+    """Joint (0, 1) and direction of the device at each place.
 
     torque_sign: a drive's torque. zero_counts: position of each drive at q = 0, before its sign.
     """

@@ -1,9 +1,9 @@
-"""Sections `[mechanics]`, `[drives]` and `[sensors]` of a scenario: what arm and devices are beyond ideal ones.
+"""Sections `[mechanics]`, `[drives]` and `[sensors]` of a scenario: properties of arm and devices beyond ideal ones.
 
 Pairs are (joint 1, joint 2).
 
-**Mechanics**: beyond rigid links with viscous and Coulomb friction. Everything is off by default, and a scenario
-without this section runs the rigid plant. Equations: `firmware_sim.arm.joint_forces`, `firmware_sim.arm.mechanics`.
+**Mechanics**: beyond rigid links with viscous and Coulomb friction. Everything is off by default: the arm is
+rigid then. Equations: `firmware_sim.arm.joint_forces`, `firmware_sim.arm.mechanics`.
 
 **Devices**: errors and limits of drives, torque sensors and encoders. The defaults are a drive that gives its rated
 torque for ever, with a torque loop of 1 kHz; a linear 16-bit torque sensor of ±50 Nm with 0.02 Nm of noise that
@@ -45,7 +45,7 @@ PayloadBody = tuple[float, Pair, float]
 
 @dataclass(frozen=True)
 class MechanicsSettings:
-    """The arm beyond the rigid plant."""
+    """Properties of the arm beyond rigid links, viscous and Coulomb friction."""
 
     static_Nm: Pair = setting(
         (0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="F_s, friction at standstill; 0: the profile's Coulomb"
@@ -139,7 +139,7 @@ class MechanicsSettings:
 
     @property
     def holding_torque_Nm(self) -> Pair:
-        """What the motors hold without power: their own friction, their brakes and their cogging."""
+        """Torque that the motors hold without power: own friction, brakes and cogging."""
         first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, self.ripple_Nm, strict=True)
         return sum(first), sum(second)
 
@@ -251,7 +251,7 @@ class MechanicsSettings:
         return oscillation, largest
 
     def substeps(self, arm: ArmProfile, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
-        """Choose the substeps of a 100 µs tick; touch_rad_s: fastest eigenfrequency of what touches the arm."""
+        """Choose the substeps of a 100 µs tick; touch_rad_s: fastest rate of bodies, hands and walls."""
         oscillation, largest = self.eigenvalues(arm, payloads)
         oscillation = max(oscillation, touch_rad_s)
         needed = max(oscillation / LARGEST_OSCILLATION, largest / LARGEST_DECAY) * TICK_S
@@ -286,7 +286,7 @@ class HabitSettings:
 
 @dataclass(frozen=True)
 class DriveSettings:
-    """What the drives get wrong and how long they bear it."""
+    """Errors of the drives, and limits of their load."""
 
     current_loop_Hz: Pair = setting(
         (CURRENT_LOOP_HZ, CURRENT_LOOP_HZ), unit="Hz", low=1.0, high=5e3, meaning="-3 dB of the torque loop"
@@ -361,7 +361,7 @@ _STEEPEST_LOOP = 0.5
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """What the torque sensors and the encoders get wrong."""
+    """Errors of the torque sensors and the encoders."""
 
     offset_drift_Nm_s: Pair = setting(
         (0.0, 0.0), unit="Nm/s", low=-10.0, high=10.0, meaning="steady drift of the torque zero since power-on"

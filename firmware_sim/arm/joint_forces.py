@@ -1,4 +1,4 @@
-"""Friction and gear of the joints, and all forces of one instant in the arm beyond the rigid plant.
+"""Friction and gear of the joints, and all forces of one instant in the arm.
 
 `firmware_sim.arm.mechanics` integrates them. `now` is one element of ROW: where the arm is.
 
@@ -71,7 +71,7 @@ MECHANICS_NUMBERS: Final = float_fields(
         "holding_brake_Nm": PAIR,  # motor side, while the drive is off
     }
 )
-"""What `MechanicsSettings.numbers` fills in: friction, transmission, gravity and the holding brakes."""
+"""Filled in by `MechanicsSettings.numbers`: friction, transmission, gravity and the holding brakes."""
 
 
 @compiled
@@ -152,7 +152,7 @@ Slips = tuple[int, int, int, int]
 """Of both links, then of both motors."""
 
 ROW: Final = float_fields({"q": PAIR, "dq": PAIR, "q_m": PAIR, "dq_m": PAIR, "bristle_rad": PAIR, "tau_m": PAIR})
-"""What is integrated, or its rates: link side, motor side, bristles, motor torque. The touch state is beside it."""
+"""The integrated state, or its rates: link side, motor side, bristles, motor torque. The touch state is beside it."""
 
 FORCES: Final = float_fields(
     {
@@ -174,7 +174,7 @@ FORCES: Final = float_fields(
 
 
 class Surroundings(NamedTuple):
-    """What acts on the arm in a tick: elements of MECHANICAL_STATE, ARM_NUMBERS and MECHANICS_NUMBERS, and who touches.
+    """Everything that acts on the arm in a tick: elements of MECHANICAL_STATE, ARM_NUMBERS, MECHANICS_NUMBERS; touches.
 
     contact: one row of the contact table, or none. things: the touch table.
     """

@@ -1,11 +1,11 @@
-"""The arm with everything that the rigid plant leaves out, in motion: RK4 in substeps of the 100 µs tick.
+"""The arm in motion: RK4 in substeps of the 100 µs tick. A rigid arm is one whose other properties are 0.
 
 Link side, with the mass matrix and centrifugal terms of `firmware_sim.arm.plant`:
 
     M(q) q̈ + centrifugal = τ_J + τ_ext − τ_gravity − friction          friction: `firmware_sim.arm.joint_forces`
 
 An elastic joint has τ_J = τ_s and a motor side of its own (`firmware_sim.arm.joint_forces`). A stiff joint turns
-with its rotor: M gets the rotor's inertia R, motor-side friction adds to the joint's, and what the sensor sees follows:
+with its rotor: M gets the rotor's inertia R, motor-side friction adds to the joint's, and the sensor sees
 τ_J = τ_m + ripple − R q̈ − motor-side friction. While a stiff joint sticks, motor-side and joint friction share the load
 in the ratio of their levels; rigid bodies leave it open.
 
@@ -77,7 +77,7 @@ class _StepWork(NamedTuple):
 
 
 def work_space(touch_size: int) -> Vector:
-    """Allocate what a step works in, for a touch state of `touch_size` values."""
+    """Allocate the work space of a step, for a touch state of `touch_size` values."""
     return np.zeros(_FORCES_END + _ROWS * touch_size)
 
 
@@ -89,13 +89,13 @@ def _touch_rows(space: Vector) -> NDArray[np.float64]:
 
 @compiled
 def _collect(row: int, around: Surroundings, time_s: float, elapsed_s: float, work: _StepWork) -> None:
-    """Fill forces, friction levels and touch rates for what `row` holds."""
+    """Fill forces, friction levels and touch rates for the state in `row`."""
     collect_forces(around, work.rows[row], work.touch[row], work.touch[_TOUCH_RATES], time_s, elapsed_s, work.forces)
 
 
 @compiled
 def _fill_rates(row: int, rates: int, around: Surroundings, slips: Slips, work: _StepWork) -> None:
-    """Fill the row `rates` with the derivative of what `row` holds.
+    """Fill the row `rates` with the derivative of the state in `row`.
 
     Forces of the same instant are in the work space. Bristles and motor torques go their own way.
     """
@@ -329,9 +329,9 @@ def integrate_mechanics(
 ) -> None:
     """Advance the mechanical state and the touch state by `step_s` in `substeps` substeps.
 
-    contact: one row of the contact table, or none; elapsed_s: since its onset. things, touch_state: what
-    `firmware_sim.arm.touch_forces.touch` knows of bodies, hands and walls, and their state; time_s: scenario time,
-    negative before the scenario starts. target: what the drives' torque loops are asked for, Nm. space: from
+    contact: one row of the contact table, or none; elapsed_s: since its onset. things, touch_state: table and state of
+    bodies, hands and walls for `firmware_sim.arm.touch_forces.touch`; time_s: scenario time,
+    negative before the scenario starts. target: set-points of the drives' torque loops, Nm. space: from
     `work_space`.
     """
     around = Surroundings(state, arm, mechanics, contact, things)
@@ -410,7 +410,7 @@ def observe(
     elapsed_s: float,
     space: Vector,
 ) -> tuple[float, float, float, float, float, float]:
-    """Give what is true now, Nm: external torque, friction along +dq, gravity torque, two joints each.
+    """Give the present true values, Nm: external torque, friction along +dq, gravity torque, two joints each.
 
     Changes nothing that goes on.
     """

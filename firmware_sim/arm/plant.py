@@ -1,4 +1,4 @@
-"""The rigid arm in motion: Lagrange's equations in absolute link angles, friction that truly holds, RK4.
+"""Accelerations of the two rigid links: Lagrange's equations in absolute link angles, friction that truly holds.
 
 With φ₁ = q₁, φ₂ = q₁ + q₂ and the kinetic energy of `firmware_sim.arm.arms`, Lagrange gives
 
@@ -52,8 +52,8 @@ ARM_NUMBERS: Final = float_fields(
         "stop_damping_Nm_s": PAIR,
     }
 )
-"""What `firmware_sim.arm.arms.ArmProfile.numbers` fills in. It is here and not there because compiled code contains it,
-and the cache of compiled code is keyed by the modules that compile."""
+"""Filled in by `firmware_sim.arm.arms.ArmProfile.numbers`. The table is here because
+compiled code contains it, and the cache of compiled code is keyed by the modules that compile."""
 
 MECHANICAL_STATE: Final = float_fields(
     {
@@ -89,8 +89,8 @@ def fit_payload(
 ) -> None:
     """Change the payload, a body with its centre of mass at (along, beside) from the tip in the frame of link 2.
 
-    What is added was at rest: the momentum of the moving arm is shared with it, M q̇ stays. What is taken off leaves
-    with the speed that it has: q̇ stays. At rest both change nothing but the inertia.
+    An added mass was at rest: it shares the momentum of the moving arm, M q̇ stays. A mass that is taken off leaves with
+    its speed: q̇ stays. At rest both change only the inertia.
     """
     added_kg = payload_kg - state["payload_kg"]
     m11, m12, m22 = mass_matrix(state, state["q"][1])
@@ -139,8 +139,8 @@ def accelerate(
 ) -> tuple[float, float, float, float]:
     """Give ddq1, ddq2 in rad/s² and the Coulomb friction of both joints in Nm, positive along +dq.
 
-    torque is motor plus external torque. A sticking joint has no acceleration; its friction is what it takes to hold,
-    be it more than F_c or not.
+    torque is motor plus external torque. A sticking joint has no acceleration; its friction is the holding torque,
+    even where that is more than F_c.
     """
     sine = state["beta"] * math.sin(q2)
     if state["sigma"] != 0.0:

@@ -1,11 +1,11 @@
-"""What the devices measure: encoder, the drive's velocity, joint torque.
+"""Measurements of the devices: encoder, the drive's velocity, joint torque.
 
 encoder    20 bit per revolution, rounded to the nearest count
 velocity   critically damped tracking loop on the encoder at 10 kHz, v̂/q = ω² s / (s + ω)², ω = 2π · 200 rad/s;
            it lags a steady acceleration by 2/ω = 1.59 ms; sent with an LSB of 5e-4 rad/s
 torque     white noise of 0.02 Nm rms at the SYNC sample, then a 16-bit converter over ±50 Nm that saturates
 
-These are the defaults. What a scenario changes of them is in `torque_transducer`, `encoder` and `motor`.
+These are the defaults. `firmware_sim.body.sensors` and `firmware_sim.body.motor` have the errors that a scenario sets.
 """
 
 import math
@@ -37,7 +37,7 @@ _SAMPLES_AT_ONCE: Final = 256
 
 
 class DriveMode(IntEnum):
-    """What a drive does with its motor. The drive node chooses; every mode can follow every other."""
+    """The torque that a drive asks of its motor. The drive node chooses; every mode can follow every other."""
 
     OFF = 0  # no torque, the arm coasts: Switched on and below, until the node enables
     TORQUE = 1  # follows the set-point: Operation enabled, until the node disables, stops or faults
@@ -111,7 +111,7 @@ class TorqueNoise:
 
 
 class Measurement(NamedTuple):
-    """What the devices measure at one SYNC, as raw counts of the two joints; the properties give SI units."""
+    """Measurement of the devices at one SYNC, as raw counts of the two joints; the properties give SI units."""
 
     position_counts: tuple[int, int]
     velocity_counts: tuple[int, int]

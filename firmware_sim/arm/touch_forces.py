@@ -5,7 +5,7 @@ state vector: the energy, then THING_PLACES places per row. Things never touch e
 
     body   F = max(0, K δ + c δ̇) along the normal n from the link to the body, at the point nearest to its centre.
            δ is the penetration. The body moves in its free direction u: m ṡ̇ = F n·u, s = 0 where it stands. Its
-           wall, if any, takes the force as soon as s reaches the room; what kinetic energy it has then is lost.
+           wall, if any, takes the force as soon as s reaches the room; its kinetic energy is then lost.
     hand   F = K (p_d − p) + c (ṗ_d − ṗ), never larger than its limit; p_d moves from where p was when it grasped.
     wall   F = K δ max(0, 1 + χ δ̇) along its normal, at the elbow (end of link 1) and at the tip (end of link 2)
 
@@ -15,7 +15,7 @@ of a wall is that of Hunt and Crossley 1975, which has no step at the first touc
 A body or wall is put in place at its time, or as soon after it as the arm is not where it is to stand. A body's side
 of the link is decided there and whenever it is off the end of the link, so deep penetration never throws it through.
 
-Power and energy are what the arm gives: −τᵀ q̇ of all that touches it, prescribed contacts included, and its integral
+Power and energy count from the arm: −τᵀ q̇ of all touches, prescribed contacts included, and its integral
 since the arm was last untouched.
 """
 
@@ -104,7 +104,7 @@ TOUCH_TRUTH: Final = float_fields(
         "energy_J": (),
     }
 )
-"""What `describe_touch` fills."""
+"""Filled by `describe_touch`."""
 
 
 @compiled
@@ -189,7 +189,7 @@ def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float
 def _recede_rate(thing: np.void, own: np.void) -> float:
     """Give the velocity of a body along its free direction, m/s: none into the wall behind it.
 
-    What its speed ṡ gathers against the wall within a tick is taken away between ticks.
+    Between ticks, speed ṡ against the wall is reset.
     """
     if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         return 0.0
@@ -327,7 +327,7 @@ def _appear(thing: np.void, own: np.void, hand: np.void, pose: Pose) -> None:
 
 @compiled
 def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
-    """Do what happens to a body between ticks; say whether it is touched."""
+    """Stop a body at its wall and choose its side, between ticks; say whether the arm touches it."""
     if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         own["shift_rate_m_s"] = 0.0
     depth_m, point_m, normal_x, normal_y, across_m = _meet(thing, own, pose)
@@ -343,7 +343,7 @@ def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
 
 @compiled
 def change_touch(things: Structured, time_s: float, q1: float, q2: float, state: Vector, is_prescribed: bool) -> None:
-    """Do what changes between ticks: things come and go, hands grasp, a body stops at its wall, the energy restarts.
+    """Apply the changes between ticks: things come and go, hands grasp, a body stops at its wall, the energy restarts.
 
     Call it at the start of each tick and before `describe_touch`; twice at the same instant is once. is_prescribed:
     whether a prescribed contact is in force. The free direction of a body that has not moved turns with the normal.
@@ -446,7 +446,7 @@ def add_prescribed_work(
     q2: float,
     state: Vector,
 ) -> None:
-    """Add what the arm gave to a prescribed contact in a step: the mean torque along the way of the joints.
+    """Add the energy that the arm gave to a prescribed contact in a step: the mean torque along the way of the joints.
 
     before1, before2: joint positions at the start of the step, at elapsed_s; q1, q2: at its end. Frame "motion" goes by
     the mean velocity of the step. No contact adds nothing.

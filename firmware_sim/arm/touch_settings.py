@@ -14,8 +14,8 @@ Onset and end lie on the 100 µs grid of the drives, so their jumps never fall i
 
 Bodies, hands and walls have a body of their own.
 
-Points and angles are in the world's frame: origin in joint 1, x along link 1 at q₁ = 0. Where the forces come from is
-in `firmware_sim.arm.touch_forces`.
+Points and angles are in the world's frame: origin in joint 1, x along link 1 at q₁ = 0. Forces:
+`firmware_sim.arm.touch_forces`.
 
 The human body is as ISO/TS 15066:2016 Annex A models it: mass, spring constant and limits of each body region.
 The standard's two-mass model has a region of effective mass m_H behind a linear spring of constant K (table A.3). Its
@@ -37,7 +37,7 @@ TICK_S: Final = 1e-4
 """The drives' inner period, and the grid of everything that happens to the arm."""
 
 PAIR: Final = (2,)
-"""Shape of what both joints have."""
+"""Shape of a value per joint."""
 
 SHAPES: Final = ("step", "half_sine", "push")
 FRAMES: Final = ("link", "world", "motion")
@@ -262,7 +262,7 @@ BODY_REGIONS: Final = {
 
 
 _REACH_M: Final = 20.0
-"""Bound of coordinates: twice what two links of 5 m, the longest allowed, can reach."""
+"""Bound of coordinates: twice the reach of two links of 5 m, the longest allowed."""
 
 
 def _ends(lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> tuple[tuple[float, float], ...]:
@@ -368,7 +368,7 @@ class HandSettings:
 
 @dataclass(frozen=True)
 class WallSettings:
-    """A fixed wall, a line in the plane; the ends of both links can meet it, not what lies between."""
+    """A fixed wall, a line in the plane; only the ends of both links can meet it."""
 
     x_m: float = setting(unit="m", low=-_REACH_M, high=_REACH_M, meaning="a point of it, world")
     y_m: float = setting(unit="m", low=-_REACH_M, high=_REACH_M, meaning="a point of it, world")

@@ -1,4 +1,4 @@
-"""The emulated arm on the bus: one body, two drives, two torque sensors, and what happens at every SYNC.
+"""The emulated arm on the bus: one body, two drives, two torque sensors, and the cycle of every SYNC.
 
 At SYNC k: let the arm move to k with the torque that was latched at k − 1 → latch the commands that came since → sample
 the arm → status frames that are due → feedback and torque frames, identifiers ascending → truth of k. The bench sends
@@ -96,7 +96,7 @@ class Bench:
 
     @property
     def is_acknowledged(self) -> bool:
-        """Whether some device has power and is on the bus, so that what the host sends is acknowledged."""
+        """Whether some device has power and is on the bus, so that it acknowledges frames of the host."""
         return self._plan.is_acknowledged
 
     @property
@@ -166,7 +166,7 @@ class Bench:
             time.poll(time.now_ns)
 
     def _time_to_sync_ns(self, data: bytes) -> int:
-        """Say by how much this SYNC moves the bench's time, if it is heard."""
+        """Return by how much this SYNC moves the bench's time, if a device hears it."""
         if self._is_wall or not self.time.has_begun:
             return 0
         overflow = self._nodes.listeners.overflow
@@ -254,7 +254,7 @@ class Bench:
         self.time.end_sync(self.cycle, t_ns)
 
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
-        """By SYNC, live through one that a fault keeps from all devices; what they send besides goes out."""
+        """By SYNC, let the period of a SYNC pass that a fault keeps from all devices; their other frames go out."""
         is_counted = self._order.counter != 0 and any(self._nodes.listeners.takers(data)) and self._judge(data, t_ns)
         if is_counted and self.time.has_begun:
             self._nodes.listeners.miss(self._lost_syncs + 1)

@@ -1,4 +1,4 @@
-"""The nodes of a bench, two drives and two torque sensors around one arm, and what they exchange on the bus."""
+"""The nodes of a bench, two drives and two torque sensors around one arm, and their frames."""
 
 from collections.abc import Callable, Sequence
 
@@ -28,7 +28,7 @@ _UNTOLD_PERIOD_NS = 1_000_000
 
 
 class BenchNodes:
-    """All nodes of one bench: which frames each takes and sends, and what is due by time."""
+    """All nodes of one bench: the frames that each takes and sends, and their timers."""
 
     def __init__(
         self,
@@ -44,7 +44,7 @@ class BenchNodes:
         Raises CodecError when the DBC lacks a message, OSError when an EDS can't be read.
         """
         self.senders: tuple[tuple[int, Callable[[], None]], ...] = ()
-        """What answers SYNC: place of a node, and how it sends."""
+        """Senders of the answers to SYNC: place of a node, and its function."""
         self.commands: dict[int, tuple[tuple[int, Handler], ...]] = {}
         """By identifier, the nodes that take a frame of the host, and how."""
         self.has_all_answers = False
@@ -114,7 +114,7 @@ class BenchNodes:
         self.commands = commands
 
     def poll(self, t_ns: int) -> int:
-        """Do what is due by time; return when to look again."""
+        """Act on timers that are due; return when to look again."""
         drive1, drive2 = self.drives
         sensor1, sensor2 = self.sensors
         return min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
@@ -172,7 +172,7 @@ class BenchNodes:
 
     def _set_period(self, period_us: int) -> None:
         self.told_period_ns = period_us * 1000
-        if period_us:  # 0 is written to change 0x1019; what a SYNC is worth stays
+        if period_us:  # 0 is written to change 0x1019; the time of a SYNC stays
             self.period_ns = self.told_period_ns
 
 

@@ -217,7 +217,7 @@ class BenchTime:
         self._rows.add_sync_row(cycle, self.host_ns if self._outbox.is_paced else stamp_ns)
 
     def poll(self, t_ns: int) -> None:
-        """Do what is due by time and remember when to look again."""
+        """Let the nodes act on timers that are due, and remember when to look again."""
         self.due_ns = self._nodes.poll(t_ns)
         if self._injector.has_faults:
             self.due_ns = min(self.due_ns, self._injector.due_ns, self._outbox.due_ns)
@@ -271,7 +271,7 @@ class BenchTime:
         self._is_orphaned = False
 
     def _act_at(self, t_ns: int) -> None:
-        """Reach `t_ns` and do what is due then."""
+        """Reach `t_ns` and act on everything that is due then."""
         self.reach(t_ns)
         self.advance_faults(t_ns)
         self._outbox.release(self.now_ns)

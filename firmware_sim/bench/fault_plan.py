@@ -30,7 +30,7 @@ _NOT_VALID = 0x01  # of 0x6150
 _FRAME_KINDS = ("lose", "duplicate", "delay", "reorder", "corrupt", "freeze_counter")
 _VALUE_KINDS = ("stick", "jump", "saturate")
 _NODES_OWN = ("wrong_node_id", "duplicate_node_id", "drive_fault", "sensor_error", "clock_drift")
-"""What a node does by itself once it has been told."""
+"""Kinds whose effect the node keeps by itself, from power-on or since a `NodeAction`."""
 
 Pair = tuple[int, int]
 
@@ -44,7 +44,7 @@ class FaultEdge(NamedTuple):
 
 
 class ActionKind(Enum):
-    """What happens to a node. `NodeAction.value` is in brackets."""
+    """Actions on a node. `NodeAction.value` is in brackets."""
 
     POWER_OFF = "power off"
     POWER_ON = "power on"
@@ -110,7 +110,7 @@ class FaultPlan:
 
     @property
     def is_acknowledged(self) -> bool:
-        """Whether some device has power and is on the bus, so that what the host sends is acknowledged."""
+        """Whether some device has power and is on the bus, so that it acknowledges frames of the host."""
         return len(self._off | self._off_bus) < len(NODES)
 
     @property
@@ -136,13 +136,13 @@ class FaultPlan:
         return edges
 
     def actions(self) -> list[NodeAction]:
-        """Take what happens to nodes now, in order."""
+        """Take the actions on nodes that are due now, in order."""
         taken, self._actions = self._actions, []
         self._find_quiet()
         return taken
 
     def transmit(self, node: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
-        """Return what becomes of a frame that a node sends: delay in ns, identifier, data of each."""
+        """Apply the faults to a frame that a node sends; return delay in ns, identifier, data of each."""
         if node in self._silent:
             return []
         rows = self._sending.get((node, can_id)) or self._sending.get((node, ANY_FRAME))
@@ -151,15 +151,15 @@ class FaultPlan:
         return [(delay_ns, can_id, changed) for delay_ns, changed in self._change(rows, can_id, data)]
 
     def receive(self, node: int, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
-        """Return what becomes of a frame of the host on its way to a node: delay in ns and data of each.
+        """Apply the faults to a frame of the host on its way to a node; return delay in ns and data of each.
 
-        A frame that comes to all devices is asked for with `EVERYBODY` first, and what is left of it for each node.
+        For a frame to all devices call it with `EVERYBODY` first, then with each of the returned frames for each node.
         """
         rows = self._receiving.get((node, can_id))
         return self._change(rows, can_id, data) if rows else [(0, data)]
 
     def distort(self, position: Pair, velocity: Pair, torque: Pair) -> tuple[Pair, Pair, Pair]:
-        """Return what the devices take for measured in the body's counts, joint 1 and 2 each. Once per SYNC."""
+        """Apply the faults to measured values, in the body's counts, joint 1 and 2 each. Once per SYNC."""
         if not self._distorting:
             return position, velocity, torque
         values = [list(position), list(velocity), list(torque)]
@@ -211,7 +211,7 @@ class FaultPlan:
         return edges
 
     def _begin(self, row: FaultRow) -> None:
-        """Do what happens to nodes once, without an end."""
+        """Queue the actions of a row without length."""
         settings = row.settings
         for node in settings.nodes:
             if settings.kind == "reboot" and not settings.duration_ns:
@@ -221,7 +221,7 @@ class FaultPlan:
                 self._actions += [NodeAction(ActionKind.FAIL, node, code), NodeAction(ActionKind.MEND, node)]
 
     def _take_over(self) -> None:
-        """Make the tables of what acts now, and let happen to nodes what follows."""
+        """Make the tables of the active rows, and queue the actions on nodes that follow."""
         active = [row for row in self._rows if row.is_active]
         self.mask = sum(1 << row.index for row in active)
         self._distorting = _of(active, *_VALUE_KINDS)
@@ -245,7 +245,7 @@ class FaultPlan:
                 self._sending[node, can_id] = tuple(sorted(both, key=lambda row: row.index))
 
     def _switch(self, active: list[FaultRow]) -> None:
-        """Let happen to nodes what has changed: power, bus, failures, sensor status, clocks."""
+        """Queue the actions for changes of power, bus, failures, sensor status, clocks."""
         lasting = [row for row in active if row.settings.kind == "power_loss" or row.settings.duration_ns]
         off = _nodes_of(_of(lasting, "power_loss", "reboot"))
         off_bus = _nodes_of(_of(active, "bus_off"))

@@ -1,4 +1,4 @@
-"""Rows of a scenario's faults: when each acts, what it draws, and what becomes of a frame or a value that it hits.
+"""Rows of a scenario's faults: times, random draws, and effects on frames and values.
 
 Each row draws from a stream of its own, which follows from the seed, the row's kind, node and frame or signal, and the
 number of earlier rows that are alike in these. So rows that are added or removed, and changed numbers within a row,
@@ -38,7 +38,7 @@ Place = tuple[int, int]
 
 
 class FaultRow:
-    """One row and what it has done so far."""
+    """One row and its progress."""
 
     def __init__(self, index: int, settings: FaultSettings, seed: str, period_ns: int) -> None:
         self.index = index
@@ -90,7 +90,7 @@ class FaultRow:
 
 
 def distort_value(row: FaultRow, node: int, counts: int, lsb: float) -> int:
-    """Return what becomes of one value."""
+    """Return one value with the row's effect."""
     settings = row.settings
     if not row.hit():
         return counts

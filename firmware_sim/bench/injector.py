@@ -51,7 +51,7 @@ class Outbox:
 
     @property
     def due_ns(self) -> int:
-        """When the next of what is held back is released."""
+        """When the next held frame is released."""
         return self._held[0].due_ns if self._held else NEVER_NS
 
     def put(self, can_id: int, data: bytes) -> None:
@@ -76,12 +76,12 @@ class Outbox:
         heapq.heappush(self._held, Held(due_ns, self._order, act))
 
     def release(self, now_ns: int) -> None:
-        """Let go what is due by now."""
+        """Release everything that is due by now."""
         while self._held and self._held[0].due_ns <= now_ns:
             heapq.heappop(self._held).act()
 
     def collect(self, now_ns: int) -> None:
-        """Begin the answer to a SYNC that isn't plain: what is put from now on waits for `close`."""
+        """Begin the answer to a SYNC that isn't plain: frames that are put from now on wait for `close`."""
         self._now_ns = now_ns
         self._is_open = True
 
@@ -117,7 +117,7 @@ class Departure:
         self._frames.append((can_id, data))
 
     def go(self) -> None:
-        """Send what waits. Raises BusError; what could not be sent is dropped, as by a controller that is reset."""
+        """Send the waiting frames. Raises BusError; unsent frames are dropped, as by a controller's reset."""
         if self._frames:
             frames, self._frames = self._frames, []
             self._bus.send_all(frames)
@@ -173,7 +173,7 @@ class Injector:
         return min(self.now_ns + self.plan.wait_ns, self._flooded_ns if self.plan.is_flooding else NEVER_NS)
 
     def sender(self, place: int) -> Send:
-        """Return what a device sends by."""
+        """Return the function by which a device sends."""
         outbox, plan = self._outbox, self.plan
 
         def put(can_id: int, data: bytes) -> None:
@@ -189,7 +189,7 @@ class Injector:
         return put if self.has_faults else outbox.put
 
     def receive(self, place: int, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
-        """Give a frame of the host, or what becomes of it, to a node (or to `EVERYBODY`); tell whether anything."""
+        """Give a frame of the host, with its faults, to a node (or to `EVERYBODY`); return whether any is left."""
         if self.plan.is_quiet:
             take(data, t_ns)
             return True
@@ -203,11 +203,11 @@ class Injector:
         return bool(frames)
 
     def receive_by_all(self, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
-        """Give a frame of the host, or what becomes of it on its way to all, to a handler; tell whether anything."""
+        """Give a frame of the host to all, with its faults, to a handler; return whether any is left."""
         return self.receive(EVERYBODY, can_id, data, take, t_ns)
 
     def advance(self, now_ns: int, stamp_ns: int) -> None:
-        """Let faults begin and end by now, and do what they do to nodes. `stamp_ns`: of the events that say so."""
+        """Let faults begin and end by now, and act on nodes. `stamp_ns`: stamp of their events."""
         self.now_ns = now_ns
         scenario_ns = -1 if self._started_ns is None else now_ns - self._started_ns
         for edge in self.plan.advance(scenario_ns, now_ns - self._power_on_ns):
@@ -225,7 +225,7 @@ class Injector:
         return 0 if self.plan.is_quiet else min(self.plan.sync_delay_ns(), period_ns - 1)
 
     def flood(self, period_ns: int) -> None:
-        """Let babbling nodes send what they send in the period that begins now."""
+        """Let babbling nodes send their frames of the period that begins now."""
         if self.plan.is_flooding:
             self._flooded_ns = self.now_ns + period_ns
             for offset_ns, can_id, data in self.plan.babble(period_ns):
@@ -239,7 +239,7 @@ class Injector:
         )
 
     def sync(self, heard: Sequence[int], measured: Measurement, now_ns: int) -> None:
-        """Give a SYNC to the nodes that hear it, with what they take for measured."""
+        """Give a SYNC to the nodes that hear it, with their measured values."""
         position, velocity, torque = self.plan.distort(*measured)
         for joint, drive in enumerate(self._drives):
             if heard[joint]:

@@ -32,7 +32,7 @@ Answer = tuple[int, bytes]
 
 
 class RecordedCycle(NamedTuple):
-    """What followed one SYNC."""
+    """The answers to one SYNC."""
 
     attempt: int
     cycle: int
@@ -58,7 +58,7 @@ class RecordedCycles:
 
     @property
     def problem(self) -> str:
-        """What is missing of the recording, one line."""
+        """Missing part of the recording, one line."""
         return self._source.problem
 
     def begin(self) -> None:
@@ -131,7 +131,7 @@ class RecordedBody:
 
     def __init__(self, codec: Codec) -> None:
         self.motor_torque_Nm = (0.0, 0.0)
-        """What the motors would have if they followed at once."""
+        """Torque of motors that follow at once."""
         self._feedbacks = {codec.message(name).can_id: (place, name) for place, name in enumerate(_FEEDBACKS)}
         self._torques = {codec.message(name).can_id: (place, name) for place, name in enumerate(_TORQUES)}
         self._codec = codec
@@ -143,7 +143,7 @@ class RecordedBody:
         return self._dq_rad_s[0], self._dq_rad_s[1]
 
     def show(self, answers: Sequence[Answer]) -> None:
-        """Take over what frames say; those of a wrong length say nothing."""
+        """Take over the values of frames; ignore those of a wrong length."""
         for can_id, data in answers:
             for table in (self._feedbacks, self._torques):
                 if can_id in table:

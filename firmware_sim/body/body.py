@@ -1,9 +1,9 @@
-"""The emulated arm as one thing: its state, what it is made of, and what its devices measure.
+"""The emulated arm: its state, its properties, and the measurements of its devices.
 
 Per SYNC k the device nodes `sample` (and record the `truth` of the same instant), then `advance` to SYNC k + 1 with
 the set-point that was latched at SYNC k; inside a period the body runs on the drives' 100 µs ticks
-(`firmware_sim.body.body_ticks`). All state lies in one vector, so a body is its state, scenario and seed. What touches
-the arm is a table for compiled code: bodies, hands and walls, and how fast they make the arm swing.
+(`firmware_sim.body.body_ticks`). All state lies in one vector, so a body is its state, scenario and seed. Bodies,
+hands and walls are a table for compiled code, with the rates at which they make the arm swing.
 """
 
 import math
@@ -210,7 +210,7 @@ class MovableArm(Protocol):
 
 
 class BodyParts(NamedTuple):
-    """What `body_ticks.advance_body` takes beside set-points, modes and ticks; the arrays are the body's own."""
+    """Arguments of `body_ticks.advance_body` beside set-points, modes and ticks; the arrays are the body's own."""
 
     state: Vector
     numbers: Vector
@@ -224,7 +224,7 @@ class BodyParts(NamedTuple):
 
 
 def _pack_numbers(scenario: Scenario) -> Vector:
-    """Pack what the arm and its devices are made of, by the names in BODY_NUMBERS."""
+    """Pack the properties of the arm and its devices, by the names in BODY_NUMBERS."""
     vector = np.zeros(BODY_NUMBERS.itemsize // 8)
     numbers: np.void = vector.view(BODY_NUMBERS)[0]
     numbers["arm"] = scenario.mechanics.arm_numbers(scenario.arm)
@@ -309,7 +309,7 @@ class Body:
 
     @property
     def parts(self) -> BodyParts:
-        """What the compiled functions take, for who plays many cycles without a call for each."""
+        """Arguments of the compiled functions, for a caller that plays many cycles at once."""
         return BodyParts(
             self._state_vector, self._number_vector, self._contacts, self._things, self._touch_state,
             self._payloads, self._encoder_noise.table, self._substeps, self._work,
@@ -426,7 +426,7 @@ class Body:
         return Measurement((q1, q2), (dq1, dq2), (tau1, tau2))
 
     def truth(self, out: Vector) -> None:
-        """Fill a block laid out by TRUTH_LAYOUT with what is true now; changes nothing that is measured."""
+        """Fill a block laid out by TRUTH_LAYOUT with the present true values; changes no measurement."""
         fill_truth(
             self._state_vector,
             self._number_vector,

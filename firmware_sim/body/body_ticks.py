@@ -4,8 +4,8 @@ In each tick of 100 µs
 
     the person's and the payload's change of this tick → torque target of each drive → integrate → encoder → velocity
 
-Callers hold state and numbers as plain vectors, which cost less to hand over; BODY_STATE and BODY_NUMBERS name what is
-in them.
+Callers hold state and numbers as plain vectors, which cost less to hand over; BODY_STATE and BODY_NUMBERS name their
+fields.
 """
 
 from typing import Final
@@ -105,7 +105,7 @@ def _elapsed_s(course: np.void, contact: Structured) -> float:
 
 @compiled
 def _change_payload(state: np.void, arm: np.void, payloads: Structured) -> None:
-    """Fit or take off what the scenario says for this tick; payloads: rows of PAYLOAD_CHANGE."""
+    """Apply the payload changes of this tick; payloads: rows of PAYLOAD_CHANGE."""
     course = state["course"]
     if course["start_tick"] < 0.0:
         return
@@ -128,7 +128,7 @@ def _scenario_s(course: np.void) -> float:
 
 @compiled
 def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velocity_rad_s: float) -> float:
-    """Say what a drive asks of its torque loop, Nm, within its rated torque."""
+    """Return a drive's set-point for its torque loop, Nm, within its rated torque."""
     limit_Nm = arm["torque_limit_Nm"][joint]
     if mode == _TORQUE:
         return float(min(max(setpoint_Nm, -limit_Nm), limit_Nm))
@@ -223,7 +223,7 @@ def advance_body(
 def sample_body(
     state_vector: Vector, number_vector: Vector, noise: Vector, walk: Vector, out: NDArray[np.int64]
 ) -> None:
-    """Quantise what the devices measure now: position, velocity, torque counts, two each (6,)."""
+    """Quantise the devices' measurements: position, velocity, torque counts, two each (6,)."""
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     arm, course, transducers = state["arm"], state["course"], state["transducer"]
     tick = course["tick"]
@@ -249,7 +249,7 @@ def fill_truth(
     touch_truth: Vector,
     block: Vector,
 ) -> None:
-    """Fill a block laid out by TRUTH_LAYOUT with what is true at this instant. touch_truth: room for TOUCH_TRUTH."""
+    """Fill a block laid out by TRUTH_LAYOUT with the true values of this instant. touch_truth: room for TOUCH_TRUTH."""
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     now, course, arm = state["arm"], state["course"], numbers["arm"]
     touched, out = touch_truth.view(TOUCH_TRUTH)[0], block.view(_TRUTH)[0]

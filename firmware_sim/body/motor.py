@@ -9,9 +9,9 @@ zero error o of the current sensor, both of the scenario, the motor gives
     I²t          E' = i² − i_c² within 0 … (i_p² − i_c²) t_p, i = m + o. At the upper end only i_c is left, until a
                  tenth of E has gone (Copley lets go at once)
     temperature  T = ambient + w + h, w' = (w_r (i/i_r)² − w) / t_w, h' = (h_r (i/i_r)² − h) / t_h
-    derating     what is left falls from the whole at derating start to nothing at derating end
+    derating     the limit falls from the whole at derating start to 0 at derating end
     fault        T at or above the overheating temperature, until T is below derating start: 0x4310.
-                 Where I²t is to fault: at the upper end of E, until a tenth has gone: 0x2310
+                 I²t, if it is a fault, at the upper end of E until a tenth has gone: 0x2310
 
 i_p peak, i_c continuous, i_r rated, t_p peak time; w and h: winding over housing and housing over ambient, whose steady
 rises at rated torque are w_r and h_r. The winding's resistance and the torque constant don't change with temperature.
@@ -133,7 +133,7 @@ def command_torque(
 ) -> float:
     """Give the target at which the plant's torque loop brings the motor to where it is after this tick, Nm.
 
-    wanted: what the drive asks for, within rated torque. tau: the motor's torque now. The plant's loop has 1 kHz; one
+    wanted: the drive's set-point, within rated torque. tau: the motor's torque now. The plant's loop has 1 kHz; one
     of another bandwidth is exact at the ends of the ticks. Within a tick a slower one is off by a hundredth of the way
     to the target at most, one of 2 kHz by a twentieth, one of 5 kHz by a quarter.
     """

@@ -77,7 +77,7 @@ def read_angle(numbers: np.void, joint: int, angle_rad: float, noise_counts: flo
 
 
 class EncoderNoise:
-    """The noise of both encoders at every tick, so that a run doesn't depend on how its ticks were asked for."""
+    """The noise of both encoders at every tick, so that a run doesn't depend on the ticks per call."""
 
     def __init__(self, seed: np.random.SeedSequence, rms_counts: tuple[float, float]) -> None:
         self.is_on = any(rms_counts)
@@ -116,7 +116,7 @@ TRANSDUCER_NUMBERS: Final = float_fields(
         "lsb_Nm": PAIR,  # of the converter, Nm
         "count_Nm": PAIR,  # of the wire, Nm
         "highest": PAIR,  # code of the converter; the lowest is −1 − HIGHEST
-        "has_memory": (),  # whether what happens within a tick matters: hysteresis, filter, own clock
+        "has_memory": (),  # whether the course within a tick matters: hysteresis, filter, own clock
     }
 )
 
@@ -160,7 +160,7 @@ def transducer_numbers(settings: SensorSettings, offset_Nm: tuple[float, float])
 
 
 def count_Nm(settings: SensorSettings, joint: int) -> float:
-    """Return what a count of the wire is worth: 16 bits over the range, or over ±50 Nm where that is wider."""
+    """Return the torque of one count on the wire: 16 bits over the range, or over ±50 Nm where that is wider."""
     return TORQUE_LSB_NM * max(1.0, settings.torque_range_Nm[joint] / TORQUE_RANGE_NM)
 
 

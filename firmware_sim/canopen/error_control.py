@@ -20,8 +20,8 @@ the SYNC before, less the lateness of earlier SYNCs: a master that stalls may co
 waited for a busy receiver may come in a row. That lateness is forgotten with a time constant of 100 SYNCs, so that a
 master whose clock is slow gathers none.
 
-CAN itself may deliver a frame twice: if the last bit of its end-of-frame is disturbed, the sender repeats what
-receivers have taken already (ISO 11898-1). So a single odd SYNC is a warning. More than `TOLERATED` before
+CAN itself may deliver a frame twice: if the last bit of its end-of-frame is disturbed, the sender repeats a frame
+that receivers have taken already (ISO 11898-1). So a single odd SYNC is a warning. More than `TOLERATED` before
 `CLEAN_SYNCS` in a row were right mean that SYNC is no time base.
 """
 
@@ -86,7 +86,7 @@ class ErrorReporter:
         self._allowed_ns = 0
 
     def poll(self, t_ns: int) -> int:
-        """Send what the inhibit time held back; return when to look again."""
+        """Send messages that the inhibit time held back; return when to look again."""
         while self._waiting and t_ns >= self._allowed_ns:
             self._allowed_ns = t_ns + self._inhibit_ns
             self._send(self._cob_id, self._waiting.popleft())
@@ -127,7 +127,7 @@ class HeartbeatProducer:
         self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
 
     def poll(self, t_ns: int) -> int:
-        """Send what is due; return when the next one is."""
+        """Send a heartbeat that is due; return when the next one is."""
         if t_ns >= self._due_ns:
             self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
             self._send(self._can_id, bytes([self._state()]))
@@ -176,7 +176,7 @@ class HeartbeatConsumer:
         self._node_id = (value >> 16) & 0x7F
         self._timeout_ns = (value & 0xFFFF) * 1_000_000
         self._due_ns = NEVER_NS
-        self._find(self._now_ns())  # what isn't monitored any more isn't missing
+        self._find(self._now_ns())  # a node that isn't monitored any more isn't missing
 
     def _find(self, t_ns: int) -> None:
         if self.is_lost:

@@ -73,7 +73,7 @@ class Abort(IntEnum):
 
 
 Refusal = canopen.SdoAbortedError
-"""What `refuse` raises."""
+"""Raised by `refuse`."""
 
 
 def refuse(code: Abort) -> NoReturn:
@@ -102,7 +102,7 @@ class DictionaryVariable(NamedTuple):
 
 
 class _SilentNetwork(canopen.Network):
-    """A network without bus and threads: what a node sends goes to a function."""
+    """A network without bus and threads: a node's frames go to a function."""
 
     def __init__(self, send: Send) -> None:
         super().__init__()
@@ -208,7 +208,7 @@ def _compare_lengths(length: int, expected: int) -> None:
 
 @cache
 def _read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
-    """Read an EDS or a DCF of any encoding and ending; nodes never change what was read."""
+    """Read an EDS or a DCF of any encoding and ending; nodes never change the result."""
     stream = io.StringIO(readable_eds(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff")))
     stream.name = "object dictionary.eds"
     return canopen.import_od(stream, node_id)
@@ -225,7 +225,7 @@ class MadeUp(NamedTuple):
 def _with_defaults(
     objects: canopen.ObjectDictionary, defaults: Values, fallbacks: Values, made_up: Mapping[int, MadeUp]
 ) -> canopen.ObjectDictionary:
-    """Give a copy of a dictionary what it omits, other defaults, and one to each number without: its fallback, or 0."""
+    """Copy a dictionary with omitted objects and other defaults; a number without a default gets its fallback, or 0."""
     objects = copy.deepcopy(objects)
     for index, made in made_up.items():
         added = ODVariable(made.name, index)
@@ -385,7 +385,7 @@ class ObjectDictionary:
             self._is_requested = False
 
     def restore(self, last: int) -> None:
-        """Forget what was written to the objects up to the index `last`; those who watch get the defaults."""
+        """Forget the values written to objects up to the index `last`; functions that watch them get the defaults."""
         for index in [index for index in self._node.data_store if index <= last]:
             del self._node.data_store[index]
         for (index, subindex), appliers in self._appliers.items():
@@ -418,7 +418,7 @@ def _call_all(functions: list[Callable[[int], None]], value: int) -> None:
 
 @dataclass(frozen=True)
 class DeviceDescription:
-    """One device: its EDS, and what else its objects hold at power-on.
+    """One device: its EDS, and further values of its objects at power-on.
 
     defaults: values in place of the EDS's. fallbacks: values where the EDS has none. made_up: objects that the EDS
     omits, by index. aliases: objects that hold the live value of another.
@@ -435,8 +435,8 @@ class DeviceDescription:
 class EmulatedContract:
     """File names within `contract_folder`.
 
-    devices: those of an arm of one's own, by place, in their stead. period_us: what a SYNC is worth where no master
-    can write 0x1006; 0: 1 ms.
+    devices: those of an arm of one's own, by place, in their stead. period_us: time of a SYNC where no master can
+    write 0x1006; 0: 1 ms.
     """
 
     dbc: str

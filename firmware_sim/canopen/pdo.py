@@ -75,7 +75,7 @@ class TransmitPdo(PdoRecord):
         self._timer_due_ns = NEVER_NS
 
     def _make_sender(self) -> Callable[[], None]:
-        """Bind what sending needs, so that a frame costs little more than reading its values."""
+        """Bind everything that sending needs, so that a frame costs little more than reading its values."""
         pdos, can_id, layout, reads, sender = self._pdos, self.can_id, self.layout, self._reads, self._sender
         send, header_bytes, length = pdos.send, layout.header_bytes, layout.length
         pack, pack_into = layout.packing.pack, layout.packing.pack_into
@@ -112,7 +112,7 @@ class TransmitPdo(PdoRecord):
         return send_pair
 
     def on_sync(self) -> None:
-        """Send what this SYNC asks for: every n-th, or an event that waited."""
+        """Send the frame of this SYNC: every n-th, or an event that waited."""
         if self.type == 0:
             self.compare()
             if self.is_due:
@@ -155,7 +155,7 @@ class ReceivePdo(PdoRecord):
         self.acted_ns: int | None = None
         """When its last frame acted; None before the first."""
         self.writes: tuple[Callable[[int], object], ...] = ()
-        """What takes the received values, in the order of the mapping."""
+        """Functions that take the received values, in the order of the mapping."""
         self.pending: tuple[int, ...] | None = None
         """Values that wait for SYNC."""
         self.is_command = False
@@ -216,12 +216,12 @@ class Pdos:
         self.send = send
         self.longest = longest
         self.message_ids = frozenset(messages)
-        """Identifiers of the contract, which are heard besides those that any PDO may have."""
+        """Identifiers of the contract, which the device hears besides those that any PDO may have."""
         self.user: PdoUser
         self.header = bytes(4)
         """Header of the last protected frame, received or sent."""
         self.header_status: Callable[[], int] = int
-        """What goes into the status field of a header that is sent."""
+        """Status field of a header that is sent."""
         self.events: frozenset[tuple[int, int]] = frozenset()
         """Objects whose changes the device announces by `notify`."""
         self._is_commanded = False  # a command has acted since the last SYNC, without waiting for one
@@ -233,7 +233,7 @@ class Pdos:
         self.own_ns: Callable[[int], int] = lambda t_ns: t_ns
         """Turns the bench's time, with which frames come, into the device's."""
         self.on_sync: tuple[Callable[[], None], ...] = ()
-        """What sends the frames that belong to a SYNC."""
+        """Functions that send the frames of a SYNC."""
         self.answers: frozenset[int] = frozenset()
         """Identifiers of the frames that follow every SYNC."""
         self._asynchronous: tuple[TransmitPdo, ...] = ()
@@ -265,11 +265,11 @@ class Pdos:
         self._writers[index, subindex] = write
 
     def writer(self, index: int, subindex: int) -> Callable[[int], object]:
-        """Return what takes the received values of an object. A value that the object can't take is dropped."""
+        """Return the function that takes received values of an object. It drops a value that the object can't take."""
         return self._writers.get((index, subindex)) or (lambda value: self.dictionary.take_over(index, subindex, value))
 
     def handlers(self) -> list[tuple[int, Callable[[bytes, int], None]]]:
-        """List the identifiers that are received now, with what takes their frames."""
+        """List the identifiers that are received now, with the functions that take their frames."""
         return [(pdo.can_id, pdo.on_frame) for pdo in self._receiving]
 
     def set_operational(self, is_operational: bool, t_ns: int) -> None:
@@ -315,7 +315,7 @@ class Pdos:
             pdo.restart()
 
     def act_on_sync(self, t_ns: int) -> bool:
-        """Let what waited for SYNC act; tell whether a command has acted since the SYNC before."""
+        """Let the frames that waited for SYNC act; return whether a command has acted since the SYNC before."""
         is_commanded, self._is_commanded = self._is_commanded, False
         return self._act(self._waiting, t_ns) or is_commanded
 
@@ -326,7 +326,7 @@ class Pdos:
 
     @staticmethod
     def _act(pdos: Iterable[ReceivePdo], t_ns: int) -> bool:
-        """Write what waits; tell whether a command was among it."""
+        """Write the waiting values; return whether a command was among them."""
         is_commanded = False
         for pdo in pdos:
             values = pdo.pending
@@ -367,7 +367,7 @@ class Pdos:
         return any(pdo.is_due for pdo in self._compared)
 
     def poll(self, t_ns: int) -> int:
-        """Send what is due by event or time; return when to look again."""
+        """Send frames that are due by event or time; return when to look again."""
         due_ns = NEVER_NS
         for pdo in self._asynchronous:
             due_ns = min(due_ns, pdo.poll(t_ns))

@@ -209,7 +209,7 @@ NOTHING = PdoLayout((), struct.Struct("<"), 0, 0)
 
 
 def check_entry(dictionary: ObjectDictionary, value: int, is_received: bool) -> str:
-    """Refuse what can't be mapped in this direction; return the entry's `struct` format."""
+    """Refuse an entry that can't be mapped in this direction; return its `struct` format."""
     (index, subindex), bits = decode_entry(value)
     dummy_bits = dictionary.dummy_bits(index)
     if dummy_bits:

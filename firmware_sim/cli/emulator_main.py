@@ -1,4 +1,4 @@
-"""`firmware-sim`: plays the arm on a CAN interface until it is told to stop."""
+"""`firmware-sim`: plays the arm on a CAN interface until a signal ends it."""
 
 import json
 import logging
@@ -42,7 +42,7 @@ from firmware_sim.scenario.scenario import Scenario, load_scenario, load_truth, 
 
 
 class EmulatorExit(IntEnum):
-    """What the exit statuses mean."""
+    """Exit statuses."""
 
     OK = 0
     FAILURE = 1
@@ -222,7 +222,7 @@ def play(
 ) -> int:
     """Play the devices of a recording: on each SYNC the frames that answered it then; all else is answered live.
 
-    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. What the host commands moves nothing. After the recording's
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. Commands of the host move nothing. After the recording's
     last cycle SYNC is no longer answered. Prints "ready" on stderr once the nodes have announced themselves.
     """
     chosen = CONTRACTS[contract]
@@ -251,7 +251,7 @@ def play(
 @cli.command("list", epilog=EPILOG)
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def list_scenarios(as_json: bool) -> int:
-    """List the scenarios that come with the package: name, group, what happens."""
+    """List the scenarios that come with the package: name, group, content."""
     described = describe_all()
     if as_json:
         print(json.dumps(described, indent=2, ensure_ascii=False))
@@ -265,7 +265,7 @@ def list_scenarios(as_json: bool) -> int:
 @cli.command("truths", epilog=EPILOG)
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def list_truths(as_json: bool) -> int:
-    """List the truths that come with the package: name, and what the host is told wrongly."""
+    """List the truths that come with the package: name, and the host's wrong assumption."""
     rows = [{"name": name, "about": load_truth(name)[0].about} for name in truth_names()]
     if as_json:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
@@ -281,7 +281,7 @@ def list_truths(as_json: bool) -> int:
 @click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of the sensor noise; default: the scenario's.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON in place of TOML.")
 def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int | None, as_json: bool) -> int:
-    """Print a scenario, resolved, as TOML that loads to the same: what differs from the defaults."""
+    """Print a scenario, resolved, as TOML that loads to the same: all differences from the defaults."""
     resolved = load_scenario(scenario, profile, seed)
     if as_json:
         print(json.dumps(tomllib.loads(show(resolved, is_whole)), indent=2, ensure_ascii=False))
@@ -318,7 +318,7 @@ def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
 
 
 def _serve(service: Service) -> None:
-    """Announce the nodes, say so, and serve until it ends."""
+    """Announce the nodes, print "ready", and serve until the end."""
     # As a host does: with less, on a processor that both share and fill, the arm would never answer in time.
     for line in request_realtime().missing:
         _complain(f"not granted: {line}")
@@ -369,7 +369,7 @@ def _report(
 
 
 def _check_contract(log: Path, codec: Codec) -> None:
-    """Raise LogError when a log of ours says that it was recorded with another contract."""
+    """Raise LogError when the metadata of a log of ours name another contract."""
     digest = run_metadata(log).get("layout_digest", "") if log.suffix.lower() == ".mcap" else ""
     own = f"0x{codec.layout_digest:08X}"
     if digest and digest.casefold() != own.casefold():

@@ -1,6 +1,6 @@
 """The devices of a configuration, as the emulator plays them: the contract of their frames, EDS files, counts.
 
-The only place where the emulator reads what the host's package knows of devices: profiles, which are files that
+The only place where the emulator reads the host package's description of devices: profiles, which are files that
 describe a device, and the contract that follows from them, which is the definition of the messages.
 """
 
@@ -57,14 +57,14 @@ _OBJECTS = {
     "status": (0x6150, 1),
     "temperature": (0x2111, 0),
 }
-"""Where the emulated devices have what a profile maps from objects of its own."""
+"""Objects of the emulated devices for the signals that a profile maps from objects of its own."""
 _OWN_EDS = {eds for contract in CONTRACTS.values() for eds in (contract.drive_eds, contract.sensor_eds)}
 """EDS that give every object a value."""
 _SIGNED8, _UNSIGNED16, _UNSIGNED32 = 0x0002, 0x0006, 0x0007  # data types, CiA 301 table 44
 
 
 def _made_up(kind: str, settings: Settings) -> dict[int, MadeUp]:
-    """List what every device of a kind has, whether its EDS says so or not."""
+    """List the objects that every device of a kind has, in its EDS or not."""
     made = {
         0x1006: MadeUp("SYNC period", _UNSIGNED32, 0),
         0x1017: MadeUp("heartbeat time", _UNSIGNED16, settings.bus.heartbeat_ms),
@@ -79,7 +79,7 @@ def _made_up(kind: str, settings: Settings) -> dict[int, MadeUp]:
 
 
 class Rehearsal(NamedTuple):
-    """An arm that can be played: its frames, its devices, its scenario; and what was assumed, a line each."""
+    """An arm that can be played: its frames, its devices, its scenario; and the assumptions, a line each."""
 
     codec: Codec
     contract: EmulatedContract
@@ -128,7 +128,7 @@ def rehearse_settings(
 
 
 def _omissions(devices: list[PlacedDevice], contract: EmulatedContract) -> list[str]:
-    """Say what was made up because an EDS omits it, a line for each EDS."""
+    """Name the objects that were made up because an EDS omits them, a line for each EDS."""
     lines: dict[str, None] = {}
     for device, description in zip(devices, contract.devices, strict=True):
         if names := ", ".join(f"0x{index:04X} ({made.name})" for index, made in description.made_up.items()):
@@ -166,7 +166,7 @@ def _counts(codec: Codec, devices: list[PlacedDevice]) -> DeviceCounts:
 
 
 def _default(device: PlacedDevice, index: int, sub: int) -> int:
-    """Return what an EDS gives of an object, 0 where it gives nothing."""
+    """Return an object's default in the EDS, 0 without one."""
     variable = device.variable(ObjectName(index, sub)) if device.has(index, sub) else None
     return 0 if variable is None or variable.default is None else variable.default
 
@@ -200,7 +200,7 @@ def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
 
 
 def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
-    """Say what a device's objects hold at power-on: what its EDS says, where that is silent what the profile does."""
+    """Give the values of a device's objects at power-on: those of its EDS, else those of the profile."""
     kind, scale = device.settings.kind, device.settings.scale
     made_up = {index: made for index, made in _made_up(kind, settings).items() if not device.has(index)}
     defaults: dict[tuple[int, int], int] = {}
@@ -223,7 +223,7 @@ def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
     if kind == "drive":
         counts = _counts_of_position(device)
         fallbacks |= counts
-        # What can be written has been set up for this arm, whatever the factory said; a guess is played as it is.
+        # Writable objects have been set up for this arm, whatever the factory's values; a guess is played as it is.
         defaults |= {place: value for place, value in counts.items() if _can_be_set(device, *place)}
         fallbacks[0x6502, 0] = _CYCLIC_SYNCHRONOUS_TORQUE
     else:

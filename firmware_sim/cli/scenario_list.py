@@ -40,7 +40,7 @@ def describe_all() -> list[dict[str, Any]]:
 
 
 def show(scenario: Scenario, is_whole: bool) -> str:
-    """Write a scenario as TOML that loads to the same: what differs from the defaults, or everything."""
+    """Write a scenario as TOML that loads to the same: all differences from the defaults, or everything."""
     return to_toml(scenario) if is_whole else to_short_toml(scenario)
 
 

@@ -64,7 +64,7 @@ class Service:
         self._gone_ns = NEVER_NS  # when the host was found to have gone
 
     def boot(self) -> None:
-        """Announce the nodes, having dropped what the bus carried before. Raises BusError."""
+        """Announce the nodes, having dropped earlier frames of the bus. Raises BusError."""
         while self._bus.receive(0.0) is not None and not self._stop.is_made:
             pass
         self._time_ns = self._heard_ns = self._clock.now_ns()

@@ -50,7 +50,7 @@ class Application(PdoUser):
 
     @property
     def is_at_work(self) -> bool:
-        """Whether the device does what its objects must not be changed under."""
+        """Whether the device is at work, so that its objects must not change."""
         return False
 
     def leave_operational(self, t_ns: int) -> None:
@@ -107,7 +107,7 @@ class EmulatedDevice(ObjectDictionary):
         self.fault_bits = 0
         """Bits of 0x1001 that name the kind of that fault."""
         self.now_ns = 0
-        """Time of the last request, for what it starts."""
+        """Time of the last request, for timers that it starts."""
         self.power_on_ns = 0
         """When the device got its power, by its own clock."""
         self.pause_ns = 0
@@ -142,7 +142,7 @@ class EmulatedDevice(ObjectDictionary):
         return bool(_OF_SYNC & self.watchdogs.tripped)
 
     def attach(self, application: Application) -> None:
-        """Connect what the device does."""
+        """Connect the application."""
         self._application = application
         self.pdos.user = application
 
@@ -154,7 +154,7 @@ class EmulatedDevice(ObjectDictionary):
         self._boot(self.power_on_ns)
 
     def power_off(self, _t_ns: int) -> None:
-        """Take the power away: nothing is said or heard, and all that was written is forgotten."""
+        """Take the power away: the device neither sends nor hears, and forgets all written values."""
         self.is_powered = self.is_on_bus = False
         self._errors.reset()
         self.is_operational = False
@@ -170,7 +170,7 @@ class EmulatedDevice(ObjectDictionary):
             self._enter(NmtState.PRE_OPERATIONAL, self.clock.own_ns(t_ns))
 
     def return_to_bus(self, t_ns: int) -> None:
-        """Let the controller take part again; the device says so."""
+        """Let the controller take part again; the device reports it."""
         self._is_bus_off = False
         self.is_on_bus = self.is_powered
         if self.is_on_bus:
@@ -263,11 +263,11 @@ class EmulatedDevice(ObjectDictionary):
         self._errors.report(0, t_ns)
 
     def poll(self, t_ns: int) -> int:
-        """Do what is due by its own clock; return when something is due next."""
+        """Act on timers that are due by its own clock; return when the next one is."""
         return min(self._producer.poll(t_ns), self._consumer.poll(t_ns), self._errors.poll(t_ns))
 
     def _is_locked_at_work(self, index: int, subindex: int) -> bool:
-        """Whether SDO may not write an object now: while the device is at work, none but what changes nothing."""
+        """Whether SDO may not write an object now: while the device is at work, only objects in `open_at_work`."""
         return self._application.is_at_work and (index, subindex) not in self.open_at_work
 
     def _check_period(self, period_us: int) -> None:
@@ -286,7 +286,7 @@ class EmulatedDevice(ObjectDictionary):
         self.sync_overflow = overflow
 
     def _send(self, can_id: int, data: bytes) -> None:
-        """Send what isn't a PDO; PDOs are exchanged in Operational only, and there a device is on the bus."""
+        """Send a frame that isn't a PDO; PDOs are exchanged in Operational only, and there a device is on the bus."""
         if self.is_on_bus:
             self._put_on_bus(can_id, data)
 
@@ -361,7 +361,7 @@ class SyncListeners:
         self.overflow = SYNC_OVERFLOW
         """The last SYNC counter before 1."""
         self.is_remembering = False
-        """Whether a device remembers a SYNC that was odd or lost, and wants to be told of right ones, too."""
+        """Whether a device remembers a SYNC that was odd or lost, and counts right ones, too."""
         for device in devices:
             device.watch(0x1019, 0, lambda _: self._sort())
         self._sort()
@@ -375,7 +375,7 @@ class SyncListeners:
         return self._takers.get(len(data), self._nobody)
 
     def tell(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:
-        """Tell what a SYNC is and how many were lost before it. `heard`: how often each device hears it."""
+        """Report the kind of a SYNC and how many were lost before it. `heard`: how often each device hears it."""
         for place, device in enumerate(self._devices):
             self._unheard[place] += lost
             if heard[place] == 0:
@@ -388,7 +388,7 @@ class SyncListeners:
         self._remember()
 
     def ignore(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, t_ns: int) -> None:
-        """Tell what a SYNC is that nobody answers."""
+        """Report the kind of a SYNC that no device answers."""
         for place, device in enumerate(self._devices):
             for _ in range(heard[place]):
                 device.note_sync(kind if takers[place] else SyncKind.WRONG_LENGTH, 0, t_ns)

@@ -2,10 +2,10 @@
 
 A command frame is checked end to end when it arrives and, unless its PDO is mapped to act at once, acts at the next
 SYNC. The motor has torque only in Operation enabled with mode 10; Quick stop active and Fault reaction active
-brake, and so do shutdown and disable operation where 0x605B and 0x605C say so; everywhere else the arm coasts.
+brake, and so do shutdown and disable operation by 0x605B and 0x605C; everywhere else the arm coasts.
 
 Units on the wire: position in encoder counts, velocity in the LSB of the contract, torque in per mille of rated torque
-0x6076, rated torque in mNm of the joint, or in what one count of an arm of one's own is worth behind the gear.
+0x6076, rated torque in mNm of the joint, or in the count of an arm of one's own, behind the gear.
 
 While the motor is powered, SDO writes nothing but the controlword and clears the error history. While an RPDO brings
 the controlword, SDO writes only those that take the power away: Disable voltage and Quick stop.
@@ -108,7 +108,7 @@ class DriveNode(Application):
         self._mode = self._wanted_mode = device.default_or(0, 0x6060)
         self._habits = habits
         self._has_habits = habits != HabitSettings()
-        # On 0x6061; what it shows once the time for it has passed, and until then.
+        # On 0x6061: the mode shown now, the one once its time has passed, and the one until then.
         self._shown_mode = self._told_mode = self._meanwhile = self._mode
         self._told_ns = 0
         self._enabling_ns: int | None = None
@@ -140,7 +140,7 @@ class DriveNode(Application):
         serve(0x6077, 0, lambda: self._torque_permille)
 
     def _configure(self) -> None:
-        """Act on what is written, by SDO or PDO."""
+        """Act on written objects, by SDO or PDO."""
         device = self.device
         device.open_at_work |= {_CONTROLWORD}
         self._pdos.events = _EVENTS
@@ -252,7 +252,7 @@ class DriveNode(Application):
         self._drive_motor()
 
     def poll(self, t_ns: int) -> int:
-        """Do what is due by time; return when something is due next."""
+        """Act on timers that are due; return when the next one is."""
         t_ns = self._clock.own_ns(t_ns)
         due_ns = self.device.poll(t_ns)
         self._feel_failure(t_ns)
@@ -272,7 +272,7 @@ class DriveNode(Application):
         return self._clock.bench_ns(due_ns)
 
     def fail(self, code: int, t_ns: int) -> None:
-        """Fault by itself, with an error code of 0x603F; what causes it stays until `mend`."""
+        """Fault by itself, with an error code of 0x603F; its cause stays until `mend`."""
         self._failure = code
         self._feel_failure(self._clock.own_ns(t_ns))
 
@@ -415,7 +415,7 @@ class DriveNode(Application):
         self._standstill.begin(t_ns)
 
     def _reset_fault(self, t_ns: int) -> None:
-        """Leave Fault, unless what caused it is still there."""
+        """Leave Fault, unless its cause is still there."""
         if self.state is not DriveState.FAULT or self._is_cause_present(t_ns):
             return
         self._apply(DriveEvent.FAULT_RESET, t_ns)
@@ -512,7 +512,7 @@ class DriveNode(Application):
             self._apply(DriveEvent.QUICK_STOP_DONE, t_ns)
 
     def _drive_motor(self) -> None:
-        """Tell the motor what the state allows: torque only in Operation enabled with mode 10."""
+        """Command the motor as the state allows: torque only in Operation enabled with mode 10."""
         self._demand = self._limits.demand() if self._follows_target else 0
         self.torque_Nm = self._demand * self._rated_mNm * 1e-6
 

@@ -1,6 +1,6 @@
 """An emulated joint torque sensor: a CiA 404 analogue input whose process value is the torque in the contract's LSB.
 
-The sensor sends the value on every SYNC. Where the frame has an end-to-end header, the header's status carries the low
+The sensor sends the value on every SYNC. If the frame has an end-to-end header, the header's status carries the low
 bits of 0x6150, so that a frame shows the overload that spoils its value.
 
 In Operational, where a host uses the measurement, SDO writes nothing but clears the error history. A master requests
@@ -21,17 +21,17 @@ STATUS_NOT_VALID = 0x01
 STATUS_POSITIVE_OVERLOAD = 0x02
 STATUS_NEGATIVE_OVERLOAD = 0x04
 AUTOZERO_SIGNATURE = int.from_bytes(b"zero", "little")
-"""What 0x6125 takes."""
+"""The value that 0x6125 accepts."""
 AUTOZERO_SAMPLES = 64
 """Samples whose mean becomes the zero: an eighth of the noise of one."""
 ROOM_TEMPERATURE_C = 25.0
-"""What 0x2111 says of a sensor that isn't told its joint's temperature."""
+"""0x2111 of a sensor without the temperature of its joint."""
 
 _EVENTS = frozenset({(0x6150, 1), (0x1001, 0)})
 
 
 class SensorNode(Application):
-    """One torque sensor on the bus. It takes no commands, and who measures by SYNC is told of odd ones."""
+    """One torque sensor on the bus. It takes no commands, and reports odd SYNCs."""
 
     def __init__(
         self,
@@ -45,8 +45,8 @@ class SensorNode(Application):
         """Connect the node to its device.
 
         `number`: 1 or 2, as in the DBC's names. `converter_ends`: lowest and highest counts that the converter gives.
-        `temperature_C`: of the joint, 0x2111. `count_Nm`: what the device makes of a count of the converter; None: its
-        worth, and then no value is beyond the signal.
+        `temperature_C`: of the joint, 0x2111. `count_Nm`: torque sent for a converter's count; None: the
+        true one, and then no value is beyond the signal.
         """
         self.device = device
         self.has_news = False
@@ -102,7 +102,7 @@ class SensorNode(Application):
         self._error_bits = bits
 
     def poll(self, t_ns: int) -> int:
-        """Do what is due by time; return when something is due next."""
+        """Act on timers that are due; return when the next one is."""
         clock = self.device.clock
         t_ns = clock.own_ns(t_ns)
         due_ns = self.device.poll(t_ns)
@@ -120,12 +120,12 @@ class SensorNode(Application):
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def note_error(self) -> None:
-        """Let the status frame say so."""
+        """Let the status frame report it."""
         self.has_news = True
 
     @property
     def is_at_work(self) -> bool:
-        """Whether somebody relies on what it measures."""
+        """Whether a host relies on its measurement."""
         return self.device.is_operational
 
     def restart(self, is_node_reset: bool) -> None:

@@ -3,7 +3,7 @@
 A row acts from `at_s` for `duration_s`, or until it has acted `count` times, or, with neither, to the end. `fault_plan`
 has the row's effect on frames, values and nodes. A row without length, such as a reboot, is active for one period.
 
-Nodes are named drive1, drive2, sensor1, sensor2; frames by what they carry, as in the contract's DBC.
+Nodes are named drive1, drive2, sensor1, sensor2; frames by their content, as in the contract's DBC.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,8 +34,8 @@ FRAME_NODES: Mapping[str, tuple[str, ...]] = {
     "sdo_response": (*NODES, ALL),
     "any": (*NODES, ALL),
 }
-"""Whose frames these can be; `any` is every frame that the node sends. SYNC, NMT and the host's heartbeat come to all
-devices at once, the other frames of the host to the node that they are for."""
+"""Nodes that can have each frame; `any` is every frame that the node sends. SYNC, NMT and the host's heartbeat come to
+all devices at once, the other frames of the host to one node."""
 BROADCAST = ("sync", "nmt")
 _OF_HOST = ("command", "sdo_request", *BROADCAST)
 SIGNAL_NODES = {"position": DRIVES, "velocity": DRIVES, "torque": SENSORS}
@@ -48,7 +48,7 @@ _COUNTED = ("feedback", "torque", "command")
 
 
 class _Kind(NamedTuple):
-    """Which keys a kind has, besides those of its time, and whom it can befall."""
+    """The keys of a kind, besides those of its time, and the nodes that it can befall."""
 
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
@@ -196,7 +196,7 @@ class FaultSettings:
 
     @property
     def text(self) -> str:
-        """What happens to whom, in one line."""
+        """Kind, frame or signal, node and details, in one line."""
         whom = self.node or ALL
         what = next((part for part in (self.frame, self.signal) if part is not None), None)
         details = [
@@ -251,7 +251,7 @@ def _check_hex(key: str, text: str | None, longest: int) -> None:
 
 
 def check_rows(rows: Sequence[FaultSettings]) -> None:
-    """Check what concerns several rows. Raises ConfigError."""
+    """Check rules between rows. Raises ConfigError."""
     if len(rows) > MOST_ROWS:
         raise ConfigError(f"`faults` has {len(rows)} rows, {MOST_ROWS} at most")
     renamed: dict[str | None, int] = {}

@@ -1,14 +1,14 @@
 """The arm of a configuration, composed for the emulator to play: mechanics, sensors, and a scenario to its size.
 
-The configuration is the one that the host reads. What it doesn't say is assumed and told, a line each; a truth
+The configuration is the one that the host reads. A missing value is assumed and reported in a line; a truth
 outweighs both. Inertia, in the words of `firmware_sim.arm.arms`, is that of masses in the truth, else of `arm.mass_kg`
-with what stands beside it, which the host doesn't read, else of `arm.cad_theta`, else of uniform rods as heavy as the
+with its neighbours, which the host doesn't read, else of `arm.cad_theta`, else of uniform rods as heavy as the
 drives' rated torque suggests:
 
     γ = m₂ l₂² / 3 = τ₂ γ_P / τ_P2        α + γ = τ₁ (α + γ)_P / τ_P1, with m₁ ≥ m₂ / 2        index P: profile P
 
 From cad_theta = (a₁, a₂, a₃, …): α = a₁ − a₃, β = a₂, γ = a₃. With c₂ in the middle of link 2, or as near to it as
-β l₁ / α ≤ c₂ ≤ γ l₁ / β allows, m₂ = a₂ / (l₁ c₂), and link 1 is a rod with what is left of α.
+β l₁ / α ≤ c₂ ≤ γ l₁ / β allows, m₂ = a₂ / (l₁ c₂), and link 1 is a rod with the rest of α.
 
 A scenario that comes with the package was made for profile P: places grow with the links, forces and payloads so that
 their torques grow with the rated torques or the inertia, whichever grows less: drives must be able to hold them, and a
@@ -57,7 +57,7 @@ _OF_THE_ARM: Final = _GEOMETRY | {
 
 
 class DeviceCounts(NamedTuple):
-    """What a profile says that the emulated devices count in; pairs are by place.
+    """Counts of the emulated devices by their profiles; pairs are by place.
 
     increments_per_joint_rev: of position. torque_range_Nm: the most that the sensors' signals can carry, or that the
     profile says. rated_count_Nm: one count of 0x6076 behind the gear. rated_torque_Nm: 0x6076 of the EDS, behind the
@@ -88,7 +88,7 @@ class ToldArm(NamedTuple):
 
     @property
     def is_own(self) -> bool:
-        """Whether the file says of an arm what no profile has."""
+        """Whether the file has keys of an arm that belong to no profile."""
         return bool(self.own_keys & _OF_THE_ARM)
 
     @property
@@ -108,7 +108,7 @@ def told_arm(settings: Settings, layers: Sequence[ConfigurationLayer]) -> ToldAr
 def compose_scenario(
     told: ToldArm, truth: ArmTruth, counts: DeviceCounts, table: dict[str, Any], is_builtin: bool
 ) -> tuple[dict[str, Any], list[str]]:
-    """Give a scenario's table the arm of a configuration; return it, and what was assumed, a line each.
+    """Give a scenario's table the arm of a configuration; return it, and the assumptions, a line each.
 
     `is_builtin`: it comes with the package, so it is fitted to the size of the arm. Raises ConfigError.
     """
@@ -318,7 +318,7 @@ def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -
 
 
 def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
-    """Say where the devices are: as the host is told, but for the truth's wiring."""
+    """Place the devices as in the host's configuration, but for the truth's wiring."""
     wiring = truth.wiring
     drive_joint, sensor_joint = (
         (2, 1) if wiring.swapped in (what, "joints") else (1, 2) for what in ("drives", "sensors")
@@ -368,7 +368,7 @@ def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: l
 
 
 def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
-    """Mount the arm as the host is told, and let its brakes hold it."""
+    """Mount the arm as in the host's configuration, and let its brakes hold it."""
     mechanics, settings = dict(said), told.settings
     holding = settings.arm.holding_torque_Nm
     if settings.mounting_deg[0] > 0.0 and "tilt_deg" not in mechanics:

@@ -5,7 +5,7 @@ package are in the folder `scenarios`. `about`, `group`, `lasts_s`, `acknowledge
 `expect_certified` are for the programs that play a scenario; they change nothing on the arm.
 
 Section `[expect]` of a scenario states the outcome with a healthy host of configuration `paper`, as that host is: where
-the host does badly, the expectation says so. `[expect_certified]` replaces `[expect]`, as a whole, for a host of
+the host does badly, so does the expectation. `[expect_certified]` replaces `[expect]`, as a whole, for a host of
 configuration `certified`; without it the same outcome is expected of both. Counts are exact unless the key that ends in
 `_most` gives them room.
 
@@ -16,11 +16,11 @@ Ends of a run:
     refused    the host did not put the devices into operation
     lost       the bus failed in operation, or nobody answered any more
 
-A truth says what the real arm is where the host is told otherwise, or nothing. The host never reads it. `[arm]` has
-values of their own; `[factor]` multiplies what the host is told; `[wiring]` exchanges and reverses devices; `[habits]`
-are ways of the drives, in place of those of their maker (`firmware_sim/maker_habits.toml`);
-`[sensors]`, `[drives]` and `[mechanics]` are the sections of a scenario and are laid over them. A truth that comes with
-the package states one thing that a user gets wrong, of any arm.
+A truth has the properties of the real arm that the host's configuration gets wrong or lacks. The host never reads it.
+`[arm]` has values of their own; `[factor]` multiplies values of the host's configuration; `[wiring]` exchanges and
+reverses devices; `[habits]` are ways of the drives, in place of those of their maker
+(`firmware_sim/maker_habits.toml`); `[sensors]`, `[drives]` and `[mechanics]` are the sections of a scenario and are
+laid over them. A truth that comes with the package has one mistake that users make, of any arm.
 """
 
 import math
@@ -94,7 +94,7 @@ class ExpectSettings:
 
     @property
     def text(self) -> str:
-        """What is expected, in a few words."""
+        """The expectation in a few words."""
         words = [f"{self._count('adaptations')} adapted", f"{self._count('contacts')} detected"]
         words += [f"{self._count(key)} {word}" for key, word in _TROUBLES if self._count(key) != "0"]
         if self.fault is not None:
@@ -140,7 +140,7 @@ class ScenarioOutcome(NamedTuple):
 
 
 def deviations(expect: ExpectSettings, outcome: ScenarioOutcome) -> tuple[str, ...]:
-    """Say, a line each, where a run differs from what was expected; nothing where it doesn't."""
+    """List the differences of a run from its expectation, a line each."""
     found = []
     for key in ("end", "fault"):
         wanted, got = getattr(expect, key), getattr(outcome, key)
@@ -270,7 +270,7 @@ class Scenario:
                 )
 
     def expected_of(self, scheme: str) -> ExpectSettings | None:
-        """Return what a healthy host of a scheme, `paper` or `certified`, makes of it; None: the file doesn't say."""
+        """Return the outcome with a healthy host of a scheme, `paper` or `certified`; None: the file has none."""
         own = self.expect_certified if scheme == "certified" else None
         return own or self.expect
 
@@ -343,7 +343,7 @@ SCENARIO_SECTIONS = ("sensors", "drives", "mechanics")
 
 @dataclass(frozen=True)
 class TruthArmSettings:
-    """The arm itself; what is absent is as the host is told, or assumed. Pairs are by joint."""
+    """The arm itself; an absent value is that of the host's configuration, or assumed. Pairs are by joint."""
 
     link_length_m: Pair | None = setting(None, unit="m", low=0.01, high=5.0, meaning="joint to joint, joint 2 to tip")
     mass_kg: Pair | None = setting(None, unit="kg", low=1e-4, high=1000.0, meaning="mass of each link")
@@ -374,7 +374,7 @@ class TruthArmSettings:
 
 @dataclass(frozen=True)
 class FactorSettings:
-    """What is multiplied, by joint; 1 leaves it."""
+    """Factors on values of the host's configuration, by joint."""
 
     link_length: Pair = setting((1.0, 1.0), low=0.1, high=10.0, meaning="of the lengths; masses keep their shares")
     mass: Pair = setting((1.0, 1.0), low=0.01, high=100.0, meaning="of the masses, and with them the inertia")
@@ -392,7 +392,7 @@ SWAPS = ("nothing", "drives", "sensors", "joints")
 
 @dataclass(frozen=True)
 class WiringSettings:
-    """Which devices are elsewhere than the host is told."""
+    """Devices that are elsewhere than in the host's configuration."""
 
     swapped: str = setting(
         "nothing", choices=SWAPS, meaning="what is exchanged between the joints; `joints`: drives and sensors"
@@ -408,7 +408,7 @@ class WiringSettings:
 
 @dataclass(frozen=True)
 class ArmTruth:
-    """What the host isn't told, resolved; `sections`: those of a scenario, as they were read."""
+    """A truth, resolved, without its sections of a scenario."""
 
     name: str = setting("", meaning="name of the truth")
     about: str = setting("", meaning="what the host is told wrongly, in one line")
