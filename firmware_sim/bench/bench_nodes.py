@@ -92,6 +92,7 @@ class BenchNodes:
                     device.serve(*alias, device.reader(*place))
                     device.pdos.accept(*alias, device.pdos.writer(*place))
         injector.attach(self.devices, self.drives, self.sensors)
+        self.latch_motors()
         self.period_ns = contract.period_us * 1000 or _UNTOLD_PERIOD_NS
         """How far one SYNC takes the arm, where time goes by SYNC."""
         self.told_period_ns = 0
@@ -118,8 +119,8 @@ class BenchNodes:
         sensor1, sensor2 = self.sensors
         return min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
 
-    def move_arm(self, tick_count: int) -> None:
-        """Let the arm move with the set-points of its motors."""
+    def latch_motors(self) -> None:
+        """Take over the drives' present set-points and modes, by joint, until the next call."""
         drive1, drive2 = self.drives
         torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
         modes = (drive1.motor_mode, drive2.motor_mode)
@@ -128,7 +129,11 @@ class BenchNodes:
             torque_Nm = (up1 * torque_Nm[0], up2 * torque_Nm[1])
             if self.wiring.drive_joint == (1, 0):
                 torque_Nm, modes = torque_Nm[::-1], modes[::-1]
-        self._arm.advance(torque_Nm, modes, tick_count)
+        self._motor_Nm, self._motor_modes = torque_Nm, modes
+
+    def move_arm(self, tick_count: int) -> None:
+        """Let the arm move with the latched set-points."""
+        self._arm.advance(self._motor_Nm, self._motor_modes, tick_count)
 
     def lose_sync(self, heard: Sequence[int], t_ns: int) -> None:
         """Let the drives that have not heard a SYNC count its period; `heard`: how often each node has."""

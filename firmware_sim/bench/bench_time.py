@@ -204,6 +204,7 @@ class BenchTime:
             self.advance(self._nodes.period_ns)
             for drive in self._nodes.drives:
                 drive.on_lost_sync(self.now_ns)
+            self._nodes.latch_motors()
 
     def delay_sample(self, late_ns: int) -> None:
         """By SYNC, let the arm move on until this SYNC reaches the devices."""
@@ -212,6 +213,7 @@ class BenchTime:
     def end_sync(self, cycle: int, stamp_ns: int) -> None:
         """Add the row of a SYNC that has been answered, or that no device heard."""
         self._sync_ns, self._has_outlived = self.now_ns, False
+        self._nodes.latch_motors()
         self._rows.add_sync_row(cycle, self.host_ns if self._outbox.is_paced else stamp_ns)
 
     def poll(self, t_ns: int) -> None:
@@ -279,6 +281,7 @@ class BenchTime:
         """Let time pass that no SYNC divides; a row of truth per period, as long as the arm moves."""
         end_ns, period_ns = self.now_ns + dt_ns, self._nodes.period_ns
         first = _FIRST_OVERDUE if self._is_wall else 1
+        self._nodes.latch_motors()
         while self._rows.cycle >= 0:
             periods = max(first, (self.now_ns - self._sync_ns) // period_ns + 1)
             row_ns = self._sync_ns + periods * period_ns
