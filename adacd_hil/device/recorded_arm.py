@@ -41,8 +41,7 @@ class Ticks(NamedTuple):
     """The beginnings of n cycles, as columns (n,) of int64.
 
     `t_ns`: when SYNC went out or came, as all messages of the cycle carry it; so do its frames, as cycle_t_ns.
-    `periods`: since the cycle before, 1 unless some were skipped: one more than the step of /cycle's overruns. Where an
-    attempt begins again it is taken for 1, since the pause before it was meant.
+    `periods`: since the cycle before, 1 unless some were skipped; the pause before an attempt counts for none.
     """
 
     cycle: NDArray[np.int64]
@@ -64,7 +63,6 @@ class RecordedArm:
         self._settings, self._codec = settings, codec
         self._is_following = settings.bus.follows
         self._devices = place_devices(settings)
-        self._has_begun_again = False
         self._begin()
 
     def _begin(self) -> None:
@@ -142,8 +140,6 @@ class RecordedArm:
         arm = self._arm
         if arm.cycle < 0:
             self.beginnings.append(place)
-            if self._has_begun_again:
-                batch.periods[place] = 1
         arm.synchronise(int(batch.cycle[place]), t_ns, int(batch.periods[place]))
         for is_sent, frame in passed[sync_at:]:
             if not is_sent:
@@ -175,7 +171,6 @@ class RecordedArm:
         """Follow what the host told the devices: it does so at the beginning of an attempt and after its end only."""
         if nmt_command == RESET_COMMUNICATION and self._is_running:
             self._begin()
-            self._has_begun_again = True
         elif nmt_command == START and not self._is_running:
             self._start()
 

@@ -65,6 +65,12 @@ def test_lost_repeated_wrong_and_late_frames_come_out_as_the_loop_took_them(trou
     assert differences(troubled.states, read) == []
 
 
+@pytest.mark.parametrize("run", ["troubled", "fd", "stock"])
+def test_the_log_says_of_every_cycle_what_the_loop_saw(run: str, request: pytest.FixtureRequest) -> None:
+    live: Live = request.getfixturevalue(run)
+    assert differences(live.states, live.logged()) == []
+
+
 def test_the_run_that_is_compared_has_old_values_and_a_fault(read: ArmBatch) -> None:
     assert set(np.unique(read.age_tau_J)) == {0, 1, 2}
     assert set(np.unique(read.age_q)) >= {0, 1, 2}
@@ -79,16 +85,6 @@ def test_a_new_attempt_forgets_the_one_before(troubled: Live) -> None:
     came_from = troubled.log.scheme["previous_state"]
     again = 1 + np.flatnonzero((came_from[1:] == SchemeState.INIT) & (came_from[:-1] == SchemeState.FAULT))
     assert arm.beginnings == [0, *again]
-
-
-def test_the_pause_before_a_new_attempt_counts_for_no_periods(troubled: Live, read: ArmBatch) -> None:
-    ticks = ticks_of(troubled.log)
-    arm = troubled.recorded_arm()
-    arm.read(ticks, troubled.log.frames)
-    _, again = arm.beginnings
-    periods = ticks.periods.copy()
-    periods[again] = 40
-    assert troubled.recorded_arm().read(ticks._replace(periods=periods), troubled.log.frames).periods[again] == 1
 
 
 def test_ordinary_cycles_read_at_once_leave_the_arm_as_frame_by_frame(
@@ -176,8 +172,10 @@ def test_a_host_that_skipped_periods_is_late_in_its_recording_too(tmp_path: Path
         )
     with live_states() as states:
         rig.run()
-    batch = Live(rig.settings, CODEC, states, rig.read()).read()
+    live = Live(rig.settings, CODEC, states, rig.read())
+    batch = live.read()
     assert differences(states, batch) == []
+    assert differences(states, live.logged()) == []
     assert batch.periods.max() == 9
     assert FaultReason.DEADLINE in batch.fault
 
@@ -187,6 +185,7 @@ def test_a_host_that_follows_anothers_sync_is_read_by_the_sync_that_came(tmp_pat
     with live_states() as states:
         rig.run()
     settings = two_arms_settings(SECOND)
-    batch = Live(settings, load_contract(settings), states, read_log(rig.path)).read()
-    assert differences(states, batch) == []
-    assert batch.is_enabled.any()
+    live = Live(settings, load_contract(settings), states, read_log(rig.path))
+    assert differences(states, live.read()) == []
+    assert differences(states, live.logged()) == []
+    assert live.logged().is_enabled.any()
