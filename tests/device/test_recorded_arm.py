@@ -14,12 +14,9 @@ from test_two_arms import Rig as TwoArms
 from test_two_arms import settings_of as two_arms_settings
 
 from adacd_hil.device.contract import load_contract
-from adacd_hil.device.cycle_frames import TorqueSensor
-from adacd_hil.device.drive import Drive
-from adacd_hil.device.ordinary_cycles import OrdinaryCycles, OrdinaryStretch
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import read_log
-from adacd_hil.records import ArmBatch, FaultReason, SchemeState
+from adacd_hil.records import ArmBatch, FaultReason
 
 pytestmark = pytest.mark.slow
 
@@ -78,59 +75,14 @@ def test_the_run_that_is_compared_has_old_values_and_a_fault(read: ArmBatch) -> 
     assert np.count_nonzero(~read.is_complete) >= 10
 
 
-def test_a_new_attempt_forgets_the_one_before(troubled: Live) -> None:
-    arm = troubled.recorded_arm()
-    ticks = ticks_of(troubled.log)
-    arm.read(ticks, troubled.log.frames)
-    came_from = troubled.log.scheme["previous_state"]
-    again = 1 + np.flatnonzero((came_from[1:] == SchemeState.INIT) & (came_from[:-1] == SchemeState.FAULT))
-    assert arm.beginnings == [0, *again]
-
-
-def test_ordinary_cycles_read_at_once_leave_the_arm_as_frame_by_frame(
-    troubled: Live, read: ArmBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    at_once, one_by_one = troubled.recorded_arm(), troubled.recorded_arm()
-    ticks, frames = ticks_of(troubled.log), troubled.log.frames
-    at_once.read(ticks, frames)
-    monkeypatch.setattr(OrdinaryCycles, "read", lambda *_: OrdinaryStretch(0, 0, []))
-    batch = one_by_one.read(ticks, frames)
-    assert differences(troubled.states, batch) == []
-    assert (at_once.exact_cycles < 0.4 * len(ticks.cycle), one_by_one.exact_cycles) == (True, len(ticks.cycle))
-    assert at_once._arm.frame_checks() == one_by_one._arm.frame_checks()
-    assert at_once._heartbeats.__dict__["_nodes"] == one_by_one._heartbeats.__dict__["_nodes"]
-    for mine, theirs in zip(at_once._arm.devices, one_by_one._arm.devices, strict=True):
-        assert _numbers(mine) == _numbers(theirs)
-
-
-def _numbers(device: Drive | TorqueSensor) -> dict[str, object]:
-    """Return all that a device and the check of its frames remember."""
-    memory = {**vars(device), **vars(device.end_to_end)}
-    return {name: value for name, value in memory.items() if isinstance(value, (int, float, bool, list, type(None)))}
-
-
 @pytest.mark.parametrize(("config", "fault"), [("fd", FaultReason.SENSOR), ("stock", FaultReason.HEARTBEAT)])
 def test_long_and_unprotected_frames_come_out_as_the_loop_took_them(
     config: str, fault: FaultReason, request: pytest.FixtureRequest
 ) -> None:
     live: Live = request.getfixturevalue(config)
-    arm = live.recorded_arm()
-    batch = arm.read(ticks_of(live.log), live.log.frames)
+    batch = live.read()
     assert differences(live.states, batch) == []
     assert fault in batch.fault
-    assert arm.exact_cycles < 0.8 * len(live.states)
-
-
-def test_nearly_all_cycles_of_a_quiet_run_are_read_at_once(troubled: Live) -> None:
-    arm = troubled.recorded_arm()
-    ticks, frames = ticks_of(troubled.log), troubled.log.frames
-    arm.read(ticks, frames)
-    quiet = arm.beginnings[-1] + 250  # from here to its end nothing befalls the second attempt
-    arm = troubled.recorded_arm()
-    for cycles in (slice(0, quiet), slice(quiet, None)):
-        before = arm.exact_cycles
-        arm.read(*_piece(ticks, frames, cycles))
-    assert arm.exact_cycles - before < 0.05 * (len(ticks.cycle) - quiet)
 
 
 def _piece(ticks: Ticks, frames: NDArray[Any], cycles: slice) -> tuple[Ticks, NDArray[Any]]:

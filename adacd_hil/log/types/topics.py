@@ -380,19 +380,10 @@ def pack_scheme(output: SchemeOutput, request: Request) -> bytes:
 
 def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
     """Pack the body of /arm; `first_cycle`: of the attempt."""
-    return ARM.body.pack(
-        arm.cycle,
-        first_cycle,
-        arm.periods,
-        arm.steps,
-        0 if arm.sampled_ns is None else arm.t_ns - arm.sampled_ns,
-        *arm.age_q,
-        *arm.age_tau_J,
-        arm.is_enabled,
-        arm.is_complete,
-        arm.fault,
-        arm.is_late,
-    )
+    cycle, t_ns, periods, _, _, _, age_q, age_tau_J, is_enabled, is_complete, fault, is_late, steps, sampled_ns = arm
+    age_ns = 0 if sampled_ns is None else t_ns - sampled_ns
+    ages = (*age_q, *age_tau_J)
+    return ARM.body.pack(cycle, first_cycle, periods, steps, age_ns, *ages, is_enabled, is_complete, fault, is_late)
 
 
 def pack_contact(report: ContactReport) -> bytes:
