@@ -15,6 +15,7 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import ArmBatch, ArmState
+from adacd_hil.replay.logged_arms import logged_arms
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 
@@ -33,6 +34,11 @@ class Live(NamedTuple):
     def read(self) -> ArmBatch:
         """Read the arm from the log, all at once."""
         return self.recorded_arm().read(ticks_of(self.log), self.log.frames)
+
+    def logged(self) -> ArmBatch:
+        """Take what the log says that the arm was."""
+        log = self.log
+        return logged_arms(log.scheme.records, log.topics["/arm"].records, ticks_of(log))
 
 
 @contextmanager
@@ -66,9 +72,8 @@ def play(
 
 
 def ticks_of(log: RunLog) -> Ticks:
-    cycle = log.cycle
-    periods = 1 + np.diff(cycle["overruns"].astype(np.int64), prepend=0)
-    return Ticks(cycle["cycle"].astype(np.int64), cycle.t_ns, periods)
+    arm = log.topics["/arm"]
+    return Ticks(arm["cycle"].astype(np.int64), arm.t_ns, arm["periods"])
 
 
 def differences(live: list[ArmState], batch: ArmBatch) -> list[str]:

@@ -91,6 +91,8 @@ class LongLog:
         """Read the log. Raises LogError when it is damaged."""
         self.blocks: list[Block] = []
         self.attachments: dict[str, bytes] = {}
+        self.first_cycle_at: dict[int, int] = {}
+        """By channel, where a record has the number of its attempt's first cycle."""
         log = SalvagedLog(path)
         for item in log:
             if isinstance(item, Attachment):
@@ -125,6 +127,8 @@ class LongLog:
             if "cycle" in fields:
                 mine = item.channels == number
                 cycles[mine] = item.starts[mine] + MESSAGE_HEAD + fields["cycle"]
+            if "first_cycle" in fields:
+                self.first_cycle_at[number] = MESSAGE_HEAD + fields["first_cycle"]
         block = Block(records, item.starts, item.channels, cycles[cycles >= 0])
         if len(item.starts):
             self.blocks.append(block.only(np.ones(len(item.starts), np.bool_)))
@@ -186,8 +190,11 @@ class Writer:
         )
         self._sink.close()
 
-    def add(self, block: Block, later_ns: int, has_cycles: bool) -> None:
-        """Write messages so much later; has_cycles: the numbers of their cycles grow with it."""
+    def add(self, block: Block, later_ns: int, has_cycles: bool, is_attempt: bool = False) -> None:
+        """Write messages so much later; has_cycles: the numbers of their cycles grow with it.
+
+        is_attempt: of another attempt, whose first cycle is later, too.
+        """
         records = block.records.copy()
         words = words_of(records)
         for place in (LOG_TIME, PUBLISH_TIME):
@@ -195,6 +202,9 @@ class Writer:
         words[block.starts + STAMP] += later_ns // SECOND_NS  # the lower half are the seconds
         if has_cycles:
             words[block.cycles] += later_ns // self._log.cycle_ns
+        if is_attempt:
+            for number, place in self._log.first_cycle_at.items():
+                words[block.starts[block.channels == number] + place] += later_ns // self._log.cycle_ns
         ids = np.array([self._file.ids.get(number, 0) for number in range(int(block.channels.max()) + 1)], np.uint16)
         ends = np.append(block.starts[1:], len(records))
         times_ns = words[block.starts + LOG_TIME]
@@ -219,7 +229,7 @@ def write(log: LongLog, path: Path, seconds: float, loop_s: tuple[float, float] 
         for repetition in range(max(1, round(seconds * SECOND_NS / round_ns))):
             for block in log.blocks:
                 # The emulator counts anew in each attempt.
-                writer.add(block, repetition * round_ns, has_cycles=not is_truth)
+                writer.add(block, repetition * round_ns, has_cycles=not is_truth, is_attempt=True)
     else:
         from_ns, until_ns = (round(bound_s * SECOND_NS) for bound_s in loop_s)
         for block in log.between(-1, until_ns):

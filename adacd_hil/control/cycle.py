@@ -25,7 +25,15 @@ from adacd_hil.device.arm_watch import ArmWatch, Recurrence
 from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.device.network import Master
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_control, pack_cycle, pack_frame_checks, pack_scheme
+from adacd_hil.log.types.topics import (
+    ChannelId,
+    pack_arm,
+    pack_contact,
+    pack_control,
+    pack_cycle,
+    pack_frame_checks,
+    pack_scheme,
+)
 from adacd_hil.records import (
     CERTIFICATE_EVENTS,
     CONTROL_LAYOUT,
@@ -117,6 +125,7 @@ class Cycle:
             self._pipeline,
         )
         self._state = SchemeState.INIT
+        self._first_cycle = -1  # before the first
         self._enabled_cycle: int | None = None
         self._faulted_cycle: int | None = None
         self._interrupts = 0
@@ -248,8 +257,11 @@ class Cycle:
     ) -> None:
         """Hand the cycle to the logger and remember where the scheme stands."""
         t_ns = arm.t_ns
+        if self._first_cycle < 0:
+            self._first_cycle = arm.cycle
         messages = [
             (ChannelId.SCHEME, pack_scheme(output, request)),
+            (ChannelId.ARM, pack_arm(arm, self._first_cycle)),
             (ChannelId.CONTROL, pack_control(arm.cycle, self._block, flags, command.enable, command.quick_stop)),
             (ChannelId.CYCLE, pack_cycle(record)),
         ]

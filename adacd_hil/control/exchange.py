@@ -109,9 +109,9 @@ class Exchange:
                 bus.unread(frames[0])
                 break
             last_ns = frames[-1].t_ns
-            if not arm.accept_answers(frames):
-                for frame in frames:
-                    self._accept(frame, is_late=frame.t_ns < sync_ns)
+            for frame in frames:
+                if not arm.accept(frame, frame.t_ns < sync_ns):
+                    self._pass_on(frame)
             elapsed_s = (last_ns - sync_ns) * 1e-9
             if not 0.0 <= elapsed_s <= self._patience_s:  # a late frame, or a stamp of a wall clock that was set
                 elapsed_s = (self._clock.now_ns() - sync_ns) * 1e-9
@@ -126,10 +126,15 @@ class Exchange:
                 return
             self._accept(late)
 
-    def _accept(self, frame: Frame, is_late: bool = False) -> None:
+    def _accept(self, frame: Frame) -> None:
+        if not self._arm.accept(frame):
+            self._pass_on(frame)
+
+    def _pass_on(self, frame: Frame) -> None:
+        """Take a frame that is none of the arm's."""
         if frame.is_error:
             say_trouble(self.events, frame)
-        elif not self._arm.accept(frame, is_late):
+        else:
             self._master.accept(frame)
 
     def leave(self) -> int:

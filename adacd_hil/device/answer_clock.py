@@ -19,7 +19,7 @@ late. And whether a frame without counter that comes when it usually does is a p
 the arm moves. It counts as the latter; a second frame on the same SYNC shows that it was the former.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 USUAL_ANSWERS = 100
@@ -46,11 +46,6 @@ class AnswerClock:
         self._usual_count = 0
         self._is_guess = False
         self._unanswered = 0  # bit k: the SYNC k before the last answered one has no answer
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether it is known when the device usually answers."""
-        return self._usual_count >= USUAL_ANSWERS
 
     def find(
         self,
@@ -122,15 +117,9 @@ class AnswerClock:
         self._latest_ns = max(self._latest_ns, offset_ns)
         self._usual_count += 1
 
-    def follow(self, ordinal: int) -> None:
-        """Take note that the device has answered this SYNC, the one after the last that it answered; it is settled."""
-        self.answered = ordinal
-        self._is_guess = False
-        self._unanswered = self._unanswered << 1 & _MASK
-
-    def pass_by(self, ordinal: int) -> None:
-        """Take note that every SYNC up to this one was answered in time by frames that were read elsewhere."""
-        self.answered = ordinal
+    def begin_anew(self, newest: int) -> None:
+        """Take note that the device's counter says nothing of before: every SYNC up to this one counts as answered."""
+        self.answered = newest
         self._is_guess = False
         self._unanswered = 0
 
@@ -154,25 +143,16 @@ class SampleAlignment:
     """
 
     def __init__(self, devices: int) -> None:
-        self._ordinals = [[-1] * KEPT for _ in range(devices)]
-        self._values: list[list[tuple[float, ...]]] = [[()] * KEPT for _ in range(devices)]
+        self._kept: list[list[tuple[int, tuple[float, ...]]]] = [[(-1, ())] * KEPT for _ in range(devices)]
 
     def put(self, device: int, ordinal: int, values: tuple[float, ...]) -> None:
         """Keep a device's values of one SYNC."""
-        place = ordinal % KEPT
-        self._ordinals[device][place] = ordinal
-        self._values[device][place] = values
-
-    def put_all(self, ordinal: int, values: Sequence[tuple[float, ...]]) -> None:
-        """Keep the values of all devices of one SYNC."""
-        place = ordinal % KEPT
-        for ordinals, kept, one in zip(self._ordinals, self._values, values, strict=True):
-            ordinals[place], kept[place] = ordinal, one
+        self._kept[device][ordinal % KEPT] = ordinal, values
 
     def newest(self, last: int, after: int) -> Sample | None:
         """Return the newest complete sample of the SYNCs up to `last` that come behind `after`, or None."""
         for ordinal in range(last, max(after, last - KEPT), -1):
-            place = ordinal % KEPT
-            if all(ordinals[place] == ordinal for ordinals in self._ordinals):
-                return Sample(ordinal, tuple(values[place] for values in self._values))
+            answers = [kept[ordinal % KEPT] for kept in self._kept]
+            if all(answered == ordinal for answered, _ in answers):
+                return Sample(ordinal, tuple(values for _, values in answers))
         return None

@@ -11,10 +11,10 @@ import numpy as np
 
 from adacd_hil.device.answer_clock import KEPT, AnswerClock, SampleAlignment
 from adacd_hil.device.arm_watch import PATIENCE_PERIODS
-from adacd_hil.device.cycle_frames import NO_CYCLE, USABLE, CycleFrames, TorqueSensor
 from adacd_hil.device.drive import Drive, option_codes, torque_limit_permille
 from adacd_hil.device.profile import PlacedDevice, place_devices
 from adacd_hil.device.strangers import Strangers
+from adacd_hil.device.torque_sensor import USABLE, TorqueSensor
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameChecks
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
@@ -27,11 +27,10 @@ FEEDBACK_SHARE = 0.7
 the worst, and two commands need 230 µs before the next SYNC."""
 
 _Take = Callable[[bytes, int], bool]
-"""What takes a frame's data and its cycle, and says whether something cyclic came of it."""
+"""Takes a status frame's data and its cycle."""
 _Command = tuple[list[float], bool, bool]
 """Commanded torque of each joint, Nm; whether the drives are to be enabled; whether they are to stop quickly."""
 _COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
-_STATUS = -1  # in place of a device's: a status frame, which answers no SYNC
 _EMERGENCY_BYTES = 8
 REMEMBERED_GAPS = 0xFF
 """Bits of as many cycles: which of them a device left without a usable frame."""
@@ -67,11 +66,17 @@ class Arm:
         self.gear_ratios = tuple(device.settings.scale.gear_ratio for device in devices[:JOINTS])
         self.status_age_limits = tuple(_status_age_limit(device, period_s) for device in devices[:JOINTS])
         """How old each drive's status may be, in cycles; infinite where nothing is expected."""
-        self._handlers = self._build_handlers()
+        self._places = {device.can_id: place for place, device in enumerate(self.devices)}  # of cyclic frames
+        self._status_takers: dict[int, _Take] = {
+            device.status_message.can_id: device.accept_status
+            for device in self.devices
+            if device.status_message is not None
+        }
         self._cycle = -1
         self._t_ns = 0
         self._periods = 1
-        self._received = 0
+        self.received = 0
+        """Bits of the devices whose cyclic frame of this cycle is in and passed its checks."""
         self._seen = 0
         self.was_enabled = False
         self._ordinal = -1  # of the last SYNC
@@ -84,25 +89,12 @@ class Arm:
         self._last_data = [b""] * len(self.devices)
         self.repeats = [0] * len(self.devices)
         """How often each device's frame came again, the same or with the same counter."""
-        self._frames = CycleFrames(self.devices, period_s)
-        self._read_values: tuple[tuple[float, ...], ...] = ()  # what `_frames` has read last, of each device
         self.strangers = Strangers(settings, codec)
         self._emergency_ids = {EMERGENCY_ID + device.node_id: device for device in self.devices}
         self._tolerated_codes = frozenset(settings.safety.tolerated_emergencies)
         self._emergencies: dict[str, int] = {}
         self.has_all_frames = False
         """Whether all cyclic frames of this cycle are in, passed their checks or not."""
-
-    def _build_handlers(self) -> dict[int, tuple[_Take, int]]:
-        handlers: dict[int, tuple[_Take, int]] = {}
-        for joint, (drive, sensor) in enumerate(zip(self.drives, self.sensors, strict=True)):
-            handlers[drive.feedback_message.can_id] = (drive.accept_cyclic, joint)
-            handlers[sensor.torque_message.can_id] = (sensor.accept_cyclic, JOINTS + joint)
-            if drive.status_message is not None:
-                handlers[drive.status_message.can_id] = (drive.accept_status, _STATUS)
-            if sensor.status_message is not None:
-                handlers[sensor.status_message.can_id] = (sensor.accept_status, _STATUS)
-        return handlers
 
     @property
     def cycle(self) -> int:
@@ -114,18 +106,18 @@ class Arm:
 
         SYNC is sent here, unless another host sends it; pipelined commands leave behind it.
         """
-        if self._frames.held:
-            self._release()
         if self._cycle >= 0:
             if not self.has_all_frames:
                 self._miss()
-            if self._received != _COMPLETE or self._has_gaps:
+            if self.received != _COMPLETE or self._has_gaps:
                 self._remember_gaps()
-        self._begin_cycle(cycle, t_ns)
-        if periods == 1 and (self._frames.read_cycle == cycle - 1 or self._are_in_step()):
-            self._frames.is_open = True
+        self._cycle = cycle
+        self._t_ns = t_ns
+        self._ordinal += 1
+        place = self._ordinal % KEPT
+        self._sync_cycles[place], self._sync_ns[place] = cycle, t_ns
         self._periods = periods
-        self._received = 0
+        self.received = 0
         self._seen = 0
         self.has_all_frames = False
         frames: tuple[tuple[int, bytes], ...] = (
@@ -138,13 +130,6 @@ class Arm:
             self._pending = None
         self._bus.send_all(frames)
 
-    def _begin_cycle(self, cycle: int, t_ns: int) -> None:
-        self._cycle = cycle
-        self._t_ns = t_ns
-        self._ordinal += 1
-        place = self._ordinal % KEPT
-        self._sync_cycles[place], self._sync_ns[place] = cycle, t_ns
-
     def _miss(self) -> None:
         """Let every device note that its frame of the cycle that ends now did not come."""
         for bit, device in enumerate(self.devices):
@@ -153,74 +138,34 @@ class Arm:
 
     def _remember_gaps(self) -> None:
         for place, gaps in enumerate(self.gaps):
-            self.gaps[place] = (gaps << 1 | ~self._received >> place & 1) & REMEMBERED_GAPS
+            self.gaps[place] = (gaps << 1 | ~self.received >> place & 1) & REMEMBERED_GAPS
         self._has_gaps = any(self.gaps)
-
-    def pass_by(self, cycles: int, cycle: int, t_ns: int) -> None:
-        """Take so many cycles, all complete and in time, for read elsewhere; the last one and its SYNC are given."""
-        self._release()
-        self._frames.read_cycle = NO_CYCLE
-        for device in self.devices:
-            device.skip(cycles)
-        self._ordinal += cycles - 1
-        self._begin_cycle(cycle, t_ns)
-        for clock in self._clocks:
-            clock.pass_by(self._ordinal)
-        self._sampled_ordinal, self._sampled_cycle = self._ordinal, cycle
-        self.gaps = [0] * len(self.devices)
-        self._has_gaps = False
-        self._received = self._seen = _COMPLETE
-        self.has_all_frames = True
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether every device has answered the last SYNC in time, and it is known when each usually does."""
-        return all(clock.is_settled and clock.answered == self._ordinal for clock in self._clocks)
 
     def accept(self, frame: Frame, is_late: bool = False) -> bool:
         """Take one frame; False when it is not one of the arm's. A frame that fails a check changes nothing.
 
         `is_late`: it came before SYNC, so it answers an earlier one.
         """
-        handler = self._handlers.get(frame.can_id)
         if frame.is_error:
             return False
-        if handler is None:
-            self._hear_emergency(frame)
-            return self.strangers.accept(frame, self._cycle)
-        take, place = handler
-        if self._frames.is_open:
-            if place != _STATUS and not is_late and self._frames.hold(place, frame):
-                if self._frames.are_all_in:
-                    self._take_together()
-                return True
-            self._release()
-        if place != _STATUS:
-            self._answer(frame, take, place, self._ordinal - 1 if is_late and self._ordinal else self._ordinal)
-        elif is_late:
-            take(frame.data, self._cycle - self._periods)
-        else:
-            take(frame.data, self._cycle)
-        return True
+        place = self._places.get(frame.can_id)
+        if place is not None:
+            self._answer(frame, place, self._ordinal - 1 if is_late and self._ordinal else self._ordinal)
+            return True
+        take_status = self._status_takers.get(frame.can_id)
+        if take_status is not None:
+            take_status(frame.data, self._cycle - self._periods if is_late else self._cycle)
+            return True
+        self._hear_emergency(frame)
+        return self.strangers.accept(frame, self._cycle)
 
     @property
     def open_answers(self) -> int:
         """Count the cyclic frames that this cycle lacks, at least 1."""
-        return max(len(self.devices) - self._seen.bit_count() - len(self._frames.held), 1)
+        return max(len(self.devices) - self._seen.bit_count(), 1)
 
-    def accept_answers(self, frames: Sequence[Frame]) -> bool:
-        """Take frames that answer this SYNC for all devices, in one call; False, and none is taken, where they don't.
-
-        As `accept` one by one does, which is for those that this refuses.
-        """
-        if not (self._frames.is_open and self._frames.hold_all(frames, self._t_ns)):
-            return False
-        self._take_together()
-        return True
-
-    def _answer(self, frame: Frame, take: _Take, place: int, newest: int) -> None:
+    def _answer(self, frame: Frame, place: int, newest: int) -> None:
         """Take a cyclic frame for the SYNC that it answers; `newest`: the last one before it came."""
-        self._frames.read_cycle = NO_CYCLE
         if newest < 0:
             return  # before any SYNC there is nothing to answer
         device, clock, data = self.devices[place], self._clocks[place], frame.data
@@ -232,7 +177,7 @@ class Arm:
             soonest_ns = self._soonest_ns(place)
         ordinal = None if step == 0 else clock.find(newest, offset_ns, step, error, soonest_ns)
         if ordinal is None:
-            self._refuse(frame, take, place, step, is_second=clock.answered is not None and clock.answered >= newest)
+            self._refuse(frame, place, step, is_second=clock.answered is not None and clock.answered >= newest)
             return
         is_present = ordinal == self._ordinal
         if is_present and len(data) == device.cyclic_length:
@@ -241,54 +186,23 @@ class Arm:
         is_revised = clock.answered == ordinal  # what was taken for it was the one before
         if is_revised:
             self._alignment.put(place, ordinal - 1, device.values)
-        if take(data, self._sync_cycles[ordinal % KEPT]):
+        if device.accept_cyclic(data, self._sync_cycles[ordinal % KEPT]):
             clock.note(ordinal, newest, offset_ns, device.is_protected)
             self._alignment.put(place, ordinal, device.values)
             self._last_data[place] = data
             if is_present:
-                self._received |= 1 << place
+                self.received |= 1 << place
         elif device.end_to_end.status is E2eStatus.WRONG_SEQUENCE:
-            clock.pass_by(newest)  # the device has begun anew, so that its counter says nothing of before
+            clock.begin_anew(newest)  # the device has begun anew, so that its counter says nothing of before
         elif device.end_to_end.status is E2eStatus.SYNC or (not device.is_protected and is_present):
             clock.note(ordinal, newest, offset_ns, device.is_protected)
-
-    def _are_in_step(self) -> bool:
-        """Tell whether every device has answered the last SYNC, each as usual; then its next frame is known."""
-        last = self._ordinal - 1
-        return all(clock.is_settled and clock.answered == last for clock in self._clocks) and self._frames.begin(
-            self._cycle
-        )
-
-    def _take_together(self) -> None:
-        """Take the frames of all devices in one call; one by one where they aren't the next right ones."""
-        cycle, ordinal = self._cycle, self._ordinal
-        values = self._frames.read(cycle)
-        if values is None:
-            self._release()
-            return
-        devices, clocks, last_data = self.devices, self._clocks, self._last_data
-        for place, frame in self._frames.close():
-            data = last_data[place] = frame.data
-            devices[place].follow(data, values[place], cycle)
-            clocks[place].follow(ordinal)
-        drive1, drive2, sensor1, sensor2 = devices
-        self._read_values = drive1.values, drive2.values, sensor1.values, sensor2.values
-        self._alignment.put_all(ordinal, self._read_values)
-        self._received = self._seen = _COMPLETE
-        self.has_all_frames = True
-
-    def _release(self) -> None:
-        """Take the frames that are held one by one."""
-        for place, frame in self._frames.close():
-            take, _ = self._handlers[frame.can_id]
-            self._answer(frame, take, place, self._ordinal)
 
     def _soonest_ns(self, place: int) -> int:
         """Return how soon a device can answer this SYNC: as the first of those whose frames are not in."""
         places = (bit for bit in range(len(self._clocks)) if bit == place or not self._seen >> bit & 1)
         return min(self._clocks[bit].earliest_ns for bit in places)
 
-    def _refuse(self, frame: Frame, take: _Take, place: int, step: int | None, is_second: bool) -> None:
+    def _refuse(self, frame: Frame, place: int, step: int | None, is_second: bool) -> None:
         """Judge a frame that answers no SYNC; its values are not used.
 
         The same frame twice says nothing new, a counter that stands still nothing true. Another frame, whose check is
@@ -299,7 +213,7 @@ class Arm:
         is_same = data == self._last_data[place]
         self.repeats[place] += step == 0 or (is_right and is_same)
         if step == 0 or not is_right:
-            take(data, self._cycle)  # the check counts it
+            device.accept_cyclic(data, self._cycle)  # the check counts it
         if is_second and is_right and not is_same:
             behind = 0 if not step else device.end_to_end.counter_range - step
             if not self._clocks[place].is_straggler(behind):
@@ -317,18 +231,6 @@ class Arm:
             self._emergencies[device.name] = code
 
     @property
-    def unusual_ids(self) -> tuple[int, ...]:
-        """Identifiers of frames that change what the arm reports whenever one comes."""
-        return (*self.strangers.can_ids, *self._emergency_ids)
-
-    def accept_past(self, frame: Frame, cycle: int) -> bool:
-        """Take one status frame of a cycle that is over; False when it is not one of the arm's."""
-        handler = self._handlers.get(frame.can_id)
-        if handler is not None:
-            handler[0](frame.data, cycle)
-        return handler is not None
-
-    @property
     def is_complete(self) -> bool:
         """Whether all cyclic frames of this cycle are in and passed their checks."""
         return self.received == _COMPLETE
@@ -336,14 +238,7 @@ class Arm:
     @property
     def missing_frames(self) -> int:
         """Count the cyclic frames of this cycle that are not in or failed their checks."""
-        return 0 if self._received == _COMPLETE else (_COMPLETE & ~self.received).bit_count()
-
-    @property
-    def received(self) -> int:
-        """Bits of the devices whose cyclic frame of this cycle is in and passed its checks."""
-        if self._frames.held:
-            self._release()
-        return self._received
+        return (_COMPLETE & ~self.received).bit_count()
 
     def missing_names(self) -> list[str]:
         """Name the devices whose cyclic frame of this cycle is not in or failed its checks."""
@@ -353,23 +248,17 @@ class Arm:
     def state(self) -> ArmState:
         """Join what has been received into the state of this cycle: the newest complete sample, else what is newest."""
         cycle = self._cycle
-        if self._frames.read_cycle == cycle:
-            return self._state_of(self._ordinal, self._read_values, (cycle,) * 4)
         if self.received == _COMPLETE:
-            return self._state_of(self._ordinal, tuple(device.values for device in self.devices), (cycle,) * 4)
+            return self._state_of(self._ordinal, [device.values for device in self.devices], (cycle,) * 4)
         sample = self._alignment.newest(self._ordinal, self._sampled_ordinal)
         if sample is not None:
             sampled = self._sync_cycles[sample.ordinal % KEPT]
             return self._state_of(sample.ordinal, sample.values, (sampled,) * 4)
         return self._state_of(
-            None,
-            tuple(device.values for device in self.devices),
-            tuple(device.sample_cycle for device in self.devices),
+            None, [device.values for device in self.devices], [device.sample_cycle for device in self.devices]
         )
 
-    def _state_of(
-        self, ordinal: int | None, values: tuple[tuple[float, ...], ...], sampled: tuple[int, ...]
-    ) -> ArmState:
+    def _state_of(self, ordinal: int | None, values: Sequence[tuple[float, ...]], sampled: Sequence[int]) -> ArmState:
         """Make the state of values sampled in given cycles; `ordinal`: of the SYNC of a complete sample."""
         (q1, dq1), (q2, dq2), (tau1,), (tau2,) = values
         sign1, sign2 = self.sign

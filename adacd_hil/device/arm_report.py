@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from adacd_hil.device.arm import REMEMBERED_GAPS, Arm
 from adacd_hil.device.canopen_bus import name_error
-from adacd_hil.device.cycle_frames import SensorStatus, TorqueSensor
 from adacd_hil.device.drive import Cia402State, Drive
+from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.records import ArmState, Event
 from adacd_hil.settings.arm_settings import DATA_WINDOW_S, SHORTEST_DATA_WINDOW
 from adacd_hil.settings.configuration import Settings
@@ -220,11 +220,11 @@ class ArmReport:
             for quantity, value, bound, unit in (
                 (
                     "position",
-                    sign * drive.position_rad - self._arm.zero_rad[joint],
+                    sign * drive.values[0] - self._arm.zero_rad[joint],
                     self._arm.limits.position_limit_deg[joint],
                     "deg",
                 ),
-                ("velocity", sign * drive.velocity_rad_s, self._arm.limits.velocity_limit_deg_s[joint], "deg/s"),
+                ("velocity", sign * drive.values[1], self._arm.limits.velocity_limit_deg_s[joint], "deg/s"),
             ):
                 value_deg = math.degrees(value)
                 if abs(value_deg) > bound:

@@ -124,10 +124,7 @@ class HeartbeatWatch:
     def __init__(self, nodes: Iterable[tuple[str, int]], period_ms: int, report: Callable[[Event], None]) -> None:
         """`nodes`: name and node id. `report` gets an event when a node falls out and when it is back."""
         self._nodes = {HEARTBEAT_ID + node_id: _WatchedNode(name, node_id) for name, node_id in nodes}
-        self.can_ids = tuple(self._nodes)
-        """Identifiers of the heartbeats that are watched."""
-        self.patience_ns = round(PATIENCE_PERIODS * period_ms * 1_000_000)
-        """Longest silence of a node that is none."""
+        self._patience_ns = round(PATIENCE_PERIODS * period_ms * 1_000_000)
         self._report = report
         self._is_watching = False
         self._since_ns: int | None = None
@@ -170,29 +167,19 @@ class HeartbeatWatch:
                 lines.append(line)
         return lines
 
-    def heard_ns(self) -> dict[int, int] | None:
-        """Say by identifier when each node was last heard, or began to be watched; None unless all are OPERATIONAL."""
-        since_ns = self._since_ns
-        nodes = self._nodes.items()
-        if since_ns is None or any(
-            node.state != OPERATIONAL or node.left_to is not None or node.complaint for _, node in nodes
-        ):
-            return None
-        return {can_id: max(node.heard_ns or since_ns, since_ns) for can_id, node in nodes}
-
     def _judge(self, node: _WatchedNode, t_ns: int, since_ns: int) -> str:
         heard_ns = since_ns if node.heard_ns is None else max(node.heard_ns, since_ns)
         silent_ns = t_ns - heard_ns
         state = node.state if node.left_to is None else node.left_to
         node.left_to = None
-        if silent_ns > self.patience_ns:
+        if silent_ns > self._patience_ns:
             complaint = "silent"
-            text = f"no heartbeat for {silent_ns // 1_000_000} ms, {self.patience_ns // 1_000_000} ms allowed"
+            text = f"no heartbeat for {silent_ns // 1_000_000} ms, {self._patience_ns // 1_000_000} ms allowed"
         elif (
             state is not None
             and state != OPERATIONAL
             # A heartbeat from before the start command took effect may still be on its way.
-            and (node.has_run or t_ns - since_ns > self.patience_ns)
+            and (node.has_run or t_ns - since_ns > self._patience_ns)
         ):
             complaint = f"state {state}"
             text = f"is {_STATES.get(state, f'in NMT state {state}')}, OPERATIONAL expected"

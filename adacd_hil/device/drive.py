@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
-from adacd_hil.device.cycle_frames import CyclicDevice, CyclicFrame
+from adacd_hil.device.cyclic_device import CyclicDevice
 from adacd_hil.device.profile import ProfileSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
@@ -201,8 +201,7 @@ class Drive(CyclicDevice):
         """
         name = f"Drive{joint}"
         self.feedback_message = codec.message(f"{name}Feedback")
-        frame = CyclicFrame(self.feedback_message, "position", "velocity", jump=position_jump_rad)
-        super().__init__(codec, name, frame, period_s)
+        super().__init__(codec, name, self.feedback_message, "position", period_s)
         self.command_message = codec.message(f"{name}Command")
         self.command_id = self.command_message.can_id
         self._sender = self.command_message.sender()
@@ -221,8 +220,7 @@ class Drive(CyclicDevice):
         self._last_controlword = int(Controlword.DISABLE_VOLTAGE)
         self.recent_permille: deque[int] = deque([0], maxlen=_RECENT_COMMANDS)
         """Commanded torque of the last cycles, per mille of rated torque."""
-        self.position_rad = 0.0
-        self.velocity_rad_s = 0.0
+        self.values = 0.0, 0.0  # position, rad, and velocity, rad/s
         self.status_cycle = -1
         """Cycle in which the status in use came; -1 before the first."""
         self.state = Cia402State.NOT_READY_TO_SWITCH_ON
@@ -242,8 +240,7 @@ class Drive(CyclicDevice):
         return abs(values[self._main_at] - last - travel) <= self._position_jump_rad
 
     def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:  # noqa: ARG002 (as of all devices)
-        self.position_rad = values[self._main_at]
-        self.velocity_rad_s = values[self._velocity_at]
+        self.values = values[self._main_at], values[self._velocity_at]
         self.sample_cycle = cycle
         if not self.has_status_frame:
             self._take_status(values, self._feedback_status, cycle)
@@ -260,11 +257,6 @@ class Drive(CyclicDevice):
     def is_limited(self) -> bool:
         """Whether the drive says that a limit of its own keeps it from the commanded torque."""
         return bool(self.statusword & _INTERNAL_LIMIT)
-
-    @property
-    def values(self) -> tuple[float, float]:
-        """Position, rad, and velocity, rad/s, in use."""
-        return self.position_rad, self.velocity_rad_s
 
     def position_error(self, data: bytes, periods: int) -> float:
         """Say by how much a frame's position is off, rad, if so many periods lie between it and the last that came."""
@@ -335,7 +327,7 @@ class Drive(CyclicDevice):
             return False
         if option < _FIRST_STAYING_OPTION:
             return True  # it leaves by itself
-        is_halted = bool(self.statusword & _TARGET_REACHED) or abs(self.velocity_rad_s) <= _STANDSTILL_RAD_S
+        is_halted = bool(self.statusword & _TARGET_REACHED) or abs(self.values[1]) <= _STANDSTILL_RAD_S
         return not is_halted
 
 

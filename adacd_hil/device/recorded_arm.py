@@ -16,6 +16,8 @@ Error frames change nothing. Of a cycle whose packet the logger dropped nothing 
 there on the states may differ until every counter and age has been renewed.
 """
 
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +27,6 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_watch import ArmWatch, follow_devices
 from adacd_hil.device.network import RESET_COMMUNICATION, START
-from adacd_hil.device.ordinary_cycles import FrameColumns, NotOrdinaryError, OrdinaryCycles, columns_of
 from adacd_hil.device.profile import place_devices
 from adacd_hil.records import JOINTS, ArmBatch, ArmState
 from adacd_hil.settings.configuration import Settings
@@ -33,7 +34,7 @@ from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import NMT_ID
 
-_Passed = list[tuple[bool, Frame]]
+_Passed = Iterable[tuple[bool, Frame]]
 """Frames in the order of the log, True for sent."""
 
 
@@ -41,8 +42,7 @@ class Ticks(NamedTuple):
     """The beginnings of n cycles, as columns (n,) of int64.
 
     `t_ns`: when SYNC went out or came, as all messages of the cycle carry it; so do its frames, as cycle_t_ns.
-    `periods`: since the cycle before, 1 unless some were skipped: one more than the step of /cycle's overruns. Where an
-    attempt begins again it is taken for 1, since the pause before it was meant.
+    `periods`: since the cycle before, 1 unless some were skipped; the pause before an attempt counts for none.
     """
 
     cycle: NDArray[np.int64]
@@ -51,20 +51,13 @@ class Ticks(NamedTuple):
 
 
 class RecordedArm:
-    """Turns what a log has of one run into what its arm reported, attempt after attempt.
-
-    `beginnings`: places in the last batch with which an attempt began. `exact_cycles`: how many cycles so far went
-    through the live classes; the others were read at once.
-    """
+    """Turns what a log has of one run into what its arm reported, attempt after attempt."""
 
     def __init__(self, settings: Settings, codec: Codec) -> None:
         """Place the devices. Raises ConfigError and CodecError as `Arm`."""
-        self.beginnings: list[int] = []
-        self.exact_cycles = 0
         self._settings, self._codec = settings, codec
         self._is_following = settings.bus.follows
         self._devices = place_devices(settings)
-        self._has_begun_again = False
         self._begin()
 
     def _begin(self) -> None:
@@ -73,8 +66,6 @@ class RecordedArm:
         self._arm = Arm(settings, self._codec, EmbeddedBus(VirtualClock()))  # with nobody on it
         self._heartbeats = follow_devices(self._devices, settings.bus.heartbeat_ms, lambda _: None)
         self._watch = ArmWatch(settings, self._heartbeats.watch)
-        self._ordinary = self._make_ordinary()
-        self._state: ArmState | None = None
         self._is_running = False
 
     def read(self, ticks: Ticks, frames: NDArray[Any]) -> ArmBatch:
@@ -83,85 +74,41 @@ class RecordedArm:
         `frames`: FRAME_DTYPE or LONG_FRAME_DTYPE of the log's reader. Consecutive calls take up a run piece by piece;
         what was logged after the last cycle of a piece may come with this call or with the next.
         """
-        batch = _empty_batch(ticks)
-        self.beginnings = []
-        columns = columns_of(frames)
-        at = place = 0
-        while place < len(batch.cycle):
-            cycles, at = self._skip(batch, place, columns, at)
-            place += cycles
-            first, end = self._find(columns, at, int(batch.t_ns[place]))
-            self._pass(_unpack(columns, at, first))
-            self._exchange(batch, place, _unpack(columns, first, end))
+        passed = _unpack(frames)
+        states: list[ArmState] = []
+        at = 0
+        for tick in zip(*(column.tolist() for column in ticks), *self._bounds(ticks, frames), strict=True):
+            cycle, t_ns, periods, sync, end = tick
+            self._pass(islice(passed, sync - at))
+            states.append(self._exchange(cycle, t_ns, periods, islice(passed, end - sync)))
             at = end
-            place += 1
-        self._pass(_unpack(columns, at, len(frames)))
-        return batch
+        self._pass(passed)
+        return _batch_of(states)
 
-    @staticmethod
-    def _find(columns: FrameColumns, at: int, t_ns: int) -> tuple[int, int]:
-        """Find the frames of a cycle, from `at` on: where they begin and end."""
-        rest = columns.cycle_t_ns[at:]
-        first, end = np.searchsorted(rest, t_ns, "left"), np.searchsorted(rest, t_ns, "right")
-        return at + int(first), at + int(end)
+    def _bounds(self, ticks: Ticks, frames: NDArray[Any]) -> tuple[list[int], list[int]]:
+        """Find the frames of n cycles, from SYNC on: where they begin and end.
 
-    def _make_ordinary(self) -> OrdinaryCycles | None:
-        """Make what reads ordinary cycles at once, where that is possible."""
-        try:
-            return OrdinaryCycles(self._settings, self._arm, self._heartbeats)
-        except NotOrdinaryError:
-            return None
-
-    def _skip(self, batch: ArmBatch, place: int, columns: FrameColumns, at: int) -> tuple[int, int]:
-        """Read ordinary cycles at once, as many as there are; return how many of them the live classes can do without.
-
-        Also return where the next frames begin. The last cycle that is ordinary goes through the live classes, so that
-        these stand where they would stand had they taken all.
+        Where SYNC was logged before the cycle's frames, they begin with the first of these.
         """
-        if self._ordinary is None or self._state is None:
-            return 0, at
-        stretch = self._ordinary.read(batch, place, columns, at, self._state)
-        skipped = stretch.cycles - 1
-        if skipped <= 0:
-            return 0, at
-        last = place + skipped - 1
-        self._arm.pass_by(skipped, int(batch.cycle[last]), int(batch.t_ns[last]))
-        for news, cycle in stretch.news:
-            ((_, frame),) = _unpack(columns, news, news + 1)
-            if not self._arm.accept_past(frame, cycle):
-                self._heartbeats.accept(frame)
-        return skipped, stretch.last
+        cycle_t_ns, is_tx = frames["cycle_t_ns"], frames["is_tx"]
+        is_sync = (frames["can_id"] == self._arm.sync_id) & (is_tx != self._is_following) & ~frames["is_error"]
+        syncs = np.flatnonzero(is_sync & (is_tx | (frames["t_ns"] == cycle_t_ns)))
+        first, end = (np.searchsorted(cycle_t_ns, ticks.t_ns, side) for side in ("left", "right"))
+        last = np.concatenate(([-1], syncs))[np.searchsorted(syncs, end)]
+        end = np.maximum.accumulate(end)  # also where a wall clock, by which SYNC was stamped, was set back
+        begin = np.maximum(np.maximum(first, last), np.concatenate(([0], end[:-1])))
+        return np.minimum(begin, end).tolist(), end.tolist()
 
-    def _exchange(self, batch: ArmBatch, place: int, passed: _Passed) -> None:
+    def _exchange(self, cycle: int, t_ns: int, periods: int, passed: _Passed) -> ArmState:
         """Do what Exchange.read did with the frames of a cycle, and judge the state as the cycle did."""
-        t_ns = int(batch.t_ns[place])
-        sync_at = self._find_sync(passed, t_ns)
-        self._pass(passed[:sync_at])
         if not self._is_running:  # a log whose beginning was cut off
             self._start()
         arm = self._arm
-        if arm.cycle < 0:
-            self.beginnings.append(place)
-            if self._has_begun_again:
-                batch.periods[place] = 1
-        arm.synchronise(int(batch.cycle[place]), t_ns, int(batch.periods[place]))
-        for is_sent, frame in passed[sync_at:]:
+        arm.synchronise(cycle, t_ns, periods)
+        for is_sent, frame in passed:
             if not is_sent:
                 self._accept(frame, is_late=frame.t_ns < t_ns)
-        self._state = self._watch.judge(arm.state())
-        self.exact_cycles += 1
-        _put(batch, place, self._state)
-
-    def _find_sync(self, passed: _Passed, t_ns: int) -> int:
-        """Find SYNC among the frames of a cycle; 0 where it was logged before them."""
-        sync_id, is_following = self._arm.sync_id, self._is_following
-        places = [
-            place
-            for place, (is_sent, frame) in enumerate(passed)
-            if frame.can_id == sync_id and is_sent != is_following and not frame.is_error
-            if is_sent or frame.t_ns == t_ns
-        ]
-        return places[-1] if places else 0
+        return self._watch.judge(arm.state())
 
     def _pass(self, passed: _Passed) -> None:
         """Take frames that came before a SYNC."""
@@ -175,7 +122,6 @@ class RecordedArm:
         """Follow what the host told the devices: it does so at the beginning of an attempt and after its end only."""
         if nmt_command == RESET_COMMUNICATION and self._is_running:
             self._begin()
-            self._has_begun_again = True
         elif nmt_command == START and not self._is_running:
             self._start()
 
@@ -188,25 +134,21 @@ class RecordedArm:
             self._heartbeats.accept(frame)
 
 
-def _unpack(columns: FrameColumns, first: int, end: int) -> _Passed:
-    """Turn some recorded frames into those of a bus."""
-    if first == end:
-        return []
-    t_ns, _, can_id, is_tx, is_error, length, data = (column[first:end] for column in columns)
-    return [
-        (was_sent, Frame(identifier, payload[:size].tobytes(), stamp_ns, is_wrong))
-        for was_sent, identifier, payload, size, stamp_ns, is_wrong in zip(
-            is_tx.tolist(), can_id.tolist(), data, length.tolist(), t_ns.tolist(), is_error.tolist(), strict=True
-        )
-    ]
+def _unpack(frames: NDArray[Any]) -> Iterator[tuple[bool, Frame]]:
+    """Turn recorded frames into those of a bus."""
+    data = frames["data"].tobytes()
+    starts = range(0, len(data), frames["data"].shape[1])
+    columns = (frames[name].tolist() for name in ("is_tx", "can_id", "length", "t_ns", "is_error"))
+    for start, is_sent, can_id, length, t_ns, is_error in zip(starts, *columns, strict=True):
+        yield is_sent, Frame(can_id, data[start : start + length], t_ns, is_error)
 
 
-def _empty_batch(ticks: Ticks) -> ArmBatch:
-    count = len(ticks.cycle)
-    return ArmBatch(
-        cycle=np.array(ticks.cycle, np.int64),
-        t_ns=np.array(ticks.t_ns, np.int64),
-        periods=np.array(ticks.periods, np.int64),
+def _batch_of(states: list[ArmState]) -> ArmBatch:
+    """Lay the states of n cycles out as columns."""
+    count = len(states)
+    numbers = {name: np.empty(count, np.int64) for name in ("cycle", "t_ns", "periods", "steps", "sampled_ns")}
+    batch = ArmBatch(
+        **numbers,
         q=np.empty((count, JOINTS)),
         dq=np.empty((count, JOINTS)),
         tau_J=np.empty((count, JOINTS)),
@@ -216,12 +158,8 @@ def _empty_batch(ticks: Ticks) -> ArmBatch:
         is_complete=np.empty(count, np.bool_),
         fault=np.empty(count, np.uint8),
         is_late=np.empty(count, np.bool_),
-        steps=np.empty(count, np.int64),
-        sampled_ns=np.empty(count, np.int64),
     )
-
-
-def _put(batch: ArmBatch, place: int, state: ArmState) -> None:
     columns: tuple[NDArray[Any], ...] = batch
-    for column, value in zip(columns, state, strict=True):
-        column[place] = value
+    for column, values in zip(columns, zip(*states, strict=True), strict=bool(states)):
+        column[:] = values
+    return batch

@@ -81,13 +81,12 @@ def _plain(name: str) -> str:
 
 
 class Strangers(RateLimitedEvents):
-    """Hears them. `can_ids`: what only this host sends."""
+    """Hears them."""
 
     def __init__(self, settings: Settings, codec: Codec) -> None:
         super().__init__()
         self._doing = host_frames(settings, codec)
         self._nodes = {0, *(device.node_id for device in place_devices(settings))}
-        self.can_ids = frozenset(self._doing)
         self._hold_cycles = round(HOLD_S / settings.bus.period_s)
         self._window_cycles = max(1, round(CONTRADICTION_WINDOW_S / settings.bus.period_s))
         self._until_cycle = -2  # before any, the first of which is -1: none begun

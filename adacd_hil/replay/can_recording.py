@@ -143,6 +143,8 @@ def _complete(frames: NDArray[Any], sync: Places, can_ids: list[int]) -> Places:
 class RecordingAgainstLog(LogSource):
     """A recording's frames in the cycles of a run's log."""
 
+    is_recording = True
+
     def __init__(self, path: Path, against: Path) -> None:
         """Open both. Raises LogError, ConfigError, CodecError."""
         super().__init__(against)
@@ -152,15 +154,18 @@ class RecordingAgainstLog(LogSource):
         self._given = 0
         self._missing = 0
 
+    def _open(self, with_frames: bool) -> LogStream:  # noqa: ARG002 (the frames are the recording's)
+        return super()._open(with_frames=False)
+
     def _piece(self, piece: Piece) -> Piece:
         """Put the recording's frames in place of the log's, and leave out the cycles that it lacks."""
-        cycles = piece.series["/cycle"]
+        cycles = piece.series[self._partner]
         number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
         recording = self._recording
         is_there = np.isin(number, recording.number)
         self._missing += int((~is_there).sum())
         series = dict(piece.series)
-        for name in ("/cycle", "/scheme"):
+        for name in (self._partner, "/scheme"):
             records = series[name].records
             is_known = np.isin(records["publish_time"], cycles.records["publish_time"][is_there])
             series[name] = Series(records[is_known], self._stream.epoch_ns)
@@ -219,6 +224,9 @@ def _answers(frames: NDArray[Any], codec: Codec) -> dict[int, bytes]:
 class RecordingAlone:
     """A recording without a log: nothing to compare with, and a user whom the configuration's script plays."""
 
+    has_arms = False
+    is_recording = True
+
     def __init__(self, path: Path, settings: Settings, codec: Codec) -> None:
         """Read the recording. Raises LogError."""
         self._recording = load_recording(path, settings, codec)
@@ -240,7 +248,7 @@ class RecordingAlone:
         recording = self._recording
         return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
 
-    def __iter__(self) -> Iterator[Part]:
+    def parts(self, with_frames: bool) -> Iterator[Part]:  # noqa: ARG002 (there are only frames)
         """Give one part."""
         yield Part(list(self._stretches()), {}, (), frozenset())
 
@@ -262,7 +270,14 @@ class RecordingAlone:
                     number[start:kept], t_ns[start:kept], np.diff(number[start:kept], prepend=number[start] - 1)
                 )
                 yield CycleStretch(
-                    attempt=attempt, is_begin=True, is_exact=False, ticks=ticks, frames=mine, requests=None, scheme=None
+                    attempt=attempt,
+                    is_begin=True,
+                    is_exact=False,
+                    ticks=ticks,
+                    frames=mine,
+                    arms=None,
+                    requests=None,
+                    scheme=None,
                 )
 
     def notes(self) -> list[str]:

@@ -17,7 +17,9 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import SHOWN, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
-from adacd_hil.records import CERTIFICATE_EVENTS, ContactReport, SchemeState
+from adacd_hil.log.types.topics import ARM
+from adacd_hil.records import CERTIFICATE_EVENTS, ArmBatch, ContactReport, SchemeState
+from adacd_hil.replay.logged_arms import has_arms, logged_arms
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.codec import Codec, parse_codec
@@ -34,8 +36,8 @@ class CycleStretch(NamedTuple):
     """Cycles of one attempt that follow each other without a gap in the log.
 
     `attempt`: its number in the run, from 0; `is_begin`: it begins with this. `is_exact`: nothing of it is missing so
-    far, so that a replay has to come to the same. requests (n,) of Request, None where nobody knows them; scheme: the
-    records of /scheme (n,).
+    far, so that a replay has to come to the same. arms (n,): as the log has them, None where it doesn't. requests (n,)
+    of Request, None where nobody knows them; scheme: the records of /scheme (n,).
     """
 
     attempt: int
@@ -43,6 +45,7 @@ class CycleStretch(NamedTuple):
     is_exact: bool
     ticks: Ticks
     frames: NDArray[Any]
+    arms: ArmBatch | None
     requests: NDArray[np.uint8] | None
     scheme: Series | None
 
@@ -55,115 +58,184 @@ class LogGap(NamedTuple):
     missing: int
 
 
+class _Paired(NamedTuple):
+    """The records of n cycles, in order: /scheme's, and /arm's or, of an older log, /cycle's."""
+
+    scheme: NDArray[Any]
+    other: NDArray[Any]
+    has_arms: bool
+
+    @property
+    def number(self) -> Places:
+        """Number of each cycle."""
+        return np.asarray(self.other["cycle"].astype(np.int64))
+
+
+class _Rows(NamedTuple):
+    """Number of each of n cycles, periods since the one before, and how many cycles the log lacks in between."""
+
+    number: Places
+    periods: Places
+    missing: Places
+
+
 class AttemptSplitter:
-    """Splits the pieces of a log, in order."""
+    """Splits the pieces of a log, in order.
+
+    /arm says with which cycle an attempt began, and how many periods were skipped. Without it, an attempt begins with
+    the host's reset of communication, and skipped periods follow from /cycle's overruns and the counters of SYNC.
+    """
 
     def __init__(self, epoch_ns: int) -> None:
         self.gaps: list[LogGap] = []
         self.headless_cycles = 0
         """Cycles at the beginning of the log, of an attempt that had begun before: there is nothing to replay from."""
         self.unpaired = 0
-        """Records of /scheme and /cycle without the other one of their cycle."""
+        """Records of /scheme, /arm and /cycle without the other one of their cycle."""
         self._epoch_ns = epoch_ns
         self._frames: NDArray[Any] | None = None  # of an attempt whose first cycle is yet to come
         self._has_begun = False
         self._attempt = -1
         self._is_exact = False
-        self._last = (-1, 0, int(SchemeState.INIT))  # cycle, overruns and state before
+        self._last_cycle, self._overruns, self._state = -1, 0, int(SchemeState.INIT)  # of the cycle before
+        self._first_cycle = -1  # of its attempt
         self._tail = np.zeros(0, np.uint8)  # counters of the SYNCs after that cycle
 
     def split(self, piece: Piece) -> Iterator[CycleStretch]:
         """Give the stretches of the next piece."""
-        scheme, cycle = _paired(piece)
-        self.unpaired += len(piece.series["/scheme"]) + len(piece.series["/cycle"]) - 2 * len(cycle)
+        paired = self._pair(piece)
         frames = piece.frames
         if self._frames is not None:
             frames = _join(self._frames, frames)
             self._frames = None
-        resets = _resets(frames)
-        t_ns = cycle["publish_time"].astype(np.int64) - self._epoch_ns
-        begins = self._begins(t_ns, scheme, frames, resets)
+        t_ns = paired.other["publish_time"].astype(np.int64) - self._epoch_ns
+        begins = self._begins(t_ns, paired, frames)
         if len(begins) and begins[-1][0] == len(t_ns):
             self._frames = frames[begins[-1][1] :]
             frames = frames[: begins[-1][1]]
             begins = begins[:-1]
         if len(t_ns):
-            yield from self._stretches(t_ns, scheme, cycle, frames, dict(begins))
+            yield from self._stretches(t_ns, paired, frames, dict(begins))
 
-    def _begins(
-        self, t_ns: Places, scheme: NDArray[Any], frames: NDArray[Any], resets: Places
-    ) -> list[tuple[int, int]]:
+    def _pair(self, piece: Piece) -> _Paired:
+        """Return the records that belong to one cycle each; count the others."""
+        has_arms = ARM.name in piece.series
+        scheme = piece.series["/scheme"].records
+        other = piece.series[ARM.name if has_arms else "/cycle"].records
+        theirs, own = scheme["publish_time"], other["publish_time"]
+        if not np.array_equal(theirs, own):
+            _, first, second = np.intersect1d(theirs, own, return_indices=True)
+            self.unpaired += len(scheme) + len(other) - 2 * len(first)
+            scheme, other = scheme[first], other[second]
+        return _Paired(scheme, other, has_arms)
+
+    def _begins(self, t_ns: Places, paired: _Paired, frames: NDArray[Any]) -> list[tuple[int, int]]:
         """List the rows with which attempts begin, and the frame with which each does."""
         begins: dict[int, int] = {}
+        resets = _resets(frames)
         rows = np.searchsorted(t_ns, frames["cycle_t_ns"][resets])
         for row, place in zip(rows.tolist(), resets.tolist(), strict=True):
             begins[row] = place  # the last one, if the devices didn't answer to the first
-        before = np.concatenate(([self._last[2]], scheme["state"][:-1])) if len(scheme) else scheme["state"]
+        is_new = self._named_begins(paired) if paired.has_arms else self._shown_begins(paired.scheme)
+        for row in np.flatnonzero(is_new).tolist():
+            begins.setdefault(row, int(np.searchsorted(frames["cycle_t_ns"], t_ns[row])))
+        if paired.has_arms:
+            begins = {row: place for row, place in begins.items() if row == len(t_ns) or is_new[row]}
+        return sorted(begins.items())
+
+    def _named_begins(self, paired: _Paired) -> NDArray[np.bool_]:
+        """Say which cycles belong to another attempt than the one before (n,)."""
+        first = paired.other["first_cycle"].astype(np.int64)
+        is_new = np.diff(first, prepend=self._first_cycle) != 0
+        if len(first):
+            is_new[0] &= self._has_begun or first[0] == paired.other["cycle"][0] or self._first_cycle >= 0
+            self._first_cycle = int(first[-1])
+        return np.asarray(is_new)
+
+    def _shown_begins(self, scheme: NDArray[Any]) -> NDArray[np.bool_]:
+        """Say in which cycles the scheme begins anew, after a fault or with the log (n,)."""
+        before = np.concatenate(([self._state], scheme["state"][:-1])) if len(scheme) else scheme["state"]
         is_anew = (scheme["previous_state"] == SchemeState.INIT) & (scheme["state"] <= SchemeState.COMMISSION)
         is_after_fault = before == SchemeState.FAULT
         if not self._has_begun and len(scheme):
             is_after_fault[0] = True
-        for row in np.flatnonzero(is_anew & is_after_fault).tolist():
-            begins.setdefault(row, int(np.searchsorted(frames["cycle_t_ns"], t_ns[row])))
-        return sorted(begins.items())
+        return np.asarray(is_anew & is_after_fault)
 
     def _stretches(
-        self, t_ns: Places, scheme: NDArray[Any], cycle: NDArray[Any], frames: NDArray[Any], begins: dict[int, int]
+        self, t_ns: Places, paired: _Paired, frames: NDArray[Any], begins: dict[int, int]
     ) -> Iterator[CycleStretch]:
-        number = cycle["cycle"].astype(np.int64)
-        overruns = cycle["overruns"].astype(np.int64)
-        skipped = np.diff(overruns, prepend=self._last[1])
-        steps = np.diff(number, prepend=self._last[0])
-        is_begin = np.zeros(len(number), np.bool_)
+        is_begin = np.zeros(len(t_ns), np.bool_)
         is_begin[list(begins)] = True
-        is_jump = steps != 1 + skipped
-        is_cut = is_begin & (scheme["previous_state"] != SchemeState.INIT)  # its first cycles are missing
-        is_gap = is_jump & (~is_begin | is_cut)
-        if not self._has_begun and not is_begin[0]:
-            is_gap[0] = False
-        periods = np.where(is_gap & ~is_begin, np.maximum(steps, 1), np.maximum(1 + skipped, 1))
+        rows = (
+            self._read_periods(paired, is_begin)
+            if paired.has_arms
+            else self._count_periods(t_ns, paired, frames, begins, is_begin)
+        )
+        is_gap = rows.missing != 0
         cuts = np.flatnonzero(is_begin | is_gap).tolist()
-        bounds = sorted({0, *cuts, len(number)})
+        bounds = sorted({0, *cuts, len(t_ns)})
         places = [begins.get(row, int(np.searchsorted(frames["cycle_t_ns"], t_ns[row]))) for row in bounds[:-1]]
         places[0] = begins.get(0, 0)
-        for row, place in begins.items():
-            before = frames[: np.searchsorted(frames["cycle_t_ns"], t_ns[row - 1], "right")] if row else frames[:0]
-            counters = _sync_counters(frames[len(before) : place])
-            last = int(number[row - 1]) if row else self._last[0]
-            periods[row] -= _skipped(counters if row else np.concatenate((self._tail, counters)), last)
-        periods = np.maximum(periods, 1)
         for start, end, first, last in zip(bounds[:-1], bounds[1:], places, [*places[1:], len(frames)], strict=True):
             if is_begin[start]:
                 self._has_begun = self._is_exact = True
                 self._attempt += 1
             if is_gap[start]:
                 self._is_exact = False
-                self.gaps.append(LogGap(int(number[start]), int(t_ns[start]), int(steps[start] - 1 - skipped[start])))
+                self.gaps.append(LogGap(int(rows.number[start]), int(t_ns[start]), int(rows.missing[start])))
             if not self._has_begun:
                 self.headless_cycles += end - start
                 self._attempt = 0
                 continue
+            scheme, other = paired.scheme[start:end], paired.other[start:end]
+            ticks = Ticks(rows.number[start:end], t_ns[start:end], rows.periods[start:end])
             yield CycleStretch(
                 attempt=self._attempt,
                 is_begin=bool(is_begin[start]),
                 is_exact=self._is_exact,
-                ticks=Ticks(number[start:end], t_ns[start:end], periods[start:end]),
+                ticks=ticks,
                 frames=frames[first:last],
-                requests=scheme["request"][start:end],
-                scheme=Series(scheme[start:end], self._epoch_ns),
+                arms=logged_arms(scheme, other, ticks) if paired.has_arms else None,
+                requests=scheme["request"],
+                scheme=Series(scheme, self._epoch_ns),
             )
-        self._last = (int(number[-1]), int(overruns[-1]), int(scheme["state"][-1]))
+
+    def _read_periods(self, paired: _Paired, is_begin: NDArray[np.bool_]) -> _Rows:
+        """Take from /arm what was skipped, and what of it the log lacks."""
+        number, periods = paired.number, np.asarray(paired.other["periods"], np.int64)
+        steps = np.diff(number, prepend=self._last_cycle)
+        missing = np.where(is_begin, number - paired.other["first_cycle"].astype(np.int64), steps - periods)
+        if not self._has_begun and not is_begin[0]:
+            missing[0] = 0
+        self._last_cycle = int(number[-1])
+        return _Rows(number, np.where((missing != 0) & ~is_begin, np.maximum(steps, 1), periods), missing)
+
+    def _count_periods(
+        self,
+        t_ns: Places,
+        paired: _Paired,
+        frames: NDArray[Any],
+        begins: dict[int, int],
+        is_begin: NDArray[np.bool_],
+    ) -> _Rows:
+        """Count what was skipped by overruns, and for the first cycle of an attempt by the counters of SYNC, too."""
+        number, scheme = paired.number, paired.scheme
+        overruns = paired.other["overruns"].astype(np.int64)
+        skipped = np.diff(overruns, prepend=self._overruns)
+        steps = np.diff(number, prepend=self._last_cycle)
+        is_cut = is_begin & (scheme["previous_state"] != SchemeState.INIT)  # its first cycles are missing
+        missing = np.where(~is_begin | is_cut, steps - 1 - skipped, 0)
+        if not self._has_begun and not is_begin[0]:
+            missing[0] = 0
+        periods = np.where((missing != 0) & ~is_begin, np.maximum(steps, 1), np.maximum(1 + skipped, 1))
+        for row, place in begins.items():
+            before = frames[: np.searchsorted(frames["cycle_t_ns"], t_ns[row - 1], "right")] if row else frames[:0]
+            counters = _sync_counters(frames[len(before) : place])
+            last = int(number[row - 1]) if row else self._last_cycle
+            periods[row] -= _skipped(counters if row else np.concatenate((self._tail, counters)), last)
+        self._last_cycle, self._overruns, self._state = int(number[-1]), int(overruns[-1]), int(scheme["state"][-1])
         self._tail = _sync_counters(frames[np.searchsorted(frames["cycle_t_ns"], t_ns[-1], "right") :])
-
-
-def _paired(piece: Piece) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the records of /scheme and /cycle that belong to one cycle each, in order."""
-    scheme, cycle = piece.series["/scheme"].records, piece.series["/cycle"].records
-    theirs, own = scheme["publish_time"], cycle["publish_time"]
-    if np.array_equal(theirs, own):
-        return scheme, cycle
-    _, first, second = np.intersect1d(theirs, own, return_indices=True)
-    return scheme[first], cycle[second]
+        return _Rows(number, np.maximum(periods, 1), missing)
 
 
 def _join(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
@@ -196,7 +268,7 @@ def _resets(frames: NDArray[Any]) -> Places:
 
 
 FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
-TOPICS: Final = (*FRAME_TOPICS, "/scheme", "/cycle", "/contact", "/events")
+_TOPICS: Final = ("/scheme", "/contact", "/events")
 CYCLES_PER_PIECE: Final = 8_000
 _SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
 _SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
@@ -204,14 +276,19 @@ _SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
 
 
 class ReplaySource(Protocol):
-    """Where stretches come from: a log of ours, or a recording by others. Iterated once; notes are complete then."""
+    """Where stretches come from: a log of ours, or a recording by others. Read once; notes are complete then.
+
+    has_arms: whether stretches have the arm's states. is_recording: the frames are others' and are always decoded.
+    """
 
     settings: Settings
     codec: Codec
     metadata: Mapping[str, str]
+    has_arms: bool
+    is_recording: bool
 
-    def __iter__(self) -> Iterator["Part"]:
-        """Give the parts, in order."""
+    def parts(self, with_frames: bool) -> Iterator["Part"]:
+        """Give the parts, in order. with_frames: stretches have their frames, else none."""
 
     @property
     def start_ns(self) -> int:
@@ -233,18 +310,28 @@ class Part(NamedTuple):
 class LogSource:
     """A log of ours."""
 
+    is_recording = False
+
     def __init__(self, path: Path, cycles_per_piece: int = CYCLES_PER_PIECE) -> None:
         """Open the log. Raises LogError, ConfigError, CodecError."""
-        self._stream = LogStream(path, TOPICS, cycles_per_piece, is_ahead=False)  # replay reads in a thread
+        self.has_arms = has_arms(path)
+        self._partner = ARM.name if self.has_arms else "/cycle"
         self._path = path
+        self._cycles_per_piece = cycles_per_piece
+        self._stream = self._open(with_frames=False)
         self.metadata: Mapping[str, str] = self._stream.metadata
         self.settings = settings_of(path, self._stream.attachments)
         self.codec = codec_of(path, self._stream.attachments)
         self._said = _SAID if _has_anchors(self._stream.attachments) else _SAID_BEFORE_ANCHORS
         self._splitter = AttemptSplitter(self._stream.epoch_ns)
 
-    def __iter__(self) -> Iterator[Part]:
-        """Give the parts, in order."""
+    def _open(self, with_frames: bool) -> LogStream:
+        topics = (*_TOPICS, self._partner, *(FRAME_TOPICS if with_frames else ()))
+        return LogStream(self._path, topics, self._cycles_per_piece, is_ahead=False)  # replay reads in a thread
+
+    def parts(self, with_frames: bool) -> Iterator[Part]:
+        """Give the parts, in order. with_frames: stretches have their frames, else none."""
+        self._stream = self._open(with_frames)
         for read in self._stream:
             piece = self._piece(read)
             events = [logged for logged in self._stream.events(piece) if logged.event.name in self._said]
@@ -278,7 +365,7 @@ class LogSource:
         if len(splitter.gaps) > SHOWN:
             notes.append(f"and {len(splitter.gaps) - SHOWN} more gaps")
         if splitter.unpaired:
-            notes.append(f"{splitter.unpaired} records of /scheme or /cycle lack the other one of their cycle")
+            notes.append(f"{splitter.unpaired} records of /scheme or {self._partner} lack the other one of their cycle")
         return notes
 
 

@@ -1,4 +1,8 @@
-"""Replay: the raw frames of a log once more through codec, arm and scheme, and the result beside the log.
+"""Replay: the arm's states of a log once more through the scheme, and the result beside the log.
+
+The log has the states in /arm and /scheme. Its frames are decoded by the arm's live classes where it lacks them, as
+logs of earlier versions and recordings do, where other settings of the arm would make other states of the frames, and
+where that is to be proved: then each state is compared with the logged one, too.
 
 The log is read in pieces, in constant memory. Each attempt of the run has an arm and a pipeline of its own, as it had
 on the arm. The log has the user's requests and the motion of the arm: a replay with other settings decides otherwise
@@ -35,7 +39,6 @@ from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch, arm_at
 from adacd_hil.score.emulator_truth import TrueContacts, contacts_beside
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.codec import Codec
 
 SCRIPTED: Final = "script"
 """Of a log's metadata `operator`: nobody could type anything."""
@@ -89,7 +92,7 @@ class _DecodedPart(NamedTuple):
 
 
 class _Player:
-    """One variant on its way through the log."""
+    """One variant on its way through the log. checks_arms: its states were decoded, and are compared with the log's."""
 
     def __init__(
         self,
@@ -97,6 +100,7 @@ class _Player:
         truth: TrueContacts | None,
         comparison: SchemeComparison | None,
         asking: Asking | None,
+        checks_arms: bool,
     ) -> None:
         self.settings = settings
         self.cycles = self.monitored = 0  # in the stretch
@@ -105,6 +109,7 @@ class _Player:
         self.gatherer = OutcomeGatherer(settings, truth)
         self.attempts = 0
         self._asking = asking
+        self._checks_arms = checks_arms
         self._pipeline: Pipeline = Pipeline(settings)
         self._state = SchemeState.INIT
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
@@ -125,12 +130,13 @@ class _Player:
         if is_told:
             self.cycles += len(ticks.cycle)
             self.monitored += int(np.count_nonzero(batch.state == SchemeState.MONITOR))
-            self._compare(stretch, batch, asked, part, events)
+            self._compare(stretch, arms, batch, asked, part, events)
         return batch
 
     def _compare(
         self,
         stretch: CycleStretch,
+        arms: ArmBatch,
         batch: SchemeBatch,
         asked: NDArray[np.uint8] | None,
         part: Part,
@@ -140,6 +146,8 @@ class _Player:
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
         ticks = stretch.ticks
+        if self._checks_arms and stretch.arms is not None:
+            self.comparison.compare_arms(stretch.arms, arms, ticks)
         self.comparison.compare(stretch.scheme, ticks, batch)
         if asked is None:  # whatever a user could ask is believed
             asked = _known(stretch.requests)
@@ -206,11 +214,13 @@ def replay_source(
     shown: int = SHOWN,
     watch: Watch | None = None,
     stretch: TimeWindow = WHOLE,
+    by_frames: bool = False,
 ) -> list[Replay]:
     """Replay what a source gives, once for each of the settings; shown: mismatches that are kept.
 
-    stretch: what is compared and told; watch sees all from the beginning of the log on. Raises LogError, also when
-    nothing in the stretch can be replayed, ConfigError, CodecError.
+    stretch: what is compared and told; watch sees all from the beginning of the log on. by_frames: decode the frames
+    and compare each state with the log's. Raises LogError, also when nothing in the stretch can be replayed,
+    ConfigError, CodecError.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
@@ -220,27 +230,32 @@ def replay_source(
     for settings in variants:
         comparison = SchemeComparison(settings, tolerance, shown) if settings == source.settings else None
         asking = Asking(settings, script_of) if is_scripted and script_of is not None else None
-        players.append(_Player(settings, truth, comparison, asking))
-    decoders = _Decoders(source.codec, variants)
+        players.append(_Player(settings, truth, comparison, asking, by_frames))
+    reader = _ArmReader(source, variants, by_frames)
+    if not by_frames and (reason := why_frames(source, variants)):
+        progress(reason)
     done = 0
     milestones = Milestones(lambda count: progress(f"{count} cycles replayed"), _PROGRESS_CYCLES)
-    for part in _one_ahead(_decoded(source, decoders, bounds_ns[1])):
+    for part in _one_ahead(_decoded(source, reader, bounds_ns[1])):
         done += _replay_part(part, players, bounds_ns, watch)
         milestones.reach(done)
     if not stretch.is_whole and not players[0].cycles:
         raise LogError(f"the log has no cycle {stretch.text} that can be replayed")
-    return [_result(player, source, tolerance, bounds_ns[0]) for player in players]
+    notes = source.notes()
+    if by_frames and not source.has_arms:
+        notes.append("the log has no /arm: what its frames were taken for can't be compared, only the decisions")
+    return [_result(player, source, notes, tolerance, bounds_ns[0]) for player in players]
 
 
-def _decoded(source: ReplaySource, decoders: "_Decoders", end_ns: int) -> Generator[_DecodedPart]:
-    """Read and decode a source part by part, up to the stretch that has the end of what is told."""
-    for part in source:
+def _decoded(source: ReplaySource, reader: "_ArmReader", end_ns: int) -> Generator[_DecodedPart]:
+    """Read a source part by part, up to the stretch that has the end of what is told."""
+    for part in source.parts(reader.needs_frames):
         stretches: list[CycleStretch] = []
         arms: list[list[ArmBatch]] = []
         is_over = False
         for stretch in part.stretches:
             stretches.append(stretch)
-            arms.append(decoders.read(stretch))
+            arms.append(reader.read(stretch))
             is_over = bool(stretch.ticks.t_ns[-1] >= end_ns)
             if is_over:
                 break
@@ -310,18 +325,27 @@ def _rows_of(stretch: CycleStretch, rows: slice) -> CycleStretch:
     return stretch._replace(
         is_begin=stretch.is_begin and rows.start == 0,
         ticks=Ticks(*(column[rows] for column in stretch.ticks)),
+        arms=None if stretch.arms is None else _arms_of(stretch.arms, rows),
         requests=None if requests is None else requests[rows],
         scheme=None if scheme is None else scheme.part(rows),
     )
 
 
-class _Decoders:
-    """Recorded arms: one for all settings that make the same of the frames."""
+class _ArmReader:
+    """Gives the arm's states: the log's, or those of frames, decoded once for all settings that make the same of them.
 
-    def __init__(self, codec: Codec, variants: Sequence[Settings]) -> None:
-        self._codec = codec
+    needs_frames: whether any are decoded.
+    """
+
+    def __init__(self, source: ReplaySource, variants: Sequence[Settings], by_frames: bool) -> None:
+        self._codec = source.codec
         self._keys = [_decoding_key(settings) for settings in variants]
         self._settings = dict(zip(self._keys, variants, strict=True))
+        self._logged_key: Any = None
+        if source.has_arms and not (source.is_recording or by_frames):
+            self._logged_key = _decoding_key(source.settings)
+            self._settings.pop(self._logged_key, None)
+        self.needs_frames = bool(self._settings)
         self._arms: dict[Any, RecordedArm] = {}
 
     def read(self, stretch: CycleStretch) -> list[ArmBatch]:
@@ -329,19 +353,35 @@ class _Decoders:
         if stretch.is_begin:
             self._arms = {key: RecordedArm(settings, self._codec) for key, settings in self._settings.items()}
         batches = {key: arm.read(stretch.ticks, stretch.frames) for key, arm in self._arms.items()}
+        if self._logged_key is not None and stretch.arms is not None:
+            batches[self._logged_key] = stretch.arms
         return [batches[key] for key in self._keys]
+
+
+def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
+    """Say why frames must be decoded, which takes longer, one line; empty where the log's states serve."""
+    if source.is_recording:
+        return ""
+    if not source.has_arms:
+        return "the log has no /arm, as those of earlier versions: its frames are decoded, which takes longer"
+    own = _decoding_key(source.settings)
+    if all(_decoding_key(settings) == own for settings in variants):
+        return ""
+    return "a setting is another by which the arm takes its frames: they are decoded, which takes longer"
 
 
 def _decoding_key(settings: Settings) -> Any:
     """Return what of the settings the arm goes by."""
     arm = settings.arm
-    shape = (arm.sign, arm.zero_deg, arm.torque_offset_Nm, arm.rated_torque_Nm, arm.torque_limit_Nm)
+    shape = (arm.sign, arm.zero_deg, arm.torque_offset_Nm, settings.safety.tolerated_emergencies)
     return (*shape, settings.bus, settings.devices, settings.realtime)
 
 
-def _result(player: _Player, source: ReplaySource, tolerance: float, first_ns: int) -> Replay:
+def _result(
+    player: _Player, source: ReplaySource, source_notes: Sequence[str], tolerance: float, first_ns: int
+) -> Replay:
     """Sum up what a player came to from a time on."""
-    gatherer, comparison, notes = player.gatherer, player.comparison, list(source.notes())
+    gatherer, comparison, notes = player.gatherer, player.comparison, list(source_notes)
     gatherer.end()
     score = gatherer.score()
     score = None if score is None else score.since(first_ns)
@@ -359,6 +399,7 @@ def _result(player: _Player, source: ReplaySource, tolerance: float, first_ns: i
         cycles=player.cycles,
         monitored_s=player.monitored * player.settings.bus.period_s,
         compared=0 if comparison is None else comparison.cycles,
+        arms_compared=0 if comparison is None else comparison.arms,
         attempts=player.attempts,
         states=tuple(each for each in gatherer.transitions if each.t_ns >= first_ns),
         contacts=tuple(each for each in gatherer.reports if each.t_ns >= first_ns),

@@ -201,16 +201,18 @@ class Replay:
     """The outcome of one replay.
 
     cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 where the settings
-    are not the log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
-    `mismatched_fields`. parameters: of the end. score: of contacts and alarms that begin in the stretch, None where the
-    truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one.
-    ending: the last change of state, which may be before the stretch. attempts, sight: from the beginning of the log.
+    are not the log's. arms_compared: cycles whose state, made of the frames, was compared with the log's. monitored_s:
+    in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`.
+    parameters: of the end. score: of contacts and alarms that begin in the stretch, None where the truth is not known.
+    adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one. ending: the last change of
+    state, which may be before the stretch. attempts, sight: from the beginning of the log.
     """
 
     settings: Settings
     cycles: int
     monitored_s: float
     compared: int
+    arms_compared: int
     attempts: int
     states: tuple[StateChange, ...]
     contacts: tuple[LoggedContact, ...]

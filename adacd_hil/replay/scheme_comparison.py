@@ -1,5 +1,7 @@
 """A replay's decisions against the log's: every field of /scheme, every contact report, events, the user's requests.
 
+States of the arm that were decoded from the frames once more must equal those of /arm to the bit, on every machine.
+
 Two values are the same if they have the same bits. Between machines whose arithmetic differs (`different_arithmetic`) a
 real value may be off by `TOLERANCE` of the largest one that its field has had so far, and by as much of one unit; then,
 too, counts, names, switches, and values that are infinite or not a number have to be the same.
@@ -12,7 +14,7 @@ import itertools
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -22,7 +24,7 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError, arithmetic
 from adacd_hil.log.logged_run import SHOWN, Mismatch
 from adacd_hil.log.reader import LoggedEvent, Series
-from adacd_hil.records import JOINTS, ContactReport, Event, Layout, Request, SchemeState, Vector
+from adacd_hil.records import JOINTS, ArmBatch, ContactReport, Event, Layout, Request, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import KeptRequest
 from adacd_hil.settings.configuration import Settings
@@ -30,6 +32,7 @@ from adacd_hil.settings.run_settings import OperatorSettings
 
 TOLERANCE: Final = 1e-9
 """Least squares over a minute amplify a rounding error of 1e-16 by the condition number, up to 1e6."""
+_JOINTS: Final = tuple(f"joint {joint + 1}" for joint in range(JOINTS))
 _HEAD: Final = ("cycle", "state", "previous_state", "fault", "contact_joints", "is_model_valid")
 
 
@@ -53,7 +56,7 @@ class SchemeComparison:
         self.mismatches: list[Mismatch] = []
         self.count = 0
         self.fields: Counter[str] = Counter()
-        self.cycles = 0
+        self.cycles = self.arms = 0  # cycles whose decisions, and whose arms, were compared
         self.missing_fields: list[str] = []
         """Fields that the log's format lacks."""
         self._shown = shown
@@ -81,7 +84,7 @@ class SchemeComparison:
     def _compare_whole(self, name: str, logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks) -> None:
         is_other = np.asarray(logged != replayed)
         if is_other.any():
-            self._note(name, is_other[:, np.newaxis], logged[:, np.newaxis], replayed[:, np.newaxis], ticks)
+            self._note("/scheme", name, is_other, logged, replayed, ticks)
 
     def _compare_reals(self, name: str, logged: Vector, replayed: Vector, ticks: Ticks) -> None:
         """Compare a field of the block (n, k)."""
@@ -91,7 +94,7 @@ class SchemeComparison:
         if self._tolerance:
             is_other &= ~self._is_near(name, logged, replayed)
         if is_other.any():
-            self._note(name, is_other, logged, replayed, ticks)
+            self._note("/scheme", name, is_other, logged, replayed, ticks)
 
     def _is_near(self, name: str, logged: Vector, replayed: Vector) -> NDArray[np.bool_]:
         finite = np.where(np.isfinite(logged), np.abs(logged), 0.0)
@@ -101,17 +104,35 @@ class SchemeComparison:
             is_near = np.abs(logged - replayed) <= self._tolerance * scale
         return np.asarray(is_near | (logged == replayed) | (np.isnan(logged) & np.isnan(replayed)))
 
+    def compare_arms(self, logged: ArmBatch, decoded: ArmBatch, ticks: Ticks) -> None:
+        """Compare the states of n cycles, as the log has them, with those made of its frames."""
+        self.arms += len(ticks.cycle)
+        for name in ArmBatch._fields:
+            theirs: NDArray[Any] = getattr(logged, name)
+            ours: NDArray[Any] = getattr(decoded, name)
+            bits = np.uint64 if theirs.dtype == np.float64 else theirs.dtype
+            is_other = np.asarray(theirs.view(bits) != ours.view(bits))
+            if is_other.any():
+                self._note("/arm", name, is_other, theirs, ours, ticks)
+
     def _note(
-        self, name: str, is_other: NDArray[np.bool_], logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks
+        self,
+        topic: str,
+        name: str,
+        is_other: NDArray[np.bool_],
+        logged: NDArray[Any],
+        replayed: NDArray[Any],
+        ticks: Ticks,
     ) -> None:
-        """Count what differs (n, k), and keep the first of it."""
+        """Count what differs, (n,) or (n, k), and keep the first of it."""
+        is_other, logged, replayed = (each.reshape(len(each), -1) for each in (is_other, logged, replayed))
         rows, columns = np.nonzero(is_other)
         self.count += len(rows)
-        self.fields[f"/scheme.{name}"] += len(rows)
+        self.fields[f"{topic}.{name}"] += len(rows)
         for row, column in zip(rows[: self._shown].tolist(), columns[: self._shown].tolist(), strict=True):
-            place = self._names[name][column] if name in self._names else ""
+            names = self._names.get(name, ("",) if logged.shape[1] == 1 else _JOINTS)
             values = (_text(side[row, column].item()) for side in (logged, replayed))
-            self._keep(Mismatch("/scheme", name, place, int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
+            self._keep(Mismatch(topic, name, names[column], int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
 
     def add(self, mismatch: Mismatch) -> None:
         """Count a mismatch that was found elsewhere."""
@@ -187,7 +208,6 @@ def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Itera
 
 def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...]]:
     """Name the values of every field of the block."""
-    joints = tuple(f"joint {joint + 1}" for joint in range(JOINTS))
     parameters, further = settings.estimator.parameter_names, settings.further_names
     named = {
         "theta_hat": parameters,
@@ -195,16 +215,16 @@ def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...
         "theta_further": further,
         "theta_std": (*parameters, *further),
     }
-    return {field.name: _names_of(field.name, field.size, named, joints) for field in layout.fields}
+    return {field.name: _names_of(field.name, field.size, named) for field in layout.fields}
 
 
-def _names_of(name: str, size: int, named: Mapping[str, Sequence[str]], joints: Iterable[str]) -> tuple[str, ...]:
+def _names_of(name: str, size: int, named: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     if name in named:
         return tuple(named[name])
     if size == 1:
         return ("",)
     if size == JOINTS:
-        return tuple(joints)
+        return _JOINTS
     return tuple(f"channel {index // JOINTS + 1}, joint {index % JOINTS + 1}" for index in range(size))
 
 

@@ -1,29 +1,16 @@
-"""The table of a message's signals, from which all codecs are made, and the column codec: many frames at a time.
+"""The table of a message's signals, from which both codecs are made, and the column codec: many frames at a time.
 
 A signal is a whole container of 1, 2, 4 or 8 bytes, or bits of one byte; containers cover the frame without gaps.
-`value = raw * scale + offset`, each step rounded to float64. So all codecs give the same values, bit for bit:
-`MessageCodec` (adacd_hil.wire.codec) for one frame, `ColumnCodec` for an array of frames, `adacd_hil.wire.cyclic_codec`
-for the frames of a cycle in compiled code.
+`value = raw * scale + offset`, each step rounded to float64. So both codecs give the same values, bit for bit:
+`MessageCodec` (adacd_hil.wire.codec) for one frame, `ColumnCodec` for an array of frames.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-SIGNAL_ROW = np.dtype(
-    [
-        ("byte", np.int64),  # where its container begins
-        ("size", np.int64),  # bytes of the container
-        ("shift", np.int64),  # of its lowest bit within the container, where it has a mask
-        ("mask", np.int64),  # its bits after the shift; 0: the whole container
-        ("is_signed", np.int64),  # numba has no arrays of bool in a structure
-        ("scale", np.float64),
-        ("offset", np.float64),
-    ]
-)
 
 
 @dataclass(frozen=True)
@@ -75,30 +62,24 @@ def plain_tables(messages: Iterable[MessageTable]) -> tuple[MessageTable, ...]:
     return tuple(MessageTable(one.name, one.can_id, one.length, one.signals) for one in messages)
 
 
-def signal_rows(signals: Sequence[SignalCodec]) -> NDArray[Any]:
-    """Lay the signals of a message out as rows (s,) of SIGNAL_ROW."""
-    sizes = {signal.container: signal.size for signal in signals}
-    begins = {container: sum(sizes[before] for before in range(container)) for container in sizes}
-    return np.array(
-        [(begins[s.container], s.size, s.shift, s.mask, s.is_signed, s.scale, s.offset) for s in signals], SIGNAL_ROW
-    )
-
-
 class ColumnCodec:
     """Decodes the frames of one message."""
 
     def __init__(self, message: MessageTable) -> None:
         self.length = message.length
         self.count = len(message.signals)
-        self._rows = signal_rows(message.signals).tolist()
+        sizes = {signal.container: signal.size for signal in message.signals}
+        self._begins = {container: sum(sizes[before] for before in range(container)) for container in sizes}
+        self._signals = message.signals
 
     def decode(self, data: NDArray[np.uint8], values: NDArray[np.float64]) -> None:
         """Decode `data` (n, length), each row in one piece, into `values` (n, signals)."""
-        for column, (byte, size, shift, mask, is_signed, scale, offset) in enumerate(self._rows):
-            form = f"<{'i' if is_signed and not mask else 'u'}{size}"
-            raw: NDArray[Any] = data[:, byte : byte + size].view(form)[:, 0]
+        for column, signal in enumerate(self._signals):
+            begin, size, mask = self._begins[signal.container], signal.size, signal.mask
+            form = f"<{'i' if signal.is_signed and not mask else 'u'}{size}"
+            raw: NDArray[Any] = data[:, begin : begin + size].view(form)[:, 0]
             if mask:
-                raw = (raw.astype(np.int64) >> shift) & mask
-                if is_signed:
+                raw = (raw.astype(np.int64) >> signal.shift) & mask
+                if signal.is_signed:
                     raw -= (raw > mask >> 1) * np.int64(mask + 1)
-            values[:, column] = raw.astype(np.float64) * scale + offset
+            values[:, column] = raw.astype(np.float64) * signal.scale + signal.offset

@@ -29,12 +29,12 @@ def _crc8_table() -> bytes:
     return bytes(table)
 
 
-TABLE_8 = _crc8_table()
+_TABLE_8 = _crc8_table()
 
 
 def crc8(data: bytes | bytearray, data_id: int) -> int:
     """Compute the Profile 2 CRC of a frame whose bytes 1… are `data[1:]`."""
-    table = TABLE_8
+    table = _TABLE_8
     crc = 0xFF
     for byte in data[1:]:
         crc = table[crc ^ byte]
@@ -159,11 +159,6 @@ class E2eReceiver:
         """Number of values of the counter; 0 without counter."""
         return 0
 
-    @property
-    def counter(self) -> int | None:
-        """Counter of the last frame; None before the first, after a frame out of sequence, or without counter."""
-        return None
-
     def check(self, frame: bytes) -> E2eStatus:
         """Check one frame and return its status; use its values only if the status is valid."""
         status = self.status = self._judge(frame)
@@ -196,16 +191,6 @@ class E2eReceiver:
     def restart(self) -> None:
         """Forget the sequence: the next frame with a right CRC starts a new one. The counts stay."""
 
-    def skip(self, count: int) -> None:
-        """Count so many frames as OK that were checked elsewhere; the next frame with a right CRC starts a sequence."""
-        self.counts[E2eStatus.OK] += count
-        self.restart()
-
-    def follow(self) -> None:
-        """Count the next frame in sequence as OK, checked elsewhere; requires `counter` other than None."""
-        self.counts[E2eStatus.OK] += 1
-        self.status = E2eStatus.OK
-
     def _judge(self, frame: bytes) -> E2eStatus:  # noqa: ARG002
         return E2eStatus.OK
 
@@ -227,16 +212,6 @@ class _SequenceReceiver(E2eReceiver):
         self._last: int | None = None
         self._missing = 0
         self._to_sync = 0
-
-    @property
-    def counter(self) -> int | None:
-        """Counter of the last frame; None before the first and after a frame out of sequence."""
-        return self._last if self._missing == self._to_sync == 0 else None
-
-    def follow(self) -> None:
-        """Count the next frame in sequence as OK, checked elsewhere; requires `counter` other than None."""
-        super().follow()
-        self._last = ((self._last or 0) + 1) % self.counter_range
 
     def _note_silence(self) -> None:
         self._missing += 1
@@ -281,11 +256,6 @@ class Profile2Receiver(_SequenceReceiver):
         self._max_delta = self._tolerance.max_delta
 
     @property
-    def counter(self) -> int | None:
-        """Counter of the last frame; None before the first and after a frame out of sequence."""
-        return super().counter if self._max_delta == self._tolerance.max_delta else None
-
-    @property
     def counter_range(self) -> int:
         """Number of values of the counter."""
         return _COUNTER_MASK_2 + 1
@@ -301,15 +271,11 @@ class Profile2Receiver(_SequenceReceiver):
         return len(frame) == self._length and frame[0] == crc8(frame, self._data_ids[frame[1] & _COUNTER_MASK_2])
 
     def _note_silence(self) -> None:
-        self._widen()
+        self._max_delta += 1
         self._missing += 1
 
-    def _widen(self) -> None:
-        if self._max_delta < _COUNTER_MASK_2:
-            self._max_delta += 1
-
     def _judge(self, frame: bytes) -> E2eStatus:
-        self._widen()
+        self._max_delta += 1
         if not self.is_signed(frame):
             return E2eStatus.WRONG_CRC
         counter = frame[1] & _COUNTER_MASK_2

@@ -47,11 +47,13 @@ Change = Callable[[Piece], Piece]
 
 
 class ChangedLog(LogSource):
-    """A log of which something was changed after it was written."""
+    """A log of which something was changed after it was written. is_old: as if it had no /arm."""
 
-    def __init__(self, path: Path, change: Change, cycles_per_piece: int = 20_000) -> None:
+    def __init__(self, path: Path, change: Change, cycles_per_piece: int = 20_000, is_old: bool = False) -> None:
         super().__init__(path, cycles_per_piece)
         self._change = change
+        if is_old:
+            self.has_arms, self._partner = False, "/cycle"
 
     def _piece(self, piece: Piece) -> Piece:
         return self._change(piece)
@@ -84,11 +86,12 @@ def without_cycles(first: int, last: int) -> Change:
     """Drop the cycles from one number up to another, frames and all."""
 
     def change(piece: Piece) -> Piece:
-        cycles = piece.series["/cycle"]
+        partner = "/arm" if "/arm" in piece.series else "/cycle"
+        cycles = piece.series[partner]
         number = cycles["cycle"].astype(np.int64)
         lost = (number >= first) & (number < last)
         gone = cycles.records["publish_time"][lost]
-        for topic in ("/scheme", "/cycle", "/contact"):
+        for topic in ("/scheme", partner, "/contact"):
             records = piece.series[topic].records
             piece = with_records(piece, topic, records[~np.isin(records["publish_time"], gone)])
         frames = piece.frames

@@ -30,6 +30,43 @@ def piece(rows, frames=(), dtype=FRAME_DTYPE) -> Piece:
     return Piece({"/scheme": Series(scheme, 0), "/cycle": Series(cycle, 0)}, passed, {})
 
 
+def piece_of_arms(rows, frames=()) -> Piece:
+    """Rows: cycle, the attempt's first cycle, periods."""
+    whole = piece([(number, 0, N, N) for number, _, _ in rows], frames)
+    arm = np.zeros(len(rows), DTYPES["/arm"])
+    arm["publish_time"] = whole.series["/cycle"].records["publish_time"]
+    for name, values in zip(("cycle", "first_cycle", "periods"), zip(*rows, strict=True), strict=True):
+        arm[name] = values
+    return whole._replace(series={"/scheme": whole.series["/scheme"], "/arm": Series(arm, 0)})
+
+
+def test_of_states_of_the_arm_attempts_gaps_and_periods_are_as_they_say() -> None:
+    splitter = AttemptSplitter(0)
+    rows = [(0, 0, 1), (1, 0, 1), (4, 0, 3), (9, 0, 2), (20, 18, 1), (21, 18, 1), (30, 30, 2)]
+    pieces = [piece_of_arms(rows[:3]), piece_of_arms(rows[3:5]), piece_of_arms(rows[5:])]
+    found = [stretch for each in pieces for stretch in splitter.split(each)]
+    assert [stretch.ticks.cycle.tolist() for stretch in found] == [[0, 1, 4], [9], [20], [21], [30]]
+    assert [stretch.ticks.periods.tolist() for stretch in found] == [[1, 1, 3], [5], [1], [1], [2]]
+    assert [stretch.attempt for stretch in found] == [0, 0, 1, 1, 2]
+    assert [stretch.is_begin for stretch in found] == [True, False, True, False, True]
+    assert [stretch.is_exact for stretch in found] == [True, False, False, False, True]
+    assert [(gap.cycle, gap.missing) for gap in splitter.gaps] == [(9, 3), (20, 2)]
+
+
+def test_of_states_of_the_arm_what_begins_in_the_middle_is_left_out() -> None:
+    splitter = AttemptSplitter(0)
+    assert list(splitter.split(piece_of_arms([(700, 3, 1), (701, 3, 1)]))) == []
+    (after,) = splitter.split(piece_of_arms([(702, 3, 1), (720, 720, 1)]))
+    assert (splitter.headless_cycles, after.is_exact, after.attempt, splitter.gaps) == (3, True, 1, [])
+
+
+def test_the_frames_of_an_attempt_begin_with_its_reset_where_the_log_names_its_first_cycle() -> None:
+    frames = [(0, SYNC, 1), (1, SYNC, 2), (5, NMT, RESET), (9, NMT, RESET), (20, SYNC, 21)]
+    before, after = AttemptSplitter(0).split(piece_of_arms([(0, 0, 1), (1, 0, 1), (20, 20, 1)], frames))
+    assert before.frames["can_id"].tolist() == [SYNC, SYNC, NMT]
+    assert after.frames["can_id"].tolist() == [NMT, SYNC]
+
+
 def test_skipped_periods_are_no_gap() -> None:
     splitter = AttemptSplitter(0)
     (stretch,) = splitter.split(piece([(0, 0, N, N), (1, 0, N, M), (4, 2, M, M), (5, 2, M, M)]))

@@ -25,9 +25,9 @@ from firmware_sim.bench.bench_time import TruthLog
 pytestmark = pytest.mark.slow
 
 
-def changed(log: Path, change, cycles_per_piece: int = 20_000):
-    source = ChangedLog(log, change, cycles_per_piece)
-    return replay_source(source, [source.settings], script_of=ScriptedOperator, shown=50)[0]
+def changed(log: Path, change, cycles_per_piece: int = 20_000, is_old: bool = False, by_frames: bool = False):
+    source = ChangedLog(log, change, cycles_per_piece, is_old)
+    return replay_source(source, [source.settings], script_of=ScriptedOperator, shown=80, by_frames=by_frames)[0]
 
 
 def test_a_replay_comes_to_the_same_bits_through_contact_fault_and_recovery(log: Path, whole: Replay) -> None:
@@ -41,14 +41,72 @@ def test_a_replay_comes_to_the_same_bits_through_contact_fault_and_recovery(log:
     assert len(found.contacts) == len(read_log(log, ("/contact",)).contacts) > 0
 
 
-def test_where_the_log_is_cut_into_pieces_doesnt_matter(log: Path, whole: Replay) -> None:
-    found = changed(log, lambda piece: piece, cycles_per_piece=333)
+@pytest.mark.parametrize(("is_old", "by_frames"), [(False, False), (False, True), (True, False)])
+def test_where_the_log_is_cut_into_pieces_doesnt_matter(
+    log: Path, whole: Replay, is_old: bool, by_frames: bool
+) -> None:
+    found = changed(log, lambda piece: piece, 333, is_old, by_frames)
     assert (found.mismatches, found.attempts, found.notes) == ((), 2, ())
     assert found.states == whole.states
+    assert found.arms_compared == (whole.cycles if by_frames else 0)
+
+
+def said_of(source: LogSource, **changes: str) -> list[str]:
+    """Replay with changed settings; return what the replay says meanwhile."""
+    said: list[str] = []
+    replay_source(source, [source.settings, apply_settings(source.settings, changes)], progress=said.append)
+    return said
+
+
+def test_a_replay_that_must_decode_the_frames_says_why(log: Path) -> None:
+    assert said_of(LogSource(log), **{"detector.threshold_Nm": "0.3"}) == []
+    (why,) = said_of(LogSource(log), **{"safety.tolerated_emergencies": "[4096]"})
+    assert why.startswith("a setting is another by which the arm takes its frames")
+    (why,) = said_of(ChangedLog(log, lambda piece: piece, is_old=True), **{"detector.threshold_Nm": "0.3"})
+    assert why.startswith("the log has no /arm")
+
+
+def test_without_the_states_of_the_arm_a_proof_by_frames_is_not_whole(log: Path, whole: Replay) -> None:
+    found = changed(log, lambda piece: piece, is_old=True, by_frames=True)
+    assert (found.is_identical, found.arms_compared, found.compared) == (True, 0, whole.compared)
+    assert ["no /arm" in note for note in found.notes] == [True]
+
+
+ARM_FIELDS = ["steps", "sample_age_ns", "age_q", "age_tau_J", "is_enabled", "is_complete", "fault", "is_late"]
+
+
+def test_what_the_log_says_of_the_arm_otherwise_than_its_frames_is_named(log: Path) -> None:
+    def change(piece):
+        records = writable(piece.series["/arm"])
+        for place, name in enumerate(ARM_FIELDS):
+            flip(records, 300 + 7 * place, name)
+        return with_records(piece, "/arm", records)
+
+    found = changed(log, change, by_frames=True)
+    named = {"sample_age_ns": "sampled_ns"}
+    assert {(each.topic, each.field, each.cycle) for each in found.mismatches} == {
+        ("/arm", named.get(name, name), 300 + 7 * place) for place, name in enumerate(ARM_FIELDS)
+    }
+    by_field = {each.field: each for each in found.mismatches}
+    assert (by_field["age_q"].place, by_field["age_q"].logged, by_field["age_q"].replayed) == ("joint 1", "1", "0")
+    assert changed(log, change).arms_compared == 0
+
+
+def test_a_fault_of_the_arm_that_this_version_does_not_know_is_refused(log: Path) -> None:
+    def change(piece):
+        records = writable(piece.series["/arm"])
+        records["fault"][5] = 99
+        return with_records(piece, "/arm", records)
+
+    with pytest.raises(LogError, match=r"/arm has fault 99 in cycle 5,"):
+        changed(log, change)
 
 
 def test_every_flipped_bit_is_found_and_named(log: Path) -> None:
-    """A bit of every field of /scheme, of one value of each, each in a cycle of its own."""
+    """A bit of every field of /scheme, of one value of each, each in a cycle of its own.
+
+    q, dq and tau_J are what the scheme was given: that they are another is seen by the frames.
+    """
     fields = read_log(log, ("/scheme",)).scheme.records.dtype
     names = [name for name in fields.names if name not in ("record_length", "log_time", "publish_time", "sec")]
     places = {name: (300 + 7 * k, max(int(np.prod(fields[name].shape)), 1) - 1) for k, name in enumerate(names)}
@@ -59,12 +117,14 @@ def test_every_flipped_bit_is_found_and_named(log: Path) -> None:
             flip(records, row, name, element)
         return with_records(piece, "/scheme", records)
 
-    found = changed(log, change)
+    found = changed(log, change, by_frames=True)
     named = {"nanosec": "stamp_ns"}
+    measured = ("q", "dq", "tau_J")
     assert {(each.topic, each.field, each.cycle) for each in found.mismatches} == {
-        ("/scheme", named.get(name, name), row) for name, (row, _) in places.items()
+        *(("/scheme", named.get(name, name), row) for name, (row, _) in places.items()),
+        *(("/arm", name, places[name][0]) for name in measured),
     }
-    assert found.mismatch_count == len(names)
+    assert found.mismatch_count == len(names) + len(measured)
     by_field = {each.field: each for each in found.mismatches}
     assert by_field["q"].place == "joint 2"
     assert by_field["theta_hat"].place == "F_c2"
@@ -80,7 +140,7 @@ def test_an_nmt_frame_without_data_tells_nothing(log: Path, whole: Replay) -> No
         frames["length"][first] = 0
         return piece._replace(frames=frames)
 
-    assert changed(log, change).states == whole.states
+    assert changed(log, change, is_old=True).states == whole.states
 
 
 def at_s(log: Path, t_ns: int) -> float:
@@ -125,7 +185,7 @@ def test_only_what_differs_in_the_stretch_is_named(log: Path, row: int, count: i
 
     def change(piece):
         records = writable(piece.series["/scheme"])
-        flip(records, row, "tau_J")
+        flip(records, row, "tau_ext_hat")
         return with_records(piece, "/scheme", records)
 
     stretch = TimeWindow(at_s(log, scheme.t_ns[900] - 400_000), at_s(log, scheme.t_ns[1100] - 400_000))
@@ -175,8 +235,11 @@ def test_a_report_that_is_not_in_the_log_is_named(log: Path) -> None:
     assert (mismatch.name, mismatch.logged, mismatch.replayed) == ("/contact.report", "no report", "a report")
 
 
-def test_a_gap_is_said_and_what_follows_it_in_the_attempt_is_not_compared(log: Path, whole: Replay) -> None:
-    found = changed(log, without_cycles(700, 725), cycles_per_piece=1000)
+@pytest.mark.parametrize("is_old", [False, True])
+def test_a_gap_is_said_and_what_follows_it_in_the_attempt_is_not_compared(
+    log: Path, whole: Replay, is_old: bool
+) -> None:
+    found = changed(log, without_cycles(700, 725), cycles_per_piece=1000, is_old=is_old)
     number = read_log(log, ("/cycle",)).cycle["cycle"].astype(int)
     assert found.mismatches == ()
     assert found.compared == 700 + (number > number[np.argmax(np.diff(number))]).sum()
@@ -185,8 +248,9 @@ def test_a_gap_is_said_and_what_follows_it_in_the_attempt_is_not_compared(log: P
     assert not found.is_whole
 
 
-def test_of_a_log_that_begins_in_the_middle_the_next_attempt_is_compared(log: Path) -> None:
-    found = changed(log, without_cycles(0, 500), cycles_per_piece=1000)
+@pytest.mark.parametrize("is_old", [False, True])
+def test_of_a_log_that_begins_in_the_middle_the_next_attempt_is_compared(log: Path, is_old: bool) -> None:
+    found = changed(log, without_cycles(0, 500), cycles_per_piece=1000, is_old=is_old)
     assert found.attempts == 1 or found.compared < found.cycles
     assert found.mismatches == ()
     assert found.compared > 1000

@@ -107,7 +107,7 @@ def test_an_overtaken_frame_is_known_by_its_counter_once() -> None:
     assert [clock.is_straggler(behind) for behind in (2, 1, 2, 1)] == [True, True, False, False]
 
 
-def test_what_was_passed_by_was_answered() -> None:
+def test_a_device_that_begins_anew_owes_no_answer_from_before() -> None:
     clock = settled()
-    clock.pass_by(500)
+    clock.begin_anew(500)
     assert clock.find(501, USUAL_NS, None) == 501

@@ -276,7 +276,7 @@ def test_the_raw_torque_stays_beside_the_tared_one() -> None:
     devices.arm.synchronise(0, 0, 1)
     devices.answer()
     devices.arm.state()
-    assert [sensor.torque_Nm for sensor in devices.arm.sensors] == [1.5, -2.5]
+    assert [sensor.values[0] for sensor in devices.arm.sensors] == [1.5, -2.5]
 
 
 def test_a_late_frame_is_of_the_cycle_before_and_leaves_the_present_one_open() -> None:

@@ -120,14 +120,14 @@ def test_a_faulted_drive_gets_rising_edges_of_fault_reset() -> None:
 def test_plausible_feedback_is_taken_with_its_cycle() -> None:
     arm = drive()
     arm.accept_cyclic(feedback_frame(0.5, 1.0), 7)
-    assert (round(arm.position_rad, 5), arm.velocity_rad_s, arm.sample_cycle) == (0.5, 1.0, 7)
+    assert (round(arm.values[0], 5), arm.values[1], arm.sample_cycle) == (0.5, 1.0, 7)
 
 
 def test_a_jump_of_position_changes_nothing() -> None:
     arm = drive()
     arm.accept_cyclic(feedback_frame(0.5, 1.0), 0)
     arm.accept_cyclic(feedback_frame(0.5 + 2 * IMPLAUSIBLE_JUMP_RAD, 1.0), 1)
-    assert (round(arm.position_rad, 5), arm.sample_cycle, arm.implausible_frames) == (0.5, 0, 1)
+    assert (round(arm.values[0], 5), arm.sample_cycle, arm.implausible_frames) == (0.5, 0, 1)
 
 
 def test_fast_motion_is_no_jump() -> None:

@@ -43,7 +43,7 @@ class Sender:
 def test_protected_feedback_brings_motion_and_status() -> None:
     seen = drive()
     assert seen.accept_cyclic(Sender().frame(), 7) is True
-    assert (seen.position_rad, seen.velocity_rad_s) == pytest.approx((0.25, -0.5), abs=1e-5)
+    assert (seen.values[0], seen.values[1]) == pytest.approx((0.25, -0.5), abs=1e-5)
     assert (seen.sample_cycle, seen.status_cycle) == (7, 7)
     assert (seen.state, seen.mode, seen.statusword) == (Cia402State.OPERATION_ENABLED, 10, OPERATION_ENABLED)
     assert (seen.torque_actual_permille, seen.torque_demand_permille) == (-120, 345)
@@ -56,7 +56,7 @@ def test_a_frame_that_fails_its_check_changes_nothing() -> None:
     frame = bytearray(Sender().frame())
     frame[5] ^= 0x40
     assert seen.accept_cyclic(bytes(frame), 7) is False
-    assert (seen.position_rad, seen.sample_cycle, seen.status_cycle, seen.statusword) == (0.0, -1, -1, 0)
+    assert (seen.values[0], seen.sample_cycle, seen.status_cycle, seen.statusword) == (0.0, -1, -1, 0)
     assert dict(seen.end_to_end.tally())[E2eStatus.WRONG_CRC] == 1
     assert seen.implausible_frames == 0
 

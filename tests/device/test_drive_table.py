@@ -93,7 +93,7 @@ def test_the_way_up_commands_what_the_standard_says() -> None:
 def test_a_drive_that_has_said_nothing_is_nowhere_and_not_ready(joint: int) -> None:
     drive = Drive(CODEC, joint, PERIOD_S)
     assert (drive.name, drive.node_id, drive.command_id) == (f"Drive{joint}", joint, 0x200 + joint)
-    assert (drive.position_rad, drive.velocity_rad_s, drive.sample_cycle) == (0.0, 0.0, -1)
+    assert (drive.values[0], drive.values[1], drive.sample_cycle) == (0.0, 0.0, -1)
     assert (drive.state, drive.mode, drive.is_enabled) == (Cia402State.NOT_READY_TO_SWITCH_ON, 0, False)
     assert (drive.torque_actual_permille, drive.error_code, drive.implausible_frames) == (0, 0, 0)
     assert controlword_of(drive.command(100, enable=True, quick_stop=False)) == 0

@@ -14,12 +14,9 @@ from test_two_arms import Rig as TwoArms
 from test_two_arms import settings_of as two_arms_settings
 
 from adacd_hil.device.contract import load_contract
-from adacd_hil.device.cycle_frames import TorqueSensor
-from adacd_hil.device.drive import Drive
-from adacd_hil.device.ordinary_cycles import OrdinaryCycles, OrdinaryStretch
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import read_log
-from adacd_hil.records import ArmBatch, FaultReason, SchemeState
+from adacd_hil.records import ArmBatch, FaultReason
 
 pytestmark = pytest.mark.slow
 
@@ -65,6 +62,12 @@ def test_lost_repeated_wrong_and_late_frames_come_out_as_the_loop_took_them(trou
     assert differences(troubled.states, read) == []
 
 
+@pytest.mark.parametrize("run", ["troubled", "fd", "stock"])
+def test_the_log_says_of_every_cycle_what_the_loop_saw(run: str, request: pytest.FixtureRequest) -> None:
+    live: Live = request.getfixturevalue(run)
+    assert differences(live.states, live.logged()) == []
+
+
 def test_the_run_that_is_compared_has_old_values_and_a_fault(read: ArmBatch) -> None:
     assert set(np.unique(read.age_tau_J)) == {0, 1, 2}
     assert set(np.unique(read.age_q)) >= {0, 1, 2}
@@ -72,69 +75,14 @@ def test_the_run_that_is_compared_has_old_values_and_a_fault(read: ArmBatch) -> 
     assert np.count_nonzero(~read.is_complete) >= 10
 
 
-def test_a_new_attempt_forgets_the_one_before(troubled: Live) -> None:
-    arm = troubled.recorded_arm()
-    ticks = ticks_of(troubled.log)
-    arm.read(ticks, troubled.log.frames)
-    came_from = troubled.log.scheme["previous_state"]
-    again = 1 + np.flatnonzero((came_from[1:] == SchemeState.INIT) & (came_from[:-1] == SchemeState.FAULT))
-    assert arm.beginnings == [0, *again]
-
-
-def test_the_pause_before_a_new_attempt_counts_for_no_periods(troubled: Live, read: ArmBatch) -> None:
-    ticks = ticks_of(troubled.log)
-    arm = troubled.recorded_arm()
-    arm.read(ticks, troubled.log.frames)
-    _, again = arm.beginnings
-    periods = ticks.periods.copy()
-    periods[again] = 40
-    assert troubled.recorded_arm().read(ticks._replace(periods=periods), troubled.log.frames).periods[again] == 1
-
-
-def test_ordinary_cycles_read_at_once_leave_the_arm_as_frame_by_frame(
-    troubled: Live, read: ArmBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    at_once, one_by_one = troubled.recorded_arm(), troubled.recorded_arm()
-    ticks, frames = ticks_of(troubled.log), troubled.log.frames
-    at_once.read(ticks, frames)
-    monkeypatch.setattr(OrdinaryCycles, "read", lambda *_: OrdinaryStretch(0, 0, []))
-    batch = one_by_one.read(ticks, frames)
-    assert differences(troubled.states, batch) == []
-    assert (at_once.exact_cycles < 0.4 * len(ticks.cycle), one_by_one.exact_cycles) == (True, len(ticks.cycle))
-    assert at_once._arm.frame_checks() == one_by_one._arm.frame_checks()
-    assert at_once._heartbeats.__dict__["_nodes"] == one_by_one._heartbeats.__dict__["_nodes"]
-    for mine, theirs in zip(at_once._arm.devices, one_by_one._arm.devices, strict=True):
-        assert _numbers(mine) == _numbers(theirs)
-
-
-def _numbers(device: Drive | TorqueSensor) -> dict[str, object]:
-    """Return all that a device and the check of its frames remember."""
-    memory = {**vars(device), **vars(device.end_to_end)}
-    return {name: value for name, value in memory.items() if isinstance(value, (int, float, bool, list, type(None)))}
-
-
 @pytest.mark.parametrize(("config", "fault"), [("fd", FaultReason.SENSOR), ("stock", FaultReason.HEARTBEAT)])
 def test_long_and_unprotected_frames_come_out_as_the_loop_took_them(
     config: str, fault: FaultReason, request: pytest.FixtureRequest
 ) -> None:
     live: Live = request.getfixturevalue(config)
-    arm = live.recorded_arm()
-    batch = arm.read(ticks_of(live.log), live.log.frames)
+    batch = live.read()
     assert differences(live.states, batch) == []
     assert fault in batch.fault
-    assert arm.exact_cycles < 0.8 * len(live.states)
-
-
-def test_nearly_all_cycles_of_a_quiet_run_are_read_at_once(troubled: Live) -> None:
-    arm = troubled.recorded_arm()
-    ticks, frames = ticks_of(troubled.log), troubled.log.frames
-    arm.read(ticks, frames)
-    quiet = arm.beginnings[-1] + 250  # from here to its end nothing befalls the second attempt
-    arm = troubled.recorded_arm()
-    for cycles in (slice(0, quiet), slice(quiet, None)):
-        before = arm.exact_cycles
-        arm.read(*_piece(ticks, frames, cycles))
-    assert arm.exact_cycles - before < 0.05 * (len(ticks.cycle) - quiet)
 
 
 def _piece(ticks: Ticks, frames: NDArray[Any], cycles: slice) -> tuple[Ticks, NDArray[Any]]:
@@ -176,8 +124,10 @@ def test_a_host_that_skipped_periods_is_late_in_its_recording_too(tmp_path: Path
         )
     with live_states() as states:
         rig.run()
-    batch = Live(rig.settings, CODEC, states, rig.read()).read()
+    live = Live(rig.settings, CODEC, states, rig.read())
+    batch = live.read()
     assert differences(states, batch) == []
+    assert differences(states, live.logged()) == []
     assert batch.periods.max() == 9
     assert FaultReason.DEADLINE in batch.fault
 
@@ -187,6 +137,7 @@ def test_a_host_that_follows_anothers_sync_is_read_by_the_sync_that_came(tmp_pat
     with live_states() as states:
         rig.run()
     settings = two_arms_settings(SECOND)
-    batch = Live(settings, load_contract(settings), states, read_log(rig.path)).read()
-    assert differences(states, batch) == []
-    assert batch.is_enabled.any()
+    live = Live(settings, load_contract(settings), states, read_log(rig.path))
+    assert differences(states, live.read()) == []
+    assert differences(states, live.logged()) == []
+    assert live.logged().is_enabled.any()

@@ -1,8 +1,8 @@
 """One joint torque sensor as the host sees it."""
 
 from adacd_hil.device.contract import compose
-from adacd_hil.device.cycle_frames import SensorStatus, TorqueSensor
 from adacd_hil.device.profile import place_devices
+from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.e2e import E2eStatus
@@ -36,7 +36,7 @@ def int32(torque: float) -> bytes:
 def test_a_valid_frame_is_taken_with_its_cycle() -> None:
     rig = Protected()
     assert rig.sensor.accept_cyclic(rig.frame(1.5), 7)
-    assert (rig.sensor.torque_Nm, rig.sensor.sample_cycle, rig.sensor.status) == (1.5, 7, 0)
+    assert (rig.sensor.values[0], rig.sensor.sample_cycle, rig.sensor.status) == (1.5, 7, 0)
 
 
 def test_the_status_in_the_header_counts_in_the_very_frame() -> None:
@@ -49,7 +49,7 @@ def test_a_saturated_sensor_is_fresh_and_overloaded() -> None:
     rig = Protected()
     for cycle in range(20):
         rig.sensor.accept_cyclic(rig.frame(20.0, status=3), cycle)
-    assert (rig.sensor.sample_cycle, rig.sensor.is_overloaded, rig.sensor.torque_Nm) == (19, True, 20.0)
+    assert (rig.sensor.sample_cycle, rig.sensor.is_overloaded, rig.sensor.values[0]) == (19, True, 20.0)
 
 
 def test_a_sensor_that_repeats_its_frame_ages() -> None:
@@ -66,14 +66,14 @@ def test_a_silent_sensor_is_counted_as_no_new_data() -> None:
     rig.sensor.miss()
     rig.sensor.miss()
     assert rig.sensor.end_to_end.counts[E2eStatus.NO_NEW_DATA] == 2
-    assert (rig.sensor.torque_Nm, rig.sensor.sample_cycle) == (1.5, 0)
+    assert (rig.sensor.values[0], rig.sensor.sample_cycle) == (1.5, 0)
 
 
 def test_a_jump_of_unprotected_torque_changes_nothing() -> None:
     sensor = unprotected()
     sensor.accept_cyclic(int32(1.0), 0)
     assert not sensor.accept_cyclic(int32(1.0 + 2**21 * 1e-5), 1)  # a flipped bit
-    assert (sensor.torque_Nm, sensor.sample_cycle, sensor.implausible_frames) == (1.0, 0, 1)
+    assert (sensor.values[0], sensor.sample_cycle, sensor.implausible_frames) == (1.0, 0, 1)
 
 
 def test_a_true_step_of_unprotected_torque_is_taken_with_the_second_frame() -> None:

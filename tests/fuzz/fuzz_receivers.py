@@ -146,8 +146,8 @@ class HostReceiver:
             self._explain(frame)
 
     def _values(self) -> tuple[object, ...]:
-        drives = tuple((d.position_rad, d.velocity_rad_s, d.sample_cycle, d.state, d.mode) for d in self.arm.drives)
-        return drives + tuple((s.torque_Nm, s.sample_cycle, s.status) for s in self.arm.sensors)
+        drives = tuple((*d.values, d.sample_cycle, d.state, d.mode) for d in self.arm.drives)
+        return drives + tuple((*s.values, s.sample_cycle, s.status) for s in self.arm.sensors)
 
     def _explain(self, frame: CanFrame) -> None:
         can_id, data = frame

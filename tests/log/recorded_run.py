@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
-from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_control, pack_cycle, pack_scheme
+from adacd_hil.log.types.topics import ChannelId, pack_arm, pack_contact, pack_control, pack_cycle, pack_scheme
 from adacd_hil.records import (
     CONTROL_LAYOUT,
+    ArmState,
     ContactReport,
     CycleRecord,
     Event,
@@ -41,6 +42,7 @@ LONG_ID = 0x3A5
 @dataclass
 class Cycle:
     t_ns: int
+    arm: ArmState
     output: SchemeOutput
     request: Request
     control: np.ndarray
@@ -53,6 +55,7 @@ class Cycle:
     def messages(self):
         messages = [
             (ChannelId.SCHEME, pack_scheme(self.output, self.request)),
+            (ChannelId.ARM, pack_arm(self.arm, 5)),
             (ChannelId.CONTROL, pack_control(self.output.cycle, self.control, self.gate_flags, True, False)),
             (ChannelId.CYCLE, pack_cycle(self.record)),
         ]
@@ -100,6 +103,7 @@ def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123, has_fd=Fa
         )
         cycle = Cycle(
             t_ns=t_ns,
+            arm=_arm_state(number, t_ns, block, layout.slices),
             output=output,
             request=Request(number % len(Request)),
             control=generator.normal(size=CONTROL_LAYOUT.size),
@@ -131,6 +135,15 @@ def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123, has_fd=Fa
             cycle.event = Event(level, f"name{number}", f"Nachricht {number}: θ̂ ok")
         cycles.append(cycle)
     return Run(cycles, parameter_count)
+
+
+def _arm_state(number, t_ns, block, places):
+    q, dq, tau_J = (block[places[name]] for name in ("q", "dq", "tau_J"))
+    ages = ((number % 3, number % 5), (2**40 + number, number % 2))
+    fault = FaultReason(number % len(FaultReason))
+    return ArmState(
+        number, t_ns, 1 + number % 4, q, dq, tau_J, *ages, number % 2 == 0, number % 3 == 0, fault, False, 2, t_ns - 9
+    )
 
 
 def _frames(generator, t_ns, number):

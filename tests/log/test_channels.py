@@ -18,6 +18,7 @@ from adacd_hil.log.types.message_types import (
 )
 from adacd_hil.log.types.topics import (
     ChannelId,
+    pack_arm,
     pack_contact,
     pack_control,
     pack_cycle,
@@ -29,6 +30,7 @@ from adacd_hil.log.types.topics import (
 from adacd_hil.records import (
     CONTROL_LAYOUT,
     TRUTH_LAYOUT,
+    ArmState,
     ContactKind,
     ContactLevel,
     ContactReport,
@@ -175,6 +177,28 @@ def test_cycle_is_laid_out_as_its_type_says():
     record = CycleRecord(1, -2, 3, 4, 5, -6, 7, 8, 9, 10, 11, 12, 13, 14)
     message = decode(ChannelId.CYCLE, pack_cycle(record))
     assert {name: getattr(message, name) for name in CycleRecord._fields} == record._asdict()
+
+
+def arm_state(t_ns=9_000_000, sampled_ns=6_500_000):
+    q, dq, tau_J = np.array([0.1, 0.2]), np.array([0.3, 0.4]), np.array([0.5, 0.6])
+    return ArmState(
+        2**40, t_ns, 3, q, dq, tau_J, (4, 5), (6, 2**33), True, False, FaultReason.DATA_AGE, True, 7, sampled_ns
+    )
+
+
+def test_arm_is_laid_out_as_its_type_says():
+    message = decode(ChannelId.ARM, pack_arm(arm_state(), 17))
+    assert (message.cycle, message.first_cycle, message.periods, message.steps) == (2**40, 17, 3, 7)
+    assert (message.age_q, message.age_tau_j, message.sample_age_ns) == ([4, 5], [6, 2**33], 2_500_000)
+    assert (message.is_enabled, message.is_complete, message.fault, message.is_late) == (True, False, 1, True)
+
+
+def test_a_sample_may_be_stamped_after_the_sync_of_a_clock_that_was_set_back():
+    assert decode(ChannelId.ARM, pack_arm(arm_state(sampled_ns=9_000_001), 0)).sample_age_ns == -1
+
+
+def test_a_state_that_names_no_sync_of_its_sample_was_sampled_on_its_own():
+    assert decode(ChannelId.ARM, pack_arm(arm_state(sampled_ns=None), 0)).sample_age_ns == 0
 
 
 def test_states_are_named_before_the_field_that_holds_them():

@@ -48,6 +48,7 @@ STATED_HZ = {
     "/scheme": 50,
     "/joint_states": 50,
     "/control": 50,
+    "/arm": 20,
     "/cycle": 20,
     "/to_can_bus": 10,
     "/from_can_bus": 10,

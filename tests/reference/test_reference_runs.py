@@ -20,8 +20,12 @@ from reference_runs import (
     play,
 )
 
+from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.device.profile import place_devices
+from adacd_hil.log.reader import RunLog
 from adacd_hil.records import SchemeState
+from adacd_hil.replay.log_source import LogSource
+from adacd_hil.replay.replay import replay_source
 from adacd_hil.settings.configuration import load_settings
 
 RENEW = "if this is meant: python tests/reference/renew.py"
@@ -30,9 +34,16 @@ UNCOMPILED = {"certified-quick": 1000, "paper-quick": 750}
 
 
 @pytest.fixture(scope="module", params=names())
-def played(request, tmp_path_factory) -> tuple[Reference, Reference]:
+def log(request, tmp_path_factory) -> tuple[str, RunLog]:
+    """A run by its name, and its log now."""
+    return request.param, play(request.param, tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def played(log: tuple[str, RunLog]) -> tuple[Reference, Reference]:
     """What is stored of a run, and what it comes to now."""
-    return Reference.stored(request.param), Reference.of(play(request.param, tmp_path_factory.mktemp("run")))
+    name, now = log
+    return Reference.stored(name), Reference.of(now)
 
 
 @pytest.mark.slow
@@ -49,6 +60,14 @@ def test_a_reference_run_has_the_stored_bits(played: tuple[Reference, Reference]
     if stored.arithmetic != now.arithmetic:
         pytest.skip(f"bits are compared on {stored.arithmetic} only; here is {now.arithmetic}")
     assert bit_differences(stored, now) == [], RENEW
+
+
+@pytest.mark.slow
+def test_the_frames_of_a_reference_run_come_to_the_states_of_the_arm_and_the_decisions(log: tuple[str, RunLog]) -> None:
+    source = LogSource(log[1].path)
+    (found,) = replay_source(source, [source.settings], script_of=ScriptedOperator, by_frames=True)
+    assert found.mismatches == ()
+    assert found.arms_compared == found.compared == len(log[1].scheme) > 0
 
 
 @pytest.mark.long

@@ -43,6 +43,7 @@ _MOST_COLUMNS = 6
 @profile_option
 @click.option("--dbc", type=GivenPath(dir_okay=False), help="Contract of a recording without a log.")
 @click.option("--against", type=GivenPath(), help="Log of the run that a recording is of, to compare with.")
+@click.option("--frames", "by_frames", is_flag=True, help="Decode the frames, and compare the arm's states, too.")
 @click.option(
     "--tolerance",
     type=click.FloatRange(0.0, 1.0),
@@ -60,16 +61,21 @@ def replay(
     profile: str | None,
     dbc: Path | None,
     against: Path | None,
+    by_frames: bool,
     tolerance: float | None,
     shown: int,
     as_json: bool,
     stretch: "TimeWindow",
 ) -> ExitCode:
-    """Replay logs: the raw frames once more through codec, arm and scheme.
+    """Replay logs: what the arm reported once more through the scheme.
 
     Without other settings, every field of /scheme and every contact report is compared with the log, bit for bit; a
     folder stands for the run log in it. With --set, --vary or --config, the result stands beside the original: contacts
     that would have been detected, when, false alarms, parameters. The truth.mcap beside a log is joined to it.
+
+    With --frames, the raw frames go through codec and arm once more, and what the arm makes of them in each cycle is
+    compared with what the log says that it did (/arm), bit for bit, before the scheme gets it. Logs of earlier versions
+    lack /arm: there the frames are decoded, too, and the decisions alone are compared.
 
     Frames that others recorded (candump .log, BLF, ASC, MF4, TRC) are replayed --against the log of their run, or with
     --config alone, where the configuration's script plays the user.
@@ -79,7 +85,9 @@ def replay(
     """
     with Progress() as progress:
         results = [
-            _replay_one(path, changes, vary, (config, profile, dbc), against, tolerance, shown, stretch, progress)
+            _replay_one(
+                path, changes, vary, (config, profile, dbc), against, by_frames, tolerance, shown, stretch, progress
+            )
             for path in logs
         ]
     if as_json:
@@ -107,6 +115,7 @@ def _replay_one(
     vary: tuple[str, ...],
     configured: tuple[str | None, str | None, Path | None],
     against: Path | None,
+    by_frames: bool,
     tolerance: float | None,
     shown: int,
     stretch: "TimeWindow",
@@ -139,7 +148,9 @@ def _replay_one(
     progress(f"replaying {given}" + (f" with {counted(len(variants), 'other setting')}" if variants else ""))
     truth = contacts_beside(log_in(against or given), progress)
     settings: list[Settings] = [own, *variants.values()]
-    replays = replay_source(source, settings, truth, progress, tolerance, ScriptedOperator, shown, stretch=stretch)
+    replays = replay_source(
+        source, settings, truth, progress, tolerance, ScriptedOperator, shown, stretch=stretch, by_frames=by_frames
+    )
     return given, replays, list(variants)
 
 
@@ -193,7 +204,8 @@ def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, 
     own = replays[0]
     attempts = f" in {own.attempts} attempts" if own.attempts > 1 else ""
     where = "" if stretch.is_whole else f", {stretch.text}; replayed from the beginning of the log"
-    lines = [f"{path}: {_verdict(own)}: {own.compared} of {own.cycles} cycles{attempts} compared{where}"]
+    states = f", {own.arms_compared} of them with the arm's states of the frames" if own.arms_compared else ""
+    lines = [f"{path}: {_verdict(own)}: {own.compared} of {own.cycles} cycles{attempts} compared{states}{where}"]
     lines += [f"  {mismatch.line(own.zero_ns)}" for mismatch in own.mismatches[:shown]]
     if own.mismatch_count > shown:
         lines.append(f"  … {own.mismatch_count} in all: " + _counts(own))
@@ -226,6 +238,7 @@ def _as_json(
         "identical": own.is_identical,
         "cycles": own.cycles,
         "compared": own.compared,
+        "arms_compared": own.arms_compared,
         "attempts": own.attempts,
         "tolerance": own.tolerance,
         "mismatch_count": own.mismatch_count,

@@ -16,11 +16,11 @@ from adacd_hil.control.host_checks import Check, CheckOutcome, failed, ok, skipp
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import read_object
-from adacd_hil.device.cycle_frames import SensorStatus
 from adacd_hil.device.device_setup import contract_differences, describe_torque_scale, read_pdos
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, survey
+from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.lab.commission.communication_test import (
     CommunicationReport,
     CommunicationTest,

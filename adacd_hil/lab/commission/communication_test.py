@@ -21,9 +21,9 @@ from adacd_hil.clock import Clock
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.pacing import make_pacer
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.cycle_frames import TorqueSensor
 from adacd_hil.device.drive import DISABLE_CYCLES, Drive
 from adacd_hil.device.network import Master
+from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.lab.score.evaluation import OLDEST_CYCLES
 from adacd_hil.log.logged_run import CycleColumns, columns_of_records
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason

@@ -14,6 +14,7 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 | /decoded/<DBC message> | adacd_hil_msgs/msg/<DBC message> | every frame that the DBC knows |
 | /joint_states | sensor_msgs/msg/JointState | every cycle; measured q, dq, tau_J |
 | /scheme | adacd_hil_msgs/msg/Scheme | every cycle; records.scheme_layout or certified_layout |
+| /arm | adacd_hil_msgs/msg/ArmState | every cycle; records.ArmState but for q, dq, tau_J, which /scheme has |
 | /contact | adacd_hil_msgs/msg/Contact | when a report begins and when it is final |
 | /control | adacd_hil_msgs/msg/Control | every cycle; records.CONTROL_LAYOUT |
 | /cycle | adacd_hil_msgs/msg/Cycle | every cycle; records.CycleRecord |
@@ -46,6 +47,7 @@ from adacd_hil.log.types.message_types import (
 from adacd_hil.records import (
     CONTROL_LAYOUT,
     TRUTH_LAYOUT,
+    ArmState,
     ContactKind,
     ContactLevel,
     ContactReport,
@@ -84,6 +86,7 @@ class ChannelId(IntEnum):
     TO_CAN_BUS_FD = 10
     FROM_CAN_BUS_FD = 11
     FRAME_CHECKS = 12
+    ARM = 13
     DECODED_FIRST = 16  # and up: the messages of the DBC, in its order
 
 
@@ -130,7 +133,8 @@ class OwnTopic:
         return LogChannel(self.id, self.name, number_type(f"{PACKAGE}/{self.type}", (*self.head, *members)))
 
     @cached_property
-    def _struct(self) -> struct.Struct:
+    def body(self) -> struct.Struct:
+        """Lay out the head as it follows the stamp; where a block follows, up to it."""
         return body_struct(self.head, has_block=self.block is not None)
 
     @cached_property
@@ -146,7 +150,7 @@ class OwnTopic:
         taken: Callable[[Any], tuple[Any, ...]] = (
             attrgetter(*names) if len(names) > 1 else lambda record: tuple(getattr(record, name) for name in names)
         )
-        pack, is_ordered = self._struct.pack, head == tuple(member.name for member in self.head)
+        pack, is_ordered = self.body.pack, head == tuple(member.name for member in self.head)
         sizes = [member.size for member in self.head]
 
         def in_order(record: Any, given: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -171,7 +175,7 @@ class OwnTopic:
 
     def unpack(self, body: bytes) -> dict[str, Any]:
         """Unpack the head of a body. Raises struct.error when it is cut, ValueError for a value that has no name."""
-        numbers = iter(self._struct.unpack_from(body))
+        numbers = iter(self.body.unpack_from(body))
         return {
             member.name: member.value_of(
                 itertools.islice(numbers, member.size) if member.size > 1 else next(numbers),
@@ -211,6 +215,26 @@ SCHEME = OwnTopic(
     block=lambda size: certified_layout(*size) if size.channel_count else scheme_layout(size.parameter_count),
     rate_Hz=50,
 )
+ARM = OwnTopic(
+    ChannelId.ARM,
+    "/arm",
+    "ArmState",
+    head=(
+        _CYCLE_NUMBER,
+        Member("first_cycle", "uint64", meaning="number of the cycle with which this attempt began"),
+        Member("periods", "int64", meaning="since the cycle before, 1 unless some were skipped"),
+        Member("steps", "int64", meaning="periods from the last complete sample to this one; 0: it is not complete"),
+        Member("sample_age_ns", "int64", unit="ns", meaning="from the SYNC of the sample to this cycle's"),
+        Member("age_q", "int64", 2, meaning="cycles since the position was sampled"),
+        Member("age_tau_J", "int64", 2, meaning="cycles since the torque was sampled"),
+        Member("is_enabled", "bool", meaning="both drives produce the commanded torque"),
+        Member("is_complete", "bool", meaning="q, dq and tau_J are a new sample of one SYNC"),
+        Member("fault", "uint8", meaning="FaultReason of the arm, before the scheme", values=FaultReason),
+        Member("is_late", "bool", meaning="the host has skipped so many periods that the arm is to be held"),
+    ),
+    rate_Hz=20,
+)
+"""With q, dq and tau_J of /scheme all that the scheme is given in a cycle, but for the request."""
 CONTACT = OwnTopic(
     ChannelId.CONTACT,
     "/contact",
@@ -304,6 +328,7 @@ RUN_TOPICS = (
     FROM_CAN_BUS_FD,
     JOINT_STATES,
     SCHEME,
+    ARM,
     CONTACT,
     CONTROL,
     CYCLE,
@@ -351,6 +376,14 @@ def _check_names(channels: tuple[LogChannel, ...]) -> None:
 def pack_scheme(output: SchemeOutput, request: Request) -> bytes:
     """Pack the body of /scheme."""
     return SCHEME.pack(output, request, block=output.block)
+
+
+def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
+    """Pack the body of /arm; `first_cycle`: of the attempt."""
+    cycle, t_ns, periods, _, _, _, age_q, age_tau_J, is_enabled, is_complete, fault, is_late, steps, sampled_ns = arm
+    age_ns = 0 if sampled_ns is None else t_ns - sampled_ns
+    ages = (*age_q, *age_tau_J)
+    return ARM.body.pack(cycle, first_cycle, periods, steps, age_ns, *ages, is_enabled, is_complete, fault, is_late)
 
 
 def pack_contact(report: ContactReport) -> bytes:

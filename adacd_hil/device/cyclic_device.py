@@ -1,0 +1,83 @@
+"""A device with one frame per SYNC: its checks, and whatever of it is the same for drives and sensors."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+from adacd_hil.wire.codec import Codec, MessageCodec
+
+
+class CyclicDevice(ABC):
+    """A device that answers every SYNC with one frame, and may send its status in another.
+
+    is_protected: whether the cyclic frame carries an end-to-end header; else it is checked by plausibility. values: in
+    use, the main one first.
+    sample_cycle: of the values in use; -1 before the first.
+    """
+
+    def __init__(self, codec: Codec, name: str, message: MessageCodec, main: str, period_s: float) -> None:
+        """Take `main` for the signal by which a frame of `message` without end-to-end header is judged.
+
+        Raises CodecError when the contract lacks a signal.
+        """
+        self.name = name
+        self.node_id = codec.node_id(message.name)
+        self._message = message
+        self.can_id = message.can_id  # of its cyclic frame
+        self.cyclic_length = message.length
+        """Bytes of its cyclic frame."""
+        self.is_protected = message.is_protected
+        self.end_to_end = message.receiver()
+        self.status_message = codec.messages.get(f"{name}Status")
+        self._status_receiver = None if self.status_message is None else self.status_message.receiver()
+        self.values: tuple[float, ...] = ()
+        self.sample_cycle = -1
+        self.implausible_frames = 0
+        self._period_s = period_s
+        self._main_at = message.place(main)
+        self._received: float | None = None  # main value of the last frame that came
+        self._received_cycle = 0
+
+    def accept_cyclic(self, data: bytes, cycle: int) -> bool:
+        """Take one cyclic frame of `cycle`; False when a check fails and it changes nothing."""
+        if len(data) != self.cyclic_length:
+            self.implausible_frames += 1
+            return False
+        if self.is_protected:
+            if not self.end_to_end.check(data).is_valid:
+                return False
+            values = self._message.decode_values(data)
+        else:
+            values = self._message.decode_values(data)
+            last, self._received = self._received, values[self._main_at]
+            cycles, self._received_cycle = cycle - self._received_cycle, cycle
+            if last is not None and not self._is_plausible(values, last, cycles):
+                self.implausible_frames += 1
+                return False
+        self._use(data, values, cycle)
+        return True
+
+    def accept_status(self, data: bytes, cycle: int) -> bool:
+        """Take one status frame of `cycle`; False when its length or check is wrong and it changes nothing."""
+        message, receiver = self.status_message, self._status_receiver
+        if message is None or receiver is None or len(data) != message.length:
+            return False
+        is_valid = receiver.check(data).is_valid
+        if is_valid:
+            self._use_status(message.decode_values(data), cycle)
+        return is_valid
+
+    @abstractmethod
+    def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
+        """Say whether a frame may come so many cycles after one with the main value `last`."""
+
+    @abstractmethod
+    def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:
+        """Bring the values of a checked cyclic frame into use."""
+
+    @abstractmethod
+    def _use_status(self, values: Sequence[float], cycle: int) -> None:
+        """Bring the values of a checked status frame into use."""
+
+    def miss(self) -> None:
+        """Note a cycle in which no cyclic frame came."""
+        self.end_to_end.miss()

@@ -1,0 +1,105 @@
+"""The joint torque sensor: process value, status, checks.
+
+A saturated sensor repeats its value and goes on counting: its torque is fresh and its status says overload. A silent
+one ages. Torque is the device's own, with its own zero: sign and tare belong to `adacd_hil.device.arm`. Source: CiA
+404, clause 7.
+"""
+
+import math
+from collections.abc import Sequence
+from enum import IntFlag
+
+from adacd_hil.device.cyclic_device import CyclicDevice
+from adacd_hil.wire.codec import Codec
+
+
+class SensorStatus(IntFlag):
+    """Bits of 0x6150, analogue input status."""
+
+    NOT_VALID = 1
+    POSITIVE_OVERLOAD = 2
+    NEGATIVE_OVERLOAD = 4
+
+
+STATUS_BITS = 0x07
+_STATUSES = tuple(SensorStatus(bits) for bits in range(STATUS_BITS + 1))
+USABLE = tuple(status for status in _STATUSES if not status & SensorStatus.NOT_VALID)
+"""Statuses with which a torque may be used; an overloaded one is a bound."""
+_OVERLOAD = SensorStatus.POSITIVE_OVERLOAD | SensorStatus.NEGATIVE_OVERLOAD
+_STATUS_IN_HEADER = {0: None, 2: (1, 4), 4: (3, 0)}
+"""Byte and shift of the sender's status, by the length of the end-to-end header: none, Profile 2, Profile 5."""
+
+
+class TorqueSensor(CyclicDevice):
+    """The torque sensor of joint 1 or 2."""
+
+    def __init__(
+        self,
+        codec: Codec,
+        joint: int,
+        period_s: float = 0.001,
+        torque_rate_Nm_s: float = math.inf,
+        torque_range_Nm: float = 0.0,
+    ) -> None:
+        """`torque_rate_Nm_s` bounds the torque of unprotected frames; at `torque_range_Nm`, if not 0, is overload.
+
+        Raises CodecError when the contract lacks a message or signal.
+        """
+        name = f"Sensor{joint}"
+        message = self.torque_message = codec.message(f"{name}Torque")
+        super().__init__(codec, name, message, "torque", period_s)
+        self._torque_rate_Nm_s = torque_rate_Nm_s
+        self.torque_range_Nm = torque_range_Nm
+        names = [signal.name for signal in message.values]
+        self._status_at = names.index("status") if "status" in names else None
+        self.status_in_header = _STATUS_IN_HEADER[message.header_bytes]
+        self._slow_status_at = -1 if self.status_message is None else self.status_message.place("status")
+        self.values = (0.0,)
+        """Torque, Nm, as the device gives it: its sign, its own auto-zero, not tared."""
+        self.status = SensorStatus(0)
+        """What either of its frames says: a sensor that contradicts itself isn't believed.
+
+        A status frame counts until the next one. One that is taken back before the second torque frame after it doesn't
+        count: so a sensor begins.
+        """
+        self._cyclic_bits = 0
+        self._slow_bits = 0
+        self._heard_bits = 0  # of the last status frame
+
+    def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
+        # Two frames of one cycle, late and present, may lie a period apart.
+        return abs(values[self._main_at] - last) <= self._torque_rate_Nm_s * (max(1, cycles) * self._period_s)
+
+    def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:
+        torque = values[self._main_at]
+        self.values = (torque,)
+        self.sample_cycle = cycle
+        if self._status_at is not None:
+            self._cyclic_bits = int(values[self._status_at]) & STATUS_BITS
+        elif self.status_in_header is not None:
+            byte, shift = self.status_in_header
+            self._cyclic_bits = data[byte] >> shift & STATUS_BITS
+        elif self.torque_range_Nm:
+            self._cyclic_bits = _judge_range(torque, self.torque_range_Nm)
+        else:
+            self._slow_bits = self._heard_bits  # nothing else says it
+        self.status = _STATUSES[self._cyclic_bits | self._slow_bits]
+        self._slow_bits = self._heard_bits
+
+    def _use_status(self, values: Sequence[float], cycle: int) -> None:  # noqa: ARG002 (as of all devices)
+        self._heard_bits = int(values[self._slow_status_at]) & STATUS_BITS
+        self._slow_bits &= self._heard_bits
+        self.status = _STATUSES[self._cyclic_bits | self._heard_bits]
+
+    @property
+    def is_overloaded(self) -> bool:
+        """Whether the torque is beyond the sensor's range: fresh, but not the torque that acts."""
+        return bool(self.status & _OVERLOAD)
+
+
+def _judge_range(torque: float, range_Nm: float) -> SensorStatus:
+    if torque >= range_Nm:
+        return SensorStatus.NOT_VALID | SensorStatus.POSITIVE_OVERLOAD
+    if torque <= -range_Nm:
+        return SensorStatus.NOT_VALID | SensorStatus.NEGATIVE_OVERLOAD
+    return SensorStatus(0)
