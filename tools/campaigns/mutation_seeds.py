@@ -6,9 +6,10 @@ from pathlib import Path
 
 import can
 import numpy as np
-from adacd_hil.control.arm_records import HISTORY_FORMAT, CertificateRecord, DeviceRecord, History, devices_digest
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
+from adacd_hil.control.device_record import DeviceRecord
+from adacd_hil.control.history_file import HISTORY_FORMAT, CertificateRecord, History, devices_digest
 from adacd_hil.lab.logs.cut import TimeWindow, cut
 from adacd_hil.log.frames.can_io import to_messages
 from adacd_hil.log.frames.frame_log import read_frames
