@@ -59,6 +59,8 @@ _K3: Final = 5
 _K4: Final = 6
 _TOUCH_RATES: Final = 7
 _ROWS: Final = 8
+_INTEGRATED: Final = 8
+"""Places of q, dq, q_m and dq_m in ROW, which Runge-Kutta advances."""
 _ROWS_END: Final = _ROWS * ROW.itemsize // 8
 _FORCES_END: Final = _ROWS_END + FORCES.itemsize // 8
 
@@ -69,9 +71,13 @@ _BISECTIONS: Final = 40
 
 
 class _StepWork(NamedTuple):
-    """Parts of the work space: rows (_ROWS,) of ROW, the touch state's rows (_ROWS, n), one element of FORCES."""
+    """Parts of the work space: rows (_ROWS,) of ROW, the touch state's rows (_ROWS, n), one element of FORCES.
+
+    values (_ROWS, places of ROW): the same memory as the rows.
+    """
 
     rows: Structured
+    values: NDArray[np.float64]
     touch: NDArray[np.float64]
     forces: np.void
 
@@ -82,9 +88,9 @@ def work_space(touch_size: int) -> Vector:
 
 
 @compiled
-def _touch_rows(space: Vector) -> NDArray[np.float64]:
-    """Give the touch state's rows in a work space."""
-    return space[_FORCES_END:].reshape((_ROWS, (space.size - _FORCES_END) // _ROWS))
+def _matrix(space: Vector) -> NDArray[np.float64]:
+    """Give a part of a work space as one row for each of its rows."""
+    return space.reshape((_ROWS, space.size // _ROWS))
 
 
 @compiled
@@ -125,12 +131,9 @@ def _set_stage(rates: int, length_s: float, mechanics: np.void, work: _StepWork)
 
     The level of the bristles is the one of the same velocity.
     """
-    start, stage, rate = work.rows[_START], work.rows[_STAGE], work.rows[rates]
-    for joint in range(2):
-        stage["q"][joint] = start["q"][joint] + length_s * rate["q"][joint]
-        stage["dq"][joint] = start["dq"][joint] + length_s * rate["dq"][joint]
-        stage["q_m"][joint] = start["q_m"][joint] + length_s * rate["q_m"][joint]
-        stage["dq_m"][joint] = start["dq_m"][joint] + length_s * rate["dq_m"][joint]
+    values = work.values
+    for place in range(_INTEGRATED):
+        values[_STAGE, place] = values[_START, place] + length_s * values[rates, place]
     for index in range(work.touch.shape[1]):
         work.touch[_STAGE, index] = work.touch[_START, index] + length_s * work.touch[rates, index]
     _set_bristles(_STAGE, length_s, mechanics, work)
@@ -150,10 +153,11 @@ def _set_bristles(row: int, length_s: float, mechanics: np.void, work: _StepWork
 
 
 @compiled
-def _combined(start: float, k1: float, k2: float, k3: float, k4: float, sixth_s: float) -> float:
-    """Give the end of a step from its start and four rates."""
-    inner = k2 + k3
-    return start + sixth_s * (k1 + 2.0 * inner + k4)
+def _combine(values: NDArray[np.float64], count: int, sixth_s: float) -> None:
+    """Fill `count` places of the end row from the start and four rows of rates."""
+    for place in range(count):
+        inner = values[_K2, place] + values[_K3, place]
+        values[_END, place] = values[_START, place] + sixth_s * (values[_K1, place] + 2.0 * inner + values[_K4, place])
 
 
 @compiled
@@ -168,8 +172,8 @@ def _runge_kutta(
     work: _StepWork,
 ) -> None:
     """Fill the end row: one step of classical RK4 with constant slips. The first rates stand in the work space."""
-    rows, touch, mechanics = work.rows, work.touch, around.mechanics
-    start, stage, end = rows[_START], rows[_STAGE], rows[_END]
+    touch, mechanics = work.touch, around.mechanics
+    start, stage, end = work.rows[_START], work.rows[_STAGE], work.rows[_END]
     half_s = 0.5 * step_s
     loop_rad_s = around.arm["current_loop_rad_s"]
     mid1, end1 = follow_target(start["tau_m"][0], target1, loop_rad_s[0] * step_s)
@@ -184,24 +188,8 @@ def _runge_kutta(
         _collect(_STAGE, around, time_s + length_s, elapsed_s + length_s, work)
         _fill_rates(_STAGE, rates, around, slips, work)
     sixth_s = step_s / 6.0
-    k1, k2, k3, k4 = rows[_K1], rows[_K2], rows[_K3], rows[_K4]
-    for joint in range(2):
-        end["q"][joint] = _combined(
-            start["q"][joint], k1["q"][joint], k2["q"][joint], k3["q"][joint], k4["q"][joint], sixth_s
-        )
-        end["dq"][joint] = _combined(
-            start["dq"][joint], k1["dq"][joint], k2["dq"][joint], k3["dq"][joint], k4["dq"][joint], sixth_s
-        )
-        end["q_m"][joint] = _combined(
-            start["q_m"][joint], k1["q_m"][joint], k2["q_m"][joint], k3["q_m"][joint], k4["q_m"][joint], sixth_s
-        )
-        end["dq_m"][joint] = _combined(
-            start["dq_m"][joint], k1["dq_m"][joint], k2["dq_m"][joint], k3["dq_m"][joint], k4["dq_m"][joint], sixth_s
-        )
-    for i in range(touch.shape[1]):
-        touch[_END, i] = _combined(
-            touch[_START, i], touch[_K1, i], touch[_K2, i], touch[_K3, i], touch[_K4, i], sixth_s
-        )
+    _combine(work.values, _INTEGRATED, sixth_s)
+    _combine(touch, touch.shape[1], sixth_s)
     _set_bristles(_END, step_s, mechanics, work)
     end["tau_m"][0], end["tau_m"][1] = end1, end2
 
@@ -335,8 +323,8 @@ def integrate_mechanics(
     `work_space`.
     """
     around = Surroundings(state, arm, mechanics, contact, things)
-    forces = space[_ROWS_END:_FORCES_END].view(FORCES)[0]
-    work = _StepWork(space[:_ROWS_END].view(ROW), _touch_rows(space), forces)
+    rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]
+    work = _StepWork(rows.view(ROW), _matrix(rows), _matrix(space[_FORCES_END:]), forces)
     _load(around, touch_state, work)
     substep_s = step_s / substeps
     _collect(_START, around, time_s, elapsed_s, work)
@@ -415,10 +403,10 @@ def observe(
     Changes nothing that goes on.
     """
     around = Surroundings(state, arm, mechanics, contact, things)
-    forces = space[_ROWS_END:_FORCES_END].view(FORCES)[0]
-    work = _StepWork(space[:_ROWS_END].view(ROW), _touch_rows(space), forces)
+    rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]
+    work = _StepWork(rows.view(ROW), _matrix(rows), _matrix(space[_FORCES_END:]), forces)
     _load(around, touch_state, work)
     _collect(_START, around, time_s, elapsed_s, work)
-    _, _, friction1, friction2, _, _ = find_friction(work.rows[_START], around, forces)
-    external_Nm, held_Nm = forces["external_Nm"], forces["held_Nm"]
+    _, _, friction1, friction2, _, _ = find_friction(work.rows[_START], around, work.forces)
+    external_Nm, held_Nm = work.forces["external_Nm"], work.forces["held_Nm"]
     return external_Nm[0], external_Nm[1], friction1, friction2, held_Nm[0], held_Nm[1]
