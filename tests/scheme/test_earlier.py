@@ -454,8 +454,9 @@ def test_no_arm_has_less_friction_than_none_whatever_a_touched_belief_says():
     assert not compared.agrees()  # as one of none, 0.04 Nm more
     none[COULOMB] = -0.06  # who pushed the arm on was there
     compared.keep_only(none, 1e-5)
-    assert compared.m["kept_count"] == 0.0
+    assert not earlier.is_keeping(compared.m)
     assert compared.agrees()
+    assert compared.m["kept_count"] == 0.0
 
 
 def test_less_friction_lapses_what_was_kept_after_more_fits_than_more_of_it_does():

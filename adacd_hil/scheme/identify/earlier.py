@@ -12,8 +12,8 @@ look like, a joint's friction at some speed, an inertia, an offset that nothing 
 
 Friction and an offset that nothing anchors must agree both ways: who pushes the arm on takes friction away. Of an
 inertia **less is the arm's**, and more is a touch that has not been seen to end. Where an anchor gives the offset, a
-belief that differs has been leant on, and is forgotten; one with clearly less friction than none is not kept. The first
-beliefs know little and bound little.
+belief that differs has been leant on, and is forgotten; one with clearly less friction than none says nothing. The
+first beliefs know little and bound little.
 
 **Kept beliefs lapse** where fits in a row, without a contact between, agree with each other against them: LITTLE_FITS,
 if they have more by LITTLE times a bound and by LITTLE_NM on the trajectory at most, for a touch that nobody noticed
@@ -87,7 +87,7 @@ def keep(k: Any, m: Any) -> None:
     Of a fit that has changed on the way only what it had come to before.
     """
     m["refused_fits"] = 0.0
-    if is_keeping(m) or m["steps_used"] <= YOUNG_STEPS:
+    if m["kept_count"] > 0.0 or m["steps_used"] <= YOUNG_STEPS:
         return
     changed = fit_check.last_step_before_contradiction(k, m)
     keep_steps(k, m, int(m["steps_used"]) - 1 if changed == fit_check.NONE else changed)
@@ -98,7 +98,7 @@ def keep(k: Any, m: Any) -> None:
 @compiled
 def keep_steps(k: Any, m: Any, last: int) -> None:
     """Keep the fit's steps up to this number, if nothing is kept yet."""
-    if is_keeping(m):
+    if m["kept_count"] > 0.0:
         return
     _drop(m)
     m["refused_fits"] = 0.0
@@ -115,7 +115,6 @@ def _keep(k: Any, m: Any, theta: Vector, P: Vector, unit: float, age_s: float) -
     s = KEPT + int(m["kept_count"])
     if not _say(k, m, s, theta, P, unit):
         evidence.retract(m, s)
-        return
     evidence.date(m, s, s + 1, age_s)
     m["kept_count"] += 1.0
 
@@ -152,6 +151,8 @@ def is_no_more(k: Any, m: Any) -> bool:
             if q >= OFFSETS and not anchor.is_open(k, m, q - OFFSETS):
                 evidence.pass_over(m, s, q)
             is_no_more = is_no_more and abs(evidence.excess(m, s, q)) <= 1.0
+    if not is_keeping(m):
+        m["kept_count"] = 0.0
     if is_no_more:
         return True
     has_lapsed = _lapses(k, m)
