@@ -12,7 +12,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from adacd_hil.records import ContactLevel, FaultReason, Reaction, Request, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme.detect.margin import MarginWatch
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.pipeline.cycle import SECOND
+from adacd_hil.scheme.kernel.cycle import SECOND
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 

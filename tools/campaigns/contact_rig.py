@@ -26,8 +26,8 @@ from adacd_hil.records import (
 from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.contact.contact_report import RecalledContact, put_row, report_of
 from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.kernel.cycle import DECISION, decide, follow_contact, new_course
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
-from adacd_hil.scheme.pipeline.cycle import DECISION, decide, follow_contact, new_course
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.scheme.supervisor.transitions import Observation
 from adacd_hil.settings.configuration import Settings, load_settings, merge

@@ -16,9 +16,7 @@ from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import Doubt
 from adacd_hil.scheme.identify.doubt import begin as begin_doubt
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory, paper_kernel
-from adacd_hil.scheme.model import filter_bank
-from adacd_hil.scheme.pipeline.certificate_watch import CertificateWatch
-from adacd_hil.scheme.pipeline.cycle import (
+from adacd_hil.scheme.kernel.cycle import (
     ACCEPTED,
     FORGET,
     PUSHED,
@@ -29,6 +27,8 @@ from adacd_hil.scheme.pipeline.cycle import (
     end_certified,
     run_certified,
 )
+from adacd_hil.scheme.model import filter_bank
+from adacd_hil.scheme.pipeline.certificate_watch import CertificateWatch
 from adacd_hil.scheme.pipeline.scheme_policy import SchemePolicy
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, SchemeEvent
 from adacd_hil.settings.configuration import Settings

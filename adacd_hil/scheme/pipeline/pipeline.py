@@ -4,7 +4,7 @@ A cycle: the state reached so far says what the kernel does, the kernel says whe
 state leaves its traces: an adaptation begins or ends, a contact's report begins or becomes final. Where the schemes
 differ, a policy says what is done: `PaperPolicy`, `CertifiedPolicy`.
 
-The cycle is compiled (`pipeline.cycle`), the same live and in a replay. Once in a while it asks Python for something.
+The cycle is compiled (`kernel.cycle`), the same live and in a replay. Once in a while it asks Python for something.
 `_attend` does it, in the same cycle, before the decision is given out.
 
 **The interval** between two samples is that between the SYNCs on which they were taken: a sample that comes late was
@@ -33,10 +33,10 @@ from adacd_hil.records import (
     scheme_layout,
 )
 from adacd_hil.scheme.identify.certificate import Certificate
+from adacd_hil.scheme.kernel.cycle import BEFORE_CONTACT, DECISION
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, Numbers, fill_sample, samples_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.pipeline.certified_policy import CertifiedPolicy
-from adacd_hil.scheme.pipeline.cycle import BEFORE_CONTACT, DECISION
 from adacd_hil.scheme.pipeline.scheme_policy import PaperPolicy, SchemePolicy
 from adacd_hil.settings.configuration import Settings
 

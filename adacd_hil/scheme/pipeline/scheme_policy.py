@@ -15,9 +15,9 @@ from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.contact.contact_report import ContactEvidence, IntegratedContact, report_of
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.kernel.cycle import DECISION, REPORT, end_paper, new_course, paper_cycle, run_paper
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, Numbers
 from adacd_hil.scheme.model.regressor import is_positive_definite
-from adacd_hil.scheme.pipeline.cycle import DECISION, REPORT, end_paper, new_course, paper_cycle, run_paper
 from adacd_hil.scheme.supervisor import supervisor
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.scheme.supervisor.transitions import SchemeEvent
@@ -72,7 +72,7 @@ class SchemePolicy(ABC):
         """Compile about half of it, what `compile` comes to last; nothing where all of it takes a moment."""
 
     def cycle(self, samples: Structured, decisions: Structured, blocks: Vector) -> int:
-        """Take in the only cycle of the samples; return bits of what it asks (`pipeline.cycle`)."""
+        """Take in the only cycle of the samples; return bits of what it asks (`kernel.cycle`)."""
         return self._cycle(samples, decisions, blocks, 0, *self._cycle_arrays)
 
     def run(self, samples: Structured, decisions: Structured, blocks: Vector, first: int) -> tuple[int, int]:
