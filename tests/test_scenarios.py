@@ -144,14 +144,3 @@ def test_the_logs_of_a_short_scenario_name_it_and_its_faults(tmp_path: Path) -> 
     assert read_log(summary.log.path).metadata["scenario"] == "short"
     events = [entry.event.message for entry in read_log(truth_path).events]
     assert [text for text in events if text.startswith("begins: emcy_storm of sensor1")] != []
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_documentation_lists_it_with_what_is_expected(name: str) -> None:
-    scenario = load_scenario(name)
-    page = Path(__file__).parent.parent / "docs" / "emulator" / "scenarios.md"
-    paper, certified = (
-        expected.text for scheme in ("paper", "certified") if (expected := scenario.expected_of(scheme))
-    )
-    text = paper if certified == paper else f"{paper}; `certified`: {certified}"
-    assert f"| `{name}` | {scenario.about} | {text} |" in page.read_text(encoding="utf-8").splitlines()

@@ -2,7 +2,7 @@
 
     python tools/campaigns/fault_campaign.py -j 4  all of tests/fault_table.py: table on stdout, progress on stderr
     python tools/campaigns/fault_campaign.py torque SYNC        cases whose names have one of these words
-    python tools/campaigns/fault_campaign.py --markdown         the table of docs/emulator/faults.md
+    python tools/campaigns/fault_campaign.py --markdown         the same as a Markdown table
     python tools/campaigns/fault_campaign.py --json             one object for each run
 
 Exit status: 0 when every run is as its row says, 1 when one isn't, 2 for wrong usage. Runs in virtual time, about one
@@ -137,7 +137,7 @@ def main() -> int:
     add_jobs(parser)
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print an array of objects")
-    form.add_argument("--markdown", action="store_true", help="print the table of docs/emulator/faults.md")
+    form.add_argument("--markdown", action="store_true", help="print a Markdown table")
     arguments = parser.parse_args()
     indices = [i for i, case in enumerate(CASES) if not arguments.words or any(w in case.name for w in arguments.words)]
     if not indices:
