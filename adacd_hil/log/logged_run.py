@@ -289,7 +289,7 @@ class StretchOfRun(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """A run as plain arrays over n of its cycles: over all, or of a long one over those that `LongRun` keeps.
+    """A run as plain arrays over n of its cycles: over all, or of a long one over those that `KeptCycles` keeps.
 
     `truth` is None on a real arm.
     """

@@ -68,7 +68,7 @@ def decodable(run):
 def test_the_summary_counts_what_was_written(run, recorded):
     contacts = sum(cycle.contact is not None for cycle in run.cycles)
     events = sum(cycle.event is not None for cycle in run.cycles)
-    messages = len(run.frames) + len(decodable(run)) + 4 * len(run.cycles) + contacts + events
+    messages = len(run.frames) + len(decodable(run)) + 5 * len(run.cycles) + contacts + events
     assert recorded[1][1:-1] == (len(run.frames), messages, 0, True, "", 1)
     assert 0 < recorded[1].queue_peak_bytes < 4 * 2**20
 
