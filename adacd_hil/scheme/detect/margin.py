@@ -29,7 +29,7 @@ Both are an estimate: they assume that thresholds and residuals stay as they are
 over its test. While the arm monitors, the mean of the smallest push over each second of motion is compared with the
 worst of that test. A mean of more than LESS times that is a warning. BLIND_S of it in a row take the certificate back.
 
-Shapes: C filters, n joints; y, h (2 C - 1, n); shown (2 C - 1,): g;
+Shapes: C filters, n joints; y, h (2 C - 1, n); shown (2 C - 1,): g; seen (bins, n): cycles by threshold in force;
 seen_worst_Nm, seen_push_Nm, sum_push_Nm, sum_cycles, mean_push_Nm, dim_s (n,). Units: Nm.
 
 **Watch.** The margin of a running detector: how far the residuals of contact-free motion stay below their thresholds.
@@ -142,6 +142,7 @@ def shapes_of(channels: int) -> dict[str, tuple[int, ...]]:
         "tail_Nm": each,
         **dict.fromkeys(("block_used", "tail_s"), ()),
         **dict.fromkeys(("seen_worst_Nm", "seen_push_Nm", "sum_push_Nm", "sum_cycles", "mean_push_Nm", "dim_s"), joint),
+        "seen": (BINS, JOINTS),
     }
 
 
@@ -220,6 +221,8 @@ LESS = 2.0
 """How many times the smallest push of the certificate it may be without a word."""
 STRAIN_SAID, ROUGH_SAID = 1.5, 4.0
 """From which on strain, and the square of the velocity's noise, are named as what raises a threshold."""
+LOWEST_NM, WIDTH, BINS = 1e-3, 0.02, 512
+"""Thresholds are counted in bins that are 2 % wide, from 1 mNm to 28 Nm."""
 MEAN_S, BLIND_S = 1.0, 3.0
 """Motion over which the smallest push is averaged, and for how long the mean may be more than LESS times."""
 
@@ -241,6 +244,7 @@ def smallest_push(y: Vector, h: Vector, shown: Vector, joint: int) -> float:
 @compiled
 def begin_sight(m: Any) -> None:
     """Begin a test."""
+    m["seen"][:] = 0.0
     m["seen_worst_Nm"][:] = 0.0
     m["seen_push_Nm"][:] = 0.0
     m["sum_push_Nm"][:] = 0.0
@@ -251,8 +255,11 @@ def begin_sight(m: Any) -> None:
 @compiled
 def follow_test(k: Any, m: Any) -> None:
     """Take in one sample of a test, without contact."""
-    for i in range(m["dim_s"].shape[0]):
-        m["seen_worst_Nm"][i] = max(m["seen_worst_Nm"][i], m["wide_threshold"][i])
+    for i in range(m["seen"].shape[1]):
+        h = m["wide_threshold"][i]
+        place = int(math.log(max(h / LOWEST_NM, 1.0)) / WIDTH)
+        m["seen"][min(place, BINS - 1), i] += 1.0
+        m["seen_worst_Nm"][i] = max(m["seen_worst_Nm"][i], h)
         m["seen_push_Nm"][i] = max(m["seen_push_Nm"][i], smallest_push(m["y"], m["h"], k["shown"], i))
 
 
@@ -260,7 +267,7 @@ def follow_test(k: Any, m: Any) -> None:
 def follow_sight(k: Any, m: Any) -> bool:
     """Take in one sample of monitoring, without contact; tell whether a joint has been blind for too long."""
     is_blind = False
-    for i in range(m["dim_s"].shape[0]):
+    for i in range(m["seen"].shape[1]):
         if m["still"][filter_bank.LEARNT, i] >= MOVING:
             continue
         m["sum_push_Nm"][i] += smallest_push(m["y"], m["h"], k["shown"], i)
@@ -278,10 +285,13 @@ def follow_sight(k: Any, m: Any) -> bool:
 
 def describe_sight(m: Any) -> str:
     """Say what the last test has seen, joints separated by strokes."""
+    seen = np.cumsum(m["seen"], axis=0)
+    worst_Nm = m["seen_worst_Nm"]
+    median, most = ([_quantile(seen[:, i], worst_Nm[i], share) for i in range(JOINTS)] for share in (0.5, 0.99))
     return (
         f"a push of {_by_joint(m['seen_push_Nm'])} Nm would be found within {1e3 * WITHIN_S:g} ms at the worst moment "
-        f"of the test, its threshold {_by_joint(m['seen_worst_Nm'])} Nm at worst; its residuals came to "
-        f"{100.0 * largest_share(m):.0f} % of their thresholds"
+        f"of the test, thresholds {_by_joint(median)} Nm in the middle, {_by_joint(most)} in 99 %, "
+        f"{_by_joint(worst_Nm)} at worst; its residuals came to {100.0 * largest_share(m):.0f} % of their thresholds"
     )
 
 
@@ -313,6 +323,14 @@ def _why_dim(m: Any, joint: int) -> str:
     if np.any(m["lost"][:, joint] > 0.0):
         return "samples are missing"
     return f"its residuals have come to {math.sqrt(m['unit'][joint]):.1f} times what the settings call a good model's"
+
+
+def _quantile(seen: Vector, worst_Nm: float, share: float) -> float:
+    """Return the upper end of the bin up to which this share of the cycles is; the worst where that is less."""
+    place = int(np.searchsorted(seen, share * seen[-1]))
+    if place == BINS - 1:
+        return float(worst_Nm)
+    return min(LOWEST_NM * float(math.exp(WIDTH * (place + 1))), float(worst_Nm))
 
 
 def _by_joint(values_Nm: Any) -> str:
