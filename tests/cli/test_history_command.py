@@ -94,7 +94,7 @@ def test_devices_with_other_serial_numbers_are_another_arms(lab: Lab, file: Path
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("friction_Nm = [0.", "friction_Nm = [1.", "is not as it was written"),
+        ("friction_Nm = [0.", "friction_Nm = [1.", "changed or damaged"),
         ("is_payload = false", "is_payload = true", "certificate 1 was changed or damaged"),
         ("certificates = [", "certificate = [", "did you mean `certificates`?"),
         ("format = 1", "format = 2", "`format` = 2 is above 1"),
@@ -113,7 +113,7 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_one_line(
 
 def test_devices_that_were_edited_are_noticed_by_the_first_digest(file: Path) -> None:
     file.write_text(file.read_text().replace("serial = 2", "serial = 3", 1))
-    with pytest.raises(ConfigError, match="certificate 1 is not as it was written"):
+    with pytest.raises(ConfigError, match="certificate 1 was changed or damaged"):
         read_history(file)
 
 
@@ -159,7 +159,7 @@ def test_the_chain_of_digests_notices_a_certificate_that_is_missing_or_moved(fil
     second = replace(second, digest=second.digest_after(found.last.digest))
     assert len(History(HISTORY_FORMAT, found.devices, (found.last, second)).certificates) == 2
     for certificates in ((second,), (second, found.last), (found.last, found.last)):
-        with pytest.raises(ValueError, match="is not as it was written"):
+        with pytest.raises(ValueError, match="changed or damaged"):
             History(HISTORY_FORMAT, found.devices, certificates)
 
 

@@ -76,8 +76,12 @@ def test_quick_stop_code_0_disables_the_drive_at_once():
 
 
 def damping(code: int) -> float:
-    """Return the braking torque of joint 1 per its velocity, Nm s/rad, one period after the braking began."""
+    """Return the braking torque of joint 1 per its velocity, Nm s/rad, once the current loop has followed.
+
+    The period after a SYNC passes when the next one comes.
+    """
     host = moving_host(0x605A, code)
+    host.step(QUICK_STOP)
     host.step(QUICK_STOP)
     body = host.bench._body
     return -body.motor_torque_Nm[0] / body.drive_velocity_rad_s[0]

@@ -203,7 +203,7 @@ def _delays_ms(ratios: Vector, phases_s: Vector, period_s: float) -> Vector:
     return np.where(over[..., -1, :], np.maximum(first, 0.0) * 1e3, _LATE)
 
 
-_LOOKS: Final = ("alarm", "cad", "identified", "joint1", "joint2", "bar", "queue_log", "muted")
+_LOOKS: Final = ("alarm", "cad", "identified", "joint1", "joint2", "bar", "beside", "muted")
 
 
 def draw_comparison(comparison: Comparison) -> Drawing:

@@ -266,7 +266,7 @@ def outcome_in_words(candidate: Candidate) -> str:
     return text + f", {outcome.missed} missed, {outcome.false_alarms} false alarms{delays_phrase(outcome.delays_ms)}"
 
 
-_LOOKS: Final = ("identified", "cad", "joint1", "joint2", "bar", "queue_log", "beside", "queue_receive", "muted")
+_LOOKS: Final = ("identified", "cad", "joint1", "joint2", "bar", "beside", "alarm", "ink", "muted")
 
 _LEAST_RATE: Final = 1e-6
 """Per hour; what the model predicts below this nobody will ever check."""
