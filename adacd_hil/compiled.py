@@ -17,17 +17,14 @@ import stat
 import tempfile
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-import numpy as np
 from numba.core import event
 from numba.core.caching import FunctionCache
-from numpy.typing import ArrayLike
 
 from adacd_hil.compile_progress import CompileCount, full_name, functions_below
 
@@ -306,38 +303,3 @@ def compiling(functions: Sequence[Any], on_first: Callable[[], None] = lambda: N
     on_first: called before the first function is compiled, not at all if all come from the cache.
     """
     return _compilation.of(functions, on_first)
-
-
-Structured = np.ndarray[Any, np.dtype[np.void]]
-
-
-def packed(values: Mapping[str, ArrayLike]) -> Structured:
-    """Put values of any shape into one element (1,), as float64."""
-    element = zeroed({name: np.shape(value) for name, value in values.items()})
-    for name, value in values.items():
-        element[name] = value
-    return element
-
-
-def zeroed(shapes: Mapping[str, tuple[int, ...]]) -> Structured:
-    """Return one element (1,) of zeros, float64, with a field of each shape."""
-    return np.zeros(1, float_fields(shapes))
-
-
-def float_fields(shapes: Mapping[str, tuple[int, ...]]) -> np.dtype[np.void]:
-    """Describe an element with float64 fields of these shapes; equal descriptions are one and the same object.
-
-    At each call of compiled code numba looks up the types of the arguments: in 0.2 us if the description is the object
-    that it knows, in 5 to 10 us if it is another one that is equal, field by field.
-    """
-    return _float_fields(tuple(shapes.items()))
-
-
-@cache
-def _float_fields(shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> np.dtype[np.void]:
-    return np.dtype([(name, np.float64, shape) for name, shape in shapes])
-
-
-def record_of(*fields: tuple[Any, ...]) -> np.dtype[np.void]:
-    """Describe an element with these fields: name, type and, of an array, shape. They are read as attributes."""
-    return np.dtype((np.record, list(fields)))

@@ -377,9 +377,9 @@ class PushGatherer:
     """Gathers the cycles of MONITOR in which nothing touches the arm."""
 
     def __init__(self, settings: Settings) -> None:
-        self._shown = detect_margin.constants_of(settings)["shown"]
+        self._shown = detect_margin.constants_of(settings).shown
         self._period_s = settings.bus.period_s
-        self._excursions_Hz = detect_margin.constants_of(settings)["excursions_Hz"]
+        self._excursions_Hz = detect_margin.constants_of(settings).excursions_Hz
         self._share = np.zeros((self._shown.size, JOINTS))  # largest of residual over threshold
         self._push, self._threshold = ([Distribution() for _ in range(JOINTS)] for _ in range(2))
 

@@ -32,8 +32,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled, float_fields
+from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
+from adacd_hil.structured import Structured, float_fields
 from firmware_sim.arm.plant import accelerate, decide_slips, external_torque
 from firmware_sim.arm.touch_forces import touch
 from firmware_sim.arm.touch_settings import PAIR

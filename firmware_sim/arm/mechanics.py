@@ -31,8 +31,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured, compiled
+from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
+from adacd_hil.structured import Structured
 from firmware_sim.arm.joint_forces import (
     FORCES,
     ROW,

@@ -28,7 +28,8 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled, float_fields
+from adacd_hil.compiled import compiled
+from adacd_hil.structured import Structured, float_fields
 from firmware_sim.arm.touch_settings import PAIR, contact_force, contact_torque
 
 CURRENT_LOOP_RAD_S: Final = 2.0 * math.pi * 1000.0

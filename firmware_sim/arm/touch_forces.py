@@ -24,8 +24,9 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled, float_fields
+from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
+from adacd_hil.structured import Structured, float_fields
 from firmware_sim.arm.touch_settings import TICK_S, aim, contact_force, contact_torque
 
 BODY: Final = 0

@@ -30,8 +30,9 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled, float_fields
+from adacd_hil.compiled import compiled
 from adacd_hil.settings.schema import ConfigError, setting
+from adacd_hil.structured import Structured, float_fields
 
 TICK_S: Final = 1e-4
 """The drives' inner period, and the grid of everything that happens to the arm."""

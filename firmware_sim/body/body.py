@@ -13,8 +13,8 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured
 from adacd_hil.records import TRUTH_LAYOUT, Vector
+from adacd_hil.structured import Structured
 from firmware_sim.arm.arms import ArmProfile
 from firmware_sim.arm.mechanics import work_space
 from firmware_sim.arm.plant import fit_payload

@@ -13,8 +13,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured, compiled, float_fields
+from adacd_hil.compiled import compiled
 from adacd_hil.records import TRUTH_LAYOUT, Vector
+from adacd_hil.structured import Structured, float_fields
 from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS
 from firmware_sim.arm.mechanics import integrate_mechanics, observe
 from firmware_sim.arm.plant import (

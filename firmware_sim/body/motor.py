@@ -25,7 +25,8 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.compiled import compiled, float_fields
+from adacd_hil.compiled import compiled
+from adacd_hil.structured import float_fields
 from firmware_sim.arm.hardware_settings import CURRENT_LOOP_HZ, DriveSettings
 from firmware_sim.arm.touch_settings import PAIR, TICK_S
 

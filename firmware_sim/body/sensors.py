@@ -30,8 +30,9 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.compiled import compiled, float_fields
+from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
+from adacd_hil.structured import float_fields
 from firmware_sim.arm.hardware_settings import SensorSettings
 from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.sensing import TORQUE_LSB_NM, TORQUE_RANGE_NM, torque_counts

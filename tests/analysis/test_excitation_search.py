@@ -62,7 +62,7 @@ def test_what_a_motion_shows_is_what_the_scheme_counts() -> None:
     """Information from the equation of motion, filtered in continuous time, and the derivative by differences."""
     settings = load_settings("certified")
     search, played = Search(settings), Excitation(settings)
-    scale = constants_of(settings)[0]["scale"]
+    scale = constants_of(settings)[0].scale
     elapsed_s = np.arange(1400) * 1e-3
     W = np.zeros((1400, 2, len(scale)))
     for n, at_s in enumerate(elapsed_s):

@@ -1,19 +1,19 @@
 """A contact's course by itself: the compiled step, with a state and findings written by hand."""
 
-import numpy as np
-
-from adacd_hil.records import ContactLevel, Reaction, SchemeState
+from adacd_hil.records import JOINTS, ContactLevel, Reaction, SchemeState
 from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.supervisor import supervisor
 from adacd_hil.scheme.supervisor.transitions import ANY_CONTACT, CONTACT, CONTACT_SHIFT
+from adacd_hil.structured import zeros_of
 
 
 class Course:
     """The course of contacts under these settings; reports are due so many cycles after a detection."""
 
     def __init__(self, settings, due_cycles=(0,)):
-        self.k, self.memory = np.zeros(1, course.CONSTANTS), np.zeros(1, course.MEMORY)
-        self.m, self.state = self.memory[0], np.zeros(1, supervisor.MEMORY)
+        sizes = {"n": JOINTS, "levels": len(ContactLevel)}
+        self.k, self.memory = zeros_of(course.CourseConstants, sizes), zeros_of(course.CourseMemory, sizes)
+        self.m, self.state = self.memory[0], zeros_of(supervisor.SupervisorMemory, {})
         course.begin(self.m)
         self.fill(settings, due_cycles)
         self.cycle = 0
@@ -36,7 +36,7 @@ class Course:
 
     @property
     def reaction(self):
-        return Reaction(self.m["reaction"])
+        return Reaction(self.m.reaction)
 
     @property
     def goes_on(self):

@@ -237,7 +237,7 @@ class TouchedLoop(ExcitedLoop):
     @property
     def model_theta(self):
         """The parameters of the model in use (p,)."""
-        return self.pipeline.numbers.memory[0]["theta"]
+        return self.pipeline.numbers.memory[0].models.theta
 
     @property
     def offset_error_Nm(self):

@@ -313,11 +313,11 @@ def test_a_reading_at_rest_begins_anew_when_the_arm_moves():
     for cycle in range(60):
         pipeline.step(arm_state(cycle, tau_J=(0.3, 0.0), is_enabled=False))
     pipeline.step(arm_state(60, dq=(0.5, 0.0), tau_J=(0.3, 0.0), is_enabled=False))
-    assert m["rest_count"] == 0.0
-    assert np.isinf(m["anchor_std"][anchor.REST]).all()
+    assert m.anchor.rest_count == 0.0
+    assert np.isinf(m.anchor.anchor_std[anchor.REST]).all()
     for cycle in range(61, 71):
         pipeline.step(arm_state(cycle, tau_J=(0.1, 0.0), is_enabled=False))
-    assert m["anchor_Nm"][anchor.REST, 0] == pytest.approx(0.1)
+    assert m.anchor.anchor_Nm[anchor.REST, 0] == pytest.approx(0.1)
 
 
 class Judged:
@@ -328,18 +328,18 @@ class Judged:
         self.theta, self.P = np.zeros(len(NAMES)), np.zeros((len(NAMES), len(NAMES)))
         self.P[OFFSETS, OFFSETS] = std_Nm**2
         self.theta[FRICTION] = friction_Nm
-        self.m["anchor_std"][anchor.REST] = 0.004
+        self.m.anchor.anchor_std[anchor.REST] = 0.004
 
     def bound_Nm(self, kind=anchor.REST):
         anchor.is_within(self.k, self.m, self.theta, self.P)
-        return float(self.m["limit"][kind, evidence.OFFSETS])
+        return float(self.m.evidence.limit[kind, evidence.OFFSETS])
 
 
 def test_the_bound_is_four_deviations_of_all_that_is_not_known():
     assert Judged().bound_Nm() == pytest.approx(4.0 * np.sqrt(0.01**2 + 0.004**2 + 0.005**2))
     assert Judged(friction_Nm=0.2).bound_Nm() == pytest.approx(4.0 * np.sqrt(0.01**2 + 0.004**2 + 0.005**2 + 0.02**2))
     judged = Judged()
-    judged.m["said_age_s"] = 3600.0
+    judged.m.evidence.said_age_s = 3600.0
     drift_Nm = FREE.tare.drift_Nm_sqrt_s * 60.0
     assert judged.bound_Nm() == pytest.approx(4.0 * np.sqrt(0.01**2 + 0.004**2 + 0.005**2 + drift_Nm**2))
     assert Judged().bound_Nm(anchor.TARE) == np.inf
@@ -357,7 +357,7 @@ def test_an_offset_beyond_its_bound_is_not_kept(offset_Nm):
 def test_residuals_worse_than_expected_widen_no_bound():
     judged = Judged()
     before_Nm = judged.bound_Nm()
-    judged.m["unit"] = 9.0
+    judged.m.sensitivity.unit = 9.0
     assert judged.bound_Nm() == before_Nm
-    judged.m["unit"] = 0.25
+    judged.m.sensitivity.unit = 0.25
     assert judged.bound_Nm() < before_Nm

@@ -1,30 +1,41 @@
 """The bank of filters against scipy and against one filter alone."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import scipy.signal
 
-from adacd_hil.compiled import packed, zeroed
+from adacd_hil.scheme.memory import Filters, Regressor
 from adacd_hil.scheme.model import filter_bank
+from adacd_hil.structured import packed, zeros_of
 
 T = 1e-3
 CUTOFF = np.array([10.0, 50.0, 200.0])
 COLUMNS = 5
 
 
+@dataclass
+class BankConstants:
+    cutoff: np.ndarray
+
+
+class BankMemory:
+    filters: Filters
+    regressor: Regressor
+
+
 class Bank:
     """Filters at rest, for two joints and COLUMNS parameters."""
 
     def __init__(self):
-        columns = (2, COLUMNS)
-        shapes = {"rates": (3, 3), "Y_p": columns, "Y_h": columns}
-        shapes |= dict.fromkeys(("tau_old", "tau_f"), (3, 2)) | dict.fromkeys(("input_old", "S", "W_f"), (3, *columns))
-        self.k, self.m = packed({"cutoff": CUTOFF})[0], zeroed(shapes)[0]
-        filter_bank.discretise(CUTOFF, T, *self.m["rates"])
-        self.tau_f, self.W_f = self.m["tau_f"], self.m["W_f"]
+        sizes = {"n": 2, "p": COLUMNS, "t": 1, "filters": CUTOFF.size, "channels": CUTOFF.size}
+        self.k, self.m = packed(BankConstants(CUTOFF))[0], zeros_of(BankMemory, sizes)[0]
+        filter_bank.discretise(CUTOFF, T, *self.m.filters.rates)
+        self.tau_f, self.W_f = self.m.filters.tau_f, self.m.filters.W_f
 
     def take(self, Y_p, Y_h, tau_J, is_seen):
-        self.m["Y_p"], self.m["Y_h"] = Y_p, Y_h
+        self.m.regressor.Y_p, self.m.regressor.Y_h = Y_p, Y_h
         filter_bank.take_sample(self.k, self.m, tau_J, is_seen)
 
     def resume(self, Y_p, Y_h, tau_J):

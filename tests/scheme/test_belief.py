@@ -31,8 +31,8 @@ def samples(count=400, seed=1):
 
 def learn(m, W_f, tau_f, held=0.0):
     """Learn a sample in which friction may hold a torque, Nm."""
-    m["W_learnt"], m["tau_learnt"] = W_f, tau_f
-    m["hold"], m["still_smooth"][filter_bank.LEARNT] = 10.0 * np.asarray(held), 0.1
+    m.filters.W_learnt, m.filters.tau_learnt = W_f, tau_f
+    m.sensitivity.hold, m.sensitivity.still_smooth[filter_bank.LEARNT] = 10.0 * np.asarray(held), 0.1
     return belief.learn(K, m)
 
 
@@ -51,12 +51,12 @@ def test_a_belief_begins_with_the_prior():
 def test_nothing_is_expected_of_an_arm_but_the_velocity_s_usual_lag():
     expected = np.zeros(COUNT)
     expected[[NAMES.index("lag1"), NAMES.index("lag2")]] = SETTINGS.certified.lag_s
-    np.testing.assert_array_equal(prior()["belief"], expected)
+    np.testing.assert_array_equal(prior().models.belief, expected)
 
 
 def test_of_further_friction_load_may_be_a_quarter_and_bristles_half():
     further = SETTINGS.certified.prior_std[-1]
-    std = dict(zip(NAMES, np.sqrt(np.diag(prior()["P_belief"])), strict=True))
+    std = dict(zip(NAMES, np.sqrt(np.diag(prior().models.P_belief)), strict=True))
     shares = {"stribeck1": 1.0, "load2": 0.25, "dahl_short1": 0.5, "dahl_long2": 0.5}
     assert {name: std[name] / further for name in shares} == pytest.approx(shares)
 
@@ -69,22 +69,22 @@ def test_what_is_learnt_is_the_closed_form_of_every_fourth_sample_that_has_waite
     W_f, tau_f = samples()
     held = np.random.default_rng(2).uniform(0.0, 0.1, tau_f.shape)
     m = prior()
-    theta0, P0 = m["belief"].copy(), m["P_belief"].copy()
+    theta0, P0 = m.models.belief.copy(), m.models.P_belief.copy()
     teach(m, W_f, tau_f, held)
     learnt = slice(EVERY - 1, len(W_f) - WAITING * EVERY, EVERY)
     a, learn_s = SETTINGS.certified.cutoffs_rad_s[1], EVERY * 1e-3  # noise through a filter is correlated over 2 / a
     R = (SETTINGS.certified.residual_Nm**2 + held[learnt] ** 2) * 2.0 / (a * learn_s)
     information = np.linalg.inv(P0) + np.einsum("nij,ni,nik->jk", W_f[learnt], 1.0 / R, W_f[learnt])
     correlation = np.linalg.solve(P0, theta0) + np.einsum("nij,ni->j", W_f[learnt], tau_f[learnt] / R)
-    np.testing.assert_allclose(m["P_belief"], np.linalg.inv(information), rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(m["belief"], np.linalg.solve(information, correlation), rtol=1e-7)
+    np.testing.assert_allclose(m.models.P_belief, np.linalg.inv(information), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(m.models.belief, np.linalg.solve(information, correlation), rtol=1e-7)
 
 
 def test_samples_closer_than_their_noise_changes_count_for_less_but_never_for_more_than_one():
     a = SETTINGS.certified.cutoffs_rad_s[1]
     for every, correlated in ((EVERY, 2.0 / (a * EVERY * 1e-3)), (20, 2.0), (60, 1.0)):
         settings = replace(SETTINGS, certified=replace(SETTINGS.certified, learn_every=every))
-        assert float(certified_memory.constants_of(settings)["correlated"][0]) == pytest.approx(correlated)
+        assert float(certified_memory.constants_of(settings)[0].correlated) == pytest.approx(correlated)
 
 
 def test_the_belief_tells_when_it_has_changed():
@@ -101,10 +101,10 @@ def test_a_sample_is_not_learnt_before_it_has_waited():
     untouched_belief, belief_hat = prior(), prior()
     wait = WAITING * EVERY
     for k in range(at + wait + 1):
-        assert np.array_equal(untouched_belief["belief"], belief_hat["belief"])
+        assert np.array_equal(untouched_belief.models.belief, belief_hat.models.belief)
         learn(untouched_belief, W_f[k], tau_f[k])
         learn(belief_hat, W_f[k], touched[k])
-    assert np.max(np.abs(untouched_belief["belief"] - belief_hat["belief"])) > 1e-3
+    assert np.max(np.abs(untouched_belief.models.belief - belief_hat.models.belief)) > 1e-3
 
 
 def test_samples_that_wait_are_thrown_away_when_they_turn_out_to_be_a_touch():
@@ -118,7 +118,7 @@ def test_samples_that_wait_are_thrown_away_when_they_turn_out_to_be_a_touch():
         teach(m, W_f[:flagged], touched[:flagged])
         belief.discard(m)
         teach(m, W_f[flagged:end], touched[flagged:end])
-        beliefs.append(m["belief"].copy())
+        beliefs.append(m.models.belief.copy())
     np.testing.assert_array_equal(beliefs[0], beliefs[1])
     assert np.max(np.abs(beliefs[0])) > 0.1
 
@@ -168,17 +168,17 @@ def test_a_lag_that_is_held_moves_no_more_and_the_others_are_learnt_as_if_it_wer
     teach(m, W_f[:400], tau_f[:400])
     belief.hold_lags(K, m)
     belief.discard(m)
-    held, variance = m["belief"][LAGS].copy(), np.diag(m["P_belief"])[LAGS].copy()
-    theta0, P0 = m["belief"][OTHERS].copy(), m["P_belief"][np.ix_(OTHERS, OTHERS)].copy()
+    held, variance = m.models.belief[LAGS].copy(), np.diag(m.models.P_belief)[LAGS].copy()
+    theta0, P0 = m.models.belief[OTHERS].copy(), m.models.P_belief[np.ix_(OTHERS, OTHERS)].copy()
     teach(m, W_f[400:], tau_f[400:])
-    np.testing.assert_array_equal(m["belief"][LAGS], held)
-    np.testing.assert_array_equal(np.diag(m["P_belief"])[LAGS], variance)
+    np.testing.assert_array_equal(m.models.belief[LAGS], held)
+    np.testing.assert_array_equal(np.diag(m.models.P_belief)[LAGS], variance)
     learnt = slice(400 + EVERY - 1, len(W_f) - WAITING * EVERY, EVERY)
     W, tau = W_f[learnt][..., OTHERS], tau_f[learnt] - W_f[learnt][..., LAGS] @ held
-    R = SETTINGS.certified.residual_Nm**2 * K["correlated"]
+    R = SETTINGS.certified.residual_Nm**2 * K.correlated
     information = np.linalg.inv(P0) + np.einsum("nij,nik->jk", W, W) / R
     theta = np.linalg.solve(information, np.linalg.solve(P0, theta0) + np.einsum("nij,ni->j", W, tau) / R)
-    np.testing.assert_allclose(m["belief"][OTHERS], theta, rtol=1e-6)
+    np.testing.assert_allclose(m.models.belief[OTHERS], theta, rtol=1e-6)
 
 
 def test_noise_of_the_torque_shrinks_a_lag_that_is_learnt_on_and_on_but_not_one_that_is_held():
@@ -193,11 +193,11 @@ def test_noise_of_the_torque_shrinks_a_lag_that_is_learnt_on_and_on_but_not_one_
     lags = []
     for is_held in (False, True):
         m = prior()
-        m["belief"][LAGS], m["P_belief"][LAGS, LAGS] = 0.001, 0.01**2
+        m.models.belief[LAGS], m.models.P_belief[LAGS, LAGS] = 0.001, 0.01**2
         if is_held:
             belief.hold_lags(K, m)
         teach(m, W_f, tau_f)
-        lags.append(m["belief"][LAGS].tolist())
+        lags.append(m.models.belief[LAGS].tolist())
     assert lags[0] == pytest.approx([0.0002] * 2, abs=5e-5)
     assert lags[1] == [0.001] * 2
 

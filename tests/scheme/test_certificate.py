@@ -11,19 +11,20 @@ from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
 FIT = SETTINGS.certified.fit_s
-TRAVEL, SPEED = float(K["travel_rad"]), float(K["velocity_rad_s"])
+TRAVEL, SPEED = float(K.travel_rad), float(K.velocity_rad_s)
 
 
 def fitted_arm(**changes):
     """Return the memory of an arm whose evidence is just complete, with some fields changed."""
     m = certified_memory.new_memory(SETTINGS)[0]
-    m["samples"] = round(FIT[0] * 1e3)
-    m["P_belief"][:] = np.diag(np.array(K["enough_std"]) ** 2 * 0.999)
-    m["excitation"], m["condition"] = K["excitation_Nm2s"], K["condition"]
-    m["q_low"][:], m["q_high"][:] = -0.5001 * TRAVEL, 0.5001 * TRAVEL
-    m["dq_low"][:], m["dq_high"][:] = -SPEED, SPEED
+    m.motion.samples = round(FIT[0] * 1e3)
+    m.models.P_belief[:] = np.diag(np.array(K.enough_std) ** 2 * 0.999)
+    m.fit.excitation, m.fit.condition = K.excitation_Nm2s, K.condition
+    m.motion.q_low[:], m.motion.q_high[:] = -0.5001 * TRAVEL, 0.5001 * TRAVEL
+    m.motion.dq_low[:], m.motion.dq_high[:] = -SPEED, SPEED
     for name, value in changes.items():
-        m[name] = value
+        (record,) = (record for record in (m.motion, m.fit, m.models) if name in record.dtype.names)
+        record[name] = value
     return m
 
 
@@ -33,8 +34,8 @@ def missing(m):
 
 def uncertain(name, times):
     j = NAMES.index(name)
-    P = np.array(fitted_arm()["P_belief"])
-    P[j, j] = (times * K["enough_std"][j]) ** 2
+    P = np.array(fitted_arm().models.P_belief)
+    P[j, j] = (times * K.enough_std[j]) ** 2
     return P
 
 

@@ -37,10 +37,10 @@ class Kernel:
         certified_kernel.begin_adaptation(self.constants, self.memory, False, True)
         self.m, self.out = self.memory[0], self.block[0]
         if theta is not None:
-            self.m["theta"][: len(theta)] = theta
-            self.m["theta"][len(theta) :] = 0.0
+            self.m.models.theta[: len(theta)] = theta
+            self.m.models.theta[len(theta) :] = 0.0
         if P is not None:
-            self.m["P"][:] = P
+            self.m.models.P[:] = P
 
     def step(self, q, dq, tau_J, mode=0, is_complete=1, periods=1, period_s=0.0):
         self.out["q"][:], self.out["dq"][:], self.out["tau_J"][:] = q, dq, tau_J
@@ -53,7 +53,7 @@ class Kernel:
         for k in range(len(q)):
             each_s = 0.0 if period_s is None else period_s[k]
             observations.append(self.step(q[k], dq[k], tau_J[k], mode, period_s=each_s))
-            residuals.append(self.m["r"].copy())
+            residuals.append(self.m.filters.r.copy())
         return np.array(observations), np.array(residuals)
 
 
@@ -117,10 +117,10 @@ def test_the_weight_of_a_payload_at_rest_is_no_contact_as_the_arm_begins_to_lear
     settings = replace(SETTINGS, arm=arm, estimator=replace(SETTINGS.estimator, gravity=True, P0=(1.0,) * 9))
     kernel = Kernel(settings)
     m, names = kernel.m, certified_memory.parameter_names(settings)
-    m["certified"][:9] = *THETA["P"], 8.0, 1.5
-    m["certified"][[names.index("lag1"), names.index("lag2")]] = lag_s
-    m["P_certified"][:] = np.diag(kernel.constants[0]["enough_std"] ** 2) * 0.01
-    m["theta"][:], m["P"][:] = m["certified"], m["P_certified"]
+    m.models.certified[:9] = *THETA["P"], 8.0, 1.5
+    m.models.certified[[names.index("lag1"), names.index("lag2")]] = lag_s
+    m.models.P_certified[:] = np.diag(kernel.constants[0].enough_std ** 2) * 0.01
+    m.models.theta[:], m.models.P[:] = m.models.certified, m.models.P_certified
     l1, l2 = arm.link_length_m
     weight = 9.80665 * np.array([l1 + l2, l2])
     rest = np.zeros(2), np.zeros(2), np.array([9.5, 1.5]) + weight
@@ -137,7 +137,7 @@ def test_a_gap_is_cut_out_of_time(smooth):
     kernel = Kernel(theta=SMOOTH)
     _, before = kernel.run(q[:300], dq[:300], tau_J[:300])
     kernel.step(q[450], dq[450], tau_J[450], periods=150)
-    np.testing.assert_allclose(kernel.m["r"], before[-1], atol=1e-12)
+    np.testing.assert_allclose(kernel.m.filters.r, before[-1], atol=1e-12)
     _, after = kernel.run(q[451:], dq[451:], tau_J[451:])
     assert np.max(np.abs(after)) < 2e-4
 
@@ -146,11 +146,11 @@ def test_what_was_lost_is_a_gap_for_the_sample_after_it(smooth):
     q, dq, tau_J = smooth
     kernel = Kernel(theta=SMOOTH)
     kernel.run(q[:300], dq[:300], tau_J[:300])
-    before = kernel.m["r"].copy()
+    before = kernel.m.filters.r.copy()
     kernel.step(q[299] + 9.0, dq[299], tau_J[299] + 9.0, is_complete=0)
-    np.testing.assert_array_equal(kernel.m["r"], before)
+    np.testing.assert_array_equal(kernel.m.filters.r, before)
     kernel.step(q[309], dq[309], tau_J[309], periods=sensitivity.MOST_FILLED + 2)
-    np.testing.assert_allclose(kernel.m["r"], before, atol=1e-12)
+    np.testing.assert_allclose(kernel.m.filters.r, before, atol=1e-12)
 
 
 @pytest.mark.parametrize("lost", [1, 2, 3])
@@ -165,11 +165,11 @@ def test_a_few_lost_samples_lie_between_their_neighbours(smooth, lost):
     expected = whole.run(q[after], dq[after], tau_J[after] - 1.0)[1][-1]
     seen = pushed.step(q[300 + lost], dq[300 + lost], tau_J[300 + lost] - 1.0, periods=lost + 1)
     assert not seen & Observation.UNSEEN
-    assert np.all(np.abs(pushed.m["r"]) > 0.4 * np.abs(expected))
+    assert np.all(np.abs(pushed.m.filters.r) > 0.4 * np.abs(expected))
     unpushed = Kernel(theta=SMOOTH)
     unpushed.run(q[:300], dq[:300], tau_J[:300])
     unpushed.step(q[300 + lost], dq[300 + lost], tau_J[300 + lost], periods=lost + 1)
-    assert np.max(np.abs(unpushed.m["r"])) < 1e-3
+    assert np.max(np.abs(unpushed.m.filters.r)) < 1e-3
 
 
 def test_an_incomplete_cycle_and_the_sample_after_a_gap_are_said_to_be_unseen(smooth):
@@ -186,12 +186,12 @@ def test_a_sample_that_is_no_number_is_told_and_filtered_by_nobody(smooth):
     q, dq, tau_J = smooth
     kernel = Kernel(theta=SMOOTH)
     kernel.run(q[:50], dq[:50], tau_J[:50])
-    before = kernel.m["r"].copy()
+    before = kernel.m.filters.r.copy()
     for place in range(3):
         values = [q[50].copy(), dq[50].copy(), tau_J[50].copy()]
         values[place][1] = np.nan
         assert kernel.step(*values) & Observation.NOT_A_NUMBER
-        np.testing.assert_array_equal(kernel.m["r"], before)
+        np.testing.assert_array_equal(kernel.m.filters.r, before)
 
 
 def test_the_measured_period_counts():
@@ -213,9 +213,9 @@ def test_an_interval_far_from_the_period_is_a_gap(smooth, period_s):
     q, dq, tau_J = smooth
     kernel = Kernel(theta=SMOOTH)
     kernel.run(q[:300], dq[:300], tau_J[:300] + 1.0)
-    before = kernel.m["r"].copy()
+    before = kernel.m.filters.r.copy()
     kernel.step(q[300], dq[300], tau_J[300], period_s=period_s)
-    np.testing.assert_allclose(kernel.m["r"], before, atol=1e-12)
+    np.testing.assert_allclose(kernel.m.filters.r, before, atol=1e-12)
 
 
 LEARNT_S = 3.0
@@ -229,7 +229,7 @@ def learnt(delay_s=0.0, offset=(0.0, 0.0)):
     open_minded = replace(SETTINGS.certified, prior_std=(1.0, 0.5, 0.5, 10.0, 0.3, 0.01, 0.2))
     kernel = Kernel(replace(SETTINGS, certified=open_minded))
     kernel.run(q, dq, tau_J, certified_kernel.LEARN)
-    return kernel.m["theta"].copy()
+    return kernel.m.models.theta.copy()
 
 
 def test_the_lag_of_the_velocity_is_identified():
@@ -242,7 +242,7 @@ def test_a_velocity_that_is_noisy_takes_no_inertia_away():
     """Noise of 5 mrad/s, as of a coarse encoder: least squares on the unsmoothed filter find 2 to 3 % less."""
     measured = record(THETA["P"], 20.0)
     noise = 0.005 * np.random.default_rng(5).standard_normal(measured.dq.shape)
-    found = play(measured._replace(dq=measured.dq + noise)).memory[0]["belief"]
+    found = play(measured._replace(dq=measured.dq + noise)).memory[0].models.belief
     np.testing.assert_allclose(found[:3], THETA["P"][:3], rtol=0.005)
 
 
@@ -333,7 +333,7 @@ def filtered_regressor(measured):
     kernel, rows = Kernel(), []
     for sample in zip(*measured, strict=True):
         kernel.step(*sample)
-        rows.append(kernel.m["W_f"][0].copy())
+        rows.append(kernel.m.filters.W_f[0].copy())
     return np.array(rows)
 
 
@@ -361,12 +361,12 @@ def test_after_a_touch_it_learns_with_thresholds_twice_as_high(touched):
     measured, played = touched
     begins = int(np.flatnonzero(played.observation.astype(int) & Observation.CONTACT)[0]) + RECOVER + 1
     calm, learn = Kernel(), certified_kernel.WATCH | certified_kernel.LEARN
-    calm.m["bent"][:] = np.sign(measured.dq[begins])
+    calm.m.regressor.bent[:] = np.sign(measured.dq[begins])
     for k in range(begins, begins + 100):
         calm.step(*(values[k] for values in measured), learn)
         if k >= begins + 50:
             expected = np.broadcast_to([2.0, 1.0], (5, 2))
-            np.testing.assert_allclose(played.h[k] / calm.m["h"], expected, rtol=0.01)
+            np.testing.assert_allclose(played.h[k] / calm.m.sensitivity.h, expected, rtol=0.01)
 
 
 def test_an_arm_that_stands_still_gets_no_certificate_and_the_reason_names_it():
@@ -399,11 +399,11 @@ def noisy_rest(std, mode, count=2000):
 def test_a_sensor_that_is_found_noisier_at_rest_raises_its_thresholds():
     noise = SETTINGS.certified.torque_noise_Nm * np.array([3.0, 0.5])
     kernel = noisy_rest(noise, certified_kernel.MEASURE)
-    np.testing.assert_allclose(kernel.m["roughness"], [9.0, 1.0], rtol=0.1)
+    np.testing.assert_allclose(kernel.m.sensitivity.roughness, [9.0, 1.0], rtol=0.1)
 
 
 def test_only_at_rest_is_the_sensors_noise_measured():
-    assert noisy_rest(0.5, 0, 50).m["roughness"].tolist() == [1.0, 1.0]
+    assert noisy_rest(0.5, 0, 50).m.sensitivity.roughness.tolist() == [1.0, 1.0]
 
 
 def test_without_watching_nothing_is_a_contact_and_no_threshold_is_in_force():
@@ -461,30 +461,30 @@ def test_a_contact_pauses_the_test_of_a_candidate_until_the_arm_has_recovered():
     while not kernel.step(rest, rest, [-2.0, 0.0], mode) & Observation.CONTACT:
         before += 1.0
     sums = ("candidate_cycles", "candidate_square", "frozen_square", "candidate_worst")
-    paused = [float(kernel.m[name]) for name in sums]
+    paused = [float(kernel.m.models[name]) for name in sums]
     assert paused[0] == before
-    assert kernel.m["ring_used"] == 0.0
-    assert kernel.m["recovering_cycles"] == RECOVER
+    assert kernel.m.ring.used == 0.0
+    assert kernel.m.models.recovering_cycles == RECOVER
     while kernel.step(rest, rest, rest, mode) & Observation.CONTACT:
         pass
     for _ in range(RECOVER - 2):
         kernel.step(rest, rest, rest, mode)
-    assert [float(kernel.m[name]) for name in sums] == paused
+    assert [float(kernel.m.models[name]) for name in sums] == paused
     kernel.step(rest, rest, rest, mode)
-    assert kernel.m["candidate_cycles"] == before + 1.0
+    assert kernel.m.models.candidate_cycles == before + 1.0
 
 
 @pytest.mark.parametrize(("mode", "strain"), [("LEARN", 4.0), ("TEST", 4.0), ("REFINE", 1.0)])
 def test_each_contact_before_the_certificate_strains_the_thresholds_once(mode, strain):
     """Twice over the threshold, with a recovery between."""
     kernel = Kernel(P=np.zeros((COUNT, COUNT)))
-    kernel.m["P_belief"][:] = 0.0
+    kernel.m.models.P_belief[:] = 0.0
     rest, mode = np.zeros(2), certified_kernel.WATCH | getattr(certified_kernel, mode)
     for _ in range(2):
         for torque_Nm, count in ((-5.0, 30), (0.0, 600 + RECOVER)):
             found = [kernel.step(rest, rest, [torque_Nm, 0.0], mode) for _ in range(count)]
             assert bool(found[-1] & Observation.CONTACT) is (torque_Nm != 0.0)
-    assert kernel.m["strain"].tolist() == [strain, 1.0]
+    assert kernel.m.sensitivity.strain.tolist() == [strain, 1.0]
 
 
 @pytest.mark.parametrize("speeds", [(0.0, 0.0), (0.5, 0.0), (0.0, -0.5)])
@@ -492,7 +492,7 @@ def test_a_test_in_which_a_joint_rests_proves_nothing(speeds):
     """A model of nothing, of an arm of nothing: no residual, so only the motion is missing."""
     kernel = Kernel(theta=np.zeros(COUNT))
     certified_kernel.begin_test(kernel.constants, kernel.memory)
-    kernel.m["theta"][:] = 0.0
+    kernel.m.models.theta[:] = 0.0
     found = [kernel.step([0.0, 0.0], speeds, [0.0, 0.0], certified_kernel.TEST) for _ in range(2 * TESTED)]
     assert not np.any(np.array(found) & (Observation.CERTIFIED | Observation.REFUTED))
     assert kernel.step([0.0, 0.0], [0.5, -0.5], [0.0, 0.0], certified_kernel.TEST) & Observation.CERTIFIED
@@ -505,14 +505,14 @@ def test_an_arm_that_rests_teaches_no_offset_where_friction_holds():
         kernel = Kernel(theta=np.zeros(COUNT))
         m = kernel.m
         std = np.where(np.char.startswith(NAMES, "offset"), 0.0115, 1e-4)
-        m["belief"][:] = 0.0
-        m["P_belief"][:] = m["P"][:] = np.diag(std**2)
+        m.models.belief[:] = 0.0
+        m.models.P_belief[:] = m.models.P[:] = np.diag(std**2)
         certified_kernel.begin_refinement(kernel.constants, kernel.memory)
-        m["still"][:] = m["still_smooth"][:] = still
-        m["h"][:] = 1.0
+        m.sensitivity.still[:] = m.sensitivity.still_smooth[:] = still
+        m.sensitivity.h[:] = 1.0
         for _ in range(2000):
             kernel.step([0.0, 0.0], [speed, speed], [0.1, -0.1], certified_kernel.REFINE)
-        learnt.append(m["belief"][OFFSETS].copy())
+        learnt.append(m.models.belief[OFFSETS].copy())
     np.testing.assert_array_equal(learnt[0], [0.0, 0.0])
     np.testing.assert_allclose(learnt[1], [0.1, -0.1], atol=0.035)
 

@@ -305,7 +305,7 @@ def test_the_sensors_noise_is_measured_while_the_arm_is_commissioned_and_never_l
     noise = 0.08 * np.random.default_rng(3).standard_normal((400, 2))
     restless = [pipeline.step(arm_state(k, dq=(0.06, 0.06), tau_J=noise[k])) for k in range(400)]
     assert restless[-1].state is SchemeState.COMMISSION
-    roughness = pipeline.numbers.memory[0]["roughness"]
+    roughness = pipeline.numbers.memory[0].sensitivity.roughness
     np.testing.assert_allclose(roughness, (0.08 / SETTINGS.certified.torque_noise_Nm) ** 2, rtol=0.2)
     rest = [pipeline.step(arm_state(400 + k)) for k in range(BEFORE)]
     assert rest[-1].state is SchemeState.ADAPT
@@ -360,7 +360,7 @@ def test_a_margin_that_shrinks_is_said_once():
     pipeline._policy._margin = MarginWatch(2, memory_blocks=5.0)
     said = []
     for share in (0.4,) * 10 + (0.9,) * 10:
-        pipeline.numbers.memory[0]["peak_share"][1] = share
+        pipeline.numbers.memory[0].sensitivity.peak_share[1] = share
         pipeline._policy.attend(SECOND, 0)
         said.append([event.message for event in pipeline.take_events()])
     lines = [line for second in said for line in second]

@@ -52,7 +52,7 @@ class Touch:
         self.constants, self.memory, self.block, _ = paper_kernel.numbers_of(settings)
         memory, block = self.memory[0], self.block[0]
         self.tau_ext_hat = block["tau_ext_hat"]
-        self.evidence = IntegratedContact(settings, self.tau_ext_hat, memory["integral"], memory["peak"])
+        self.evidence = IntegratedContact(settings, self.tau_ext_hat, memory.integral, memory.peak)
         self.course = Course(settings, self.evidence.due_cycles)
         self.reports = []
 
@@ -60,7 +60,7 @@ class Touch:
         has_begun = False
         for cycle, torque in enumerate(tau_ext):
             self.block[0]["tau_J"][:] = -torque
-            mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.course.m["is_open"] else 0)
+            mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.course.m.is_open else 0)
             joints = (
                 paper_kernel.step(self.constants, self.memory, self.block, 1, 1, mode) >> paper_kernel.CONTACT_SHIFT
             )

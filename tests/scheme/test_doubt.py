@@ -152,15 +152,15 @@ def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD, others=5):
 def verdict_of(contacts, gap_s=1.0, lasts_s=0.5, peak=3.0, ways=(0.5, 0.5)):
     memory = certified_memory.new_memory(SETTINGS)
     values = memory[0]
-    values["theta"] = 0.0
+    values.models.theta = 0.0
     judge, cycle, verdict = Doubt(SETTINGS, certified_memory.constants_of(SETTINGS), memory), 0, None
     for rw, ww, rr in contacts:
         judge.go_on(cycle)
         cycle += round(gap_s / PERIOD_S)
         judge.begin(cycle, is_touched=True)
-        values["cause_rw"], values["cause_ww"], values["contact_rr"] = rw, ww, rr
-        values["load_ww"] = np.array(ways) * ww[doubt.LOAD]
-        values["contact_peak"] = peak
+        values.doubt.cause_rw, values.doubt.cause_ww, values.doubt.contact_rr = rw, ww, rr
+        values.doubt.load_ww = np.array(ways) * ww[doubt.LOAD]
+        values.doubt.contact_peak = peak
         cycle += round(lasts_s / PERIOD_S)
         verdict = judge.end(cycle)
     return verdict
@@ -239,7 +239,7 @@ def test_a_contact_as_the_arm_goes_on_lets_it_move_further_the_next_time_four_ti
     loop = MonitoredLoop()
     loop.theta = loop.theta + added(F_c1=0.3)
     loop.run_until_taken_back()
-    assert loop.pipeline.numbers.memory[0]["strain"].tolist() == [doubt.MOST_STRAIN, 1.0]
+    assert loop.pipeline.numbers.memory[0].sensitivity.strain.tolist() == [doubt.MOST_STRAIN, 1.0]
 
 
 @pytest.mark.parametrize("size", [-0.3, 2.1])

@@ -44,7 +44,7 @@ class HeldLoop(TouchedLoop):
 
     def error_of(self, name):
         place = NAMES.index(name)
-        return abs(self.pipeline.numbers.memory[0]["theta"][place] - self.theta[place])
+        return abs(self.pipeline.numbers.memory[0].models.theta[place] - self.theta[place])
 
 
 def states(outputs):
@@ -180,7 +180,7 @@ def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound(profile):
     loop = HeldLoop(FREE, theta=THETA[profile], seed=5)
     outputs = loop.run_until(SchemeState.CERTIFY)
     m = loop.pipeline.numbers.memory[0]
-    furthest = max(fit_check.distance(m, s) for s in range(int(m["steps_used"])))
+    furthest = max(fit_check.distance(m, s) for s in range(int(m.fit_check.steps_used)))
     assert furthest < 0.5 * fit_check.STEADY * fit_check.SMALLEST_SQUARE
     outputs += loop.run_until(SchemeState.MONITOR)
     learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
@@ -193,11 +193,11 @@ class Compared:
 
     def __init__(self, settings=FREE, std=0.01):
         self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
-        self.m["P_belief"] = std**2 * np.eye(len(NAMES))
-        self.m["belief"] = 0.1
-        self.m["fit_square"], self.m["fit_rows"] = 1.0, fit_check.HARD  # u = 1
-        self.keep(self.m["belief"], std)
-        self.m["limit"][: anchor.KINDS] = np.inf if settings is UNKNOWN else 0.04
+        self.m.models.P_belief = std**2 * np.eye(len(NAMES))
+        self.m.models.belief = 0.1
+        self.m.fit_check.fit_square, self.m.fit_check.fit_rows = 1.0, fit_check.HARD  # u = 1
+        self.keep(self.m.models.belief, std)
+        self.m.evidence.limit[: anchor.KINDS] = np.inf if settings is UNKNOWN else 0.04
 
     def keep(self, theta, std, unit=1.0, age_s=0.0):
         """Keep one more belief."""
@@ -209,13 +209,13 @@ class Compared:
         self.keep(theta, std)
 
     def agrees_with(self, name, change):
-        self.m["belief"] = 0.1
-        self.m["belief"][NAMES.index(name)] += change
+        self.m.models.belief = 0.1
+        self.m.models.belief[NAMES.index(name)] += change
         return self.agrees()
 
     def agrees(self):
-        unit = fit_check.unit_of(self.m["fit_square"], self.m["fit_rows"])
-        evidence.fit(self.k, self.m, self.m["belief"], self.m["P_belief"], unit)
+        unit = fit_check.unit_of(self.m.fit_check.fit_square, self.m.fit_check.fit_rows)
+        evidence.fit(self.k, self.m, self.m.models.belief, self.m.models.P_belief, unit)
         return earlier.is_no_more(self.k, self.m)
 
 
@@ -242,16 +242,16 @@ def test_less_than_the_floor_is_nothing_however_well_all_is_known(name, floor):
 def test_an_offset_counts_both_ways_and_where_something_anchors_it_shows_that_what_was_kept_was_leant_on():
     compared = Compared(std=1e-5)
     assert compared.agrees_with("offset1", 0.0)
-    compared.m["limit"][: anchor.KINDS] = np.inf
+    compared.m.evidence.limit[: anchor.KINDS] = np.inf
     assert not compared.agrees_with("offset1", -0.05)
-    compared.m["limit"][0] = 0.04
+    compared.m.evidence.limit[0] = 0.04
     assert compared.agrees_with("offset1", -0.05)
     assert not earlier.is_keeping(compared.m)
 
 
 def test_of_two_joints_only_the_one_without_an_anchor_is_judged_by_its_earlier_offset():
     compared = Compared(std=1e-5)
-    compared.m["limit"][: anchor.KINDS, evidence.OFFSETS + 1] = np.inf
+    compared.m.evidence.limit[: anchor.KINDS, evidence.OFFSETS + 1] = np.inf
     assert not compared.agrees_with("offset2", 0.05)
     assert earlier.is_keeping(compared.m)
     assert earlier.describe_more(compared.m)[0].startswith("torque offset of joint 2 is 0.050 Nm more than 0.0 s ago")
@@ -261,7 +261,7 @@ def test_of_two_joints_only_the_one_without_an_anchor_is_judged_by_its_earlier_o
 def test_a_fit_that_is_not_a_number_agrees_with_nothing_that_was_kept():
     for settings in (FREE, UNKNOWN):
         compared = Compared(settings)
-        compared.m["belief"] = np.nan
+        compared.m.models.belief = np.nan
         assert not compared.agrees()
         assert earlier.is_keeping(compared.m)
 
@@ -269,8 +269,8 @@ def test_a_fit_that_is_not_a_number_agrees_with_nothing_that_was_kept():
 def test_what_the_prior_alone_says_judges_nothing():
     prior = Compared()
     earlier.forget(prior.m)
-    P = np.diag(certified_memory.new_memory(FREE)[0]["P_belief"].diagonal())
-    earlier._keep(prior.k, prior.m, prior.m["belief"], P, fit_check.SMALLEST_UNIT, 0.0)
+    P = np.diag(certified_memory.new_memory(FREE)[0].models.P_belief.diagonal())
+    earlier._keep(prior.k, prior.m, prior.m.models.belief, P, fit_check.SMALLEST_UNIT, 0.0)
     assert prior.agrees_with("F_c1", 1.0)
     assert prior.agrees_with("a1", 1.0)
 
@@ -280,15 +280,20 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
     compared = Compared(std=0.01)
     m = compared.m
     earlier.forget(m)
-    m["steps_used"], m["steps_theta"][:2] = 2.0, 0.1
-    m["steps_P"][:2] = 0.02**2 * np.eye(len(NAMES))
-    m["steps_square"][:2], m["steps_rows"][:2], m["fit_square"], m["fit_rows"] = 0.0, 50.0, 0.0, 100.0
+    m.fit_check.steps_used, m.fit_check.steps_theta[:2] = 2.0, 0.1
+    m.fit_check.steps_P[:2] = 0.02**2 * np.eye(len(NAMES))
+    m.fit_check.steps_square[:2], m.fit_check.steps_rows[:2], m.fit_check.fit_square, m.fit_check.fit_rows = (
+        0.0,
+        50.0,
+        0.0,
+        100.0,
+    )
     added_variance = (1.0 + fit_check.REGULAR) * 0.02**2 - 0.01**2
-    m["belief"][INERTIA] += share * np.sqrt(fit_check.STEADY * fit_check.SMALLEST_SQUARE * added_variance)
+    m.models.belief[INERTIA] += share * np.sqrt(fit_check.STEADY * fit_check.SMALLEST_SQUARE * added_variance)
     assert (fit_check.last_unsteady_step(m) == fit_check.NONE) is is_steady
     earlier.keep(compared.k, m)
-    assert m["kept_count"] == (2.0 if is_steady else 1.0)
-    assert m["said"][evidence.KEPT, evidence.FRICTIONS] == 0.1
+    assert m.earlier.kept_count == (2.0 if is_steady else 1.0)
+    assert m.evidence.said[evidence.KEPT, evidence.FRICTIONS] == 0.1
 
 
 UPRIGHT = replace(
@@ -304,22 +309,22 @@ class Halves:
         count = len(certified_memory.parameter_names(settings))
         random = np.random.default_rng(5)
         root = random.standard_normal((count, count))
-        self.m["P_belief"] = 0.01**2 * (np.eye(count) + root @ root.T / count)
-        self.m["samples_W"][:3], self.m["samples_tau"][:3] = np.eye(2, count), self.m["belief"][:2]
-        self.m["samples_kept"] = 3.0
-        self.m["steps_used"] = steps_used
-        self.m["steps_theta"][:] = self.m["belief"]
-        self.m["steps_P"][:] = 2.0 * self.m["P_belief"]
+        self.m.models.P_belief = 0.01**2 * (np.eye(count) + root @ root.T / count)
+        self.m.fit_check.samples_W[:3], self.m.fit_check.samples_tau[:3] = np.eye(2, count), self.m.models.belief[:2]
+        self.m.fit_check.samples_kept = 3.0
+        self.m.fit_check.steps_used = steps_used
+        self.m.fit_check.steps_theta[:] = self.m.models.belief
+        self.m.fit_check.steps_P[:] = 2.0 * self.m.models.P_belief
 
     def differ(self, step, change):
         """Let a step have had other parameters; return how far its later samples then are from the belief (p,)."""
-        self.m["steps_theta"][step] -= change
-        P, P_0 = self.m["P_belief"], (1.0 + fit_check.REGULAR) * self.m["steps_P"][step]
+        self.m.fit_check.steps_theta[step] -= change
+        P, P_0 = self.m.models.P_belief, (1.0 + fit_check.REGULAR) * self.m.fit_check.steps_P[step]
         alone = np.linalg.solve(
             np.linalg.inv(P) - np.linalg.inv(P_0),
-            np.linalg.solve(P, self.m["belief"]) - np.linalg.solve(P_0, self.m["steps_theta"][step]),
+            np.linalg.solve(P, self.m.models.belief) - np.linalg.solve(P_0, self.m.fit_check.steps_theta[step]),
         )
-        return alone - self.m["belief"]
+        return alone - self.m.models.belief
 
 
 def is_whole(fit):
@@ -329,11 +334,11 @@ def is_whole(fit):
 def test_the_model_of_the_later_samples_is_that_of_their_own_information():
     fit = Halves()
     root = 0.005 * np.random.default_rng(6).standard_normal((len(NAMES), 4))
-    fit.m["steps_P"][0] += root @ root.T
+    fit.m.fit_check.steps_P[0] += root @ root.T
     alone = fit.differ(0, np.linspace(-0.02, 0.03, len(NAMES)))
     m = fit.m
     assert fit_check.find_later(m, 0)
-    assert m["later"] == pytest.approx(alone, rel=1e-6)
+    assert m.fit_check.later == pytest.approx(alone, rel=1e-6)
 
 
 @pytest.mark.parametrize("steps_used", [2, 11])
@@ -347,15 +352,15 @@ def test_later_samples_that_come_to_another_torque_do_not_bear_the_fit_out(share
     step = fit_check.last_step_before_change(fit.k, fit.m)
     assert step == (fit_check.NONE if is_borne_out else steps_used - 1)
     earlier.keep_steps(fit.k, fit.m, steps_used - 1)
-    assert fit.m["kept_count"] == min(steps_used - earlier.YOUNG_STEPS, fit_check.STEPS)
-    fit.m["is_payload"] = 1.0
+    assert fit.m.earlier.kept_count == min(steps_used - earlier.YOUNG_STEPS, fit_check.STEPS)
+    fit.m.models.is_payload = 1.0
     assert fit_check.last_step_before_change(fit.k, fit.m) == fit_check.NONE
 
 
 @pytest.mark.parametrize(("share", "is_borne_out"), [(0.97, True), (1.03, False)])
 def test_where_gravity_acts_later_samples_may_differ_by_what_they_do_not_know(share, is_borne_out):
     fit, count = Halves(settings=UPRIGHT), len(certified_memory.parameter_names(UPRIGHT))
-    P, P_0 = fit.m["P_belief"], (1.0 + fit_check.REGULAR) * fit.m["steps_P"][0]
+    P, P_0 = fit.m.models.P_belief, (1.0 + fit_check.REGULAR) * fit.m.fit_check.steps_P[0]
     variance = np.diag(np.linalg.inv(np.linalg.inv(P) - np.linalg.inv(P_0)) - P)[:2]
     unknown_Nm = np.sqrt(fit_check.SMALLEST_UNIT * variance)
     far = np.abs(Halves(settings=UPRIGHT).differ(0, np.eye(count)[1])[:2])
@@ -368,7 +373,7 @@ def test_where_gravity_acts_later_samples_may_differ_by_what_they_do_not_know(sh
 @pytest.mark.parametrize(("settings", "has_mounting"), [(FREE, False), (UPRIGHT, True)], ids=["flat", "upright"])
 def test_a_fit_that_no_model_explains_names_the_mounting_where_gravity_acts(settings, has_mounting):
     constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
-    memory[0]["withheld_by"] = certificate.CHANGED
+    memory[0].certificate.withheld_by = certificate.CHANGED
     said = CertificateWatch(constants, memory, "").refuse(is_reading=False)
     assert "no one model explains the whole fit" in said.message
     assert ("arm.mounting_deg" in said.message) is has_mounting
@@ -379,7 +384,7 @@ def test_a_fit_with_noise_may_differ_by_more():
     unit = np.eye(len(NAMES))[1]
     fit.differ(0, 1.4 * fit_check.LATER_NM / np.abs(Halves().differ(0, unit)[:2]).max() * unit)
     assert not is_whole(fit)
-    fit.m["samples_tau"][:3] += 0.25 * fit_check.LATER_NM
+    fit.m.fit_check.samples_tau[:3] += 0.25 * fit_check.LATER_NM
     assert is_whole(fit)
 
 
@@ -387,7 +392,12 @@ def test_a_fit_with_noise_may_differ_by_more():
 def test_a_fit_whose_learnt_residuals_are_large_may_differ_by_a_share_of_the_better_part_of_them(share, is_borne_out):
     fit = Halves(steps_used=1)
     m, unit = fit.m, np.eye(len(NAMES))[1]
-    m["steps_square"][0], m["steps_rows"][0], m["fit_square"], m["fit_rows"] = 2.0, 50.0, 2.5, 100.0
+    m.fit_check.steps_square[0], m.fit_check.steps_rows[0], m.fit_check.fit_square, m.fit_check.fit_rows = (
+        2.0,
+        50.0,
+        2.5,
+        100.0,
+    )
     noise_Nm = fit_check.LEARNT_SHARE * FREE.certified.residual_Nm * np.sqrt(0.5 / 50.0)
     far = np.abs(Halves().differ(0, unit)[:2]).max()
     fit.differ(0, share * (fit_check.LATER_NM + noise_Nm) / far * unit)
@@ -398,11 +408,11 @@ def test_what_is_kept_is_from_before_the_contact():
     loop = HeldLoop(FREE)
     loop.learn(1.1)
     m = loop.pipeline.numbers.memory[0]
-    steps, of_steps = int(m["steps_used"]), m["steps_theta"].copy()
+    steps, of_steps = int(m.fit_check.steps_used), m.fit_check.steps_theta.copy()
     kept = steps - earlier.YOUNG_STEPS
     loop.lean(0, 3.0, 0.05)
-    assert m["kept_count"] == kept + 1 > 3
-    said = m["said"][evidence.KEPT : evidence.KEPT + kept + 1]
+    assert m.earlier.kept_count == kept + 1 > 3
+    said = m.evidence.said[evidence.KEPT : evidence.KEPT + kept + 1]
     a1 = of_steps[earlier.YOUNG_STEPS : steps, NAMES.index("a1")]
     np.testing.assert_array_equal(said[:kept, evidence.FRICTIONS], a1)
     friction = said[-1, 0] - (THETA["P"][5] + evidence.SPEEDS_RAD_S[0] * THETA["P"][3])
@@ -413,7 +423,7 @@ def test_nothing_is_kept_of_a_fit_that_is_as_young_as_a_touch_of_its_beginning()
     loop = HeldLoop(FREE)
     loop.learn(0.3)
     m = loop.pipeline.numbers.memory[0]
-    assert m["steps_used"] == 1.0
+    assert m.fit_check.steps_used == 1.0
     outputs = loop.lean(0, 5.0, 0.05)
     assert any(output.contact is not None for output in outputs)
     assert not earlier.is_keeping(m)
@@ -423,10 +433,10 @@ def test_nothing_is_kept_of_a_fit_that_is_as_young_as_a_touch_of_its_beginning()
 def test_a_kept_belief_whose_offset_an_anchor_excludes_was_leant_on_however_wide_the_anchor_is(offset_Nm, is_kept):
     compared = Compared()
     m = compared.m
-    m["limit"][: anchor.KINDS] = np.inf
-    m["limit"][anchor.REST] = 0.15  # wider than `beta_Nm`
-    m["anchor_Nm"][anchor.REST] = m["belief"][OFFSETS]
-    kept = m["belief"].copy()
+    m.evidence.limit[: anchor.KINDS] = np.inf
+    m.evidence.limit[anchor.REST] = 0.15  # wider than `beta_Nm`
+    m.anchor.anchor_Nm[anchor.REST] = m.models.belief[OFFSETS]
+    kept = m.models.belief.copy()
     kept[OFFSETS] += (offset_Nm, 0.0)
     compared.keep_only(kept, 0.01)
     compared.agrees()
@@ -435,11 +445,11 @@ def test_a_kept_belief_whose_offset_an_anchor_excludes_was_leant_on_however_wide
 
 def test_of_several_kept_beliefs_the_one_that_knew_the_arm_untouched_judges():
     compared = Compared()
-    m, compared_with = compared.m, compared.m["belief"].copy()
+    m, compared_with = compared.m, compared.m.models.belief.copy()
     for touched, std in ((0.3, 0.01), (0.0, 1.0)):  # one that has learnt the hand, one that knows nothing
         compared_with[NAMES.index("F_c1")] = 0.1 + touched
         compared.keep(compared_with, std, age_s=1.0)
-    m["said_age_s"][evidence.KEPT] = 7.0
+    m.evidence.said_age_s[evidence.KEPT] = 7.0
     assert not compared.agrees_with("F_c1", 0.3)
     (line,) = earlier.describe_more(m)
     assert line.startswith("friction of joint 1 at 0.2 rad/s is 0.300 Nm more than 7.0 s ago, bound 0.05")
@@ -450,13 +460,13 @@ def test_no_arm_has_less_friction_than_none_whatever_a_touched_belief_says():
     none = np.full(len(NAMES), 0.1)
     none[[VISCOUS, COULOMB]] = 0.0, -0.025
     compared.keep_only(none, 1e-5)
-    compared.m["belief"][[VISCOUS, COULOMB]] = 0.0, 0.04
+    compared.m.models.belief[[VISCOUS, COULOMB]] = 0.0, 0.04
     assert not compared.agrees()  # as one of none, 0.04 Nm more
     none[COULOMB] = -0.06  # who pushed the arm on was there
     compared.keep_only(none, 1e-5)
     assert not earlier.is_keeping(compared.m)
     assert compared.agrees()
-    assert compared.m["kept_count"] == 0.0
+    assert compared.m.earlier.kept_count == 0.0
 
 
 def test_less_friction_lapses_what_was_kept_after_more_fits_than_more_of_it_does():
@@ -464,8 +474,8 @@ def test_less_friction_lapses_what_was_kept_after_more_fits_than_more_of_it_does
     agreed = [compared.agrees_with("F_c1", -0.09) for _ in range(int(earlier.LESS_FITS))]  # three times the bound
     assert agreed == [False] * (int(earlier.LESS_FITS) - 1) + [True]
     leant = Compared(UNKNOWN, std=1e-5)
-    leant.m["belief"][OFFSETS] -= 0.09
-    leant.keep_only(leant.m["belief"] + 0.09 * np.isin(np.arange(len(NAMES)), [COULOMB, *OFFSETS]), 1e-5)
+    leant.m.models.belief[OFFSETS] -= 0.09
+    leant.keep_only(leant.m.models.belief + 0.09 * np.isin(np.arange(len(NAMES)), [COULOMB, *OFFSETS]), 1e-5)
     assert not any(leant.agrees() for _ in range(10))
     more = Compared(std=1e-5)
     assert not any(more.agrees_with("F_c1", 0.09) for _ in range(10))
@@ -480,7 +490,7 @@ def test_what_was_kept_lapses_where_two_fits_agree_that_exceed_it_by_little(firs
     compared = Compared(std=1e-5)  # the bound is the floor, 0.03 Nm
     assert not compared.agrees_with("F_c1", first)
     assert compared.agrees_with("F_c1", second) is lapses
-    assert bool(compared.m["has_lapsed"]) is (lapses and second > 0.0)
+    assert bool(compared.m.earlier.has_lapsed) is (lapses and second > 0.0)
 
 
 def test_a_contact_between_two_fits_keeps_what_was_kept():
@@ -493,11 +503,11 @@ def test_a_contact_between_two_fits_keeps_what_was_kept():
 
 def test_a_kept_belief_that_was_leant_on_is_forgotten_and_the_others_go_on_judging():
     compared = Compared(std=1e-5)
-    leant = compared.m["belief"].copy()
+    leant = compared.m.models.belief.copy()
     leant[NAMES.index("offset1")] += 0.3
     compared.keep(leant, 1e-5)
     assert not compared.agrees_with("F_c1", 0.04)
-    assert np.isinf(compared.m["said_variance"][evidence.KEPT : evidence.KEPT + 2, 0]).tolist() == [False, True]
+    assert np.isinf(compared.m.evidence.said_variance[evidence.KEPT : evidence.KEPT + 2, 0]).tolist() == [False, True]
 
 
 @pytest.mark.parametrize(("begins_s", "drag_Nm"), long_but(1, [(0.87, 0.14), (0.55, 0.27)]))

@@ -28,8 +28,8 @@ class Table:
 def test_a_difference_counts_from_so_many_deviations_of_source_and_fit_on(s, sigmas):
     table = Table(s, DRAG, variance=0.03**2, fitted_variance=0.04**2)
     assert table.excess(1.0 + sigmas * 0.05) == pytest.approx(1.0)
-    assert table.m["limit"][s, DRAG] == pytest.approx(sigmas * 0.05)
-    assert table.m["difference"][s, DRAG] == pytest.approx(sigmas * 0.05)
+    assert table.m.evidence.limit[s, DRAG] == pytest.approx(sigmas * 0.05)
+    assert table.m.evidence.difference[s, DRAG] == pytest.approx(sigmas * 0.05)
 
 
 def test_a_floor_is_the_least_limit_and_slack_is_added_to_it():
@@ -78,8 +78,8 @@ def test_each_quantity_is_a_column_of_the_parameters():
     of = dict(zip(NAMES, theta, strict=True))
     friction = [of[f"F_c{i}"] + v * of[f"F_v{i}"] for i in (1, 2) for v in evidence.SPEEDS_RAD_S]
     others = ("a1", "a2", "a3", "offset1", "offset2", "F_v1", "F_v2")
-    np.testing.assert_allclose(k["columns"] @ theta, [*friction, *(of[name] for name in others)])
-    assert k["columns"].shape[0] == QUANTITIES
+    np.testing.assert_allclose(k.evidence.columns @ theta, [*friction, *(of[name] for name in others)])
+    assert k.evidence.columns.shape[0] == QUANTITIES
 
 
 def test_the_prior_s_part_of_a_variance_is_not_scaled():

@@ -19,7 +19,7 @@ class Fit:
         fit_check.begin(self.m)
         random = np.random.default_rng(1)
         self.W = random.standard_normal((learnt, 2, len(NAMES)))
-        self.tau = self.W @ self.m["belief"] + 0.01 * random.standard_normal((learnt, 2))
+        self.tau = self.W @ self.m.models.belief + 0.01 * random.standard_normal((learnt, 2))
 
     @property
     def first(self):
@@ -36,7 +36,7 @@ def test_a_fit_that_explains_its_samples_has_none_that_stands_out():
 def test_a_sample_stands_out_by_the_residual_of_the_better_half(share, is_explained):
     fit = Fit()
     limit_Nm = fit_check.LIMIT_NM + fit_check.LIMIT_SHARE * 0.01
-    fit.tau[29, 1] = fit.W[29, 1] @ fit.m["belief"] - share * limit_Nm
+    fit.tau[29, 1] = fit.W[29, 1] @ fit.m.models.belief - share * limit_Nm
     assert (fit.first == -1) is is_explained
 
 
@@ -50,7 +50,7 @@ def test_a_long_fit_is_kept_in_the_same_room_from_its_beginning_to_its_end():
     fit = Fit(learnt=3000)
     fit.tau[:90] += 1.0
     assert fit.first == 0
-    kept, every = int(fit.m["samples_kept"]), fit.m["samples_every"]
+    kept, every = int(fit.m.fit_check.samples_kept), fit.m.fit_check.samples_every
     assert fit_check.ROOM // 2 <= kept <= fit_check.ROOM
     assert kept * every == pytest.approx(3000, abs=2 * every)
     fit = Fit(learnt=3000)
@@ -60,7 +60,7 @@ def test_a_long_fit_is_kept_in_the_same_room_from_its_beginning_to_its_end():
 
 def test_a_payloads_fit_is_not_asked():
     fit = Fit()
-    fit.m["is_payload"] = 1.0
+    fit.m.models.is_payload = 1.0
     fit.tau[98:104] += 5.0
     assert fit.first == -1
 

@@ -144,14 +144,14 @@ class Asked:
         history = replace(settings.history, friction_std_Nm=(0.0,) * 6, inertia_std_kgm2=(0.0,) * 3, **shares)
         settings = replace(settings, history=history)
         self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
-        self.m["P_belief"] = (std**2 + 1e-12) * np.eye(len(NAMES))
-        self.m["fit_square"], self.m["fit_rows"] = 1.0, 4.0
+        self.m.models.P_belief = (std**2 + 1e-12) * np.eye(len(NAMES))
+        self.m.fit_check.fit_square, self.m.fit_check.fit_rows = 1.0, 4.0
 
     def agrees_with(self, name, change):
-        self.m["belief"] = 0.1
-        self.m["belief"][NAMES.index(name)] += change
-        unit = fit_check.unit_of(self.m["fit_square"], self.m["fit_rows"])
-        evidence.fit(self.k, self.m, self.m["belief"], self.m["P_belief"], unit)
+        self.m.models.belief = 0.1
+        self.m.models.belief[NAMES.index(name)] += change
+        unit = fit_check.unit_of(self.m.fit_check.fit_square, self.m.fit_check.fit_rows)
+        evidence.fit(self.k, self.m, self.m.models.belief, self.m.models.P_belief, unit)
         return certificate.is_no_more(self.k, self.m)
 
 

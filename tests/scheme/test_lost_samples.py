@@ -16,31 +16,31 @@ MODE = certified_kernel.WATCH | certified_kernel.REFINE
 def followed(steps, dq=(0.3, 0.3), is_seen=True, lost_Nm2=0.0):
     """Return G (3, 2) after a sample that came so many periods after the last, which had 0.3 rad/s."""
     m = certified_memory.new_memory(SETTINGS)[0]
-    m["last"][1] = 0.3
-    m["hold"][:] = 0.1
-    m["M"][:] = np.eye(2)
-    m["lost"][:] = lost_Nm2
+    m.gaps.last[1] = 0.3
+    m.sensitivity.hold[:] = 0.1
+    m.regressor.M[:] = np.eye(2)
+    m.sensitivity.lost[:] = lost_Nm2
     sensitivity.follow_lost(K, m, np.array(dq), steps, steps * PERIOD_S, is_seen)
-    return m["lost"].copy()
+    return m.sensitivity.lost.copy()
 
 
 def test_a_sample_after_a_sample_leaves_nothing_open_and_what_was_open_is_forgotten():
     assert not followed(1).any()
-    expected = np.exp(-2.0 * K["cutoff"] * PERIOD_S)[:, None] * np.ones(2)
+    expected = np.exp(-2.0 * K.cutoff * PERIOD_S)[:, None] * np.ones(2)
     np.testing.assert_allclose(followed(1, lost_Nm2=1.0), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("steps", [2, 5, 9])
 def test_a_line_leaves_open_the_noise_of_its_ends_the_torque_s_bend_and_friction_where_the_joint_turned(steps):
-    turn = K["cutoff"] * steps * PERIOD_S
-    noise = (K["noise_sigmas"] * K["torque_noise_Nm"] * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
+    turn = K.cutoff * steps * PERIOD_S
+    noise = (K.noise_sigmas * K.torque_noise_Nm * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
     bend = sensitivity.CURVATURE_NM_S2 * (steps * PERIOD_S) ** 2 / 12.0
     expected = np.array([noise + (turn * bend) ** 2, noise + (turn * (bend + 0.1)) ** 2]).T
     np.testing.assert_allclose(followed(steps, dq=(0.3, -0.3)), expected, rtol=1e-12)
 
 
 def test_a_gap_that_is_cut_out_leaves_the_velocity_s_noise():
-    expected = (2.0 * K["cutoff"] * K["velocity_noise_rad_s"]) ** 2
+    expected = (2.0 * K.cutoff * K.noise.velocity_noise_rad_s) ** 2
     np.testing.assert_allclose(followed(20, is_seen=False), np.tile(expected[:, None], (1, 2)), rtol=1e-12)
 
 
@@ -69,10 +69,10 @@ class LossyArm:
                 mode = MODE
             elif mode == MODE:
                 self.found.append(found)
-                self.h.append(self.m[0]["h"].copy())
+                self.h.append(self.m[0].sensitivity.h.copy())
                 self.dq.append(dq)
-                self.still.append(self.m[0]["still"].copy())
-                self.roughness.append(self.m[0]["velocity_roughness"].copy())
+                self.still.append(self.m[0].sensitivity.still.copy())
+                self.roughness.append(self.m[0].sensitivity.velocity_roughness.copy())
 
 
 @pytest.mark.parametrize("burst", [1, 4, 8])

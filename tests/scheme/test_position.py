@@ -61,11 +61,11 @@ def test_the_evidence_filters_its_columns_as_the_model_would():
     names = certified_memory.parameter_names(TOLD)
     first = names.index(f"{POSITION_TERMS[0]}1")
     assert names[first:] == tuple(f"{term}{joint}" for term in POSITION_TERMS for joint in (1, 2))
-    W_f = memory[0]["W_f"][filter_bank.LEARNT]
+    W_f = memory[0].filters.W_f[filter_bank.LEARNT]
     for term in range(regressor.PLACE_TERMS):
         for joint in range(2):
             in_model = W_f[joint, first + 2 * term + joint]
-            assert memory[0]["X_f"][joint, term] == pytest.approx(in_model, abs=1e-12)
+            assert memory[0].missing_torque.X_f[joint, term] == pytest.approx(in_model, abs=1e-12)
             assert W_f[1 - joint, first + 2 * term + joint] == 0.0
 
 
@@ -73,12 +73,12 @@ def test_the_evidence_is_that_of_a_dense_gaussian_model():
     """log N(b; x = 0) of rows whose sums the kernel keeps, by numpy's own determinant and solution."""
     constants, memory = learnt(FREE, cabled(1.5))
     k, m = constants[0], memory[0]
-    lower = m["evidence_L"].sum(axis=0)
+    lower = m.missing_torque.L.sum(axis=0)
     L = lower + np.tril(lower, -1).T
-    b, count = m["evidence_b"], len(m["belief"])
+    b, count = m.missing_torque.b, len(m.models.belief)
     for is_by_place in (False, True):
         columns = np.arange(len(b) if is_by_place else count)
-        s = np.diag(k["evidence_std"][columns])
+        s = np.diag(k.missing_torque.prior_std[columns])
         M = np.eye(len(columns)) + s @ L[np.ix_(columns, columns)] @ s
         x = np.zeros(len(b))
         found = missing_torque._log_evidence(m, b, missing_torque._scale_of(k, m, is_by_place), x)
@@ -86,7 +86,7 @@ def test_the_evidence_is_that_of_a_dense_gaussian_model():
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-6)
         assert x[columns] == pytest.approx(s @ np.linalg.solve(M, s @ b[columns]), rel=1e-6, abs=1e-9)
         assert np.count_nonzero(np.delete(x, columns)) == 0
-        left = m["evidence_yy"] - 2.0 * x @ b + x @ L @ x
+        left = m.missing_torque.yy - 2.0 * x @ b + x @ L @ x
         assert missing_torque._squares_left(m, x) == pytest.approx(left, rel=1e-6)
 
 
@@ -95,7 +95,7 @@ def test_only_a_torque_by_place_that_counts_is_evidence(cable_Nm, is_found):
     constants, memory = learnt(FREE, cabled(4.0, cable_Nm))
     assert missing_torque.is_found(constants[0], memory[0]) is is_found
     if is_found:
-        assert memory[0]["missing_rms_Nm"] == pytest.approx((0.02, 0.02), abs=0.015)
+        assert memory[0].missing_torque.rms_Nm == pytest.approx((0.02, 0.02), abs=0.015)
         assert re.fullmatch(
             r"a torque that depends on where the arm is, 0\.0\d\d Nm rms in joint 1 and 0\.0\d\d Nm rms in joint 2, is "
             r"missing in the model: a cable, a base that is not mounted as arm.mounting_deg says \(flat: not level\), "

@@ -20,19 +20,19 @@ class Refined:
 
     def __init__(self, candidate, frozen):
         self.m = certified_memory.new_memory(SETTINGS)[0]
-        self.m["theta"][:] = frozen
-        self.m["belief"][:] = candidate
-        self.m["P_belief"][:] = 0.25 * np.eye(COUNT)
-        self.m["h"][:] = 0.5
+        self.m.models.theta[:] = frozen
+        self.m.models.belief[:] = candidate
+        self.m.models.P_belief[:] = 0.25 * np.eye(COUNT)
+        self.m.sensitivity.h[:] = 0.5
         belief.restart_candidate(self.m)
-        self.m["candidate_cycles"] = K["refine_cycles"] - CYCLES
+        self.m.models.candidate_cycles = K.refine_cycles - CYCLES
         self.random = np.random.default_rng(1)
 
     def sample(self, tau_ext=0.0):
         m = self.m
-        m["W_f"][:] = 0.3 * self.random.standard_normal(m["W_f"].shape)
-        m["tau_f"][:] = m["W_f"] @ TRUE - tau_ext
-        m["r"][:] = m["W_f"] @ m["theta"] - m["tau_f"]
+        m.filters.W_f[:] = 0.3 * self.random.standard_normal(m.filters.W_f.shape)
+        m.filters.tau_f[:] = m.filters.W_f @ TRUE - tau_ext
+        m.filters.r[:] = m.filters.W_f @ m.models.theta - m.filters.tau_f
         return belief.test_candidate(K, m)
 
     def run(self):
@@ -41,7 +41,7 @@ class Refined:
 
     @property
     def has_taken_over(self):
-        return self.m["promotions"] == 1.0
+        return self.m.models.promotions == 1.0
 
 
 def off_by(share):
@@ -54,23 +54,23 @@ def test_a_candidate_that_explains_the_motion_better_takes_over_at_the_end_of_it
         refined.sample()
     assert not refined.has_taken_over
     assert not refined.sample()
-    np.testing.assert_array_equal(refined.m["theta"], off_by(0.05))
-    np.testing.assert_array_equal(refined.m["P"], 0.25 * np.eye(COUNT))
-    assert refined.m["promotions"] == 1.0
+    np.testing.assert_array_equal(refined.m.models.theta, off_by(0.05))
+    np.testing.assert_array_equal(refined.m.models.P, 0.25 * np.eye(COUNT))
+    assert refined.m.models.promotions == 1.0
 
 
 def test_what_takes_over_is_what_a_payload_will_be_put_on():
     refined = Refined(off_by(0.05), off_by(0.2))
     refined.run()
-    np.testing.assert_array_equal(refined.m["certified"], off_by(0.05))
-    np.testing.assert_array_equal(refined.m["P_certified"], 0.25 * np.eye(COUNT))
+    np.testing.assert_array_equal(refined.m.models.certified, off_by(0.05))
+    np.testing.assert_array_equal(refined.m.models.P_certified, 0.25 * np.eye(COUNT))
 
 
 def test_a_worse_candidate_leaves_the_model_as_it_is():
     refined = Refined(off_by(0.2), off_by(0.05))
     assert not any(refined.run())
-    np.testing.assert_array_equal(refined.m["theta"], off_by(0.05))
-    assert refined.m["promotions"] == 0.0
+    np.testing.assert_array_equal(refined.m.models.theta, off_by(0.05))
+    assert refined.m.models.promotions == 0.0
 
 
 def test_a_candidate_that_no_arm_can_have_does_not_take_over():
@@ -78,24 +78,24 @@ def test_a_candidate_that_no_arm_can_have_does_not_take_over():
     impossible = TRUE.copy()
     impossible[2] = -1e-3
     refined = Refined(impossible, off_by(0.9))
-    refined.m["h"][:] = 100.0
+    refined.m.sensitivity.h[:] = 100.0
     assert not any(refined.run())
-    np.testing.assert_array_equal(refined.m["theta"], off_by(0.9))
+    np.testing.assert_array_equal(refined.m.models.theta, off_by(0.9))
 
 
 @pytest.mark.parametrize("channel", [0, 3, 4])
 def test_a_candidate_that_would_have_raised_an_alarm_does_not_take_over(channel):
     """By the thresholds of the bare filters, and of the slowest one's only channel."""
     refined = Refined(off_by(0.05), off_by(0.2))
-    refined.m["h"][channel] = 1e-4
+    refined.m.sensitivity.h[channel] = 1e-4
     assert not any(refined.run())
-    assert refined.m["promotions"] == 0.0
+    assert refined.m.models.promotions == 0.0
 
 
 @pytest.mark.parametrize("channel", [1, 2])
 def test_the_smoothed_channels_of_fast_filters_have_no_say(channel):
     refined = Refined(off_by(0.05), off_by(0.2))
-    refined.m["h"][channel] = 1e-4
+    refined.m.sensitivity.h[channel] = 1e-4
     assert not any(refined.run())
     assert refined.has_taken_over
 
@@ -103,24 +103,24 @@ def test_the_smoothed_channels_of_fast_filters_have_no_say(channel):
 def test_a_joint_that_rests_has_no_say_in_which_model_is_better():
     """At rest friction may hold any torque: here the model in use happens to fit joint 1, and it does not count."""
     refined = Refined(off_by(0.05), off_by(0.2))
-    refined.m["still"][0, 0] = 1.1 * sensitivity.MOVING
+    refined.m.sensitivity.still[0, 0] = 1.1 * sensitivity.MOVING
     refined.sample()
     m = refined.m
-    squares = [(m["W_f"][0, 1] @ (theta - TRUE)) ** 2 for theta in (off_by(0.05), off_by(0.2))]
-    np.testing.assert_allclose([m["candidate_square"], m["frozen_square"]], squares, rtol=1e-10)
-    m["still"][:] = 1.0
+    squares = [(m.filters.W_f[0, 1] @ (theta - TRUE)) ** 2 for theta in (off_by(0.05), off_by(0.2))]
+    np.testing.assert_allclose([m.models.candidate_square, m.models.frozen_square], squares, rtol=1e-10)
+    m.sensitivity.still[:] = 1.0
     refined.sample()
-    np.testing.assert_allclose([m["candidate_square"], m["frozen_square"]], squares, rtol=1e-10)
+    np.testing.assert_allclose([m.models.candidate_square, m.models.frozen_square], squares, rtol=1e-10)
 
 
 @pytest.mark.parametrize(("off_Nm", "is_excluded"), [(0.0, False), (0.1, True)])
 def test_a_better_candidate_that_an_anchor_excludes_is_said_once_and_does_not_take_over(off_Nm, is_excluded):
     refined = Refined(off_by(0.05), off_by(0.2))
-    refined.m["P_belief"][:] = 1e-6 * np.eye(COUNT)
+    refined.m.models.P_belief[:] = 1e-6 * np.eye(COUNT)
     belief.restart_candidate(refined.m)
-    refined.m["candidate_cycles"] = K["refine_cycles"] - CYCLES
-    refined.m["anchor_Nm"][anchor.TARE] = TRUE[[7, 8]] + [off_Nm, 0.0]
-    refined.m["anchor_std"][anchor.TARE] = 0.001
+    refined.m.models.candidate_cycles = K.refine_cycles - CYCLES
+    refined.m.anchor.anchor_Nm[anchor.TARE] = TRUE[[7, 8]] + [off_Nm, 0.0]
+    refined.m.anchor.anchor_std[anchor.TARE] = 0.001
     assert refined.run() == [False] * (CYCLES - 1) + [is_excluded]
     assert refined.has_taken_over is not is_excluded
     assert not refined.sample()  # the next test has begun
@@ -128,16 +128,16 @@ def test_a_better_candidate_that_an_anchor_excludes_is_said_once_and_does_not_ta
 
 def test_a_worse_candidate_that_an_anchor_excludes_is_not_said():
     refined = Refined(off_by(0.2), off_by(0.05))
-    refined.m["anchor_Nm"][anchor.TARE] = 5.0
-    refined.m["anchor_std"][anchor.TARE] = 0.001
+    refined.m.anchor.anchor_Nm[anchor.TARE] = 5.0
+    refined.m.anchor.anchor_std[anchor.TARE] = 0.001
     assert not any(refined.run())
 
 
 def test_after_a_test_the_next_begins_with_the_belief_as_it_is_then():
     refined = Refined(off_by(0.2), off_by(0.05))
     refined.sample()
-    refined.m["belief"][:] = off_by(0.01)
+    refined.m.models.belief[:] = off_by(0.01)
     [refined.sample() for _ in range(CYCLES - 1)]
-    np.testing.assert_array_equal(refined.m["candidate"], off_by(0.01))
+    np.testing.assert_array_equal(refined.m.models.candidate, off_by(0.01))
     sums = ("candidate_cycles", "candidate_square", "frozen_square", "candidate_worst")
-    assert [float(refined.m[name]) for name in sums] == [0.0] * 4
+    assert [float(refined.m.models[name]) for name in sums] == [0.0] * 4

@@ -30,8 +30,8 @@ def play(tau, detected, joints=3, level=ContactLevel.COLLISION):
     touch.fill(SETTINGS, evidence.due_cycles)
     reports = []
     for cycle, row in enumerate(tau):
-        put_row(evidence.rows, int(touch.m["kept_rows"]), Q, row, SIGMA, THRESHOLD)
-        touch.m["kept_rows"] += 1
+        put_row(evidence.rows, int(touch.m.kept_rows), Q, row, SIGMA, THRESHOLD)
+        touch.m.kept_rows += 1
         over = joints if cycle - detected >= 5 else joints & 1
         state = SchemeState.REACT if cycle >= detected else SchemeState.MONITOR
         if touch.step(over if cycle >= detected else 0, row, level, state, is_latched=True):
@@ -43,7 +43,7 @@ def test_a_contact_is_reported_at_once_after_ten_and_after_a_hundred_millisecond
     reports, touch = play(course(), 55)
     assert [report.is_final for report in reports] == [False, False, True]
     assert {report.cycle for report in reports} == {55}
-    assert not touch.m["is_open"]
+    assert not touch.m.is_open
 
 
 def test_a_final_report_says_all_that_can_be_known():
@@ -105,9 +105,9 @@ def test_the_peak_of_a_blow_is_that_of_its_half_sine_however_short_it_is(duratio
 def test_a_fault_ends_the_report():
     touch = Course(SETTINGS, due_cycles=(0, 10, 100))
     assert touch.step(1, np.ones(2))
-    assert touch.m["is_open"]
+    assert touch.m.is_open
     assert not touch.step(1, np.ones(2), state=SchemeState.FAULT)
-    assert not touch.m["is_open"]
+    assert not touch.m.is_open
 
 
 def test_the_history_gives_its_last_rows_in_order():

@@ -28,7 +28,7 @@ class Contact:
 
     def step(self, tau=PUSH, cycles=1, level=None, link=None, is_latched=False):
         self.level, self.link = level or self.level, link or self.link
-        self.response.m["link"] = self.link
+        self.response.m.link = self.link
         for _ in range(cycles):
             self.response.step(self.link, tau, self.level, is_latched=is_latched, is_valid=self.is_model_valid)
         return self.response.reaction
@@ -58,7 +58,7 @@ def test_a_contact_that_grows_gets_the_reaction_of_a_collision_and_keeps_it():
     contact = Contact(ContactLevel.CONTACT, 2)
     assert contact.step(level=ContactLevel.COLLISION) is Reaction.WITHDRAW
     assert contact.step(level=ContactLevel.CONTACT) is Reaction.WITHDRAW
-    assert contact.response.m["level"] == ContactLevel.COLLISION
+    assert contact.response.m.level == ContactLevel.COLLISION
 
 
 def test_a_link_that_turns_out_to_be_another_gets_its_own_reaction():
@@ -76,7 +76,7 @@ def test_a_withdrawal_from_what_lets_go_goes_on():
     contact = Contact(ContactLevel.COLLISION, 2)
     contact.step(cycles=30)
     assert contact.step(tau=0.0 * PUSH, cycles=300) is Reaction.WITHDRAW
-    assert not contact.response.m["is_two_sided"]
+    assert not contact.response.m.is_two_sided
 
 
 def test_a_withdrawal_that_pushes_something_on_the_other_side_floats():
@@ -84,7 +84,7 @@ def test_a_withdrawal_that_pushes_something_on_the_other_side_floats():
     contact.step(cycles=BLIND)
     assert contact.step(tau=-PUSH, cycles=TURNED_CYCLES - 1) is Reaction.WITHDRAW
     assert contact.step(tau=-PUSH) is Reaction.FLOAT
-    assert contact.response.m["is_two_sided"]
+    assert contact.response.m.is_two_sided
 
 
 def test_what_a_blow_leaves_in_the_estimate_is_no_second_contact():

@@ -22,15 +22,15 @@ def known_arm(seed=1):
     """Return the memory of an arm of which something is known, in some motion."""
     random = np.random.default_rng(seed)
     m = certified_memory.new_memory(SETTINGS)[0]
-    m["theta"][:] = random.uniform(0.05, 0.5, len(NAMES))
+    m.models.theta[:] = random.uniform(0.05, 0.5, len(NAMES))
     root = 0.02 * random.standard_normal((len(NAMES), len(NAMES)))
-    m["P"][:] = root @ root.T
-    m["W_f"][:] = random.standard_normal(m["W_f"].shape)
-    m["M"][:] = [[0.4, 0.1], [0.1, 0.05]]
-    m["roughness"][:] = 1.0, 2.5
-    m["velocity_roughness"][:] = 1.5, 3.0
-    m["unit"][:] = 0.5, 2.0
-    m["strain"][:] = 1.0, 2.0
+    m.models.P[:] = root @ root.T
+    m.filters.W_f[:] = random.standard_normal(m.filters.W_f.shape)
+    m.regressor.M[:] = [[0.4, 0.1], [0.1, 0.05]]
+    m.sensitivity.roughness[:] = 1.0, 2.5
+    m.sensitivity.velocity_roughness[:] = 1.5, 3.0
+    m.sensitivity.unit[:] = 0.5, 2.0
+    m.sensitivity.strain[:] = 1.0, 2.0
     return m
 
 
@@ -44,47 +44,47 @@ def thresholds_of(m):
 def noise_of(m):
     """Return what white torque noise and the velocity's quantisation leave in each channel (5, 2), Nm², by formula."""
     nu = CERTIFIED.velocity_noise_rad_s
-    momentum = np.diag(m["M"] @ np.diag(m["velocity_roughness"]) @ m["M"].T)
+    momentum = np.diag(m.regressor.M @ np.diag(m.sensitivity.velocity_roughness) @ m.regressor.M.T)
     variance = []
     for a, is_smooth in CHANNELS:
         s = CERTIFIED.smoothing_rad_s
         width = a * s / (a + s) if is_smooth else a
         share = 0.335 * s / 200.0 / (1.0 + a / 600.0) if is_smooth else sensitivity.BARE
-        torque = (CERTIFIED.noise_sigmas * CERTIFIED.torque_noise_Nm) ** 2 * width * T / 2.0 * m["roughness"]
+        torque = (CERTIFIED.noise_sigmas * CERTIFIED.torque_noise_Nm) ** 2 * width * T / 2.0 * m.sensitivity.roughness
         variance.append(torque + (share * nu * a) ** 2 * momentum)
     return np.array(variance)
 
 
 def doubt_of(m):
     """Return k_m g of each filter and joint (3, 2), Nm."""
-    D = np.diag((np.array(K["model_error"]) * m["theta"]) ** 2)
-    believed, unexplained = (np.einsum("cij,jk,cik->ci", m["W_f"], P, m["W_f"]) for P in (m["P"], D))
-    return CERTIFIED.model_sigmas * np.sqrt(m["unit"] * believed + unexplained)
+    D = np.diag((np.array(K.model_error) * m.models.theta) ** 2)
+    believed, unexplained = (np.einsum("cij,jk,cik->ci", m.filters.W_f, P, m.filters.W_f) for P in (m.models.P, D))
+    return CERTIFIED.model_sigmas * np.sqrt(m.sensitivity.unit * believed + unexplained)
 
 
 def test_a_moving_arm_s_thresholds_are_noise_and_doubt_in_quadrature():
     m = known_arm()
     g = doubt_of(m)
-    m["doubt"][:] = g  # as after a while of the same motion
+    m.sensitivity.doubt[:] = g  # as after a while of the same motion
     bare = np.concatenate([g, g[1:]])
-    np.testing.assert_allclose(thresholds_of(m), m["strain"] * np.sqrt(noise_of(m) + bare**2), rtol=1e-10)
+    np.testing.assert_allclose(thresholds_of(m), m.sensitivity.strain * np.sqrt(noise_of(m) + bare**2), rtol=1e-10)
 
 
 def test_the_doubt_of_a_smoothed_channel_follows_the_motion_as_slowly_as_its_residual():
     m = known_arm()
-    m["doubt"][:] = 0.0
+    m.sensitivity.doubt[:] = 0.0
     h = thresholds_of(m)
     followed = (1.0 - np.exp(-CERTIFIED.smoothing_rad_s * T)) * doubt_of(m)
     expected = np.sqrt(noise_of(m) + np.concatenate([followed, doubt_of(m)[1:]]) ** 2)
-    np.testing.assert_allclose(h, m["strain"] * expected, rtol=1e-10)
+    np.testing.assert_allclose(h, m.sensitivity.strain * expected, rtol=1e-10)
 
 
 def test_what_is_not_known_raises_the_threshold_of_the_joint_that_it_shows_in():
     m = known_arm()
-    m["W_f"][:] = 0.0
-    m["W_f"][:, 1, COULOMB + 1] = 1.0
+    m.filters.W_f[:] = 0.0
+    m.filters.W_f[:, 1, COULOMB + 1] = 1.0
     before = thresholds_of(m)
-    m["P"][COULOMB + 1, COULOMB + 1] += 1.0
+    m.models.P[COULOMB + 1, COULOMB + 1] += 1.0
     rise = thresholds_of(m) - before
     assert np.all(rise[:, 1] > 0.1)
     np.testing.assert_allclose(rise[:, 0], 0.0, atol=1e-12)
@@ -93,7 +93,7 @@ def test_what_is_not_known_raises_the_threshold_of_the_joint_that_it_shows_in():
 @pytest.mark.parametrize("seed", range(5))
 def test_no_threshold_is_below_the_noise_of_its_channel(seed):
     m = known_arm(seed)
-    m["still"][:] = m["still_smooth"][:] = np.random.default_rng(seed).uniform(0.0, 1.0, (3, 2))
+    m.sensitivity.still[:] = m.sensitivity.still_smooth[:] = np.random.default_rng(seed).uniform(0.0, 1.0, (3, 2))
     assert np.all(thresholds_of(m) >= np.sqrt(noise_of(m)))
 
 
@@ -103,23 +103,23 @@ def test_a_joint_at_rest_may_hold_what_static_friction_is_believed_to_hold():
     The deviation of the latter is no more than STATIC_SHARE of the former.
     """
     m = known_arm()
-    m["W_f"][:] = 0.0
+    m.filters.W_f[:] = 0.0
     moving = thresholds_of(m)
-    m["still"][:] = 0.5
-    m["still_smooth"][:] = 0.25
+    m.sensitivity.still[:] = 0.5
+    m.sensitivity.still_smooth[:] = 0.25
     places = np.array([[COULOMB, STRIBECK], [COULOMB + 1, STRIBECK + 1]])
-    held = m["theta"][places].sum(1) + np.sqrt(np.diag(m["P"])[places]).sum(1)
+    held = m.models.theta[places].sum(1) + np.sqrt(np.diag(m.models.P)[places]).sum(1)
     share = np.array([0.25, 0.25, 0.25, 0.5, 0.5])[:, None]
     np.testing.assert_allclose(thresholds_of(m) - moving, CERTIFIED.standstill_share * share * held, rtol=1e-10)
 
 
 def test_friction_that_was_learnt_negative_holds_nothing():
     m = known_arm()
-    m["still"][:] = m["still_smooth"][:] = 1.0
-    m["P"][:] = 0.0
-    m["W_f"][:] = 0.0
-    m["theta"][[COULOMB, COULOMB + 1, STRIBECK, STRIBECK + 1]] = -0.2
-    np.testing.assert_allclose(thresholds_of(m), m["strain"] * np.sqrt(noise_of(m)), rtol=1e-10)
+    m.sensitivity.still[:] = m.sensitivity.still_smooth[:] = 1.0
+    m.models.P[:] = 0.0
+    m.filters.W_f[:] = 0.0
+    m.models.theta[[COULOMB, COULOMB + 1, STRIBECK, STRIBECK + 1]] = -0.2
+    np.testing.assert_allclose(thresholds_of(m), m.sensitivity.strain * np.sqrt(noise_of(m)), rtol=1e-10)
 
 
 def test_standstill_fills_a_filter_in_its_own_time():
@@ -159,31 +159,36 @@ def test_white_torque_noise_through_a_channel_is_as_large_as_its_constant_says(c
         fall = np.exp(-CERTIFIED.smoothing_rad_s * T)
         response = scipy.signal.lfilter([1.0 - fall], [1.0, -fall], response)
     std = CERTIFIED.noise_sigmas * CERTIFIED.torque_noise_Nm * np.sqrt(np.sum(response**2))
-    assert np.sqrt(K["torque_variance"][channel]) == pytest.approx(std, rel=0.125)
+    assert np.sqrt(K.noise.torque_variance[channel]) == pytest.approx(std, rel=0.125)
 
 
 def test_a_bare_filter_multiplies_the_velocity_s_error_by_its_cut_off_and_a_smoothed_one_by_less():
-    nu = np.sqrt(K["velocity_variance"])
+    nu = np.sqrt(K.noise.velocity_variance)
     np.testing.assert_allclose(nu[3:], 1.15 * CERTIFIED.velocity_noise_rad_s * CUTOFFS[1:])
     assert np.all(nu[1:3] < 0.27 * nu[3:])
 
 
 def test_a_velocity_without_noise_leaves_the_torque_s():
     constants = sensitivity.noise_constants(CERTIFIED.__class__(velocity_noise_rad_s=0.0), T)
-    assert not np.any(constants["velocity_variance"])
-    np.testing.assert_allclose(constants["torque_variance"], K["torque_variance"])
+    assert not np.any(constants.velocity_variance)
+    np.testing.assert_allclose(constants.torque_variance, K.noise.torque_variance)
 
 
 def test_the_undone_filter_s_deviation_is_that_of_a_mean_of_five_samples():
     m = known_arm()
-    m["doubt"][:] = 0.3
-    m["h"][:] = [[0.5, 0.6], [0.3, 0.7], [0.4, 0.2], [0.9, 0.9], [0.8, 0.8]]
+    m.sensitivity.doubt[:] = 0.3
+    m.sensitivity.h[:] = [[0.5, 0.6], [0.3, 0.7], [0.4, 0.2], [0.9, 0.9], [0.8, 0.8]]
     sensitivity.fill_wide(K, m, 1)
-    torque = CERTIFIED.torque_noise_Nm**2 * m["roughness"] / 5.0
-    velocity = 2.0 * (0.12 * CERTIFIED.velocity_noise_rad_s / (5.0 * T)) ** 2 * m["M"] ** 2 @ m["velocity_roughness"]
+    torque = CERTIFIED.torque_noise_Nm**2 * m.sensitivity.roughness / 5.0
+    velocity = (
+        2.0
+        * (0.12 * CERTIFIED.velocity_noise_rad_s / (5.0 * T)) ** 2
+        * m.regressor.M**2
+        @ m.sensitivity.velocity_roughness
+    )
     model = (0.3 / CERTIFIED.model_sigmas) ** 2
-    np.testing.assert_allclose(m["wide_sigma"], np.sqrt(torque + velocity + model), rtol=1e-10)
-    np.testing.assert_array_equal(m["wide_threshold"], [0.3, 0.2])
+    np.testing.assert_allclose(m.sensitivity.wide_sigma, np.sqrt(torque + velocity + model), rtol=1e-10)
+    np.testing.assert_array_equal(m.sensitivity.wide_threshold, [0.3, 0.2])
 
 
 FLOOR_RAD_S = sensitivity.SECOND_DIFFERENCE * CERTIFIED.velocity_noise_rad_s
@@ -199,9 +204,9 @@ def after_a_swing(noise, count=2000):
 
 
 def test_velocity_noise_is_seen_in_the_second_difference_and_motion_is_not():
-    assert np.all(after_a_swing(np.zeros((2000, 2)))["velocity_roughness"] == 1.0)
+    assert np.all(after_a_swing(np.zeros((2000, 2))).sensitivity.velocity_roughness == 1.0)
     noise = np.random.default_rng(3).standard_normal((2000, 2)) * FLOOR_RAD_S * [0.2, 8.0]
-    roughness = after_a_swing(noise)["velocity_roughness"]
+    roughness = after_a_swing(noise).sensitivity.velocity_roughness
     assert 1.0 <= roughness[0] < 1.2
     assert roughness[1] == pytest.approx(6.0 * 8.0**2, rel=0.3)  # a second difference has 1 + 4 + 1 times the variance
 
@@ -209,14 +214,18 @@ def test_velocity_noise_is_seen_in_the_second_difference_and_motion_is_not():
 def test_a_coarse_encoder_raises_the_thresholds_of_all_that_its_joint_s_momentum_shows_in():
     fine, coarse = known_arm(), known_arm()
     for m in (fine, coarse):
-        m["W_f"][:] = 0.0
-        m["roughness"][:] = 0.0
+        m.filters.W_f[:] = 0.0
+        m.sensitivity.roughness[:] = 0.0
     counts = 0.02 * np.round(np.sin(5.0 * T * np.arange(2000)) / 0.02)
-    coarse["velocity_roughness"][:] = after_a_swing(np.outer(counts, [0.0, 1.0]))["velocity_roughness"]
-    fine["velocity_roughness"][:] = 1.0
-    assert coarse["velocity_roughness"][0] == 1.0
+    coarse.sensitivity.velocity_roughness[:] = after_a_swing(
+        np.outer(counts, [0.0, 1.0])
+    ).sensitivity.velocity_roughness
+    fine.sensitivity.velocity_roughness[:] = 1.0
+    assert coarse.sensitivity.velocity_roughness[0] == 1.0
     rise = thresholds_of(coarse) / thresholds_of(fine)
-    expected = np.sqrt(coarse["M"] ** 2 @ coarse["velocity_roughness"] / np.sum(coarse["M"] ** 2, axis=1))
+    expected = np.sqrt(
+        coarse.regressor.M**2 @ coarse.sensitivity.velocity_roughness / np.sum(coarse.regressor.M**2, axis=1)
+    )
     np.testing.assert_allclose(rise, np.tile(expected, (5, 1)), rtol=1e-10)
     assert np.all(rise > 1.5)
 
@@ -226,30 +235,30 @@ def test_what_an_encoder_has_shown_in_motion_is_kept_at_rest_and_goes_back_in_mo
     m = after_a_swing(noise)
     for _ in range(2):
         sensitivity.follow_velocity_noise(K, m, np.zeros(2), True)  # from the motion to rest: two jumps
-    seen = m["roughness_now"].copy()
+    seen = m.sensitivity.roughness_now.copy()
     assert np.all(seen > 3.0)
     sensitivity.keep_velocity_noise(K, m)
     for _ in range(3000):  # at rest
         sensitivity.follow_velocity_noise(K, m, np.zeros(2), True)
         sensitivity.keep_velocity_noise(K, m)
-    assert np.all(m["roughness_now"] == 1.0)
-    np.testing.assert_array_equal(m["velocity_roughness"], seen)
+    assert np.all(m.sensitivity.roughness_now == 1.0)
+    np.testing.assert_array_equal(m.sensitivity.velocity_roughness, seen)
     moves_s = 10.0
     for _ in range(round(moves_s / T)):
-        m["dq_old"][0] = 0.5  # and neither noise nor a jump
+        m.sensitivity.dq_old[0] = 0.5  # and neither noise nor a jump
         sensitivity.keep_velocity_noise(K, m)
-    sensitivity.follow_velocity_noise(K, m, m["dq_old"].copy(), True)
+    sensitivity.follow_velocity_noise(K, m, m.sensitivity.dq_old.copy(), True)
     left = 1.0 + (seen - 1.0) * np.exp([-moves_s / sensitivity.ROUGHNESS_LOST_S, 0.0])
-    np.testing.assert_allclose(m["velocity_roughness"], left, rtol=1e-2)
+    np.testing.assert_allclose(m.sensitivity.velocity_roughness, left, rtol=1e-2)
 
 
 def test_a_blow_s_jumps_are_not_kept():
     m = after_a_swing(np.zeros((2000, 2)))
     sensitivity.follow_velocity_noise(K, m, np.array([9.0, 9.0]), True)
-    assert np.all(m["velocity_roughness"] > 1.05)
+    assert np.all(m.sensitivity.velocity_roughness > 1.05)
     for _ in range(600):  # while it is a contact, and after one, nothing is kept
         sensitivity.follow_velocity_noise(K, m, np.zeros(2), True)
-    assert np.all(m["velocity_roughness"] < 1.04)
+    assert np.all(m.sensitivity.velocity_roughness < 1.04)
 
 
 def test_a_jump_of_the_velocity_counts_as_five_deviations_at_most():
@@ -259,17 +268,17 @@ def test_a_jump_of_the_velocity_counts_as_five_deviations_at_most():
         sensitivity.follow_velocity_noise(K, m, np.array([dq, 0.0]), True)
     share = T / sensitivity.ROUGHNESS_S
     most = (1.0 + share * (sensitivity.JUMP**2 - 1.0)) ** 2
-    np.testing.assert_allclose(m["velocity_roughness"], [most * (1.0 - share), 1.0], rtol=1e-10)
+    np.testing.assert_allclose(m.sensitivity.velocity_roughness, [most * (1.0 - share), 1.0], rtol=1e-10)
 
 
 def test_a_contact_doubles_the_strain_of_the_joints_that_are_over_up_to_the_largest():
     m = certified_memory.new_memory(SETTINGS)[0]
-    m["h"][:] = 1.0
-    m["y"][3, 1] = -1.1
+    m.sensitivity.h[:] = 1.0
+    m.filters.y[3, 1] = -1.1
     strains = []
     for largest in (8.0, 8.0, 8.0, 8.0, 4.0):
         sensitivity.strain(m, largest)
-        strains.append(m["strain"].tolist())
+        strains.append(m.sensitivity.strain.tolist())
     assert strains == [[1.0, 2.0], [1.0, 4.0], [1.0, 8.0], [1.0, 8.0], [1.0, 8.0]]
 
 
@@ -279,7 +288,7 @@ def stepped(step_Nm, std_Nm=0.02):
     noise = std_Nm * np.random.default_rng(3).standard_normal(200_000)
     for tau in np.round((noise[:10_000] + 0.5 * step_Nm) / step_Nm) * step_Nm:
         sensitivity.follow_torque_step(K, m, np.array([tau, 0.0]))
-        m["last"][2] = tau, 0.0
+        m.gaps.last[2] = tau, 0.0
     places = np.linspace(0.0, step_Nm, 21)
     return m, max(abs(np.mean(np.round((noise + at) / step_Nm) * step_Nm) - at) for at in places)
 
@@ -287,9 +296,9 @@ def stepped(step_Nm, std_Nm=0.02):
 @pytest.mark.parametrize("step_Nm", [0.0015, 0.04, 0.1, 0.2])
 def test_a_sensor_s_step_is_found_and_its_pull_is_what_rounding_does_to_a_mean(step_Nm):
     m, off_Nm = stepped(step_Nm)
-    np.testing.assert_allclose(m["torque_step_Nm"], [step_Nm, 0.0], rtol=1e-9)
-    assert m["torque_pull_Nm"][0] == pytest.approx(sensitivity.PULL * off_Nm, rel=0.1, abs=2e-4)
-    assert m["torque_pull_Nm"][1] == 0.0
+    np.testing.assert_allclose(m.sensitivity.torque_step_Nm, [step_Nm, 0.0], rtol=1e-9)
+    assert m.sensitivity.torque_pull_Nm[0] == pytest.approx(sensitivity.PULL * off_Nm, rel=0.1, abs=2e-4)
+    assert m.sensitivity.torque_pull_Nm[1] == 0.0
 
 
 def test_what_changes_first_or_by_much_is_no_step():
@@ -297,10 +306,10 @@ def test_what_changes_first_or_by_much_is_no_step():
     m = certified_memory.new_memory(SETTINGS)[0]
     changes = int(sensitivity.CHANGES)
     for k in range(changes + 10):
-        assert (m["torque_step_Nm"][0] > 0.0) == (k > changes)  # the first sample is no change
+        assert (m.sensitivity.torque_step_Nm[0] > 0.0) == (k > changes)  # the first sample is no change
         sensitivity.follow_torque_step(K, m, np.array([5.0 * (k % 2 == 0), 0.0]))
-        m["last"][2] = 5.0 * (k % 2 == 0), 0.0
-    assert m["torque_step_Nm"][0] == sensitivity.LARGEST_STEP_NM
+        m.gaps.last[2] = 5.0 * (k % 2 == 0), 0.0
+    assert m.sensitivity.torque_step_Nm[0] == sensitivity.LARGEST_STEP_NM
 
 
 def test_a_sensor_s_step_raises_the_thresholds_by_its_noise_and_its_pull():
@@ -308,20 +317,20 @@ def test_a_sensor_s_step_raises_the_thresholds_by_its_noise_and_its_pull():
     fine = certified_memory.new_memory(SETTINGS)[0]
     h, h_fine = np.zeros((5, 2)), np.zeros((5, 2))
     for memory, filled in ((m, h), (fine, h_fine)):
-        memory["P"][:] = 0.0
-        memory["theta"][:] = 0.0
+        memory.models.P[:] = 0.0
+        memory.models.theta[:] = 0.0
         sensitivity.fill_thresholds(K, memory, filled)
-    noise = K["torque_gain"] * 0.1**2 / 12.0
-    np.testing.assert_allclose(h[:, 0], np.sqrt(h_fine[:, 0] ** 2 + noise) + m["torque_pull_Nm"][0], rtol=1e-9)
+    noise = K.noise.torque_gain * 0.1**2 / 12.0
+    np.testing.assert_allclose(h[:, 0], np.sqrt(h_fine[:, 0] ** 2 + noise) + m.sensitivity.torque_pull_Nm[0], rtol=1e-9)
     np.testing.assert_array_equal(h[:, 1], h_fine[:, 1])
 
 
 def relaxed(share, count, strain=8.0):
     """Return the memory after samples that show this share of the threshold."""
     m = certified_memory.new_memory(SETTINGS)[0]
-    m["strain"][:] = strain
-    m["h"][:] = 0.5
-    m["y"][2] = 0.5 * share
+    m.sensitivity.strain[:] = strain
+    m.sensitivity.h[:] = 0.5
+    m.filters.y[2] = 0.5 * share
     for _ in range(count):
         sensitivity.relax(K, m)
     return m
@@ -329,33 +338,33 @@ def relaxed(share, count, strain=8.0):
 
 def test_strain_goes_back_over_ten_seconds_where_the_residual_leaves_room_and_never_below_one():
     left = 8.0 * (1.0 - T / sensitivity.STRAIN_S) ** 1000
-    np.testing.assert_allclose(relaxed(np.array([0.59, -0.61]), 1000)["strain"], [left, 8.0], rtol=1e-10)
-    assert relaxed(np.zeros(2), 1000, 1.05)["strain"].tolist() == [1.0, 1.0]
+    np.testing.assert_allclose(relaxed(np.array([0.59, -0.61]), 1000).sensitivity.strain, [left, 8.0], rtol=1e-10)
+    assert relaxed(np.zeros(2), 1000, 1.05).sensitivity.strain.tolist() == [1.0, 1.0]
 
 
 def test_a_peak_of_the_residual_holds_the_strain_for_a_while():
     m = relaxed(np.array([0.9, -0.9]), 1)
-    m["y"][:] = 0.0
+    m.filters.y[:] = 0.0
     count = round(np.log(0.9 / sensitivity.RELAXED) * sensitivity.STRAIN_S / T)
     for _ in range(count - 2):
         sensitivity.relax(K, m)
-    assert m["strain"].tolist() == [8.0, 8.0]
+    assert m.sensitivity.strain.tolist() == [8.0, 8.0]
     for _ in range(4):
         sensitivity.relax(K, m)
-    assert np.all(m["strain"] < 8.0)
+    assert np.all(m.sensitivity.strain < 8.0)
 
 
 def units_after(share, count, unit=1.0, is_monitored=False, sign=lambda _: 1.0):
     """Return the unit after samples whose squared residual is this share (2,) of what is believed."""
     m = known_arm()
-    m["unit"][:] = m["unit_by_sign"][:] = unit
-    m["held"][:] = [[0.0, 0.3], [0.1, 0.2], [0.4, 0.0]]
-    believed = CERTIFIED.residual_Nm**2 + m["held"][0] ** 2
-    believed += np.einsum("ij,jk,ik->i", m["W_f"][0], m["P"], m["W_f"][0])
+    m.sensitivity.unit[:] = m.sensitivity.unit_by_sign[:] = unit
+    m.sensitivity.held[:] = [[0.0, 0.3], [0.1, 0.2], [0.4, 0.0]]
+    believed = CERTIFIED.residual_Nm**2 + m.sensitivity.held[0] ** 2
+    believed += np.einsum("ij,jk,ik->i", m.filters.W_f[0], m.models.P, m.filters.W_f[0])
     for sample in range(count):
-        m["r"][0] = sign(sample) * np.sqrt(share * believed)
-        sensitivity.follow_unit(K, m, 0, K["unit_share"], is_monitored)
-    return m["unit"].copy()
+        m.filters.r[0] = sign(sample) * np.sqrt(share * believed)
+        sensitivity.follow_unit(K, m, 0, K.noise.unit_share, is_monitored)
+    return m.sensitivity.unit.copy()
 
 
 def test_the_unit_follows_the_residual_over_twenty_seconds():

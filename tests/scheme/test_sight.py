@@ -34,10 +34,10 @@ def tested():
     y, h = [], []
     m = loop.pipeline.numbers.memory[0]
     while loop.step().state is SchemeState.CERTIFY:
-        y.append(m["y"].copy())
-        h.append(m["h"].copy())
-    y.append(m["y"].copy())
-    h.append(m["h"].copy())
+        y.append(m.filters.y.copy())
+        h.append(m.sensitivity.h.copy())
+    y.append(m.filters.y.copy())
+    h.append(m.sensitivity.h.copy())
     return loop, np.array(y), np.array(h)
 
 
@@ -57,7 +57,7 @@ def test_a_certificate_states_the_smallest_push_and_the_thresholds_of_its_test(t
 @pytest.mark.parametrize("value_Nm", [1e-5, 0.0123, 0.4, 100.0])
 def test_a_threshold_that_is_always_the_same_is_said_as_it_is(value_Nm):
     m = certified_memory.new_memory(SETTINGS)[0]
-    m["wide_threshold"], m["h"] = value_Nm, value_Nm
+    m.sensitivity.wide_threshold, m.sensitivity.h = value_Nm, value_Nm
     for _ in range(10):
         margin.follow_test(certified_memory.constants_of(SETTINGS)[0], m)
     pair = f"{value_Nm:.3f} / {value_Nm:.3f}"
@@ -68,10 +68,10 @@ def test_the_next_test_begins_with_nothing_seen(tested):
     m = tested[0].pipeline.numbers.memory.copy()[0]
     margin.follow_sight(certified_memory.constants_of(SETTINGS)[0], m)
     for name in ("seen", "seen_push_Nm", "sum_cycles"):
-        assert m[name].any()
+        assert m.margin[name].any()
     margin.begin_sight(m)
     for name in ("seen", "seen_push_Nm", "seen_worst_Nm", "sum_push_Nm", "sum_cycles"):
-        assert not m[name].any()
+        assert not m.margin[name].any()
 
 
 def test_a_monitor_that_sees_less_than_was_certified_says_so_once():
@@ -80,15 +80,15 @@ def test_a_monitor_that_sees_less_than_was_certified_says_so_once():
     m = loop.pipeline.numbers.memory[0]
     loop.run(3000)
     assert loop.said("sight") == []
-    m["roughness"][1] = 400.0  # noise of the torque sensor, of variance
+    m.sensitivity.roughness[1] = 400.0  # noise of the torque sensor, of variance
     loop.run(2500)
     (text,) = loop.said("sight")
     found = re.match(r"joint 2 .* pushes from ([\d.]+) Nm on within 100 ms, in the test from ([\d.]+) Nm", text)
     assert float(found[1]) > margin.LESS * float(found[2])
-    assert float(found[2]) == pytest.approx(m["seen_push_Nm"][1], abs=0.005)
-    m["roughness"][1] = 1.0
+    assert float(found[2]) == pytest.approx(m.margin.seen_push_Nm[1], abs=0.005)
+    m.sensitivity.roughness[1] = 1.0
     loop.run(3000)
-    m["roughness"][1] = 400.0
+    m.sensitivity.roughness[1] = 400.0
     loop.run(2500)
     assert len(loop.said("sight")) == 2
 
@@ -98,14 +98,14 @@ def test_a_joint_that_sees_less_for_some_seconds_takes_the_certificate_back():
     loop.run_until(SchemeState.MONITOR)
     m = loop.pipeline.numbers.memory[0]
     loop.run(1000)
-    m["roughness"][1] = 400.0
+    m.sensitivity.roughness[1] = 400.0
     outputs = loop.run_until(SchemeState.STOPPED, 6000)
     blind = [output.state for output in outputs].index(SchemeState.REACT)
     assert margin.BLIND_S - 1.0 <= blind * PERIOD_S <= margin.BLIND_S + 1.0
     (revoked,) = loop.said("revoked")
     assert revoked.startswith("joint 2 sees less than was certified")
     assert len(loop.pipeline.certificates) == 0
-    m["roughness"][1] = 1.0
+    m.sensitivity.roughness[1] = 1.0
     loop.request = Request.RELEARN
     loop.run_until(SchemeState.MONITOR)
 
@@ -113,15 +113,15 @@ def test_a_joint_that_sees_less_for_some_seconds_takes_the_certificate_back():
 def test_a_joint_that_rests_is_not_asked_what_it_sees():
     """There friction holds what it can."""
     k, m = certified_memory.constants_of(SETTINGS)[0], certified_memory.new_memory(SETTINGS)[0]
-    m["h"], m["seen_push_Nm"] = 1.0, 0.1
-    m["still"][:, 0] = 1.0
-    for _ in range(int(k["mean_cycles"]) - 1):  # too little motion to tell
+    m.sensitivity.h, m.margin.seen_push_Nm = 1.0, 0.1
+    m.sensitivity.still[:, 0] = 1.0
+    for _ in range(int(k.margin.mean_cycles) - 1):  # too little motion to tell
         assert not margin.follow_sight(k, m)
     assert margin.describe_dim(m) == []
     assert not margin.follow_sight(k, m)
     (line,) = margin.describe_dim(m)
     assert line.startswith("joint 2 sees less")
-    for _ in range(2 * int(k["mean_cycles"]) - 1):
+    for _ in range(2 * int(k.margin.mean_cycles) - 1):
         assert not margin.follow_sight(k, m)
     assert margin.follow_sight(k, m)
 
@@ -138,10 +138,11 @@ def test_a_joint_that_rests_is_not_asked_what_it_sees():
 )
 def test_what_has_raised_the_thresholds_is_named(change, cause):
     m = certified_memory.new_memory(SETTINGS)[0]
-    m["h_model"][:] = 1.0
-    m["dim_s"][0] = 1.0
+    m.sensitivity.h_model[:] = 1.0
+    m.margin.dim_s[0] = 1.0
     for name, value in change.items():
-        m[name][:] = value
+        (record,) = (record for record in (m.sensitivity, m.margin) if name in record.dtype.names)
+        record[name][:] = value
     (line,) = margin.describe_dim(m)
     assert cause in line
 
@@ -159,14 +160,14 @@ def test_a_new_certificate_that_sees_less_again_is_told_again():
     loop = TouchedLoop(SETTINGS)
     loop.run_until(SchemeState.MONITOR)
     m = loop.pipeline.numbers.memory[0]
-    m["roughness"][1] = 400.0
+    m.sensitivity.roughness[1] = 400.0
     loop.run(2500)
     loop.request = Request.PAYLOAD
     loop.run_until(SchemeState.PAYLOAD)
-    m["roughness"][1] = 1.0
+    m.sensitivity.roughness[1] = 1.0
     loop.request = Request.PAYLOAD_CHANGED
     loop.run_until(SchemeState.MONITOR)
     assert len(loop.said("sight")) == 1
-    m["roughness"][1] = 400.0
+    m.sensitivity.roughness[1] = 400.0
     loop.run(2500)
     assert len(loop.said("sight")) == 2

@@ -12,6 +12,7 @@ from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
 from adacd_hil.scheme.supervisor import supervisor
 from adacd_hil.scheme.supervisor.supervisor import REST_HOLD_S, UNREST_S, Supervisor
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, TRANSITIONS, Observation, SchemeEvent, next_state
+from adacd_hil.structured import zeros_of
 
 # What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens, "back"
 # the state from which REACT was entered.
@@ -105,7 +106,8 @@ class Run:
     """A supervisor driven cycle by cycle."""
 
     def __init__(self, settings=SETTINGS):
-        self.k, self.memory = np.zeros(1, supervisor.CONSTANTS), np.zeros(1, supervisor.MEMORY)
+        self.k = zeros_of(supervisor.SupervisorConstants, {"states": len(SchemeState)})
+        self.memory = zeros_of(supervisor.SupervisorMemory, {})
         supervisor.fill_constants(settings, self.k[0])
         supervisor.begin(self.memory[0])
         self.supervisor = Supervisor(self.memory)
@@ -117,11 +119,11 @@ class Run:
 
     @property
     def fault(self):
-        return FaultReason(self.memory[0]["fault"])
+        return FaultReason(self.memory[0].fault)
 
     @property
     def is_latched(self):
-        return bool(self.memory[0]["is_latched"])
+        return bool(self.memory[0].is_latched)
 
     def step(
         self, arm=GOOD, request=Request.NONE, observation=Observation.NONE, is_reporting=False, goes_on=False, cycles=1

@@ -32,23 +32,23 @@ class Tailed:
     def __init__(self):
         self.memory = certified_memory.new_memory(SETTINGS)
         self.m = self.memory[0]
-        self.m["h_model"][:] = MODEL_NM
+        self.m.sensitivity.h_model[:] = MODEL_NM
 
     def see(self, y, samples):
         for sample in range(samples):
-            self.m["y"][:] = y if sample % 2 else np.negative(y)
+            self.m.filters.y[:] = y if sample % 2 else np.negative(y)
             margin.follow_tail(K, self.m)
 
     def push(self, y, samples):
         """See the same sign all the time."""
-        self.m["y"][:] = y
+        self.m.filters.y[:] = y
         for _ in range(samples):
             margin.follow_tail(K, self.m)
 
     def skip(self, blocks, y=0.0):
         """See as much as these blocks at once, each by its last sample."""
         for _ in range(blocks):
-            self.m["block_used"] = BLOCK - 2.0
+            self.m.margin.block_used = BLOCK - 2.0
             self.see(y, 2)
 
 
@@ -56,11 +56,11 @@ class Tailed:
 def test_the_floor_is_the_largest_residual_times_the_formula_s_factor(seen_s):
     tailed = Tailed()
     largest = np.random.default_rng(1).uniform(-0.3, 0.3, (5, 2))
-    tailed.m["tail_s"] = seen_s - margin.BLOCK_S
+    tailed.m.margin.tail_s = seen_s - margin.BLOCK_S
     tailed.see(largest, BLOCK)
     tailed.see(0.5 * largest, BLOCK)
     expected = factor(NU_HZ, seen_s)[:, None] * np.abs(largest)
-    np.testing.assert_allclose(tailed.m["tail_Nm"], expected, rtol=1e-10)
+    np.testing.assert_allclose(tailed.m.margin.tail_Nm, expected, rtol=1e-10)
 
 
 def test_the_factor_falls_from_its_bound_to_one_after_an_hour():
@@ -87,50 +87,50 @@ def test_a_residual_counts_when_its_block_and_the_one_after_it_are_over():
     tailed = Tailed()
     tailed.see(0.2, 2)
     tailed.see(0.1, 2 * BLOCK - 3)
-    assert not tailed.m["tail_Nm"].any()
+    assert not tailed.m.margin.tail_Nm.any()
     tailed.see(0.1, 1)
-    np.testing.assert_allclose(tailed.m["peak"], 0.2)
+    np.testing.assert_allclose(tailed.m.margin.peak, 0.2)
 
 
 def test_a_joint_that_has_just_rested_shows_no_tail():
     """A smoothed channel remembers rest longer than its bare filter."""
     tailed = Tailed()
-    tailed.m["still_smooth"][1, 0] = tailed.m["still"][2, 1] = 1.1 * sensitivity.MOVING
-    tailed.m["still_smooth"][2, 1] = tailed.m["still"][1, 0] = 0.9 * sensitivity.MOVING
+    tailed.m.sensitivity.still_smooth[1, 0] = tailed.m.sensitivity.still[2, 1] = 1.1 * sensitivity.MOVING
+    tailed.m.sensitivity.still_smooth[2, 1] = tailed.m.sensitivity.still[1, 0] = 0.9 * sensitivity.MOVING
     tailed.see(0.2, 2 * BLOCK)
     moving = np.full((5, 2), 0.2)
     moving[1, 0] = moving[4, 1] = 0.0
-    np.testing.assert_allclose(tailed.m["peak"], np.tile(moving, (2, 1, 1)))
+    np.testing.assert_allclose(tailed.m.margin.peak, np.tile(moving, (2, 1, 1)))
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_push_of_one_sign_raises_no_floor_above_what_the_other_sign_has_shown(sign):
     tailed = Tailed()
     tailed.see(0.02, 20 * BLOCK)
-    before = tailed.m["tail_Nm"].copy()
+    before = tailed.m.margin.tail_Nm.copy()
     for push_Nm in np.linspace(0.02, 0.4, 200):
         tailed.push(sign * push_Nm, BLOCK)
-    assert np.all(tailed.m["tail_Nm"] <= before)
+    assert np.all(tailed.m.margin.tail_Nm <= before)
 
 
 def test_an_error_of_both_signs_raises_the_floor_by_the_factor_at_most():
     tailed = Tailed()
     for error_Nm in (0.45, 0.9, 2.0, 50.0):
         tailed.skip(100, error_Nm)
-        np.testing.assert_allclose(tailed.m["peak"], min(error_Nm, MODEL_NM))
-        assert np.all(tailed.m["tail_Nm"] <= factor(NU_HZ, 1.0)[:, None] * MODEL_NM)
+        np.testing.assert_allclose(tailed.m.margin.peak, min(error_Nm, MODEL_NM))
+        assert np.all(tailed.m.margin.tail_Nm <= factor(NU_HZ, 1.0)[:, None] * MODEL_NM)
 
 
 def test_no_threshold_is_below_the_floor_and_a_floor_below_the_threshold_changes_nothing():
     m = Tailed().m
-    m["M"][:] = [[0.4, 0.1], [0.1, 0.05]]
-    m["hold"][:], m["still"][:], m["still_smooth"][:] = 0.3, 0.2, 0.1
+    m.regressor.M[:] = [[0.4, 0.1], [0.1, 0.05]]
+    m.sensitivity.hold[:], m.sensitivity.still[:], m.sensitivity.still_smooth[:] = 0.3, 0.2, 0.1
     h, floored = np.zeros((5, 2)), np.zeros((5, 2))
     sensitivity.fill_thresholds(K, m, h)
-    model = m["h_model"].copy()
-    m["tail_Nm"][:] = model * [0.9, 1.5]
+    model = m.sensitivity.h_model.copy()
+    m.margin.tail_Nm[:] = model * [0.9, 1.5]
     sensitivity.fill_thresholds(K, m, floored)
-    np.testing.assert_allclose(m["h_model"], model, rtol=1e-12)
+    np.testing.assert_allclose(m.sensitivity.h_model, model, rtol=1e-12)
     np.testing.assert_allclose(floored - h, model * [0.0, 0.5], rtol=1e-10, atol=1e-15)
 
 
@@ -141,43 +141,43 @@ def test_near_a_contact_its_block_and_the_one_before_do_not_count():
     tailed.see(0.4, BLOCK // 2)
     margin.discard_tail(tailed.m)
     tailed.see(0.05, 3 * BLOCK)
-    np.testing.assert_allclose(tailed.m["peak"], 0.1, rtol=1e-3)
+    np.testing.assert_allclose(tailed.m.margin.peak, 0.1, rtol=1e-3)
     tailed.see(0.2, 2 * BLOCK)
-    np.testing.assert_allclose(tailed.m["peak"], 0.2)
+    np.testing.assert_allclose(tailed.m.margin.peak, 0.2)
 
 
 def test_the_largest_is_forgotten_over_ten_minutes_of_motion():
     tailed = Tailed()
     tailed.skip(1, 0.4)
     tailed.skip(1)
-    first = tailed.m["tail_Nm"].copy()
+    first = tailed.m.margin.tail_Nm.copy()
     tailed.skip(round(margin.FORGOTTEN_S / margin.BLOCK_S))
-    np.testing.assert_allclose(tailed.m["peak"], 0.4 / np.e, rtol=1e-3)
-    np.testing.assert_allclose(tailed.m["tail_Nm"], first / np.e, rtol=1e-3)
+    np.testing.assert_allclose(tailed.m.margin.peak, 0.4 / np.e, rtol=1e-3)
+    np.testing.assert_allclose(tailed.m.margin.tail_Nm, first / np.e, rtol=1e-3)
 
 
 def test_only_time_in_which_something_was_seen_counts():
     tailed = Tailed()
     tailed.skip(1, 0.4)
     tailed.skip(50)
-    assert float(tailed.m["tail_s"]) == pytest.approx(margin.BLOCK_S)
+    assert float(tailed.m.margin.tail_s) == pytest.approx(margin.BLOCK_S)
     tailed.skip(50, 0.1)
-    assert float(tailed.m["tail_s"]) == pytest.approx(50 * margin.BLOCK_S)
+    assert float(tailed.m.margin.tail_s) == pytest.approx(50 * margin.BLOCK_S)
 
 
 def test_a_fit_of_another_model_begins_without_a_floor():
     tailed = Tailed()
     tailed.see(0.2, 2 * BLOCK + 1)
-    assert tailed.m["tail_Nm"].all()
+    assert tailed.m.margin.tail_Nm.all()
     certified_kernel.begin_adaptation(CONSTANTS, tailed.memory, False, True)
     for name in ("peak", "peak_now", "peak_last", "tail_Nm", "block_used", "tail_s"):
-        assert not tailed.m[name].any()
+        assert not tailed.m.margin[name].any()
 
 
 @pytest.mark.parametrize(("mode", "is_followed"), [("LEARN", False), ("TEST", True), ("REFINE", True)])
 def test_residuals_are_followed_while_a_frozen_model_is_in_use(mode, is_followed):
     kernel = steady(mode)
-    assert bool(kernel.m["tail_Nm"].any()) is is_followed
+    assert bool(kernel.m.margin.tail_Nm.any()) is is_followed
 
 
 def steady(mode, samples=1000):
@@ -196,25 +196,25 @@ def go_on(kernel, mode, samples, push_Nm):
 
 def test_what_of_a_touch_was_seen_before_it_was_flagged_raises_no_threshold():
     kernel = steady("REFINE")
-    before = kernel.m["peak"].copy()
+    before = kernel.m.margin.peak.copy()
     for push_Nm in np.linspace(0.005, 0.5, 80):
         is_touched = go_on(kernel, "REFINE", 1, push_Nm)[0]
         if is_touched:
             break
     assert is_touched
-    assert np.abs(kernel.m["y"]).max() > 4.0 * before.max()
+    assert np.abs(kernel.m.filters.y).max() > 4.0 * before.max()
     go_on(kernel, "REFINE", 600, 0.005)
-    assert kernel.m["recovering_cycles"] < RECOVER
+    assert kernel.m.models.recovering_cycles < RECOVER
     go_on(kernel, "REFINE", RECOVER + 3 * BLOCK, 0.005)
-    assert kernel.m["recovering_cycles"] == 0.0
-    np.testing.assert_allclose(kernel.m["peak"], before, rtol=0.06)
+    assert kernel.m.models.recovering_cycles == 0.0
+    np.testing.assert_allclose(kernel.m.margin.peak, before, rtol=0.06)
 
 
 def test_the_largest_share_is_that_of_the_threshold_in_force():
     memory = certified_memory.new_memory(SETTINGS)[0]
-    memory["h_model"][:] = MODEL_NM
+    memory.sensitivity.h_model[:] = MODEL_NM
     assert margin.largest_share(memory) == 0.0
-    memory["peak"][0, 1] = 0.4 * MODEL_NM, 0.5 * MODEL_NM
+    memory.margin.peak[0, 1] = 0.4 * MODEL_NM, 0.5 * MODEL_NM
     assert margin.largest_share(memory) == pytest.approx(0.5)
-    memory["tail_Nm"][1, 1] = 1.25 * MODEL_NM  # where the floor is the threshold in force, it is what counts
+    memory.margin.tail_Nm[1, 1] = 1.25 * MODEL_NM  # where the floor is the threshold in force, it is what counts
     assert margin.largest_share(memory) == pytest.approx(0.4)

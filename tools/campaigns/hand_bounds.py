@@ -59,7 +59,7 @@ def rows_of(settings: Settings, q: Array, dq: Array, tau_J: Array) -> Array:
         block["q"], block["dq"], block["tau_J"], block["period_s"] = q[k], dq[k], tau_J[k], 0.0
         certified_kernel.step(constants, memory, block, 1, 1, 0)
         if k % settings.certified.learn_every == 0:
-            rows.append(memory[0]["W_learnt"].copy())
+            rows.append(memory[0].filters.W_learnt.copy())
     return np.array(rows)
 
 

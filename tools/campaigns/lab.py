@@ -19,10 +19,11 @@ from lab_arm import LabArm, profile_arm, random_arm
 from lab_motion import PERIOD_S, Motion, cut, join, multisine, paper_motion, random_motion, random_moves, still
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured, compiled
+from adacd_hil.compiled import compiled
 from adacd_hil.control.controller import HANDOVER_S, fill_torque
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.settings.arm_settings import ArmSettings
+from adacd_hil.structured import Structured
 from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import external_torque
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S

@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled
+from adacd_hil.compiled import compiled
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.kernel.kernel_samples import Numbers
 from adacd_hil.scheme.supervisor.transitions import CERTIFIED, CONTACT, FITTED, REFUTED, WITHHELD
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.structured import Structured
 
 _ADAPT = int(SchemeState.ADAPT)
 _CERTIFY = int(SchemeState.CERTIFY)
@@ -43,8 +44,8 @@ def play_record(
     for _ in range(at_rest):
         certified_kernel.step(constants, memory, block, 1, 1, certified_kernel.WATCH)
     count = len(q)
-    state, observation, theta = np.zeros(count), np.zeros(count), np.zeros((count, memory[0]["theta"].size))
-    y, h = (np.zeros((count, *memory[0]["y"].shape)) for _ in range(2))
+    state, observation, theta = np.zeros(count), np.zeros(count), np.zeros((count, memory[0].models.theta.size))
+    y, h = (np.zeros((count, *memory[0].filters.y.shape)) for _ in range(2))
     step_record(constants, memory, block, q, dq, tau_J, payload_at, state, observation, y, h, theta)
     return PlayedRecord(state, observation, y, h, theta, numbers)
 
@@ -93,11 +94,11 @@ def step_record(
         found = certified_kernel.step(constants, memory, block, 1, 1, mode)
         state[k] = now
         observation[k] = found
-        y[k] = memory[0]["y"]
-        h[k] = memory[0]["h"]
-        theta[k] = memory[0]["theta"]
+        y[k] = memory[0].filters.y
+        h[k] = memory[0].sensitivity.h
+        theta[k] = memory[0].models.theta
         if found & CONTACT and now != _MONITOR and begins_in < 0:
-            begins_in = int(constants[0]["recover_cycles"])
+            begins_in = int(constants[0].recover_cycles)
         elif found & FITTED:
             certified_kernel.begin_test(constants, memory)
             now = _CERTIFY

@@ -19,7 +19,6 @@ from lab_motion import paper_motion
 from mujoco_arm import MujocoArm
 from planar_arm import THETA
 
-from adacd_hil.compiled import Structured
 from adacd_hil.control.controller import Controller
 from adacd_hil.control.reference import Reference
 from adacd_hil.records import ArmState, Request, SchemeOutput, SchemeState, Vector
@@ -27,6 +26,7 @@ from adacd_hil.scheme.identify import earlier, evidence, fit_check
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model.regressor import payload_direction
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
+from adacd_hil.structured import Structured
 
 FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.2)
@@ -213,15 +213,15 @@ def rule_shares(constants: Structured, memory: Structured) -> tuple[float, ...]:
     """Return how much of its limit each of RULES is of the fit that has just ended."""
     memory = memory.copy()
     k, m = constants[0], memory[0]
-    steps = range(min(int(m["steps_used"]), fit_check.STEPS))
-    places = [(s, i) for s in range(int(m["samples_kept"])) for i in range(2)]
+    steps = range(min(int(m.fit_check.steps_used), fit_check.STEPS))
+    places = [(s, i) for s in range(int(m.fit_check.samples_kept)) for i in range(2)]
     changed = max((fit_check.changed_share(m, s) for s in steps), default=0.0)
     explained = max((abs(fit_check.residual(m, *place)) for place in places), default=0.0) / fit_check.limit_Nm(m)
     later = max((fit_check.later_share(k, m, s) for s in steps), default=0.0)
     earlier.forget(m)
     earlier.keep(k, m)
     earlier.is_no_more(k, m)
-    more = np.max(m["difference"][evidence.KEPT :] / m["limit"][evidence.KEPT :])
+    more = np.max(m.evidence.difference[evidence.KEPT :] / m.evidence.limit[evidence.KEPT :])
     return float(changed), float(explained), float(later), float(more)
 
 
@@ -235,7 +235,7 @@ def paper_rows() -> Vector:
         block["q"], block["dq"], block["period_s"] = q, dq, 0.0
         certified_kernel.step(constants, memory, block, 1, 1, 0)
         if cycle >= 1000 and cycle % 20 == 0:
-            rows.append(memory[0]["W_f"][0].copy())
+            rows.append(memory[0].filters.W_f[0].copy())
     found = np.concatenate(rows)
     found[:, [place for place, name in enumerate(NAMES) if name.startswith("lag")]] = 0.0
     return found

@@ -25,13 +25,13 @@ report is given at once and becomes final when the window ends.
 """
 
 from abc import ABC, abstractmethod
-from typing import Any
 
 import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, ContactKind, ContactLevel, ContactReport, Reaction, Vector
 from adacd_hil.scheme.contact import localisation
+from adacd_hil.scheme.contact.course import CourseMemory
 from adacd_hil.scheme.detect.external_torque import ONSET_FRACTION
 from adacd_hil.settings.configuration import Settings
 
@@ -113,11 +113,8 @@ class ContactEvidence(ABC):
         """Report the contact that was detected in a cycle, so many cycles ago."""
 
 
-def report_of(evidence: ContactEvidence, m: Any, cycle: int) -> ContactReport:
-    """Make the report that is due in this cycle, and let the contact's course go by its link.
-
-    m: a record of `course.MEMORY`.
-    """
+def report_of(evidence: ContactEvidence, m: CourseMemory, cycle: int) -> ContactReport:
+    """Make the report that is due in this cycle, and let the contact's course go by its link."""
     direction = int(m.direction[0]), int(m.direction[1])
     detected = int(m.detected_cycle)
     report = evidence.report(detected, cycle - detected, direction, not m.is_open)
@@ -158,12 +155,9 @@ class IntegratedContact(ContactEvidence):
 
 
 class RecalledContact(ContactEvidence):
-    """The certified scheme's: the last samples, at detection, when the link is decided and when the kind is.
+    """The certified scheme's: the last samples, at detection, when the link is decided and when the kind is."""
 
-    m: a record of `course.MEMORY`.
-    """
-
-    def __init__(self, settings: Settings, m: Any) -> None:
+    def __init__(self, settings: Settings, m: CourseMemory) -> None:
         period_s = settings.bus.period_s
         window_cycles = round(KIND_S / period_s)
         self.due_cycles = (0, round(LINK_S / period_s), window_cycles)

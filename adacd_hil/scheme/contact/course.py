@@ -12,15 +12,17 @@ The paper's scheme withdraws from every contact, stops without one, and gives no
 Shapes: tau_ext_hat (2,), Nm.
 """
 
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adacd_hil.compiled import compiled, record_of
+from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, ContactLevel, Reaction, SchemeState, Vector
-from adacd_hil.scheme.supervisor.supervisor import IS_REACTING
+from adacd_hil.scheme.supervisor.supervisor import IS_REACTING, SupervisorMemory
 from adacd_hil.scheme.supervisor.transitions import COLLISION, CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.structured import PerJoint
 
 TURNED_CYCLES = 5
 """How many samples in a row the torque must be turned: what a blow leaves in the estimate is shorter."""
@@ -30,53 +32,80 @@ _NEVER = 1 << 60
 _CONTACT, _COLLISION = (int(level) for level in ContactLevel)
 """As plain numbers, which compiled code can compare with others."""
 
-CONSTANTS = record_of(
-    ("reactions", np.int64, (len(ContactLevel), JOINTS)),
-    *((name, np.int64) for name in ("two_sided", "is_kept", "blind_cycles")),
-    ("due_cycles", np.int64, (3,)),
-    ("collision_Nm", np.float64, (JOINTS,)),
-)
-"""reactions: by level, the lower first, and link. is_kept: a reaction stays in force until the next contact.
-due_cycles: a report is due so long after the detection, the final one last."""
-MEMORY = record_of(
-    *((name, np.int64) for name in ("is_reacting", "link", "is_open", "detected_cycle")),
-    ("direction", np.int64, (JOINTS,)),
-    *((name, np.int64) for name in ("reaction", "level", "cause_link", "is_two_sided", "is_given_up")),
-    *((name, np.int64) for name in ("cycles", "turned_cycles", "kept_rows")),
-    ("way", np.float64, (JOINTS,)),
-)
-"""link: that is touched, 0 of none. is_open: a report is out that is not final yet. level: the highest of this contact.
-cause_link: for which the reaction was chosen. kept_rows: of the history that reports are made from, so far. way: of a
-withdrawal, a unit vector; zeros without one."""
+
+class CourseConstants:
+    """The choice of reactions.
+
+    reactions: by level, the lower first, and link. is_kept: a reaction stays in force until the next contact.
+    due_cycles: a report is due so long after the detection, the final one last.
+    """
+
+    reactions: Annotated[NDArray[np.int64], "levels n"]
+    two_sided: int
+    is_kept: int
+    blind_cycles: int
+    due_cycles: Annotated[NDArray[np.int64], "3"]
+    collision_Nm: PerJoint
 
 
-def fill_constants(settings: Settings, due_cycles: tuple[int, ...], k: Any) -> None:
-    """Fill a record of CONSTANTS for the scheme of the settings."""
+class CourseMemory:
+    """How far a contact has come.
+
+    link: that is touched, 0 for none. is_open: a report is out that is not final yet. level: the highest of this
+    contact. cause_link: for which the reaction was chosen. kept_rows: of the history that reports are made from, so
+    far. way: of a withdrawal, a unit vector; zeros without one.
+    """
+
+    is_reacting: int
+    link: int
+    is_open: int
+    detected_cycle: int
+    direction: Annotated[NDArray[np.int64], "n"]
+    reaction: int
+    level: int
+    cause_link: int
+    is_two_sided: int
+    is_given_up: int
+    cycles: int
+    turned_cycles: int
+    kept_rows: int
+    way: PerJoint
+
+
+def fill_constants(settings: Settings, due_cycles: tuple[int, ...], k: CourseConstants) -> None:
+    """Fill the constants for the scheme of the settings."""
     wish, is_paper = settings.reaction, settings.scheme == "paper"
     chosen = (("withdraw",) * JOINTS,) * len(ContactLevel) if is_paper else (wish.contact, wish.collision)
-    k.reactions = [[Reaction[name.upper()] for name in names] for names in chosen]
+    k.reactions[:] = [[Reaction[name.upper()] for name in names] for names in chosen]
     k.two_sided = Reaction[wish.two_sided.upper()]
     k.is_kept = is_paper
     k.blind_cycles = _NEVER if is_paper else round(BLIND_S / settings.bus.period_s)
     k.due_cycles[:] = due_cycles[-1]
     k.due_cycles[: len(due_cycles)] = due_cycles
-    k.collision_Nm = settings.detector.collision_Nm
+    k.collision_Nm[:] = settings.detector.collision_Nm
 
 
-def begin(m: Any) -> None:
-    """Fill a record of MEMORY before the first cycle."""
+def begin(m: CourseMemory) -> None:
+    """Fill the memory before the first cycle."""
     m.level = ContactLevel.CONTACT
 
 
 @compiled
-def goes_on(m: Any) -> bool:
+def goes_on(m: CourseMemory) -> bool:
     """Tell whether the arm moves on along its path."""
     return bool(m.reaction in (Reaction.NONE, Reaction.SLOW_DOWN))
 
 
 @compiled
 def follow(
-    k: Any, m: Any, supervisor: Any, cycle: int, observation: int, is_valid: bool, tau_ext_hat: Vector, tau_ext: Vector
+    k: CourseConstants,
+    m: CourseMemory,
+    supervisor: SupervisorMemory,
+    cycle: int,
+    observation: int,
+    is_valid: bool,
+    tau_ext_hat: Vector,
+    tau_ext: Vector,
 ) -> bool:
     """Take in one cycle and tell whether a report is due in it.
 
@@ -106,7 +135,7 @@ def follow(
 
 
 @compiled
-def _leave(k: Any, m: Any, state: int) -> None:
+def _leave(k: CourseConstants, m: CourseMemory, state: int) -> None:
     """Forget the contact that is over: the arm goes on."""
     if m.is_reacting != 0:
         m.is_reacting, m.link = 0, 0
@@ -117,7 +146,7 @@ def _leave(k: Any, m: Any, state: int) -> None:
 
 
 @compiled
-def _is_due(k: Any, m: Any, cycle: int, joints: int, tau_ext: Vector) -> bool:
+def _is_due(k: CourseConstants, m: CourseMemory, cycle: int, joints: int, tau_ext: Vector) -> bool:
     """Take in which joints are over their threshold; tell whether a report is due. The final one closes the course."""
     elapsed = cycle - m.detected_cycle
     for i in range(m.direction.shape[0]):
@@ -133,7 +162,9 @@ def _is_due(k: Any, m: Any, cycle: int, joints: int, tau_ext: Vector) -> bool:
 
 
 @compiled
-def _reconsider(k: Any, m: Any, level: int, is_latched: bool, tau_ext_hat: Vector, is_valid: bool) -> None:
+def _reconsider(
+    k: CourseConstants, m: CourseMemory, level: int, is_latched: bool, tau_ext_hat: Vector, is_valid: bool
+) -> None:
     """Change the reaction if something calls for it."""
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link
@@ -147,7 +178,7 @@ def _reconsider(k: Any, m: Any, level: int, is_latched: bool, tau_ext_hat: Vecto
 
 
 @compiled
-def _choose(k: Any, m: Any, tau_ext_hat: Vector, is_valid: bool) -> None:
+def _choose(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: bool) -> None:
     reaction = k.reactions[m.level - 1, m.cause_link - 1]
     if reaction != m.reaction:
         _react(m, _possible(reaction, is_valid), tau_ext_hat, True)
@@ -159,7 +190,7 @@ def _possible(reaction: int, is_valid: bool) -> int:
 
 
 @compiled
-def _react(m: Any, reaction: int, tau_ext_hat: Vector, is_pushed: bool) -> None:
+def _react(m: CourseMemory, reaction: int, tau_ext_hat: Vector, is_pushed: bool) -> None:
     """Begin a reaction; is_pushed: away along tau_ext_hat, if it is a withdrawal."""
     m.reaction = reaction
     size = np.sqrt(tau_ext_hat[0] * tau_ext_hat[0] + tau_ext_hat[1] * tau_ext_hat[1]) if is_pushed else 0.0
@@ -169,7 +200,7 @@ def _react(m: Any, reaction: int, tau_ext_hat: Vector, is_pushed: bool) -> None:
 
 
 @compiled
-def _judge(k: Any, m: Any, tau_ext_hat: Vector, is_valid: bool) -> None:
+def _judge(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: bool) -> None:
     """Give a withdrawal up if it pushes something on the other side."""
     m.cycles += 1
     if m.cycles <= k.blind_cycles:

@@ -37,17 +37,18 @@ Sources: De Luca and Mattone, "Sensorless robot collision detection and hybrid f
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
 
-from adacd_hil.compiled import Structured, compiled, packed, zeroed
+from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import detector_registry
 from adacd_hil.scheme.detect.detector_registry import Maker, Registered
 from adacd_hil.scheme.model import regressor
 from adacd_hil.settings.schema import ConfigError, setting
+from adacd_hil.structured import PerJoint, Structured, packed, zeros_of
 
 VELOCITY_LAG_S: Final = 1.25e-3
 """The emulated drives: 1.59 ms of their tracking loop less 0.34 ms, since a commanded torque is a step at the start of
@@ -186,35 +187,54 @@ def autocovariance(z: Vector, length: int) -> Vector:
     return np.asarray(np.fft.irfft(spectrum, size)[:length] / z.shape[0])
 
 
+class DetectorMemory:
+    """The memory of the detectors; last axis: x, allowance."""
+
+    low: Annotated[Vector, "filters n 2"]
+    smooth: Annotated[Vector, "filters n 2"]
+    band: Annotated[Vector, "2 n 2"]
+    observer: Annotated[Vector, "gains n 2"]
+    ring: Annotated[Vector, "length n 2"]
+    head: float
+    up: PerJoint
+    down: PerJoint
+
+
+@dataclass(frozen=True)
+class DetectorConstants:
+    """The constants of the detectors: decay of each filter, band and gains of the observers, weights (n, N, L)."""
+
+    period_s: float
+    decay: Vector
+    smoothing: float
+    band: Vector
+    gain: Vector
+    weights: Vector
+    drift_Nm: float
+
+
 def constants_of(settings: DetectorBankSettings, weights: Vector, period_s: float) -> Structured:
     """Put settings and the joints' likelihood weights (n, N, L) into the form that the compiled step reads."""
-    values: dict[str, Any] = {
-        "period_s": period_s,
-        "decay": np.exp(-np.array(settings.cutoff_rad_s) * period_s),
-        "smoothing": math.exp(-settings.smoothing_rad_s * period_s),
-        "band": np.exp(-np.array(settings.band_rad_s) * period_s),
-        "gain": settings.observer_rad_s,
-        "weights": weights,
-        "drift_Nm": settings.drift_Nm,
-    }
-    return packed(values)
+    return packed(
+        DetectorConstants(
+            period_s=period_s,
+            decay=np.exp(-np.array(settings.cutoff_rad_s) * period_s),
+            smoothing=math.exp(-settings.smoothing_rad_s * period_s),
+            band=np.exp(-np.array(settings.band_rad_s) * period_s),
+            gain=np.array(settings.observer_rad_s),
+            weights=weights,
+            drift_Nm=settings.drift_Nm,
+        )
+    )
 
 
 def new_memory(constants: Structured) -> Structured:
-    """Return the memory before the first sample: nothing was seen, nothing stood still. Last axis: x, allowance."""
-    _, joints, _, length = constants["weights"].shape
-    filters, gains = constants["decay"].size, constants["gain"].size
-    shapes: dict[str, tuple[int, ...]] = {
-        "low": (filters, joints, 2),
-        "smooth": (filters, joints, 2),
-        "band": (2, joints, 2),
-        "observer": (gains, joints, 2),
-        "ring": (length, joints, 2),
-        "head": (),
-        "up": (joints,),
-        "down": (joints,),
-    }
-    return zeroed(shapes)
+    """Return the memory before the first sample: nothing was seen, nothing stood still."""
+    c: DetectorConstants = constants[0]
+    joints = c.weights.shape[0]
+    return zeros_of(
+        DetectorMemory, {"n": joints, "filters": c.decay.size, "gains": c.gain.size, "length": c.weights.shape[-1]}
+    )
 
 
 @compiled
@@ -223,48 +243,49 @@ def step(constants: Structured, memory: Structured, z: Vector, held_Nm: Vector, 
 
     held_Nm (n,): the friction that may hold each joint, F_c if it stands still, else 0.
     """
-    c, m = constants[0], memory[0]
-    decay, gain, weights = c["decay"], c["gain"], c["weights"]
-    length = m["ring"].shape[0]
-    head = (int(m["head"]) + 1) % length
-    m["head"] = head
+    c: DetectorConstants = constants[0]
+    m: DetectorMemory = memory[0]
+    decay, gain, weights = c.decay, c.gain, c.weights
+    length = m.ring.shape[0]
+    head = (int(m.head) + 1) % length
+    m.head = head
     for i in range(z.shape[0]):
         row = 0
         for part in range(2):
             u = z[i] if part == 0 else held_Nm[i]
-            m["ring"][head, i, part] = u
+            m.ring[head, i, part] = u
             for k in range(decay.shape[0]):
-                m["low"][k, i, part] = u + decay[k] * (m["low"][k, i, part] - u)
-                low = m["low"][k, i, part]
-                m["smooth"][k, i, part] = low + c["smoothing"] * (m["smooth"][k, i, part] - low)
+                m.low[k, i, part] = u + decay[k] * (m.low[k, i, part] - u)
+                low = m.low[k, i, part]
+                m.smooth[k, i, part] = low + c.smoothing * (m.smooth[k, i, part] - low)
             for k in range(2):
-                m["band"][k, i, part] = u + c["band"][k] * (m["band"][k, i, part] - u)
+                m.band[k, i, part] = u + c.band[k] * (m.band[k, i, part] - u)
             for k in range(gain.shape[0]):
-                half = 0.5 * gain[k] * c["period_s"]
-                m["observer"][k, i, part] = ((1.0 - half) * m["observer"][k, i, part] + 2.0 * half * u) / (1.0 + half)
+                half = 0.5 * gain[k] * c.period_s
+                m.observer[k, i, part] = ((1.0 - half) * m.observer[k, i, part] + 2.0 * half * u) / (1.0 + half)
         for k in range(decay.shape[0]):
-            statistics[row + k, i] = abs(m["low"][k, i, 0]) - m["low"][k, i, 1]
-            statistics[row + decay.shape[0] + k, i] = abs(m["smooth"][k, i, 0]) - m["smooth"][k, i, 1]
+            statistics[row + k, i] = abs(m.low[k, i, 0]) - m.low[k, i, 1]
+            statistics[row + decay.shape[0] + k, i] = abs(m.smooth[k, i, 0]) - m.smooth[k, i, 1]
         row += 2 * decay.shape[0]
-        band = m["band"][1, i, 0] - m["band"][0, i, 0]
-        statistics[row, i] = abs(band) - (m["band"][1, i, 1] + m["band"][0, i, 1])
+        band = m.band[1, i, 0] - m.band[0, i, 0]
+        statistics[row, i] = abs(band) - (m.band[1, i, 1] + m.band[0, i, 1])
         row += 1
         for k in range(gain.shape[0]):
-            statistics[row + k, i] = abs(m["observer"][k, i, 0]) - m["observer"][k, i, 1]
+            statistics[row + k, i] = abs(m.observer[k, i, 0]) - m.observer[k, i, 1]
         row += gain.shape[0]
         for k in range(weights.shape[1]):
             likelihood, allowance = 0.0, 0.0
             for past in range(length):
                 place = head - past if past <= head else head - past + length
-                likelihood += weights[i, k, past] * m["ring"][place, i, 0]
-                allowance += abs(weights[i, k, past]) * m["ring"][place, i, 1]
+                likelihood += weights[i, k, past] * m.ring[place, i, 0]
+                allowance += abs(weights[i, k, past]) * m.ring[place, i, 1]
             statistics[row + k, i] = abs(likelihood) - allowance
         row += weights.shape[1]
         last = decay.shape[0] - 1
-        x, ignored = m["smooth"][last, i, 0], c["drift_Nm"] + m["smooth"][last, i, 1]
-        m["up"][i] = max(0.0, m["up"][i] + (x - ignored) * c["period_s"])
-        m["down"][i] = max(0.0, m["down"][i] - (x + ignored) * c["period_s"])
-        statistics[row, i] = max(m["up"][i], m["down"][i])
+        x, ignored = m.smooth[last, i, 0], c.drift_Nm + m.smooth[last, i, 1]
+        m.up[i] = max(0.0, m.up[i] + (x - ignored) * c.period_s)
+        m.down[i] = max(0.0, m.down[i] - (x + ignored) * c.period_s)
+        statistics[row, i] = max(m.up[i], m.down[i])
 
 
 @compiled

@@ -22,11 +22,10 @@ begins where |y| was last below half of its threshold, which is before it is det
 Shapes: joint vectors (2,); history (WIDE_SAMPLES + 1, 2), newest first.
 """
 
-from typing import Any
-
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import Vector
+from adacd_hil.scheme.memory import Wide
 
 SMALLEST_UNIT = 0.05
 LARGEST_UNIT = 9.0
@@ -80,15 +79,10 @@ ONSET_FRACTION = 0.5
 """Part of the threshold below which a joint counts as untouched; above what a frozen model leaves (0.07 of 0.15 Nm)."""
 
 
-def shapes_of() -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    return {"history": (WIDE_SAMPLES + 1, JOINTS)}
-
-
 @compiled
-def forget(m: Any) -> None:
+def forget(wide: Wide) -> None:
     """Forget the samples of the mean."""
-    m["history"][:] = 0.0
+    wide.history[:] = 0.0
 
 
 @compiled

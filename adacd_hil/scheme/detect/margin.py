@@ -38,7 +38,7 @@ Source of the law of block maxima: E. J. Gumbel, "Statistics of Extremes", 1958.
 """
 
 import math
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.detect.sensitivity import AGREES, MOVING
+from adacd_hil.scheme.memory import Constants, MarginConstants, Memory
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.settings.configuration import Settings
 
@@ -121,75 +122,63 @@ BLOCK_S = 0.064
 """Longer than a touch is held back before it is seen."""
 
 
-def constants_of(settings: Settings) -> dict[str, Vector]:
+def constants_of(settings: Settings) -> MarginConstants:
     """Return `excursions_Hz`, `shown` (2 C - 1,) and `block_cycles`."""
     a = np.array(settings.certified.cutoffs_rad_s)
-    return {
-        "excursions_Hz": np.concatenate([a, a[1:]]) / np.pi,
-        "block_cycles": np.array(max(round(BLOCK_S / settings.bus.period_s), 1)),
-        "mean_cycles": np.array(round(MEAN_S / settings.bus.period_s)),
-        "shown": np.array(
+    return MarginConstants(
+        excursions_Hz=np.concatenate([a, a[1:]]) / np.pi,
+        block_cycles=max(round(BLOCK_S / settings.bus.period_s), 1),
+        mean_cycles=round(MEAN_S / settings.bus.period_s),
+        shown=np.array(
             [filter_bank.step_response(WITHIN_S, *channel) for channel in filter_bank.channels_of(settings)]
         ),
-    }
-
-
-def shapes_of(channels: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    joint, each, signed = (JOINTS,), (channels, JOINTS), (2, channels, JOINTS)
-    return {
-        **dict.fromkeys(("peak", "peak_now", "peak_last"), signed),
-        "tail_Nm": each,
-        **dict.fromkeys(("block_used", "tail_s"), ()),
-        **dict.fromkeys(("seen_worst_Nm", "seen_push_Nm", "sum_push_Nm", "sum_cycles", "mean_push_Nm", "dim_s"), joint),
-        "seen": (BINS, JOINTS),
-    }
+    )
 
 
 @compiled
-def begin_tail(m: Any) -> None:
+def begin_tail(m: Memory) -> None:
     """Begin with a model that no residual has been seen of."""
-    m["peak"][:] = 0.0
-    m["tail_Nm"][:] = 0.0
-    m["tail_s"] = 0.0
+    m.margin.peak[:] = 0.0
+    m.margin.tail_Nm[:] = 0.0
+    m.margin.tail_s = 0.0
     discard_tail(m)
 
 
 @compiled
-def discard_tail(m: Any) -> None:
+def discard_tail(m: Memory) -> None:
     """Throw away the residuals of the last block and the one under way: a contact is near."""
-    m["peak_now"][:] = 0.0
-    m["peak_last"][:] = 0.0
-    m["block_used"] = 0.0
+    m.margin.peak_now[:] = 0.0
+    m.margin.peak_last[:] = 0.0
+    m.margin.block_used = 0.0
 
 
 @compiled
-def follow_tail(k: Any, m: Any) -> None:
+def follow_tail(k: Constants, m: Memory) -> None:
     """Take in one sample without contact."""
-    filters = m["r"].shape[0]
-    for c in range(m["y"].shape[0]):
-        still = m["still_smooth"][c] if c < filters else m["still"][filter_bank.filter_of(c, filters)]
-        for i in range(m["y"].shape[1]):
+    filters = m.filters.r.shape[0]
+    for c in range(m.filters.y.shape[0]):
+        still = m.sensitivity.still_smooth[c] if c < filters else m.sensitivity.still[filter_bank.filter_of(c, filters)]
+        for i in range(m.filters.y.shape[1]):
             if still[i] < sensitivity.MOVING:
-                seen = min(abs(m["y"][c, i]), m["h_model"][c, i])
-                sign = 0 if m["y"][c, i] < 0.0 else 1
-                m["peak_now"][sign, c, i] = max(m["peak_now"][sign, c, i], seen)
-    m["block_used"] += 1.0
-    if m["block_used"] < k["block_cycles"]:
+                seen = min(abs(m.filters.y[c, i]), m.sensitivity.h_model[c, i])
+                sign = 0 if m.filters.y[c, i] < 0.0 else 1
+                m.margin.peak_now[sign, c, i] = max(m.margin.peak_now[sign, c, i], seen)
+    m.margin.block_used += 1.0
+    if m.margin.block_used < k.margin.block_cycles:
         return
-    block_s = m["block_used"] * k["period_s"]
-    m["block_used"] = 0.0
-    if np.max(m["peak_last"]) > 0.0:
-        m["tail_s"] += block_s
-    for c in range(m["y"].shape[0]):
-        factor = _factor(k["excursions_Hz"][c], 0.5 * m["tail_s"])
-        for i in range(m["y"].shape[1]):
+    block_s = m.margin.block_used * k.period_s
+    m.margin.block_used = 0.0
+    if np.max(m.margin.peak_last) > 0.0:
+        m.margin.tail_s += block_s
+    for c in range(m.filters.y.shape[0]):
+        factor = _factor(k.margin.excursions_Hz[c], 0.5 * m.margin.tail_s)
+        for i in range(m.filters.y.shape[1]):
             for sign in range(2):
-                kept = m["peak"][sign, c, i] * (1.0 - block_s / FORGOTTEN_S)
-                m["peak"][sign, c, i] = max(kept, m["peak_last"][sign, c, i])
-                m["peak_last"][sign, c, i] = m["peak_now"][sign, c, i]
-                m["peak_now"][sign, c, i] = 0.0
-            m["tail_Nm"][c, i] = factor * min(m["peak"][0, c, i], m["peak"][1, c, i])
+                kept = m.margin.peak[sign, c, i] * (1.0 - block_s / FORGOTTEN_S)
+                m.margin.peak[sign, c, i] = max(kept, m.margin.peak_last[sign, c, i])
+                m.margin.peak_last[sign, c, i] = m.margin.peak_now[sign, c, i]
+                m.margin.peak_now[sign, c, i] = 0.0
+            m.margin.tail_Nm[c, i] = factor * min(m.margin.peak[0, c, i], m.margin.peak[1, c, i])
 
 
 def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> float:
@@ -203,9 +192,11 @@ def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> flo
     return float(HOUR_S * excursions_Hz * seen ** (-1.0 / largest_share**2))
 
 
-def largest_share(m: Any) -> float:
+def largest_share(m: Memory) -> float:
     """Return the largest residual seen without contact, as a share of its threshold."""
-    return float(np.max(m["peak"].max(axis=0) / np.maximum(np.maximum(m["h_model"], m["tail_Nm"]), 1e-12)))
+    return float(
+        np.max(m.margin.peak.max(axis=0) / np.maximum(np.maximum(m.sensitivity.h_model, m.margin.tail_Nm), 1e-12))
+    )
 
 
 @compiled
@@ -242,87 +233,92 @@ def smallest_push(y: Vector, h: Vector, shown: Vector, joint: int) -> float:
 
 
 @compiled
-def begin_sight(m: Any) -> None:
+def begin_sight(m: Memory) -> None:
     """Begin a test."""
-    m["seen"][:] = 0.0
-    m["seen_worst_Nm"][:] = 0.0
-    m["seen_push_Nm"][:] = 0.0
-    m["sum_push_Nm"][:] = 0.0
-    m["sum_cycles"][:] = 0.0
-    m["dim_s"][:] = 0.0
+    m.margin.seen[:] = 0.0
+    m.margin.seen_worst_Nm[:] = 0.0
+    m.margin.seen_push_Nm[:] = 0.0
+    m.margin.sum_push_Nm[:] = 0.0
+    m.margin.sum_cycles[:] = 0.0
+    m.margin.dim_s[:] = 0.0
 
 
 @compiled
-def follow_test(k: Any, m: Any) -> None:
+def follow_test(k: Constants, m: Memory) -> None:
     """Take in one sample of a test, without contact."""
-    for i in range(m["seen"].shape[1]):
-        h = m["wide_threshold"][i]
+    for i in range(m.margin.dim_s.shape[0]):
+        h = m.sensitivity.wide_threshold[i]
         place = int(math.log(max(h / LOWEST_NM, 1.0)) / WIDTH)
-        m["seen"][min(place, BINS - 1), i] += 1.0
-        m["seen_worst_Nm"][i] = max(m["seen_worst_Nm"][i], h)
-        m["seen_push_Nm"][i] = max(m["seen_push_Nm"][i], smallest_push(m["y"], m["h"], k["shown"], i))
+        m.margin.seen[min(place, BINS - 1), i] += 1.0
+        m.margin.seen_worst_Nm[i] = max(m.margin.seen_worst_Nm[i], h)
+        m.margin.seen_push_Nm[i] = max(
+            m.margin.seen_push_Nm[i], smallest_push(m.filters.y, m.sensitivity.h, k.margin.shown, i)
+        )
 
 
 @compiled
-def follow_sight(k: Any, m: Any) -> bool:
+def follow_sight(k: Constants, m: Memory) -> bool:
     """Take in one sample of monitoring, without contact; tell whether a joint has been blind for too long."""
     is_blind = False
-    for i in range(m["seen"].shape[1]):
-        if m["still"][filter_bank.LEARNT, i] >= MOVING:
+    for i in range(m.margin.dim_s.shape[0]):
+        if m.sensitivity.still[filter_bank.LEARNT, i] >= MOVING:
             continue
-        m["sum_push_Nm"][i] += smallest_push(m["y"], m["h"], k["shown"], i)
-        m["sum_cycles"][i] += 1.0
-        if m["sum_cycles"][i] < k["mean_cycles"]:
+        m.margin.sum_push_Nm[i] += smallest_push(m.filters.y, m.sensitivity.h, k.margin.shown, i)
+        m.margin.sum_cycles[i] += 1.0
+        if m.margin.sum_cycles[i] < k.margin.mean_cycles:
             continue
-        m["mean_push_Nm"][i] = m["sum_push_Nm"][i] / m["sum_cycles"][i]
-        is_dim = not m["mean_push_Nm"][i] <= LESS * m["seen_push_Nm"][i]
-        m["dim_s"][i] = m["dim_s"][i] + MEAN_S if is_dim else 0.0
-        m["sum_push_Nm"][i] = 0.0
-        m["sum_cycles"][i] = 0.0
-        is_blind = is_blind or m["dim_s"][i] >= BLIND_S
+        m.margin.mean_push_Nm[i] = m.margin.sum_push_Nm[i] / m.margin.sum_cycles[i]
+        is_dim = not m.margin.mean_push_Nm[i] <= LESS * m.margin.seen_push_Nm[i]
+        m.margin.dim_s[i] = m.margin.dim_s[i] + MEAN_S if is_dim else 0.0
+        m.margin.sum_push_Nm[i] = 0.0
+        m.margin.sum_cycles[i] = 0.0
+        is_blind = is_blind or m.margin.dim_s[i] >= BLIND_S
     return is_blind
 
 
-def describe_sight(m: Any) -> str:
+def describe_sight(m: Memory) -> str:
     """Say what the last test has seen, joints separated by strokes."""
-    seen = np.cumsum(m["seen"], axis=0)
-    worst_Nm = m["seen_worst_Nm"]
+    seen = np.cumsum(m.margin.seen, axis=0)
+    worst_Nm = m.margin.seen_worst_Nm
     median, most = ([_quantile(seen[:, i], worst_Nm[i], share) for i in range(JOINTS)] for share in (0.5, 0.99))
     return (
-        f"a push of {_by_joint(m['seen_push_Nm'])} Nm would be found within {1e3 * WITHIN_S:g} ms at the worst moment "
-        f"of the test, thresholds {_by_joint(median)} Nm in the middle, {_by_joint(most)} in 99 %, "
+        f"a push of {_by_joint(m.margin.seen_push_Nm)} Nm would be found within {1e3 * WITHIN_S:g} ms at the worst "
+        f"moment of the test, thresholds {_by_joint(median)} Nm in the middle, {_by_joint(most)} in 99 %, "
         f"{_by_joint(worst_Nm)} at worst; its residuals came to {100.0 * largest_share(m):.0f} % of their thresholds"
     )
 
 
-def describe_push(m: Any) -> str:
+def describe_push(m: Memory) -> str:
     """Say in brief what the last test has seen."""
-    pushes = " / ".join(f"{value:.2f}" for value in m["seen_push_Nm"])
+    pushes = " / ".join(f"{value:.2f}" for value in m.margin.seen_push_Nm)
     return f"pushes of {pushes} Nm at the joints: found within {1e3 * WITHIN_S:g} ms (estimate)"
 
 
-def describe_dim(m: Any) -> list[str]:
+def describe_dim(m: Memory) -> list[str]:
     """Say which joints see less than in the test, and since when, a line each; empty if none."""
     return [
-        f"joint {i + 1} sees less than was certified: for {m['dim_s'][i]:g} s of motion it has found pushes from "
-        f"{m['mean_push_Nm'][i]:.2f} Nm on within {1e3 * WITHIN_S:g} ms, in the test from {m['seen_push_Nm'][i]:.2f} "
-        f"Nm on at worst; {_why_dim(m, i)}"
+        f"joint {i + 1} sees less than was certified: for {m.margin.dim_s[i]:g} s of motion it has found pushes from "
+        f"{m.margin.mean_push_Nm[i]:.2f} Nm on within {1e3 * WITHIN_S:g} ms, in the test from "
+        f"{m.margin.seen_push_Nm[i]:.2f} Nm on at worst; {_why_dim(m, i)}"
         for i in range(JOINTS)
-        if m["dim_s"][i] > 0.0
+        if m.margin.dim_s[i] > 0.0
     ]
 
 
-def _why_dim(m: Any, joint: int) -> str:
+def _why_dim(m: Memory, joint: int) -> str:
     """Say what raises a joint's thresholds most."""
-    if np.any(m["tail_Nm"][:, joint] > m["h_model"][:, joint]):
+    if np.any(m.margin.tail_Nm[:, joint] > m.sensitivity.h_model[:, joint]):
         return "residuals of both signs have come near the thresholds: the arm moves otherwise than its model"
-    if m["strain"][joint] > STRAIN_SAID:
-        return f"contacts right after going on have raised its thresholds {m['strain'][joint]:.1f} times"
-    if m["velocity_roughness"][joint] > ROUGH_SAID:
-        return f"its velocity has {math.sqrt(m['velocity_roughness'][joint]):.1f} times the noise of the settings"
-    if np.any(m["lost"][:, joint] > 0.0):
+    if m.sensitivity.strain[joint] > STRAIN_SAID:
+        return f"contacts right after going on have raised its thresholds {m.sensitivity.strain[joint]:.1f} times"
+    if m.sensitivity.velocity_roughness[joint] > ROUGH_SAID:
+        return (
+            f"its velocity has {math.sqrt(m.sensitivity.velocity_roughness[joint]):.1f} times the noise of the settings"
+        )
+    if np.any(m.sensitivity.lost[:, joint] > 0.0):
         return "samples are missing"
-    return f"its residuals have come to {math.sqrt(m['unit'][joint]):.1f} times what the settings call a good model's"
+    times = math.sqrt(m.sensitivity.unit[joint])
+    return f"its residuals have come to {times:.1f} times what the settings call a good model's"
 
 
 def _quantile(seen: Vector, worst_Nm: float, share: float) -> float:
@@ -333,5 +329,5 @@ def _quantile(seen: Vector, worst_Nm: float, share: float) -> float:
     return min(LOWEST_NM * float(math.exp(WIDTH * (place + 1))), float(worst_Nm))
 
 
-def _by_joint(values_Nm: Any) -> str:
+def _by_joint(values_Nm: Iterable[float]) -> str:
     return " / ".join(f"{value:.3f}" for value in values_Nm)

@@ -37,14 +37,14 @@ Shapes: C filters, n joints; lost (C, n), Nm².
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import external_torque
+from adacd_hil.scheme.memory import Constants, Memory, NoiseConstants
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.scheme_settings import CertifiedSettings
 
@@ -86,7 +86,7 @@ _SMOOTHED_SHARE = 0.335 / 200.0
 _SMOOTHED_FALL_RAD_S = 600.0
 
 
-def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, Vector]:
+def noise_constants(certified: CertifiedSettings, period_s: float) -> NoiseConstants:
     """Return, by channel (2 C - 1,), (k_tau sigma_tau)² in Nm² and nu² in rad²/s⁴."""
     a, s = np.array(certified.cutoffs_rad_s), certified.smoothing_rad_s
     width = np.concatenate([a * s / (a + s), a[1:]])
@@ -94,18 +94,18 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
     share = np.concatenate([smoothed, np.full(a.size - 1, BARE)])
     nu = certified.velocity_noise_rad_s * np.concatenate([a, a[1:]]) * share
     gain = certified.noise_sigmas**2 * 0.5 * period_s * width
-    return {
-        "torque_variance": certified.torque_noise_Nm**2 * gain,
-        "torque_gain": gain,
-        "velocity_variance": nu**2,
-        "velocity_noise_rad_s": np.array(certified.velocity_noise_rad_s),
-        "roughness_share": np.array(period_s / ROUGHNESS_S),
-        "roughness_loss": np.array(period_s / ROUGHNESS_LOST_S),
-        "strain_share": np.array(period_s / STRAIN_S),
-        "unit_share": np.array(period_s / UNIT_S),
-        "unit_test_share": np.array(period_s / UNIT_TEST_S),
-        "velocity_std_rad_s": np.array(filter_bank.VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
-    }
+    return NoiseConstants(
+        torque_variance=certified.torque_noise_Nm**2 * gain,
+        torque_gain=gain,
+        velocity_variance=nu**2,
+        velocity_noise_rad_s=certified.velocity_noise_rad_s,
+        roughness_share=period_s / ROUGHNESS_S,
+        roughness_loss=period_s / ROUGHNESS_LOST_S,
+        strain_share=period_s / STRAIN_S,
+        unit_share=period_s / UNIT_S,
+        unit_test_share=period_s / UNIT_TEST_S,
+        velocity_std_rad_s=filter_bank.VELOCITY_STD_SHARE * certified.velocity_noise_rad_s,
+    )
 
 
 @compiled
@@ -137,39 +137,41 @@ def follow_standstill(
 
 
 @compiled
-def measure_noise(k: Any, m: Any, tau_J: Vector) -> None:
+def measure_noise(k: Constants, m: Memory, tau_J: Vector) -> None:
     """Take one sample at rest into `roughness` (n,): variance of the torque over that of the settings, at least 1."""
-    m["rest_samples"] += 1.0
+    m.sensitivity.rest_samples += 1.0
     for i in range(tau_J.shape[0]):
-        if m["rest_samples"] > 1.0:
-            m["rest_square"][i] += 0.5 * (tau_J[i] - m["rest_tau"][i]) ** 2
-            variance = m["rest_square"][i] / (m["rest_samples"] - 1.0)
-            m["roughness"][i] = max(variance / max(k["torque_noise_Nm"] ** 2, 1e-12), 1.0)
-        m["rest_tau"][i] = tau_J[i]
+        if m.sensitivity.rest_samples > 1.0:
+            m.sensitivity.rest_square[i] += 0.5 * (tau_J[i] - m.sensitivity.rest_tau[i]) ** 2
+            variance = m.sensitivity.rest_square[i] / (m.sensitivity.rest_samples - 1.0)
+            m.sensitivity.roughness[i] = max(variance / max(k.torque_noise_Nm**2, 1e-12), 1.0)
+        m.sensitivity.rest_tau[i] = tau_J[i]
 
 
 @compiled
-def follow_torque_step(k: Any, m: Any, tau_J: Vector) -> None:
+def follow_torque_step(k: Constants, m: Memory, tau_J: Vector) -> None:
     """Take one sample into the sensors' step L (n,), the smallest change ever seen, and how far it pulls their mean.
 
     A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most. Until
     enough changes were seen L is 0: the first ones may be a push.
     """
     for i in range(tau_J.shape[0]):
-        change = abs(tau_J[i] - m["last"][2, i])  # nan of the first sample
+        change = abs(tau_J[i] - m.gaps.last[2, i])  # nan of the first sample
         if not change > 0.0:
             continue
-        m["torque_changes"][i] += 1.0
-        m["torque_change_Nm"][i] = change if m["torque_changes"][i] == 1.0 else min(change, m["torque_change_Nm"][i])
-        step_Nm = min(m["torque_change_Nm"][i], LARGEST_STEP_NM)
-        if m["torque_changes"][i] >= CHANGES and step_Nm != m["torque_step_Nm"][i]:
-            m["torque_step_Nm"][i] = step_Nm
-            variance = k["torque_noise_Nm"] ** 2 * m["roughness"][i]
-            m["torque_pull_Nm"][i] = PULL * step_Nm / np.pi * math.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
+        m.sensitivity.torque_changes[i] += 1.0
+        m.sensitivity.torque_change_Nm[i] = (
+            change if m.sensitivity.torque_changes[i] == 1.0 else min(change, m.sensitivity.torque_change_Nm[i])
+        )
+        step_Nm = min(m.sensitivity.torque_change_Nm[i], LARGEST_STEP_NM)
+        if m.sensitivity.torque_changes[i] >= CHANGES and step_Nm != m.sensitivity.torque_step_Nm[i]:
+            m.sensitivity.torque_step_Nm[i] = step_Nm
+            variance = k.torque_noise_Nm**2 * m.sensitivity.roughness[i]
+            m.sensitivity.torque_pull_Nm[i] = PULL * step_Nm / np.pi * math.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
 
 
 @compiled
-def follow_velocity_noise(k: Any, m: Any, dq: Vector, is_steady: bool) -> None:
+def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) -> None:
     """Take one sample into the roughness (n,) of the velocity: its noise over the settings', squared.
 
     Noise shows in the second difference of dq, motion does not: at 1 kHz 50 rad/s³ make 5e-5 rad/s of it, a coarse
@@ -178,82 +180,87 @@ def follow_velocity_noise(k: Any, m: Any, dq: Vector, is_steady: bool) -> None:
 
     It is forgotten soon, but for what is kept (`keep_velocity_noise`).
     """
-    floor = (SECOND_DIFFERENCE * k["velocity_noise_rad_s"]) ** 2
+    floor = (SECOND_DIFFERENCE * k.noise.velocity_noise_rad_s) ** 2
     for i in range(dq.shape[0]):
-        ddq = dq[i] - m["dq_old"][i]
+        ddq = dq[i] - m.sensitivity.dq_old[i]
         if is_steady and floor > 0.0:
-            square = (ddq - m["ddq_old"][i]) ** 2 / floor
-            square = min(square, JUMP**2 * m["roughness_now"][i])
-            now = max(m["roughness_now"][i] + k["roughness_share"] * (square - m["roughness_now"][i]), 1.0)
-            m["roughness_now"][i] = now
-            m["velocity_roughness"][i] = max(now, m["roughness_kept"][i])
-        m["ddq_old"][i] = ddq
-        m["dq_old"][i] = dq[i]
+            square = (ddq - m.sensitivity.ddq_old[i]) ** 2 / floor
+            square = min(square, JUMP**2 * m.sensitivity.roughness_now[i])
+            now = max(
+                m.sensitivity.roughness_now[i] + k.noise.roughness_share * (square - m.sensitivity.roughness_now[i]),
+                1.0,
+            )
+            m.sensitivity.roughness_now[i] = now
+            m.sensitivity.velocity_roughness[i] = max(now, m.sensitivity.roughness_kept[i])
+        m.sensitivity.ddq_old[i] = ddq
+        m.sensitivity.dq_old[i] = dq[i]
 
 
 @compiled
-def keep_velocity_noise(k: Any, m: Any) -> None:
+def keep_velocity_noise(k: Constants, m: Memory) -> None:
     """Keep the largest roughness (n,) of a sample that nothing touched, until motion shows less.
 
     At rest an encoder that doesn't count shows no noise, and has it again with the first count.
     """
-    for i in range(m["roughness_kept"].shape[0]):
-        now, kept = m["roughness_now"][i], m["roughness_kept"][i]
-        if abs(m["dq_old"][i]) > regressor.SLOW_RAD_S:
-            kept -= k["roughness_loss"] * (kept - now)
-        m["roughness_kept"][i] = max(kept, now)
+    for i in range(m.sensitivity.roughness_kept.shape[0]):
+        now, kept = m.sensitivity.roughness_now[i], m.sensitivity.roughness_kept[i]
+        if abs(m.sensitivity.dq_old[i]) > regressor.SLOW_RAD_S:
+            kept -= k.noise.roughness_loss * (kept - now)
+        m.sensitivity.roughness_kept[i] = max(kept, now)
 
 
 @compiled
-def strain(m: Any, largest: float) -> None:
+def strain(m: Memory, largest: float) -> None:
     """Doubt the thresholds of the joints that are over theirs now: a contact while learning may be the model's failure.
 
     Once it may be a hand; again and again it is what no parameter explains, such as backlash. Then the arm is armed
     with higher thresholds rather than never.
     """
-    for i in range(m["strain"].shape[0]):
-        for c in range(m["y"].shape[0]):
-            if not (abs(m["y"][c, i]) <= m["h"][c, i]):
-                m["strain"][i] = min(STRAIN * m["strain"][i], max(largest, m["strain"][i]))
+    for i in range(m.sensitivity.strain.shape[0]):
+        for c in range(m.filters.y.shape[0]):
+            if not (abs(m.filters.y[c, i]) <= m.sensitivity.h[c, i]):
+                m.sensitivity.strain[i] = min(STRAIN * m.sensitivity.strain[i], max(largest, m.sensitivity.strain[i]))
                 break
 
 
 @compiled
-def relax(k: Any, m: Any) -> None:
+def relax(k: Constants, m: Memory) -> None:
     """Take one sample without contact into the strain (n,): it goes back while the residual leaves room for it."""
-    for i in range(m["strain"].shape[0]):
+    for i in range(m.sensitivity.strain.shape[0]):
         share = 0.0
-        for c in range(m["y"].shape[0]):
-            share = max(share, abs(m["y"][c, i]) / m["h"][c, i])
-        m["peak_share"][i] = max(m["peak_share"][i], share)
-        m["used"][i] = max(share, m["used"][i] * (1.0 - k["strain_share"]))
-        if m["used"][i] < RELAXED:
-            m["strain"][i] = max(m["strain"][i] * (1.0 - k["strain_share"]), 1.0)
+        for c in range(m.filters.y.shape[0]):
+            share = max(share, abs(m.filters.y[c, i]) / m.sensitivity.h[c, i])
+        m.sensitivity.peak_share[i] = max(m.sensitivity.peak_share[i], share)
+        m.sensitivity.used[i] = max(share, m.sensitivity.used[i] * (1.0 - k.noise.strain_share))
+        if m.sensitivity.used[i] < RELAXED:
+            m.sensitivity.strain[i] = max(m.sensitivity.strain[i] * (1.0 - k.noise.strain_share), 1.0)
 
 
 @compiled
-def follow_unit(k: Any, m: Any, fit: int, share: float, is_monitored: bool) -> None:
+def follow_unit(k: Constants, m: Memory, fit: int, share: float, is_monitored: bool) -> None:
     """Take one sample without contact into the unit (n,) of the belief's variances; share: what it counts.
 
     fit: filter by whose residual. In a faster one the velocity's noise would count as the model's error. is_monitored:
     the unit is the smaller one of both signs; else it is that of all residuals, and both signs begin with it.
     """
-    for i in range(m["unit"].shape[0]):
-        w = m["W_f"][fit, i]
-        believed = k["residual_Nm"] ** 2 + m["held"][fit, i] ** 2
+    for i in range(m.sensitivity.unit.shape[0]):
+        w = m.filters.W_f[fit, i]
+        believed = k.residual_Nm**2 + m.sensitivity.held[fit, i] ** 2
         for j in range(w.shape[0]):
-            believed += w[j] * linalg.dot(m["P"][j], w)
+            believed += w[j] * linalg.dot(m.models.P[j], w)
         if not np.isfinite(believed):
             continue
-        square = UNIT_PEAK * m["r"][fit, i] ** 2 / believed
+        square = UNIT_PEAK * m.filters.r[fit, i] ** 2 / believed
         if not is_monitored:
-            m["unit"][i] = _approach(m["unit"][i], square, share)
-            m["unit_by_sign"][:, i] = m["unit"][i]
+            m.sensitivity.unit[i] = _approach(m.sensitivity.unit[i], square, share)
+            m.sensitivity.unit_by_sign[:, i] = m.sensitivity.unit[i]
             continue
         for sign in range(2):
-            has_sign = m["r"][fit, i] > 0.0 if sign else m["r"][fit, i] < 0.0
-            m["unit_by_sign"][sign, i] = _approach(m["unit_by_sign"][sign, i], 2.0 * square if has_sign else 0.0, share)
-        m["unit"][i] = np.min(m["unit_by_sign"][:, i])
+            has_sign = m.filters.r[fit, i] > 0.0 if sign else m.filters.r[fit, i] < 0.0
+            m.sensitivity.unit_by_sign[sign, i] = _approach(
+                m.sensitivity.unit_by_sign[sign, i], 2.0 * square if has_sign else 0.0, share
+            )
+        m.sensitivity.unit[i] = np.min(m.sensitivity.unit_by_sign[:, i])
 
 
 @compiled
@@ -264,78 +271,83 @@ def _approach(unit: float, square: float, share: float) -> float:
 
 
 @compiled
-def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
+def fill_thresholds(k: Constants, m: Memory, h: Vector) -> None:
     """Fill h (2 C - 1, n) from the constants `k` and the state `m` of the kernel."""
-    filters = m["r"].shape[0]
+    filters = m.filters.r.shape[0]
     for i in range(h.shape[1]):
         momentum = momentum_noise(m, i)
-        hold = m["hold"][i]
+        hold = m.sensitivity.hold[i]
         for c in range(filters):
-            g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i], m["unit"][i]))
-            m["doubt"][c, i] = g + k["smoothing"] * (m["doubt"][c, i] - g)
-            slow = LOW_SPEED_SHARE * m["low_speed"][c, i]
-            held = hold * max(m["still_smooth"][c, i], slow)
-            h[c, i] = _threshold(k, m, c, i, momentum, m["doubt"][c, i]) + held
+            g = k.model_sigmas * np.sqrt(_doubt(k, m, m.filters.W_f[c, i], m.sensitivity.unit[i]))
+            m.sensitivity.doubt[c, i] = g + k.smoothing * (m.sensitivity.doubt[c, i] - g)
+            slow = LOW_SPEED_SHARE * m.sensitivity.low_speed[c, i]
+            held = hold * max(m.sensitivity.still_smooth[c, i], slow)
+            h[c, i] = _threshold(k, m, c, i, momentum, m.sensitivity.doubt[c, i]) + held
             if c > 0:
                 bare = filters + c - 1
-                h[bare, i] = _threshold(k, m, bare, i, momentum, g) + hold * max(m["still"][c, i], slow)
+                h[bare, i] = _threshold(k, m, bare, i, momentum, g) + hold * max(m.sensitivity.still[c, i], slow)
 
 
 @compiled
-def momentum_noise(m: Any, joint: int) -> float:
+def momentum_noise(m: Memory, joint: int) -> float:
     """Return (M R M')_ii of a joint."""
     total = 0.0
-    for j in range(m["M"].shape[1]):
-        total += m["velocity_roughness"][j] * m["M"][joint, j] ** 2
+    for j in range(m.regressor.M.shape[1]):
+        total += m.sensitivity.velocity_roughness[j] * m.regressor.M[joint, j] ** 2
     return float(total)
 
 
 @compiled
-def follow_friction(k: Any, m: Any, tau_J: Vector) -> None:
+def follow_friction(k: Constants, m: Memory, tau_J: Vector) -> None:
     """Fill the torque (n,) that friction may hold at standstill, and how much of it is in each filter (C, n) now, Nm.
 
     Friction at rest is no noise that averages out: of a joint that mostly rested it is inf, so nothing is learnt.
     """
-    for i in range(m["hold"].shape[0]):
-        m["hold"][i] = k["standstill_share"] * _static_friction(k, m, i, tau_J[i])
-        for c in range(m["held"].shape[0]):
-            m["held"][c, i] = held_Nm(m, i, m["still"][c, i])
+    for i in range(m.sensitivity.hold.shape[0]):
+        m.sensitivity.hold[i] = k.standstill_share * _static_friction(k, m, i, tau_J[i])
+        for c in range(m.sensitivity.held.shape[0]):
+            m.sensitivity.held[c, i] = held_Nm(m, i, m.sensitivity.still[c, i])
 
 
 @compiled
-def held_Nm(m: Any, joint: int, still: float) -> float:
+def held_Nm(m: Memory, joint: int, still: float) -> float:
     """Return how much torque friction may hold in a filter whose memory is by `still` of standstill."""
-    return float(m["hold"][joint] * still) if still < RESTING else np.inf
+    return float(m.sensitivity.hold[joint] * still) if still < RESTING else np.inf
 
 
 @compiled
-def _static_friction(k: Any, m: Any, joint: int, load_Nm: float) -> float:
+def _static_friction(k: Constants, m: Memory, joint: int, load_Nm: float) -> float:
     """Return the most that friction is believed to hold of a joint that stands still under a torque, Nm."""
-    coulomb = int(k["first_coulomb"]) + joint
-    total = max(m["theta"][coulomb], 0.0) + np.sqrt(max(m["P"][coulomb, coulomb], 0.0))
+    coulomb = int(k.first_coulomb) + joint
+    total = max(m.models.theta[coulomb], 0.0) + np.sqrt(max(m.models.P[coulomb, coulomb], 0.0))
     further = 0.0
-    for position in range(k["terms"].shape[0]):
-        term = int(k["first_term"]) + position * m["r"].shape[1] + joint
-        if k["terms"][position] == regressor.STRIBECK:
-            open_Nm = min(np.sqrt(max(m["P"][term, term], 0.0)), STATIC_SHARE * total)
-            further += max(m["theta"][term], 0.0) + open_Nm
-        elif k["terms"][position] == regressor.LOAD:
-            further += max(m["theta"][term], 0.0) * abs(load_Nm)
+    for position in range(k.terms.shape[0]):
+        term = int(k.first_term) + position * m.filters.r.shape[1] + joint
+        if k.terms[position] == regressor.STRIBECK:
+            open_Nm = min(np.sqrt(max(m.models.P[term, term], 0.0)), STATIC_SHARE * total)
+            further += max(m.models.theta[term], 0.0) + open_Nm
+        elif k.terms[position] == regressor.LOAD:
+            further += max(m.models.theta[term], 0.0) * abs(load_Nm)
     return float(total + further)
 
 
 @compiled
-def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float) -> float:
+def _threshold(k: Constants, m: Memory, channel: int, joint: int, momentum: float, g: float) -> float:
     """Return a channel's threshold but for standstill, and keep what it is without the floor."""
-    lost = m["lost"][filter_bank.filter_of(channel, m["lost"].shape[0]), joint]
-    noise = k["torque_variance"][channel] * m["roughness"][joint] + k["velocity_variance"][channel] * momentum
-    noise += k["torque_gain"][channel] * m["torque_step_Nm"][joint] ** 2 / 12.0 + lost
-    m["h_model"][channel, joint] = m["strain"][joint] * np.sqrt(noise + g * g) + m["torque_pull_Nm"][joint]
-    return float(max(m["h_model"][channel, joint], m["tail_Nm"][channel, joint]))
+    lost = m.sensitivity.lost[filter_bank.filter_of(channel, m.sensitivity.lost.shape[0]), joint]
+    noise = (
+        k.noise.torque_variance[channel] * m.sensitivity.roughness[joint]
+        + k.noise.velocity_variance[channel] * momentum
+    )
+    noise += k.noise.torque_gain[channel] * m.sensitivity.torque_step_Nm[joint] ** 2 / 12.0 + lost
+    m.sensitivity.h_model[channel, joint] = (
+        m.sensitivity.strain[joint] * np.sqrt(noise + g * g) + m.sensitivity.torque_pull_Nm[joint]
+    )
+    return float(max(m.sensitivity.h_model[channel, joint], m.margin.tail_Nm[channel, joint]))
 
 
 @compiled
-def fill_wide(k: Any, m: Any, c: int) -> None:
+def fill_wide(k: Constants, m: Memory, c: int) -> None:
     """Fill standard deviation and lower threshold (n,) of the external torque with filter c undone.
 
     The undone filter is a mean over five samples of what went into it: its noise is white torque noise over five, and
@@ -343,22 +355,22 @@ def fill_wide(k: Any, m: Any, c: int) -> None:
     least of all channels'.
     """
     samples = float(external_torque.WIDE_SAMPLES)
-    span_s = samples * k["period_s"]
-    for i in range(m["r"].shape[1]):
+    span_s = samples * k.period_s
+    for i in range(m.filters.r.shape[1]):
         momentum = momentum_noise(m, i)
-        noise = k["torque_noise_Nm"] ** 2 * m["roughness"][i] / samples
-        velocity = 2.0 * (k["velocity_std_rad_s"] / span_s) ** 2 * momentum
-        doubt = m["doubt"][c, i] / k["model_sigmas"]
-        m["wide_sigma"][i] = np.sqrt(noise + velocity + doubt * doubt)
-        m["wide_threshold"][i] = np.min(m["h"][:, i])
+        noise = k.torque_noise_Nm**2 * m.sensitivity.roughness[i] / samples
+        velocity = 2.0 * (k.noise.velocity_std_rad_s / span_s) ** 2 * momentum
+        doubt = m.sensitivity.doubt[c, i] / k.model_sigmas
+        m.sensitivity.wide_sigma[i] = np.sqrt(noise + velocity + doubt * doubt)
+        m.sensitivity.wide_threshold[i] = np.min(m.sensitivity.h[:, i])
 
 
 @compiled
-def _doubt(k: Any, m: Any, w: Vector, unit: float) -> float:
+def _doubt(k: Constants, m: Memory, w: Vector, unit: float) -> float:
     """Return w (u P + D) w'."""
     total = 0.0
     for j in range(w.shape[0]):
-        total += unit * w[j] * linalg.dot(m["P"][j], w) + (k["model_error"][j] * m["theta"][j] * w[j]) ** 2
+        total += unit * w[j] * linalg.dot(m.models.P[j], w) + (k.model_error[j] * m.models.theta[j] * w[j]) ** 2
     return max(total, 0.0)
 
 
@@ -391,60 +403,45 @@ MOST_FILLED = 8
 """Missing samples that are put on the line between their neighbours."""
 
 
-_ONES = ("roughness", "roughness_now", "roughness_kept", "velocity_roughness", "unit", "strain")
-_STEPS = ("torque_changes", "torque_change_Nm", "torque_step_Nm", "torque_pull_Nm")
-_OTHERS = ("used", "peak_share", "hold", "dq_old", "ddq_old", "rest_tau", "rest_square", "wide_sigma", "wide_threshold")
-
-
-def shapes_of(filters: int, channels: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the memory, by name."""
-    return {
-        **dict.fromkeys(("still", "still_smooth", "low_speed", "doubt", "held", "lost"), (filters, JOINTS)),
-        **dict.fromkeys(("h", "h_model"), (channels, JOINTS)),
-        **dict.fromkeys((*_ONES, *_STEPS, *_OTHERS), (JOINTS,)),
-        "unit_by_sign": (2, JOINTS),
-        "rest_samples": (),
-    }
-
-
-def begin(m: Any) -> None:
+def begin(m: Memory) -> None:
     """Begin with an arm that is as the settings say."""
-    for name in _ONES:
-        m[name] = 1.0
+    own = m.sensitivity
+    for ones in (own.roughness, own.roughness_now, own.roughness_kept, own.velocity_roughness, own.unit, own.strain):
+        ones[:] = 1.0
 
 
 @compiled
-def begin_fit(m: Any) -> None:
+def begin_fit(m: Memory) -> None:
     """Begin with a belief whose residuals are what the settings call a good model's."""
-    m["unit"][:] = 1.0
+    m.sensitivity.unit[:] = 1.0
 
 
 @compiled
-def lift(m: Any) -> None:
+def lift(m: Memory) -> None:
     """Watch nothing: no torque is over its threshold."""
-    m["wide_threshold"][:] = np.inf
+    m.sensitivity.wide_threshold[:] = np.inf
 
 
-def take_peak_shares(m: Any) -> Vector:
+def take_peak_shares(m: Memory) -> Vector:
     """Return the largest share of its threshold that each joint (n,) has come to since the last call."""
-    shares = np.array(m["peak_share"])
-    m["peak_share"][:] = 0.0
+    shares = np.array(m.sensitivity.peak_share)
+    m.sensitivity.peak_share[:] = 0.0
     return shares
 
 
 @compiled
-def follow_lost(k: Any, m: Any, dq: Vector, steps: int, period_s: float, is_seen: bool) -> None:
+def follow_lost(k: Constants, m: Memory, dq: Vector, steps: int, period_s: float, is_seen: bool) -> None:
     """Take in a sample that came `steps` periods, `period_s`, after the one before; is_seen: the line was filled in."""
-    lost, before = m["lost"], m["last"][1]
+    lost, before = m.sensitivity.lost, m.gaps.last[1]
     for c in range(lost.shape[0]):
-        turn = k["cutoff"][c] * period_s
+        turn = k.cutoff[c] * period_s
         decay = math.exp(-2.0 * turn)
-        noise = (k["noise_sigmas"] * k["torque_noise_Nm"] * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
+        noise = (k.noise_sigmas * k.torque_noise_Nm * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
         for i in range(lost.shape[1]):
             lost[c, i] *= decay
             if is_seen and steps > 1:
                 has_turned = np.sign(dq[i]) != np.sign(before[i])
-                left_out = CURVATURE_NM_S2 * period_s**2 / 12.0 + (m["hold"][i] if has_turned else 0.0)
-                lost[c, i] += noise * m["roughness"][i] + (turn * left_out) ** 2
+                left_out = CURVATURE_NM_S2 * period_s**2 / 12.0 + (m.sensitivity.hold[i] if has_turned else 0.0)
+                lost[c, i] += noise * m.sensitivity.roughness[i] + (turn * left_out) ** 2
             elif not is_seen:
-                lost[c, i] += (2.0 * k["cutoff"][c] * k["velocity_noise_rad_s"]) ** 2 * momentum_noise(m, i)
+                lost[c, i] += (2.0 * k.cutoff[c] * k.noise.velocity_noise_rad_s) ** 2 * momentum_noise(m, i)

@@ -29,14 +29,13 @@ tells whether it should.
 Shapes: by_place_Nm (n,): the largest torque by place of the fit.
 """
 
-from typing import Any
-
 import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import evidence
 from adacd_hil.scheme.identify.evidence import OFFSETS
+from adacd_hil.scheme.memory import AnchorConstants, Constants, Memory
 from adacd_hil.settings.configuration import Settings
 
 REST, TARE, ACCEPTED, LAST = range(4)
@@ -52,21 +51,21 @@ ASYMMETRY = 0.1
 """Part of the Coulomb friction by which its two directions may differ."""
 
 
-def constants_of(settings: Settings) -> dict[str, Vector]:
+def constants_of(settings: Settings) -> AnchorConstants:
     """Return what the kernel needs to know: `zero_drift_Nm2_s`, `rest_cycles`, and the following (n,).
 
     `holding_Nm`; `zero_Nm`, `zero_std_Nm`: of the configuration; `last_zero_Nm`, `_std_Nm`: of the last certificate.
     """
     arm, history = settings.arm, settings.history
-    return {
-        "zero_Nm": np.array(arm.torque_offset_Nm),
-        "last_zero_Nm": np.array(history.offset_Nm if history.is_known else arm.torque_offset_Nm),
-        "last_zero_std_Nm": _or_unknown(history.offset_std_Nm if history.is_known else None),
-        "holding_Nm": _or_unknown(arm.holding_torque_Nm),
-        "zero_std_Nm": _or_unknown(arm.torque_offset_std_Nm),
-        "zero_drift_Nm2_s": np.array(settings.tare.drift_Nm_sqrt_s**2),
-        "rest_cycles": np.array(settings.commission_cycles),
-    }
+    return AnchorConstants(
+        zero_Nm=np.array(arm.torque_offset_Nm),
+        last_zero_Nm=np.array(history.offset_Nm if history.is_known else arm.torque_offset_Nm),
+        last_zero_std_Nm=_or_unknown(history.offset_std_Nm if history.is_known else None),
+        holding_Nm=_or_unknown(arm.holding_torque_Nm),
+        zero_std_Nm=_or_unknown(arm.torque_offset_std_Nm),
+        zero_drift_Nm2_s=settings.tare.drift_Nm_sqrt_s**2,
+        rest_cycles=settings.commission_cycles,
+    )
 
 
 def unanchored_joints(settings: Settings) -> list[int]:
@@ -88,153 +87,144 @@ def _or_unknown(values: tuple[float, ...] | None) -> Vector:
     return np.full(JOINTS, np.inf) if values is None else np.array(values)
 
 
-def shapes_of() -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    return {
-        **dict.fromkeys(("anchor_Nm", "anchor_std"), (KINDS, JOINTS)),
-        "rest_count": (),
-        "by_place_Nm": (JOINTS,),
-    }
-
-
-def begin(k: Any, m: Any) -> None:
+def begin(k: Constants, m: Memory) -> None:
     """Fill the anchors before the first sample: the tare, and the last certificate."""
-    m["anchor_std"][:] = np.inf
-    m["anchor_std"][TARE] = k["zero_std_Nm"]
-    m["anchor_Nm"][LAST] = k["last_zero_Nm"] - k["zero_Nm"]
-    m["anchor_std"][LAST] = k["last_zero_std_Nm"]
+    m.anchor.anchor_std[:] = np.inf
+    m.anchor.anchor_std[TARE] = k.anchor.zero_std_Nm
+    m.anchor.anchor_Nm[LAST] = k.anchor.last_zero_Nm - k.anchor.zero_Nm
+    m.anchor.anchor_std[LAST] = k.anchor.last_zero_std_Nm
 
 
 @compiled
-def measure(k: Any, m: Any, tau_J: Vector, is_resting: bool) -> None:
+def measure(k: Constants, m: Memory, tau_J: Vector, is_resting: bool) -> None:
     """Take one sample before the drives are enabled into the reading at rest, which begins anew when the arm moves.
 
     A mean over the last `rest_cycles` samples or so: who leaned before and has gone is forgotten.
     """
-    m["rest_count"] = min(m["rest_count"] + 1.0, k["rest_cycles"]) if is_resting else 0.0
+    m.anchor.rest_count = min(m.anchor.rest_count + 1.0, k.anchor.rest_cycles) if is_resting else 0.0
     evidence.date(m, 0, KINDS, 0.0)
     for i in range(tau_J.shape[0]):
         if not is_resting:
-            m["anchor_std"][REST, i] = np.inf
+            m.anchor.anchor_std[REST, i] = np.inf
             continue
-        m["anchor_Nm"][REST, i] += (tau_J[i] - m["anchor_Nm"][REST, i]) / m["rest_count"]
-        if k["holding_Nm"][i] != np.inf:
-            m["anchor_std"][REST, i] = np.sqrt(_rest_variance(k, m, i))
+        m.anchor.anchor_Nm[REST, i] += (tau_J[i] - m.anchor.anchor_Nm[REST, i]) / m.anchor.rest_count
+        if k.anchor.holding_Nm[i] != np.inf:
+            m.anchor.anchor_std[REST, i] = np.sqrt(_rest_variance(k, m, i))
 
 
 @compiled
-def _rest_variance(k: Any, m: Any, joint: int) -> float:
-    noise = k["torque_noise_Nm"] ** 2 * m["roughness"][joint] / max(m["rest_count"], 1.0)
+def _rest_variance(k: Constants, m: Memory, joint: int) -> float:
+    noise = k.torque_noise_Nm**2 * m.sensitivity.roughness[joint] / max(m.anchor.rest_count, 1.0)
     return float(noise + REST_STD_NM**2)
 
 
 @compiled
-def is_rest_refused(k: Any, m: Any) -> bool:
+def is_rest_refused(k: Constants, m: Memory) -> bool:
     """Tell whether some joint reads at rest what its tare excludes, beyond what the motor side may hold.
 
     Asked of a whole reading: the supervisor counts as many cycles, so no arm gets on without.
     """
-    if m["rest_count"] < k["rest_cycles"]:
+    if m.anchor.rest_count < k.anchor.rest_cycles:
         return False
     is_refused = False
-    for i in range(m["anchor_Nm"].shape[1]):
-        q, std, slack = OFFSETS + i, m["anchor_std"][TARE, i], k["holding_Nm"][i]
+    for i in range(m.anchor.anchor_Nm.shape[1]):
+        q, std, slack = OFFSETS + i, m.anchor.anchor_std[TARE, i], k.anchor.holding_Nm[i]
         variance = std**2 if np.isfinite(std + slack) else np.inf
         for kind in range(KINDS):
             evidence.pass_over(m, kind, q)
-        evidence.put_fitted(m, q, m["anchor_Nm"][REST, i], _rest_variance(k, m, i))
-        evidence.say(m, TARE, q, m["anchor_Nm"][TARE, i], variance, 0.0, slack)
+        evidence.put_fitted(m, q, m.anchor.anchor_Nm[REST, i], _rest_variance(k, m, i))
+        evidence.say(m, TARE, q, m.anchor.anchor_Nm[TARE, i], variance, 0.0, slack)
         excess = abs(evidence.weigh(k, m, TARE, q))
         is_refused = is_refused or not excess <= 1.0
     return is_refused
 
 
 @compiled
-def is_within(k: Any, m: Any, theta: Vector, P: Vector) -> bool:
+def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
     """Tell whether a model's offsets are within the bounds of all anchors. theta (p,), P (p, p)."""
-    first_coulomb, is_within = int(k["first_coulomb"]), True
-    evidence.fit(k, m, theta, P, min(np.max(m["unit"]), 1.0))
-    for i in range(m["anchor_Nm"].shape[1]):
+    first_coulomb, is_within = int(k.first_coulomb), True
+    evidence.fit(k, m, theta, P, min(np.max(m.sensitivity.unit), 1.0))
+    for i in range(m.anchor.anchor_Nm.shape[1]):
         q, friction = OFFSETS + i, ASYMMETRY * max(theta[first_coulomb + i], 0.0)
         for kind in range(KINDS):
             variance = _variance(k, m, kind, i) + friction**2 + MODEL_STD_NM**2
-            if kind == LAST and np.min(m["limit"][:LAST, q]) <= k["beta_Nm"]:
+            if kind == LAST and np.min(m.evidence.limit[:LAST, q]) <= k.beta_Nm:
                 variance = np.inf
-            slack = k["holding_Nm"][i] if kind == REST else 0.0
-            evidence.say(m, kind, q, m["anchor_Nm"][kind, i], variance, 0.0, slack)
+            slack = k.anchor.holding_Nm[i] if kind == REST else 0.0
+            evidence.say(m, kind, q, m.anchor.anchor_Nm[kind, i], variance, 0.0, slack)
             excess = abs(evidence.weigh(k, m, kind, q))
             is_within = is_within and excess <= 1.0
     return bool(is_within)
 
 
 @compiled
-def _variance(k: Any, m: Any, kind: int, joint: int) -> float:
+def _variance(k: Constants, m: Memory, kind: int, joint: int) -> float:
     """Return sigma_a² + b² t."""
-    return float(m["anchor_std"][kind, joint] ** 2 + k["zero_drift_Nm2_s"] * m["said_age_s"][kind])
+    return float(m.anchor.anchor_std[kind, joint] ** 2 + k.anchor.zero_drift_Nm2_s * m.evidence.said_age_s[kind])
 
 
 @compiled
-def is_excluded(m: Any, joint: int, offset_Nm: float) -> bool:
+def is_excluded(m: Memory, joint: int, offset_Nm: float) -> bool:
     """Tell whether an anchor excludes another offset of a joint, by the bounds of the fit that was judged last."""
-    bounds_Nm = m["limit"][:KINDS, OFFSETS + joint]
-    return not bool(np.all(np.abs(offset_Nm - m["anchor_Nm"][:, joint]) <= bounds_Nm))
+    bounds_Nm = m.evidence.limit[:KINDS, OFFSETS + joint]
+    return not bool(np.all(np.abs(offset_Nm - m.anchor.anchor_Nm[:, joint]) <= bounds_Nm))
 
 
 @compiled
-def innovation(k: Any, m: Any, joint: int, offset_Nm: float, variance_Nm2: float) -> float:
+def innovation(k: Constants, m: Memory, joint: int, offset_Nm: float, variance_Nm2: float) -> float:
     """Return (o - a) / (P_oo + sigma_a² + b² t) of the joint's best known anchor, 1/Nm; 0 where there is none.
 
     theta less P_o times this is the model corrected by the anchor as by a measurement of its offset.
     """
-    kind = int(np.argmin(m["anchor_std"][:, joint]))
+    kind = int(np.argmin(m.anchor.anchor_std[:, joint]))
     known = _variance(k, m, kind, joint)
     if known == np.inf:
         return 0.0
     if kind == REST:
-        known += k["holding_Nm"][joint] ** 2
-    return float((offset_Nm - m["anchor_Nm"][kind, joint]) / (variance_Nm2 + known))
+        known += k.anchor.holding_Nm[joint] ** 2
+    return float((offset_Nm - m.anchor.anchor_Nm[kind, joint]) / (variance_Nm2 + known))
 
 
-def accept(m: Any, offset_Nm: Vector, std_Nm: Vector) -> None:
+def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
     """Let offsets (n,) that the user takes for the sensors' zero, with their deviations, replace all anchors."""
-    m["anchor_std"][:] = np.inf
-    m["anchor_Nm"][ACCEPTED] = offset_Nm
-    m["anchor_std"][ACCEPTED] = std_Nm
+    m.anchor.anchor_std[:] = np.inf
+    m.anchor.anchor_Nm[ACCEPTED] = offset_Nm
+    m.anchor.anchor_std[ACCEPTED] = std_Nm
     evidence.date(m, 0, KINDS, 0.0)
 
 
-def accept_reading(m: Any) -> None:
+def accept_reading(m: Memory) -> None:
     """Let the reading at rest, which the tare excludes, stand without the tare."""
-    m["anchor_std"][TARE] = np.inf
+    m.anchor.anchor_std[TARE] = np.inf
 
 
 @compiled
-def is_open(k: Any, m: Any, joint: int) -> bool:
+def is_open(k: Constants, m: Memory, joint: int) -> bool:
     """Tell whether no anchor bounds the offset that was judged last as closely as a test does, to `beta_Nm`."""
-    return bool(not (np.min(m["limit"][:KINDS, OFFSETS + joint]) <= k["beta_Nm"]))
+    return bool(not (np.min(m.evidence.limit[:KINDS, OFFSETS + joint]) <= k.beta_Nm))
 
 
-def tightest(k: Any, m: Any, joint: int) -> int | None:
+def tightest(k: Constants, m: Memory, joint: int) -> int | None:
     """Return the anchor that bounds the offset that was judged last most closely; None where none does."""
-    return None if is_open(k, m, joint) else int(np.argmin(m["limit"][:KINDS, OFFSETS + joint]))
+    return None if is_open(k, m, joint) else int(np.argmin(m.evidence.limit[:KINDS, OFFSETS + joint]))
 
 
-def open_joints(k: Any, m: Any) -> list[int]:
+def open_joints(k: Constants, m: Memory) -> list[int]:
     """List the joints whose offset that was judged last has no anchor, from 0."""
     return [i for i in range(JOINTS) if tightest(k, m, i) is None]
 
 
-def is_anchored(k: Any, m: Any) -> bool:
+def is_anchored(k: Constants, m: Memory) -> bool:
     """Tell whether every offset that was judged last has an anchor."""
     return not open_joints(k, m)
 
 
-def judged_Nm(m: Any) -> Vector:
+def judged_Nm(m: Memory) -> Vector:
     """Return the offsets, or readings at rest, that were judged last (n,)."""
-    return np.array(m["fitted"][OFFSETS : OFFSETS + JOINTS])
+    return np.array(m.evidence.fitted[OFFSETS : OFFSETS + JOINTS])
 
 
-def describe(k: Any, m: Any) -> str:
+def describe(k: Constants, m: Memory) -> str:
     """Say of each joint what anchors the offset that was judged last, and how closely, Nm."""
     texts = []
     for i in range(JOINTS):
@@ -242,12 +232,12 @@ def describe(k: Any, m: Any) -> str:
         texts.append(
             f"joint {i + 1} not at all: who has leaned on it since before the start is in its torque offset"
             if kind is None
-            else f"joint {i + 1} to ± {m['limit'][kind, OFFSETS + i]:.3f} Nm by {NAMES[kind]}"
+            else f"joint {i + 1} to ± {m.evidence.limit[kind, OFFSETS + i]:.3f} Nm by {NAMES[kind]}"
         )
     return f"torque offsets anchored: {'; '.join(texts)}"
 
 
-def describe_refused(m: Any, is_reading: bool) -> list[str]:
+def describe_refused(m: Memory, is_reading: bool) -> list[str]:
     """Say which of the torques that have been judged last an anchor excludes, and by how much, a line each.
 
     is_reading: it was the reading at rest; else the offsets of a fit.
@@ -255,7 +245,7 @@ def describe_refused(m: Any, is_reading: bool) -> list[str]:
     lines = []
     for i, value in enumerate(judged_Nm(m).tolist()):
         for kind in range(KINDS):
-            expected, limit = float(m["anchor_Nm"][kind, i]), float(m["limit"][kind, OFFSETS + i])
+            expected, limit = float(m.anchor.anchor_Nm[kind, i]), float(m.evidence.limit[kind, OFFSETS + i])
             if not abs(value - expected) <= limit:
                 what = (
                     f"reads {value:.3f} Nm at rest" if is_reading else f"has a fitted torque offset of {value:.3f} Nm"
@@ -272,48 +262,48 @@ LARGEST_OF_STD = 2.5
 
 
 @compiled
-def is_place_bounded(k: Any, m: Any) -> bool:
+def is_place_bounded(k: Constants, m: Memory) -> bool:
     """Tell whether the fit's torque by place keeps to `arm.position_torque_Nm`; fill `by_place_Nm`."""
-    if k["position_torque_Nm"] == 0.0:
+    if k.position_torque_Nm == 0.0:
         return True
     is_place_bounded = True
-    for i in range(m["by_place_Nm"].shape[0]):
-        m["by_place_Nm"][i] = _largest_Nm(k, m, i)
-        is_place_bounded = is_place_bounded and m["by_place_Nm"][i] <= k["position_torque_Nm"]
+    for i in range(m.anchor.by_place_Nm.shape[0]):
+        m.anchor.by_place_Nm[i] = _largest_Nm(k, m, i)
+        is_place_bounded = is_place_bounded and m.anchor.by_place_Nm[i] <= k.position_torque_Nm
     return bool(is_place_bounded)
 
 
 @compiled
-def _largest_Nm(k: Any, m: Any, joint: int) -> float:
+def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
     """Return the largest torque by place of a joint over the fit's samples, its offset where the anchor says."""
-    joints, first = m["by_place_Nm"].shape[0], int(k["first_position"])
-    offset, largest = int(k["base"]) + joint, 0.0
-    P, theta = m["P_belief"], m["belief"]
+    joints, first = m.anchor.by_place_Nm.shape[0], int(k.first_position)
+    offset, largest = int(k.first_offset) + joint, 0.0
+    P, theta = m.models.P_belief, m.models.belief
     off = innovation(k, m, joint, theta[offset], P[offset, offset])
-    for s in range(int(m["samples_kept"])):
+    for s in range(int(m.fit_check.samples_kept)):
         torque = 0.0
-        for term in range(m["X"].shape[1]):
+        for term in range(m.regressor.X.shape[1]):
             j = first + term * joints + joint
-            torque += m["samples_W"][s, joint, j] * (theta[j] - P[j, offset] * off)
+            torque += m.fit_check.samples_W[s, joint, j] * (theta[j] - P[j, offset] * off)
         largest = max(largest, abs(torque))
     return float(largest)
 
 
-def describe_place(k: Any, m: Any) -> str:
+def describe_place(k: Constants, m: Memory) -> str:
     """Say how much of a torque by place the certified model has, Nm; empty where it has none."""
-    if k["position_torque_Nm"] == 0.0:
+    if k.position_torque_Nm == 0.0:
         return ""
     return (
-        f"; torque by place up to {_by_joint(m['by_place_Nm'])}, believed up to {float(k['position_torque_Nm']):g} Nm"
+        f"; torque by place up to {_by_joint(m.anchor.by_place_Nm)}, believed up to {float(k.position_torque_Nm):g} Nm"
     )
 
 
-def describe_place_refused(k: Any, m: Any) -> list[str]:
+def describe_place_refused(k: Constants, m: Memory) -> list[str]:
     """Say of each joint whose torque by place is too large how large it is, a line each."""
-    limit = float(k["position_torque_Nm"])
+    limit = float(k.position_torque_Nm)
     return [
         f"joint {i + 1} has a torque of up to {torque:.3f} Nm that depends on where the arm is, bound {limit:g} Nm"
-        for i, torque in enumerate(m["by_place_Nm"].tolist())
+        for i, torque in enumerate(m.anchor.by_place_Nm.tolist())
         if not torque <= limit
     ]
 

@@ -29,8 +29,6 @@ a contact pauses the test, and what is left below the thresholds can't move a ca
 that has left its anchor (`anchor`), by somebody who leans lightly or a sensor that moves, takes the certificate back.
 """
 
-from typing import Any
-
 import numpy as np
 
 from adacd_hil import linalg
@@ -38,6 +36,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.identify import anchor, estimator, fit_check, missing_torque
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.model.regressor import is_positive_definite
 
@@ -47,88 +46,70 @@ _SETTLED = 1e-9
 """Nm or Nm s/rad that the last sweep may still have moved one of them by."""
 
 
-def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name, of a model with this many parameters and a ring so long.
-
-    theta: model in use; certified: that of the certificate; recovering_cycles: for which nothing is learnt.
-    """
-    numbers = (
-        "promotions", "candidate_cycles", "candidate_square", "frozen_square", "candidate_worst", "ring_used",
-        "ring_next", "since_learnt", "are_lags_held", "recovering_cycles", "is_payload",
-    )  # fmt: skip
-    return {
-        **dict.fromkeys(numbers, ()),
-        **dict.fromkeys(("theta", "certified", "belief", "candidate", "v", "K"), (count,)),
-        **dict.fromkeys(("P", "P_certified", "P_belief", "P_candidate"), (count, count)),
-        "ring_W": (waiting, JOINTS, count),
-        **dict.fromkeys(("ring_tau", "ring_R", "ring_still"), (waiting, JOINTS)),
-    }
-
-
 @compiled
-def begin_fit(k: Any, m: Any, is_payload: bool) -> None:
+def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
     """Begin to learn and use what is believed: the prior, or the certified arm with a payload."""
-    m["is_payload"] = 1.0 if is_payload else 0.0
+    m.models.is_payload = 1.0 if is_payload else 0.0
     if is_payload:
-        m["belief"][:] = m["certified"]
-        m["P_belief"][:] = m["P_certified"]
-        add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_rest_std"], m["P_belief"])
+        m.models.belief[:] = m.models.certified
+        m.models.P_belief[:] = m.models.P_certified
+        add_payload(k.payload_direction, k.payload_std_kg, k.payload_rest_std, m.models.P_belief)
     else:
-        begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
+        begin(k.prior, k.prior_std, m.models.belief, m.models.P_belief)
     _use(m)
     discard(m)
-    m["are_lags_held"] = 0.0
-    m["recovering_cycles"] = 0.0
+    m.models.are_lags_held = 0.0
+    m.models.recovering_cycles = 0.0
 
 
 @compiled
-def freeze(k: Any, m: Any) -> None:
+def freeze(k: Constants, m: Memory) -> None:
     """Take the belief, as far as it is physically possible, for the model in use."""
-    first_coulomb = int(k["first_coulomb"])
-    keep_non_negative(first_coulomb - JOINTS, first_coulomb + JOINTS, m["belief"], m["P_belief"])
+    first_coulomb = int(k.first_coulomb)
+    keep_non_negative(first_coulomb - JOINTS, first_coulomb + JOINTS, m.models.belief, m.models.P_belief)
     _use(m)
     discard(m)
 
 
 @compiled
-def certify(k: Any, m: Any) -> None:
+def certify(k: Constants, m: Memory) -> None:
     """Take the model in use for the certified one, and begin to refine it."""
-    m["promotions"] = 0.0
+    m.models.promotions = 0.0
     _certify(m)
     hold_lags(k, m)
     restart_candidate(m)
 
 
 @compiled
-def _certify(m: Any) -> None:
-    m["certified"][:] = m["theta"]
-    m["P_certified"][:] = m["P"]
+def _certify(m: Memory) -> None:
+    m.models.certified[:] = m.models.theta
+    m.models.P_certified[:] = m.models.P
 
 
 @compiled
-def _use(m: Any) -> None:
-    m["theta"][:] = m["belief"]
-    m["P"][:] = m["P_belief"]
+def _use(m: Memory) -> None:
+    m.models.theta[:] = m.models.belief
+    m.models.P[:] = m.models.P_belief
 
 
 @compiled
-def pause(m: Any, cycles: float) -> None:
+def pause(m: Memory, cycles: float) -> None:
     """Learn nothing for so many cycles, at least: something touches the arm, or a filter has to settle."""
-    m["recovering_cycles"] = max(m["recovering_cycles"], cycles)
+    m.models.recovering_cycles = max(m.models.recovering_cycles, cycles)
 
 
 @compiled
-def is_free(k: Any, m: Any, is_touched: bool) -> bool:
+def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
     """Count a cycle; tell whether the arm has been left alone for long enough to learn."""
     if is_touched:
-        pause(m, k["recover_cycles"])
-    elif m["recovering_cycles"] > 0.0:
-        m["recovering_cycles"] -= 1.0
-    return bool(m["recovering_cycles"] == 0.0)
+        pause(m, k.recover_cycles)
+    elif m.models.recovering_cycles > 0.0:
+        m.models.recovering_cycles -= 1.0
+    return bool(m.models.recovering_cycles == 0.0)
 
 
 @compiled
-def learn_and_use(k: Any, m: Any) -> bool:
+def learn_and_use(k: Constants, m: Memory) -> bool:
     """Take this sample in as `learn` does, and use what is believed at once; return whether the belief has changed."""
     has_learnt = learn(k, m)
     if has_learnt:
@@ -170,49 +151,49 @@ def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
 
 
 @compiled
-def learn(k: Any, m: Any) -> bool:
+def learn(k: Constants, m: Memory) -> bool:
     """Put this sample, W_learnt (n, p) and tau_learnt (n,), into the ring; return whether the belief has changed.
 
     It is corrected by the sample that has waited long enough, if one has.
     """
-    W, tau_J, still = m["W_learnt"], m["tau_learnt"], m["still_smooth"][filter_bank.LEARNT]
-    m["since_learnt"] += 1.0
-    if m["since_learnt"] < k["learn_every"]:
+    W, tau_J, still = m.filters.W_learnt, m.filters.tau_learnt, m.sensitivity.still_smooth[filter_bank.LEARNT]
+    m.models.since_learnt += 1.0
+    if m.models.since_learnt < k.learn_every:
         return False
-    m["since_learnt"] = 0.0
-    place = int(m["ring_next"])
-    has_waited = m["ring_used"] == m["ring_tau"].shape[0]
+    m.models.since_learnt = 0.0
+    place = int(m.ring.next)
+    has_waited = m.ring.used == m.ring.tau.shape[0]
     if has_waited:
         for i in range(tau_J.shape[0]):
-            R = m["ring_R"][place, i]
-            w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
+            R = m.ring.R[place, i]
+            w, tau = m.ring.W[place, i], m.ring.tau[place, i]
             if np.inf == R:
                 continue
             missing_torque.add(k, m, place, i)
-            epsilon, s = estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
-            fit_check.add_residual(m, epsilon * epsilon / (s - R + R / k["correlated"]))
+            epsilon, s = estimator.correct(w, tau, R, True, m.models.belief, m.models.P_belief, m.models.v, m.models.K)
+            fit_check.add_residual(m, epsilon * epsilon / (s - R + R / k.correlated))
     else:
-        m["ring_used"] += 1.0
-    m["ring_W"][place] = W
+        m.ring.used += 1.0
+    m.ring.W[place] = W
     missing_torque.keep(m, place)
     for i in range(still.shape[0]):
-        m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > regressor.SLOW_RAD_S else 1.0
-    m["ring_tau"][place] = tau_J
-    if m["are_lags_held"] != 0.0:
+        m.ring.still[place, i] = still[i] if abs(m.sensitivity.dq_old[i]) > regressor.SLOW_RAD_S else 1.0
+    m.ring.tau[place] = tau_J
+    if m.models.are_lags_held != 0.0:
         _take_out_lags(k, m, place)
     for i in range(tau_J.shape[0]):
-        m["ring_R"][place, i] = k["correlated"] * (k["residual_Nm"] ** 2 + sensitivity.held_Nm(m, i, still[i]) ** 2)
-    m["ring_next"] = (place + 1) % m["ring_tau"].shape[0]
+        m.ring.R[place, i] = k.correlated * (k.residual_Nm**2 + sensitivity.held_Nm(m, i, still[i]) ** 2)
+    m.ring.next = (place + 1) % m.ring.tau.shape[0]
     return bool(has_waited)
 
 
 @compiled
-def hold_lags(k: Any, m: Any) -> None:
+def hold_lags(k: Constants, m: Memory) -> None:
     """Learn the lags no further; what is left open of them stays open, and moves nothing else."""
-    m["are_lags_held"] = 1.0
-    P = m["P_belief"]
-    first = int(k["base"]) + m["ring_tau"].shape[1]
-    for j in range(first, first + m["ring_tau"].shape[1]):
+    m.models.are_lags_held = 1.0
+    P = m.models.P_belief
+    first = int(k.first_offset) + m.ring.tau.shape[1]
+    for j in range(first, first + m.ring.tau.shape[1]):
         variance = P[j, j]
         P[j, :] = 0.0
         P[:, j] = 0.0
@@ -220,20 +201,20 @@ def hold_lags(k: Any, m: Any) -> None:
 
 
 @compiled
-def _take_out_lags(k: Any, m: Any, place: int) -> None:
-    joints = m["ring_tau"].shape[1]
-    first = int(k["base"]) + joints
+def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
+    joints = m.ring.tau.shape[1]
+    first = int(k.first_offset) + joints
     for i in range(joints):
         for j in range(first, first + joints):
-            m["ring_tau"][place, i] -= m["ring_W"][place, i, j] * m["belief"][j]
-            m["ring_W"][place, i, j] = 0.0
+            m.ring.tau[place, i] -= m.ring.W[place, i, j] * m.models.belief[j]
+            m.ring.W[place, i, j] = 0.0
 
 
 @compiled
-def discard(m: Any) -> None:
+def discard(m: Memory) -> None:
     """Throw away the samples that wait."""
-    m["ring_used"] = 0.0
-    m["since_learnt"] = 0.0
+    m.ring.used = 0.0
+    m.models.since_learnt = 0.0
 
 
 @compiled
@@ -262,37 +243,37 @@ def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
 
 
 @compiled
-def restart_candidate(m: Any) -> None:
+def restart_candidate(m: Memory) -> None:
     """Begin the next test with the belief as it is now."""
-    m["candidate_cycles"] = 0.0
-    m["candidate_square"] = 0.0
-    m["frozen_square"] = 0.0
-    m["candidate_worst"] = 0.0
-    m["candidate"][:] = m["belief"]
-    m["P_candidate"][:] = m["P_belief"]
+    m.models.candidate_cycles = 0.0
+    m.models.candidate_square = 0.0
+    m.models.frozen_square = 0.0
+    m.models.candidate_worst = 0.0
+    m.models.candidate[:] = m.models.belief
+    m.models.P_candidate[:] = m.models.P_belief
 
 
 @compiled
-def test_candidate(k: Any, m: Any) -> bool:
+def test_candidate(k: Constants, m: Memory) -> bool:
     """Take one sample into the test; tell whether a candidate that passes it is excluded by an anchor alone."""
-    m["candidate_cycles"] += 1.0
-    for c in range(m["W_f"].shape[0]):
-        for i in range(m["W_f"].shape[1]):
-            residual = linalg.misfit(m["W_f"][c, i], m["candidate"], m["tau_f"][c, i])
-            if c == filter_bank.SLOW and m["still"][c, i] < sensitivity.MOVING:
-                m["candidate_square"] += residual * residual
-                m["frozen_square"] += m["r"][c, i] ** 2
-            bare = max(m["r"].shape[0] + c - 1, 0) if c > 0 else 0
-            m["candidate_worst"] = max(m["candidate_worst"], abs(residual) / m["h"][bare, i])
-    if m["candidate_cycles"] < k["refine_cycles"]:
+    m.models.candidate_cycles += 1.0
+    for c in range(m.filters.W_f.shape[0]):
+        for i in range(m.filters.W_f.shape[1]):
+            residual = linalg.misfit(m.filters.W_f[c, i], m.models.candidate, m.filters.tau_f[c, i])
+            if c == filter_bank.SLOW and m.sensitivity.still[c, i] < sensitivity.MOVING:
+                m.models.candidate_square += residual * residual
+                m.models.frozen_square += m.filters.r[c, i] ** 2
+            bare = max(m.filters.r.shape[0] + c - 1, 0) if c > 0 else 0
+            m.models.candidate_worst = max(m.models.candidate_worst, abs(residual) / m.sensitivity.h[bare, i])
+    if m.models.candidate_cycles < k.refine_cycles:
         return False
-    is_better = m["candidate_square"] < m["frozen_square"] and m["candidate_worst"] < 1.0
-    is_fit = is_better and is_positive_definite(m["candidate"])
-    is_anchored = is_fit and anchor.is_within(k, m, m["candidate"], m["P_candidate"])
+    is_better = m.models.candidate_square < m.models.frozen_square and m.models.candidate_worst < 1.0
+    is_fit = is_better and is_positive_definite(m.models.candidate)
+    is_anchored = is_fit and anchor.is_within(k, m, m.models.candidate, m.models.P_candidate)
     if is_anchored:
-        m["theta"][:] = m["candidate"]
-        m["P"][:] = m["P_candidate"]
+        m.models.theta[:] = m.models.candidate
+        m.models.P[:] = m.models.P_candidate
         _certify(m)
-        m["promotions"] += 1.0
+        m.models.promotions += 1.0
     restart_candidate(m)
     return bool(is_fit and not is_anchored)

@@ -12,7 +12,7 @@ until the user says that nobody touches the arm. share: `history.friction_share`
 differs from another. Not asked with a payload that was announced. It judges the fit, and never pulls it.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import anchor, earlier, evidence, fit_check, missing_torque
 from adacd_hil.scheme.identify.evidence import FRICTIONS, INERTIAS, LAST, OFFSETS, SPEEDS_RAD_S, VISCOUS
+from adacd_hil.scheme.memory import Constants, LastConstants, Memory
 from adacd_hil.settings.configuration import Settings
 
 NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, BLIND = range(8)
@@ -51,7 +52,7 @@ class Certificate(NamedTuple):
         return f"<Certificate{' with a payload' if self.is_payload else ''}: a1, a2, a3 = {inertia} kg m²>"
 
 
-def constants_of(settings: Settings) -> dict[str, Vector]:
+def constants_of(settings: Settings) -> LastConstants:
     """Return `last`, `last_variance`, `last_slack` (Q,): what the last certificate says of each quantity; inf: nothing.
 
     The deviations of the two frictions that a viscous friction is between count as if they were independent, which is
@@ -71,49 +72,46 @@ def constants_of(settings: Settings) -> dict[str, Vector]:
         variance = quantities**2 @ np.square((*history.friction_std_Nm, *history.inertia_std_kgm2))
         variance += np.square(share * last)
         variance[OFFSETS:VISCOUS] = np.inf
-    return {
-        "last": last,
-        "last_variance": variance,
-        "last_slack": np.repeat((FLOOR_NM, FLOOR_KGM2, 0.0, FLOOR_NM_S), counts),
-    }
+    return LastConstants(
+        value=last,
+        variance=variance,
+        slack=np.repeat((FLOOR_NM, FLOOR_KGM2, 0.0, FLOOR_NM_S), counts),
+    )
 
 
-def shapes_of() -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    return {"withheld_by": ()}
-
-
-def begin(k: Any, m: Any) -> None:
+def begin(k: Constants, m: Memory) -> None:
     """Believe the last certificate, if there is one."""
-    evidence.say_all(m, LAST, k["last"], k["last_variance"], k["last_slack"])
+    evidence.say_all(m, LAST, k.last.value, k.last.variance, k.last.slack)
 
 
-def forget(m: Any) -> None:
+def forget(m: Memory) -> None:
     """Compare no more with the last certificate: the user says that nobody touches the arm."""
     evidence.retract(m, LAST)
 
 
-def is_compared(m: Any) -> bool:
+def is_compared(m: Memory) -> bool:
     """Tell whether the last certificate is compared with the fit: not with a payload that was announced."""
-    return bool(m["said_variance"][LAST, 0] != np.inf and not m["is_payload"])
+    return bool(m.evidence.said_variance[LAST, 0] != np.inf and not m.models.is_payload)
 
 
 @compiled
-def withhold(m: Any, cause: int) -> None:
+def withhold(m: Memory, cause: int) -> None:
     """Note what a certificate is withheld by, or taken back; NOTHING: it isn't."""
-    m["withheld_by"] = cause
+    m.certificate.withheld_by = cause
 
 
 @compiled
-def contradicted_by(k: Any, m: Any) -> int:
+def contradicted_by(k: Constants, m: Memory) -> int:
     """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
-    if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
+    if not anchor.is_within(k, m, m.models.belief, m.models.P_belief):
         return ANCHOR
     last_step = fit_check.last_step_before_change(k, m)
     if last_step != fit_check.NONE:
         earlier.keep_steps(k, m, last_step)
         return BY_PLACE if missing_torque.is_found(k, m) else CHANGED
-    evidence.fit(k, m, m["belief"], m["P_belief"], fit_check.unit_of(m["fit_square"], m["fit_rows"]))
+    evidence.fit(
+        k, m, m.models.belief, m.models.P_belief, fit_check.unit_of(m.fit_check.fit_square, m.fit_check.fit_rows)
+    )
     if not earlier.is_no_more(k, m):
         return MORE
     if not anchor.is_place_bounded(k, m):
@@ -122,18 +120,18 @@ def contradicted_by(k: Any, m: Any) -> int:
 
 
 @compiled
-def is_no_more(k: Any, m: Any) -> bool:
+def is_no_more(k: Constants, m: Memory) -> bool:
     """Tell whether the fit has no more friction and inertia than the last certificate."""
     is_agreed = True
-    for q in range(m["fitted"].shape[0]):
+    for q in range(m.evidence.fitted.shape[0]):
         excess = evidence.weigh(k, m, LAST, q)
         is_agreed = is_agreed and excess <= 1.0
-    return bool(is_agreed or m["is_payload"] != 0.0)
+    return bool(is_agreed or m.models.is_payload != 0.0)
 
 
-def describe_more(m: Any, date_utc: str) -> list[str]:
+def describe_more(m: Memory, date_utc: str) -> list[str]:
     """Say of which quantities the fit has more than the last certificate, and by how much, a line each."""
-    difference, limit = m["difference"][LAST], m["limit"][LAST]
+    difference, limit = m.evidence.difference[LAST], m.evidence.limit[LAST]
     return [
         f"{what} is {float(difference[q]):.3f} {unit} more than in the certificate of {date_utc}, "
         f"bound {float(limit[q]):.3f} {unit}"
@@ -141,10 +139,10 @@ def describe_more(m: Any, date_utc: str) -> list[str]:
     ]
 
 
-def certificate_of(k: Any, theta: Vector, P: Vector, is_payload: bool, text: str) -> Certificate:
+def certificate_of(k: Constants, theta: Vector, P: Vector, is_payload: bool, text: str) -> Certificate:
     """Return what a model that was certified says. theta (p,), P (p, p): with the offsets; text: its event."""
-    base, first = int(k["base"]), FRICTIONS
-    rows = k["columns"][:OFFSETS]
+    base, first = int(k.first_offset), FRICTIONS
+    rows = k.evidence.columns[:OFFSETS]
     values = rows @ theta
     std = np.sqrt([row @ P @ row for row in rows])
     offsets = slice(base, base + JOINTS)
@@ -154,7 +152,7 @@ def certificate_of(k: Any, theta: Vector, P: Vector, is_payload: bool, text: str
         friction_std_Nm=tuple(std[:first].tolist()),
         inertia_kgm2=tuple(values[first:].tolist()),
         inertia_std_kgm2=tuple(std[first:].tolist()),
-        offset_Nm=tuple((k["zero_Nm"] + theta[offsets]).tolist()),
+        offset_Nm=tuple((k.anchor.zero_Nm + theta[offsets]).tolist()),
         offset_std_Nm=tuple(np.sqrt(np.diag(P)[offsets]).tolist()),
         is_payload=is_payload,
         text=text,

@@ -26,16 +26,18 @@ Shapes: c (h, p), sums (h,), of the share of standstill (h, n) and (n,).
 
 from collections import deque
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from adacd_hil import linalg
-from adacd_hil.compiled import Structured, compiled
+from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.memory import Constants, DoubtConstants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.structured import Structured
 
 WITHIN_S = 60.0
 """How far back the end of a contact may lie."""
@@ -71,28 +73,18 @@ RARELY_PER_H, OFTEN_PER_H, ODDS = 1.0, 30.0, 1000.0
 LOAD = 0
 """Place of a payload among the causes."""
 _FRICTIONS = (("Coulomb friction", "Nm"), ("viscous friction", "Nm s/rad"))
+CAUSES = 1 + len(_FRICTIONS) * JOINTS
 TOLD_NOTHING = 0.6
 """Share of standstill in a filter's memory from which on a sample of its joint tells nothing of a cause."""
 
 
-def constants_of(settings: Settings, count: int) -> dict[str, Vector]:
+def constants_of(settings: Settings, count: int) -> DoubtConstants:
     """Return `causes` (h, p): a payload of 1 kg, then by joint Coulomb and viscous friction."""
     unit = np.eye(count)
     first = PARAMETER_NAMES.index("F_c1"), PARAMETER_NAMES.index("F_v1")
     rows = [regressor.payload_direction(settings.arm.link_length_m, count, settings.gravity_m_s2)]
     rows += [unit[place + i] for i in range(JOINTS) for place in first]
-    return {"causes": np.array(rows)}
-
-
-def shapes_of() -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    causes = (1 + len(_FRICTIONS) * JOINTS,)
-    each = (JOINTS,)
-    return {
-        "cause_rw": causes, "cause_ww": causes, "cause_ws": (*causes, JOINTS),
-        "contact_rr": (), "contact_rows": (), "contact_peak": (), "contact_rs": each, "contact_ss": each,
-        "load_ww": (2,),
-    }  # fmt: skip
+    return DoubtConstants(np.array(rows))
 
 
 @compiled
@@ -109,61 +101,72 @@ def react(memory: Structured, is_touched: bool, is_soon: bool) -> None:
 
 
 @compiled
-def _clear(m: Any) -> None:
-    m["cause_rw"][:] = 0.0
-    m["cause_ww"][:] = 0.0
-    m["cause_ws"][:] = 0.0
-    m["load_ww"][:] = 0.0
-    m["contact_rs"][:] = 0.0
-    m["contact_ss"][:] = 0.0
-    m["contact_rr"] = 0.0
-    m["contact_rows"] = 0.0
-    m["contact_peak"] = 0.0
+def _clear(m: Memory) -> None:
+    m.doubt.cause_rw[:] = 0.0
+    m.doubt.cause_ww[:] = 0.0
+    m.doubt.cause_ws[:] = 0.0
+    m.doubt.load_ww[:] = 0.0
+    m.doubt.contact_rs[:] = 0.0
+    m.doubt.contact_ss[:] = 0.0
+    m.doubt.contact_rr = 0.0
+    m.doubt.contact_rows = 0.0
+    m.doubt.contact_peak = 0.0
 
 
 @compiled
-def begin(k: Any, m: Any, least_peak: float) -> None:
+def begin(k: Constants, m: Memory, least_peak: float) -> None:
     """Begin a contact, with the samples that were held back. least_peak: what its peak counts as at least."""
     _clear(m)
-    m["contact_peak"] = least_peak
+    m.doubt.contact_peak = least_peak
     _follow_peak(m)
-    for s in range(int(m["ring_used"])):
-        for i in range(m["ring_tau"].shape[1]):
-            if m["ring_still"][s, i] < TOLD_NOTHING:
-                _add(k, m, i, m["ring_W"][s, i], m["ring_tau"][s, i], m["ring_still"][s, i], k["learn_every"])
+    for s in range(int(m.ring.used)):
+        for i in range(m.ring.tau.shape[1]):
+            if m.ring.still[s, i] < TOLD_NOTHING:
+                _add(k, m, i, m.ring.W[s, i], m.ring.tau[s, i], m.ring.still[s, i], k.learn_every)
 
 
 @compiled
-def weigh(k: Any, m: Any) -> None:
+def weigh(k: Constants, m: Memory) -> None:
     """Take in one sample of a contact; of a joint that rests, friction may hold anything."""
     _follow_peak(m)
-    for i in range(m["tau_f"].shape[1]):
-        if m["still_smooth"][filter_bank.LEARNT, i] < TOLD_NOTHING and abs(m["dq_old"][i]) > regressor.SLOW_RAD_S:
-            _add(k, m, i, m["W_learnt"][i], m["tau_learnt"][i], m["still_smooth"][filter_bank.LEARNT, i], 1.0)
+    for i in range(m.filters.tau_f.shape[1]):
+        if (
+            m.sensitivity.still_smooth[filter_bank.LEARNT, i] < TOLD_NOTHING
+            and abs(m.sensitivity.dq_old[i]) > regressor.SLOW_RAD_S
+        ):
+            _add(
+                k,
+                m,
+                i,
+                m.filters.W_learnt[i],
+                m.filters.tau_learnt[i],
+                m.sensitivity.still_smooth[filter_bank.LEARNT, i],
+                1.0,
+            )
 
 
 @compiled
-def _follow_peak(m: Any) -> None:
-    for c in range(m["y"].shape[0]):
-        for i in range(m["y"].shape[1]):
-            m["contact_peak"] = max(m["contact_peak"], abs(m["y"][c, i]) / m["h"][c, i])
+def _follow_peak(m: Memory) -> None:
+    for c in range(m.filters.y.shape[0]):
+        for i in range(m.filters.y.shape[1]):
+            m.doubt.contact_peak = max(m.doubt.contact_peak, abs(m.filters.y[c, i]) / m.sensitivity.h[c, i])
 
 
 @compiled
-def _add(k: Any, m: Any, i: int, w: Vector, tau: float, still: float, weight: float) -> None:
+def _add(k: Constants, m: Memory, i: int, w: Vector, tau: float, still: float, weight: float) -> None:
     """Take in one row w (p,) of joint i."""
-    r = linalg.misfit(w, m["theta"], tau)
-    m["contact_rr"] += weight * r * r
-    m["contact_rows"] += weight
-    m["contact_rs"][i] += weight * r * still
-    m["contact_ss"][i] += weight * still * still
-    for h in range(m["cause_rw"].shape[0]):
-        left = -linalg.dot(w, k["causes"][h])
-        m["cause_rw"][h] += weight * r * left
-        m["cause_ww"][h] += weight * left * left
-        m["cause_ws"][h, i] += weight * left * still
+    r = linalg.misfit(w, m.models.theta, tau)
+    m.doubt.contact_rr += weight * r * r
+    m.doubt.contact_rows += weight
+    m.doubt.contact_rs[i] += weight * r * still
+    m.doubt.contact_ss[i] += weight * still * still
+    for h in range(m.doubt.cause_rw.shape[0]):
+        left = -linalg.dot(w, k.doubt.causes[h])
+        m.doubt.cause_rw[h] += weight * r * left
+        m.doubt.cause_ww[h] += weight * left * left
+        m.doubt.cause_ws[h, i] += weight * left * still
         if h == LOAD:
-            m["load_ww"][0 if left < 0.0 else 1] += weight * left * left
+            m.doubt.load_ww[0 if left < 0.0 else 1] += weight * left * left
 
 
 class CommonCause(NamedTuple):
@@ -310,9 +313,9 @@ class Doubt:
 
     def _can_be(self, h: int, size: float) -> bool:
         """Tell whether an arm may have so much more of a friction than the model: none has less than none."""
-        cause = self._constants["causes"][h]
-        total = float(cause @ self._memory[0]["theta"]) + size
-        return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._constants["prior_std"])
+        cause = self._constants.doubt.causes[h]
+        total = float(cause @ self._memory[0].models.theta) + size
+        return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._constants.prior_std)
 
     def _common(self, contacts: list[_Weighed], h: int, spread: float) -> float | None:
         """Return the size of cause h that explains each of the contacts, or None."""
@@ -337,15 +340,15 @@ class Doubt:
         return float(RESIDUAL_NM * np.sqrt(self._correlated / ww))
 
 
-def _weighed(m: Any, waited_s: float, now_s: float) -> _Weighed:
+def _weighed(m: Memory, waited_s: float, now_s: float) -> _Weighed:
     """Return a contact's sums, less what each joint's torque at rest explains, and what a good model leaves."""
-    ss = np.maximum(m["contact_ss"], 1e-12)
-    rs, ws = m["contact_rs"], m["cause_ws"]
-    rw = m["cause_rw"] - ws @ (rs / ss)
-    ww = np.maximum(m["cause_ww"] - (ws * ws) @ (1.0 / ss), 0.0)
-    rr = float(m["contact_rr"] - np.sum(rs * rs / ss))
-    rr = max(rr - RESIDUAL_NM**2 * float(m["contact_rows"]), LEAST_SHARE * rr)
-    return _Weighed(rw, ww, rr, m["load_ww"].copy(), float(m["contact_peak"]), waited_s, now_s)
+    ss = np.maximum(m.doubt.contact_ss, 1e-12)
+    rs, ws = m.doubt.contact_rs, m.doubt.cause_ws
+    rw = m.doubt.cause_rw - ws @ (rs / ss)
+    ww = np.maximum(m.doubt.cause_ww - (ws * ws) @ (1.0 / ss), 0.0)
+    rr = float(m.doubt.contact_rr - np.sum(rs * rs / ss))
+    rr = max(rr - RESIDUAL_NM**2 * float(m.doubt.contact_rows), LEAST_SHARE * rr)
+    return _Weighed(rw, ww, rr, m.doubt.load_ww.copy(), float(m.doubt.contact_peak), waited_s, now_s)
 
 
 def _explained(contacts: list[_Weighed], h: int) -> float:

@@ -21,14 +21,13 @@ bends the beliefs it comes into; LESS_FITS, if they have less friction, and no m
 for the hand that was there before may have dragged. A hand as small as that, or that helps as long, is learnt then.
 """
 
-from typing import Any
-
 import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import anchor, evidence, fit_check
 from adacd_hil.scheme.identify.evidence import FRICTIONS, INERTIAS, KEPT, OFFSETS, REFUSED, VISCOUS
+from adacd_hil.scheme.memory import Constants, EarlierConstants, Memory
 
 YOUNG_STEPS = 1
 """The first ones are not kept: for so long a hand may have been there all the time, and nothing could tell."""
@@ -44,83 +43,85 @@ INERTIA_SHARE = 0.03
 """Less than these, and less than this share of an inertia, is nothing."""
 
 
-def constants_of() -> dict[str, Vector]:
+def constants_of() -> EarlierConstants:
     """Return `kept_floor`, `kept_share` (VISCOUS,): what is nothing; inf of a2, which any touch of the arm bends.
 
     A mass shows in a1 and a3.
     """
     floors = [FRICTION_NM] * FRICTIONS + [INERTIA_KGM2, np.inf, INERTIA_KGM2] + [OFFSET_NM] * JOINTS
     shares = np.repeat((0.0, INERTIA_SHARE, 0.0), (FRICTIONS, INERTIAS, JOINTS))
-    return {"kept_floor": np.array(floors), "kept_share": shares}
-
-
-def shapes_of() -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    return dict.fromkeys(("kept_count", "refused_fits", "has_lapsed"), ())
+    return EarlierConstants(kept_floor=np.array(floors), kept_share=shares)
 
 
 @compiled
-def forget(m: Any) -> None:
+def forget(m: Memory) -> None:
     """Keep nothing: a certificate stands, or the user says that nobody touches the arm."""
     _drop(m)
-    m["refused_fits"] = 0.0
-    m["has_lapsed"] = 0.0
+    m.earlier.refused_fits = 0.0
+    m.earlier.has_lapsed = 0.0
 
 
 @compiled
-def _drop(m: Any) -> None:
-    m["kept_count"] = 0.0
-    for s in range(KEPT, m["said"].shape[0]):
+def _drop(m: Memory) -> None:
+    m.earlier.kept_count = 0.0
+    for s in range(KEPT, m.evidence.said.shape[0]):
         evidence.retract(m, s)
 
 
 @compiled
-def is_keeping(m: Any) -> bool:
+def is_keeping(m: Memory) -> bool:
     """Tell whether something is kept that has not been forgotten since."""
-    return bool(np.any(m["said_variance"][KEPT:, 0] != np.inf))
+    return bool(np.any(m.evidence.said_variance[KEPT:, 0] != np.inf))
 
 
 @compiled
-def keep(k: Any, m: Any) -> None:
+def keep(k: Constants, m: Memory) -> None:
     """Keep what the fit has come to, and how it came about, if nothing is kept yet: a touch may have begun.
 
     Of a fit that has changed on the way only what it had come to before.
     """
-    m["refused_fits"] = 0.0
-    if m["kept_count"] > 0.0 or m["steps_used"] <= YOUNG_STEPS:
+    m.earlier.refused_fits = 0.0
+    if m.earlier.kept_count > 0.0 or m.fit_check.steps_used <= YOUNG_STEPS:
         return
     changed = fit_check.last_step_before_contradiction(k, m)
-    keep_steps(k, m, int(m["steps_used"]) - 1 if changed == fit_check.NONE else changed)
+    keep_steps(k, m, int(m.fit_check.steps_used) - 1 if changed == fit_check.NONE else changed)
     if changed == fit_check.NONE:
-        _keep(k, m, m["belief"], m["P_belief"], fit_check.unit_of(m["fit_square"], m["fit_rows"]), 0.0)
+        _keep(
+            k,
+            m,
+            m.models.belief,
+            m.models.P_belief,
+            fit_check.unit_of(m.fit_check.fit_square, m.fit_check.fit_rows),
+            0.0,
+        )
 
 
 @compiled
-def keep_steps(k: Any, m: Any, last: int) -> None:
+def keep_steps(k: Constants, m: Memory, last: int) -> None:
     """Keep the fit's steps up to this number, if nothing is kept yet."""
-    if m["kept_count"] > 0.0:
+    if m.earlier.kept_count > 0.0:
         return
     _drop(m)
-    m["refused_fits"] = 0.0
-    steps = m["steps_rows"].shape[0]
-    for number in range(max(int(m["steps_used"]) - steps, YOUNG_STEPS), last + 1):
+    m.earlier.refused_fits = 0.0
+    steps = m.fit_check.steps_rows.shape[0]
+    for number in range(max(int(m.fit_check.steps_used) - steps, YOUNG_STEPS), last + 1):
         s = number % steps
-        age_s = fit_check.STEP_S * (m["steps_used"] - 1.0 - number)
-        unit = fit_check.unit_of(m["steps_square"][s], m["steps_rows"][s])
-        _keep(k, m, m["steps_theta"][s], m["steps_P"][s], unit, age_s)
+        age_s = fit_check.STEP_S * (m.fit_check.steps_used - 1.0 - number)
+        unit = fit_check.unit_of(m.fit_check.steps_square[s], m.fit_check.steps_rows[s])
+        _keep(k, m, m.fit_check.steps_theta[s], m.fit_check.steps_P[s], unit, age_s)
 
 
 @compiled
-def _keep(k: Any, m: Any, theta: Vector, P: Vector, unit: float, age_s: float) -> None:
-    s = KEPT + int(m["kept_count"])
+def _keep(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, age_s: float) -> None:
+    s = KEPT + int(m.earlier.kept_count)
     if not _say(k, m, s, theta, P, unit):
         evidence.retract(m, s)
     evidence.date(m, s, s + 1, age_s)
-    m["kept_count"] += 1.0
+    m.earlier.kept_count += 1.0
 
 
 @compiled
-def _say(k: Any, m: Any, s: int, theta: Vector, P: Vector, unit: float) -> bool:
+def _say(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit: float) -> bool:
     """Fill a source's rows with what a belief says; tell whether no friction is clearly less than none.
 
     Who pushes the arm on looks like less than none: what is less counts as none.
@@ -128,21 +129,21 @@ def _say(k: Any, m: Any, s: int, theta: Vector, P: Vector, unit: float) -> bool:
     has_friction = True
     for q in range(VISCOUS):
         value, variance = evidence.of_belief(k, q, theta, P, unit)
-        least = -max(k["kept_floor"][q], evidence.BELIEF_SIGMAS * np.sqrt(variance))
+        least = -max(k.earlier.kept_floor[q], evidence.BELIEF_SIGMAS * np.sqrt(variance))
         has_friction = has_friction and (q >= FRICTIONS or not value < least)
         value = max(value, 0.0) if q < OFFSETS else value
-        evidence.say(m, s, q, value, variance, max(k["kept_floor"][q], k["kept_share"][q] * abs(value)), 0.0)
+        evidence.say(m, s, q, value, variance, max(k.earlier.kept_floor[q], k.earlier.kept_share[q] * abs(value)), 0.0)
     return has_friction
 
 
 @compiled
-def is_no_more(k: Any, m: Any) -> bool:
+def is_no_more(k: Constants, m: Memory) -> bool:
     """Tell whether the fit has the friction of what was kept, no more inertia, and no other unanchored offset.
 
     The fit's offsets keep to their anchors. A kept belief whose offsets don't has been leant on, and is forgotten.
     """
     is_no_more = True
-    for s in range(KEPT, KEPT + int(m["kept_count"])):
+    for s in range(KEPT, KEPT + int(m.earlier.kept_count)):
         for q in range(VISCOUS):
             evidence.weigh(k, m, s, q)
         if _is_leant_on(k, m, s):
@@ -152,61 +153,72 @@ def is_no_more(k: Any, m: Any) -> bool:
                 evidence.pass_over(m, s, q)
             is_no_more = is_no_more and abs(evidence.excess(m, s, q)) <= 1.0
     if not is_keeping(m):
-        m["kept_count"] = 0.0
+        m.earlier.kept_count = 0.0
     if is_no_more:
         return True
     has_lapsed = _lapses(k, m)
     if has_lapsed:
         _drop(m)
-        m["has_lapsed"] = 1.0
+        m.earlier.has_lapsed = 1.0
     return has_lapsed
 
 
 @compiled
-def _is_leant_on(k: Any, m: Any, s: int) -> bool:
+def _is_leant_on(k: Constants, m: Memory, s: int) -> bool:
     """Tell whether a kept belief has another offset than the fit where an anchor gives it, or excludes the other."""
-    for i in range(m["anchor_Nm"].shape[1]):
+    for i in range(m.anchor.anchor_Nm.shape[1]):
         q = OFFSETS + i
         is_another = abs(evidence.excess(m, s, q)) > 1.0
-        if is_another and (not anchor.is_open(k, m, i) or anchor.is_excluded(m, i, m["said"][s, q])):
+        if is_another and (not anchor.is_open(k, m, i) or anchor.is_excluded(m, i, m.evidence.said[s, q])):
             return True
     return False
 
 
 @compiled
-def _lapses(k: Any, m: Any) -> bool:
+def _lapses(k: Constants, m: Memory) -> bool:
     """Tell whether enough fits in a row have been refused for the same, as large as it is; remember this one."""
     is_little, is_less, is_same, friction_Nm, else_Nm = True, True, True, 0.0, 0.0
     for q in range(VISCOUS):
-        s = evidence.foremost(m, KEPT, KEPT + int(m["kept_count"]), q)
+        s = evidence.foremost(m, KEPT, KEPT + int(m.earlier.kept_count), q)
         excess = evidence.excess(m, s, q)
         is_little = is_little and abs(excess) <= (LITTLE if excess > 0.0 or q >= FRICTIONS else 1.0)
         is_less = is_less and excess <= 1.0 and (q < OFFSETS or excess >= -1.0)
-        change_Nm = abs(m["difference"][s, q]) * k["torque_Nm"][q] if abs(excess) > 1.0 else 0.0
+        change_Nm = abs(m.evidence.difference[s, q]) * k.evidence.torque_Nm[q] if abs(excess) > 1.0 else 0.0
         if q < FRICTIONS:
             friction_Nm = max(friction_Nm, change_Nm)
         else:
             else_Nm += change_Nm
-        is_same = is_same and (m["refused_fits"] == 0.0 or abs(evidence.weigh(k, m, REFUSED, q)) <= 1.0)
-    _say(k, m, REFUSED, m["belief"], m["P_belief"], fit_check.unit_of(m["fit_square"], m["fit_rows"]))
-    m["refused_fits"] = m["refused_fits"] + 1.0 if is_same else 1.0
+        is_same = is_same and (m.earlier.refused_fits == 0.0 or abs(evidence.weigh(k, m, REFUSED, q)) <= 1.0)
+    _say(
+        k,
+        m,
+        REFUSED,
+        m.models.belief,
+        m.models.P_belief,
+        fit_check.unit_of(m.fit_check.fit_square, m.fit_check.fit_rows),
+    )
+    m.earlier.refused_fits = m.earlier.refused_fits + 1.0 if is_same else 1.0
     if is_little and friction_Nm + else_Nm <= LITTLE_NM:
-        return bool(m["refused_fits"] >= LITTLE_FITS)
-    return bool(is_less and m["refused_fits"] >= LESS_FITS)
+        return bool(m.earlier.refused_fits >= LITTLE_FITS)
+    return bool(is_less and m.earlier.refused_fits >= LESS_FITS)
 
 
-def describe_more(m: Any) -> list[str]:
+def describe_more(m: Memory) -> list[str]:
     """Say in which quantities the fit contradicts what was kept, by how much and since when, a line each.
 
     Of a joint's friction only the speed at which it stands out most.
     """
-    excesses = np.abs(m["difference"][KEPT:] / m["limit"][KEPT:])
+    excesses = np.abs(m.evidence.difference[KEPT:] / m.evidence.limit[KEPT:])
     worst = KEPT + np.argmax(excesses, axis=0)
     return [_changed(m, worst[q], q, what, unit) for q, what, unit in evidence.named(excesses.max(axis=0))]
 
 
-def _changed(m: Any, s: int, q: int, what: str, unit: str) -> str:
-    change, limit, age_s = float(m["difference"][s, q]), float(m["limit"][s, q]), float(m["said_age_s"][s])
+def _changed(m: Memory, s: int, q: int, what: str, unit: str) -> str:
+    change, limit, age_s = (
+        float(m.evidence.difference[s, q]),
+        float(m.evidence.limit[s, q]),
+        float(m.evidence.said_age_s[s]),
+    )
     is_helped = q < FRICTIONS and change < 0.0
     why = "a hand helps the motion, or one that dragged has let go"
     if not is_helped:

@@ -21,13 +21,13 @@ Shapes: Q quantities, S sources, p parameters; columns (Q, p), columns_prior, to
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.scheme.memory import Constants, EvidenceConstants, Memory
 from adacd_hil.settings.configuration import Settings
 
 SPEEDS_RAD_S = (0.2, 0.6, 1.2)
@@ -51,7 +51,7 @@ PEAK_ACCELERATION = 10.0 / math.sqrt(3.0)
 """Of a rest-to-rest quintic, over travel / duration²."""
 
 
-def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
+def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:
     """Return `columns`, `columns_prior`, `torque_Nm`, `sigmas` and `less_counts`. prior_std (p,).
 
     torque_Nm: torque that one unit of the quantity makes at most on the trajectory; of viscous friction nothing, which
@@ -67,13 +67,13 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
     less_counts = np.ones((SOURCES, QUANTITIES))
     less_counts[LAST] = 0.0
     less_counts[KEPT:, FRICTIONS:OFFSETS] = 0.0
-    return {
-        "columns": columns,
-        "columns_prior": columns**2 @ prior_std**2,
-        "torque_Nm": np.concatenate([np.ones(FRICTIONS), _accelerations(settings), np.ones(JOINTS), np.zeros(JOINTS)]),
-        "sigmas": np.repeat((ANCHOR_SIGMAS, LAST_SIGMAS, BELIEF_SIGMAS), (ANCHORS, 1, 1 + BELIEFS)),
-        "less_counts": less_counts,
-    }
+    return EvidenceConstants(
+        columns=columns,
+        columns_prior=columns**2 @ prior_std**2,
+        torque_Nm=np.concatenate([np.ones(FRICTIONS), _accelerations(settings), np.ones(JOINTS), np.zeros(JOINTS)]),
+        sigmas=np.repeat((ANCHOR_SIGMAS, LAST_SIGMAS, BELIEF_SIGMAS), (ANCHORS, 1, 1 + BELIEFS)),
+        less_counts=less_counts,
+    )
 
 
 def _accelerations(settings: Settings) -> tuple[float, ...]:
@@ -83,84 +83,74 @@ def _accelerations(settings: Settings) -> tuple[float, ...]:
     return first, 2.0 * first + second, first + second
 
 
-def shapes_of() -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    rows = ("said", "said_variance", "said_floor", "said_slack", "difference", "limit")
-    return {
-        **dict.fromkeys(rows, (SOURCES, QUANTITIES)),
-        "said_age_s": (SOURCES,),
-        **dict.fromkeys(("fitted", "fitted_variance"), (QUANTITIES,)),
-    }
-
-
-def begin(m: Any) -> None:
+def begin(m: Memory) -> None:
     """Begin with sources that say nothing."""
-    m["said_variance"][:] = np.inf
-    m["limit"][:] = np.inf
+    m.evidence.said_variance[:] = np.inf
+    m.evidence.limit[:] = np.inf
 
 
-def say_all(m: Any, s: int, said: Vector, variance: Vector, slack: Vector) -> None:
+def say_all(m: Memory, s: int, said: Vector, variance: Vector, slack: Vector) -> None:
     """Fill all rows of a source (Q,), without a floor."""
-    m["said"][s], m["said_variance"][s], m["said_slack"][s] = said, variance, slack
+    m.evidence.said[s], m.evidence.said_variance[s], m.evidence.said_slack[s] = said, variance, slack
 
 
 @compiled
-def follow(m: Any, period_s: float) -> None:
+def follow(m: Memory, period_s: float) -> None:
     """Let a period pass."""
-    for s in range(m["said_age_s"].shape[0]):
-        m["said_age_s"][s] += period_s
+    for s in range(m.evidence.said_age_s.shape[0]):
+        m.evidence.said_age_s[s] += period_s
 
 
 @compiled
-def date(m: Any, first: int, last: int, age_s: float) -> None:
+def date(m: Memory, first: int, last: int, age_s: float) -> None:
     """Say how old the knowledge of the sources first .. last - 1 is."""
-    m["said_age_s"][first:last] = age_s
+    m.evidence.said_age_s[first:last] = age_s
 
 
 @compiled
-def say(m: Any, s: int, q: int, value: float, variance: float, floor: float, slack: float) -> None:
+def say(m: Memory, s: int, q: int, value: float, variance: float, floor: float, slack: float) -> None:
     """Fill a row: what source s says of quantity q."""
-    m["said"][s, q] = value
-    m["said_variance"][s, q] = variance
-    m["said_floor"][s, q] = floor
-    m["said_slack"][s, q] = slack
+    m.evidence.said[s, q] = value
+    m.evidence.said_variance[s, q] = variance
+    m.evidence.said_floor[s, q] = floor
+    m.evidence.said_slack[s, q] = slack
 
 
 @compiled
-def retract(m: Any, s: int) -> None:
+def retract(m: Memory, s: int) -> None:
     """Let a source say nothing."""
-    m["said_variance"][s] = np.inf
-    m["difference"][s] = 0.0
-    m["limit"][s] = np.inf
+    m.evidence.said_variance[s] = np.inf
+    m.evidence.difference[s] = 0.0
+    m.evidence.limit[s] = np.inf
 
 
 @compiled
-def pass_over(m: Any, s: int, q: int) -> None:
+def pass_over(m: Memory, s: int, q: int) -> None:
     """Leave a row unasked this time."""
-    m["difference"][s, q] = 0.0
-    m["limit"][s, q] = np.inf
+    m.evidence.difference[s, q] = 0.0
+    m.evidence.limit[s, q] = np.inf
 
 
 @compiled
-def fit(k: Any, m: Any, theta: Vector, P: Vector, unit: float) -> None:
+def fit(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float) -> None:
     """Fill what a model theta (p,), P (p, p) says of each quantity; unit: of its residuals."""
-    for q in range(m["fitted"].shape[0]):
+    for q in range(m.evidence.fitted.shape[0]):
         value, variance = of_belief(k, q, theta, P, unit)
         put_fitted(m, q, value, variance)
 
 
 @compiled
-def put_fitted(m: Any, q: int, value: float, variance: float) -> None:
+def put_fitted(m: Memory, q: int, value: float, variance: float) -> None:
     """Fill what is weighed of one quantity."""
-    m["fitted"][q] = value
-    m["fitted_variance"][q] = variance
+    m.evidence.fitted[q] = value
+    m.evidence.fitted_variance[q] = variance
 
 
 @compiled
-def of_belief(k: Any, q: int, theta: Vector, P: Vector, unit: float) -> tuple[float, float]:
+def of_belief(k: Constants, q: int, theta: Vector, P: Vector, unit: float) -> tuple[float, float]:
     """Return what a belief says of a quantity, c theta, and its variance."""
-    column = k["columns"][q]
-    return linalg.dot(column, theta), split(linalg.quadratic(P, column), k["columns_prior"][q], unit)
+    column = k.evidence.columns[q]
+    return linalg.dot(column, theta), split(linalg.quadratic(P, column), k.evidence.columns_prior[q], unit)
 
 
 @compiled
@@ -170,28 +160,28 @@ def split(variance: float, prior: float, unit: float) -> float:
 
 
 @compiled
-def weigh(k: Any, m: Any, s: int, q: int) -> float:
+def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
     """Return how many times its limit the fit has more of a quantity than a source says; fill `difference`, `limit`.
 
     Negative: less. 0 where less doesn't count, or nothing is said.
     """
-    difference = m["fitted"][q] - m["said"][s, q]
-    if m["said_variance"][s, q] == np.inf or (difference < 0.0 and k["less_counts"][s, q] == 0.0):
+    difference = m.evidence.fitted[q] - m.evidence.said[s, q]
+    if m.evidence.said_variance[s, q] == np.inf or (difference < 0.0 and k.evidence.less_counts[s, q] == 0.0):
         difference = 0.0 if np.isfinite(difference) else difference
-    std = np.sqrt(m["said_variance"][s, q] + m["fitted_variance"][q])
-    m["difference"][s, q] = difference
-    m["limit"][s, q] = m["said_slack"][s, q] + max(m["said_floor"][s, q], k["sigmas"][s] * std)
-    return float(difference / m["limit"][s, q])
+    std = np.sqrt(m.evidence.said_variance[s, q] + m.evidence.fitted_variance[q])
+    m.evidence.difference[s, q] = difference
+    m.evidence.limit[s, q] = m.evidence.said_slack[s, q] + max(m.evidence.said_floor[s, q], k.evidence.sigmas[s] * std)
+    return float(difference / m.evidence.limit[s, q])
 
 
 @compiled
-def excess(m: Any, s: int, q: int) -> float:
+def excess(m: Memory, s: int, q: int) -> float:
     """Return the same of a row as it was weighed last."""
-    return float(m["difference"][s, q] / m["limit"][s, q])
+    return float(m.evidence.difference[s, q] / m.evidence.limit[s, q])
 
 
 @compiled
-def foremost(m: Any, first: int, last: int, q: int) -> int:
+def foremost(m: Memory, first: int, last: int, q: int) -> int:
     """Return which of the sources first .. last - 1 contradicts a quantity most, as weighed last."""
     worst = first
     for s in range(first, last):

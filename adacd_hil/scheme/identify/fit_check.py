@@ -25,14 +25,13 @@ steps_P (t, p, p), steps_square, steps_rows (t,); factor (p, p), apart, later (p
 second sample goes, and half as many come.
 """
 
-from typing import Any
-
 import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import Vector
 from adacd_hil.scheme.detect.external_torque import LARGEST_UNIT
+from adacd_hil.scheme.memory import Constants, FitCheckConstants, Memory
 from adacd_hil.scheme.model.regressor import A5
 from adacd_hil.settings.configuration import Settings
 
@@ -66,78 +65,62 @@ SMALLEST_UNIT = 0.1
 """Least unit of the variances; the rest of it as `sensitivity` has it."""
 
 
-def constants_of(settings: Settings) -> dict[str, Vector]:
+def constants_of(settings: Settings) -> FitCheckConstants:
     """Return `step_samples`: learnt samples from one step to the next."""
     learn_s = settings.bus.period_s * settings.certified.learn_every
-    return {"step_samples": np.array(max(round(STEP_S / learn_s), 1))}
-
-
-def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name, of a model with this many parameters."""
-    of_samples = ("samples_kept", "samples_every", "samples_left_out")
-    return {
-        **dict.fromkeys(("fit_square", "fit_rows", "fit_samples", "steps_used", *of_samples), ()),
-        "samples_W": (ROOM, JOINTS, count),
-        "samples_tau": (ROOM, JOINTS),
-        "steps_theta": (STEPS, count),
-        "steps_P": (STEPS, count, count),
-        "steps_square": (STEPS,),
-        "steps_rows": (STEPS,),
-        "factor": (count, count),
-        **dict.fromkeys(("apart", "later"), (count,)),
-    }
+    return FitCheckConstants(step_samples=max(round(STEP_S / learn_s), 1))
 
 
 @compiled
-def begin(m: Any) -> None:
+def begin(m: Memory) -> None:
     """Begin a fit."""
-    m["steps_used"] = 0.0
-    m["fit_square"] = 0.0
-    m["fit_rows"] = 0.0
-    m["fit_samples"] = 0.0
-    m["samples_kept"] = 0.0
-    m["samples_every"] = FIRST_EVERY
-    m["samples_left_out"] = 0.0
+    m.fit_check.steps_used = 0.0
+    m.fit_check.fit_square = 0.0
+    m.fit_check.fit_rows = 0.0
+    m.fit_check.fit_samples = 0.0
+    m.fit_check.samples_kept = 0.0
+    m.fit_check.samples_every = FIRST_EVERY
+    m.fit_check.samples_left_out = 0.0
 
 
 @compiled
-def add_residual(m: Any, square: float) -> None:
+def add_residual(m: Memory, square: float) -> None:
     """Take in the residual of a row that is learnt, squared, over its variance."""
-    m["fit_square"] += square
-    m["fit_rows"] += 1.0
+    m.fit_check.fit_square += square
+    m.fit_check.fit_rows += 1.0
 
 
 @compiled
-def follow(k: Any, m: Any, W_f: Vector, tau_f: Vector) -> None:
+def follow(k: Constants, m: Memory, W_f: Vector, tau_f: Vector) -> None:
     """Take in that the fit has learnt a sample, W_f (n, p), tau_f (n,) of the filter by which it is tested."""
     _keep_sample(m, W_f, tau_f)
-    m["fit_samples"] += 1.0
-    if m["fit_samples"] % k["step_samples"] != 0.0:
+    m.fit_check.fit_samples += 1.0
+    if m.fit_check.fit_samples % k.fit_check.step_samples != 0.0:
         return
-    s = int(m["steps_used"]) % m["steps_rows"].shape[0]
-    m["steps_theta"][s] = m["belief"]
-    m["steps_P"][s] = m["P_belief"]
-    m["steps_square"][s] = m["fit_square"]
-    m["steps_rows"][s] = m["fit_rows"]
-    m["steps_used"] += 1.0
+    s = int(m.fit_check.steps_used) % m.fit_check.steps_rows.shape[0]
+    m.fit_check.steps_theta[s] = m.models.belief
+    m.fit_check.steps_P[s] = m.models.P_belief
+    m.fit_check.steps_square[s] = m.fit_check.fit_square
+    m.fit_check.steps_rows[s] = m.fit_check.fit_rows
+    m.fit_check.steps_used += 1.0
 
 
 @compiled
-def _keep_sample(m: Any, W_f: Vector, tau_f: Vector) -> None:
-    m["samples_left_out"] += 1.0
-    if m["samples_left_out"] < m["samples_every"]:
+def _keep_sample(m: Memory, W_f: Vector, tau_f: Vector) -> None:
+    m.fit_check.samples_left_out += 1.0
+    if m.fit_check.samples_left_out < m.fit_check.samples_every:
         return
-    m["samples_left_out"] = 0.0
-    kept, room = int(m["samples_kept"]), m["samples_tau"].shape[0]
+    m.fit_check.samples_left_out = 0.0
+    kept, room = int(m.fit_check.samples_kept), m.fit_check.samples_tau.shape[0]
     if kept == room:
         kept = room // 2
         for s in range(kept):
-            m["samples_W"][s] = m["samples_W"][2 * s]
-            m["samples_tau"][s] = m["samples_tau"][2 * s]
-        m["samples_every"] *= 2.0
-    m["samples_W"][kept] = W_f
-    m["samples_tau"][kept] = tau_f
-    m["samples_kept"] = kept + 1.0
+            m.fit_check.samples_W[s] = m.fit_check.samples_W[2 * s]
+            m.fit_check.samples_tau[s] = m.fit_check.samples_tau[2 * s]
+        m.fit_check.samples_every *= 2.0
+    m.fit_check.samples_W[kept] = W_f
+    m.fit_check.samples_tau[kept] = tau_f
+    m.fit_check.samples_kept = kept + 1.0
 
 
 @compiled
@@ -147,78 +130,83 @@ def unit_of(square: float, rows: float) -> float:
 
 
 @compiled
-def late_square(m: Any) -> float:
+def late_square(m: Memory) -> float:
     """Return u of the later half of the fit, so that what touched its beginning doesn't count; 1 of a short one."""
-    used = int(m["steps_used"])
+    used = int(m.fit_check.steps_used)
     if used < 2:
         return 1.0
-    steps = m["steps_rows"].shape[0]
+    steps = m.fit_check.steps_rows.shape[0]
     s = max(used // 2 - 1, used - steps) % steps
-    return float((m["fit_square"] - m["steps_square"][s]) / max(m["fit_rows"] - m["steps_rows"][s], 1.0))
+    return float(
+        (m.fit_check.fit_square - m.fit_check.steps_square[s])
+        / max(m.fit_check.fit_rows - m.fit_check.steps_rows[s], 1.0)
+    )
 
 
 @compiled
-def _better_square(m: Any, s: int) -> float:
+def _better_square(m: Memory, s: int) -> float:
     """Return u of the residuals up to step s, or of those after it, the smaller."""
-    early = m["steps_square"][s] / max(m["steps_rows"][s], 1.0)
-    late = (m["fit_square"] - m["steps_square"][s]) / max(m["fit_rows"] - m["steps_rows"][s], 1.0)
+    early = m.fit_check.steps_square[s] / max(m.fit_check.steps_rows[s], 1.0)
+    late = (m.fit_check.fit_square - m.fit_check.steps_square[s]) / max(
+        m.fit_check.fit_rows - m.fit_check.steps_rows[s], 1.0
+    )
     return float(min(early, late))
 
 
 @compiled
-def last_step_before_change(k: Any, m: Any) -> int:
+def last_step_before_change(k: Constants, m: Memory) -> int:
     """Return the number of the last step, from 0, of which the whole fit is no continuation; NONE if it is of all.
 
     Where only its later samples don't bear it out, that is the last step of all. -1: no step is old enough.
     """
-    used, oldest = int(m["steps_used"]), max(int(m["steps_used"]) - m["steps_rows"].shape[0], 0)
+    used, oldest = int(m.fit_check.steps_used), max(int(m.fit_check.steps_used) - m.fit_check.steps_rows.shape[0], 0)
     changed = last_step_before_contradiction(k, m)
-    if changed != NONE or m["is_payload"] != 0.0:
+    if changed != NONE or m.models.is_payload != 0.0:
         return changed
     for number in range(oldest, used):
-        if not later_share(k, m, number % m["steps_rows"].shape[0]) <= 1.0:
+        if not later_share(k, m, number % m.fit_check.steps_rows.shape[0]) <= 1.0:
             return used - 1
     return NONE
 
 
 @compiled
-def last_step_before_contradiction(k: Any, m: Any) -> int:
+def last_step_before_contradiction(k: Constants, m: Memory) -> int:
     """Return the number of the last step before the fit changed, or a sample stands out; NONE where neither does."""
     changed = last_unsteady_step(m)
     first = first_unexplained(m)
-    return changed if changed != NONE or first < 0 else int(first // k["step_samples"]) - 1
+    return changed if changed != NONE or first < 0 else int(first // k.fit_check.step_samples) - 1
 
 
 @compiled
-def first_unexplained(m: Any) -> int:
+def first_unexplained(m: Memory) -> int:
     """Return which of the fit's learnt samples, from 0, is the first that its belief doesn't explain; -1: none is."""
-    kept, first = int(m["samples_kept"]), -1
-    if m["is_payload"] != 0.0 or kept < 2:
+    kept, first = int(m.fit_check.samples_kept), -1
+    if m.models.is_payload != 0.0 or kept < 2:
         return first
     limit = limit_Nm(m)
     for s in range(kept - 1, -1, -1):
-        for i in range(m["samples_tau"].shape[1]):
+        for i in range(m.fit_check.samples_tau.shape[1]):
             if not abs(residual(m, s, i)) <= limit:
                 first = s
-    return first if first < 0 else int(first * m["samples_every"])
+    return first if first < 0 else int(first * m.fit_check.samples_every)
 
 
 @compiled
-def limit_Nm(m: Any) -> float:
+def limit_Nm(m: Memory) -> float:
     """Return the largest residual that the fit explains."""
     return float(LIMIT_NM + LIMIT_SHARE * better_rms(m))
 
 
 @compiled
-def residual(m: Any, s: int, joint: int) -> float:
+def residual(m: Memory, s: int, joint: int) -> float:
     """Return what the belief leaves of sample s, Nm."""
-    return float(-linalg.misfit(m["samples_W"][s, joint], m["belief"], m["samples_tau"][s, joint]))
+    return float(-linalg.misfit(m.fit_check.samples_W[s, joint], m.models.belief, m.fit_check.samples_tau[s, joint]))
 
 
 @compiled
-def last_unsteady_step(m: Any) -> int:
+def last_unsteady_step(m: Memory) -> int:
     """Return the number of the last step, from 0, since which the fit has changed; NONE if it hasn't."""
-    used, steps = int(m["steps_used"]), m["steps_rows"].shape[0]
+    used, steps = int(m.fit_check.steps_used), m.fit_check.steps_rows.shape[0]
     for number in range(used - 1, max(used - steps, 0) - 1, -1):
         if not changed_share(m, number % steps) <= 1.0:
             return number
@@ -226,23 +214,23 @@ def last_unsteady_step(m: Any) -> int:
 
 
 @compiled
-def changed_share(m: Any, s: int) -> float:
+def changed_share(m: Memory, s: int) -> float:
     """Return how much of its limit the distance of step s from the whole fit is."""
     return float(distance(m, s) / (STEADY * max(_better_square(m, s), SMALLEST_SQUARE)))
 
 
 @compiled
-def later_share(k: Any, m: Any, s: int) -> float:
+def later_share(k: Constants, m: Memory, s: int) -> float:
     """Return how much of its limit the torque is by which what came after step s differs from the fit."""
     if not find_later(m, s):
         return np.inf
     limit_Nm = LATER_NM + RMS_SHARE * better_rms(m)
-    limit_Nm += LEARNT_SHARE * k["residual_Nm"] * np.sqrt(_better_square(m, s))
-    has_gravity, unit, largest = int(k["base"]) > A5, unit_of(m["fit_square"], m["fit_rows"]), 0.0
-    for sample in range(int(m["samples_kept"])):
-        for i in range(m["samples_tau"].shape[1]):
-            w, allowed_Nm = m["samples_W"][sample, i], limit_Nm
-            torque = abs(linalg.dot(w, m["later"]))
+    limit_Nm += LEARNT_SHARE * k.residual_Nm * np.sqrt(_better_square(m, s))
+    has_gravity, unit, largest = int(k.first_offset) > A5, unit_of(m.fit_check.fit_square, m.fit_check.fit_rows), 0.0
+    for sample in range(int(m.fit_check.samples_kept)):
+        for i in range(m.fit_check.samples_tau.shape[1]):
+            w, allowed_Nm = m.fit_check.samples_W[sample, i], limit_Nm
+            torque = abs(linalg.dot(w, m.fit_check.later))
             if has_gravity and torque > limit_Nm:
                 allowed_Nm += np.sqrt(unit * _later_variance(m, s, w))
             largest = max(largest, torque / allowed_Nm)
@@ -250,26 +238,26 @@ def later_share(k: Any, m: Any, s: int) -> float:
 
 
 @compiled
-def better_rms(m: Any) -> float:
+def better_rms(m: Memory) -> float:
     """Return the root mean square of the residuals, Nm, of the earlier or later half of the samples, the smaller."""
-    squares, half = np.zeros(2), int(m["samples_kept"]) // 2
+    squares, half = np.zeros(2), int(m.fit_check.samples_kept) // 2
     for s in range(2 * half):
-        for i in range(m["samples_tau"].shape[1]):
+        for i in range(m.fit_check.samples_tau.shape[1]):
             squares[s // half] += residual(m, s, i) ** 2
-    return float(np.sqrt(np.min(squares) / max(half * m["samples_tau"].shape[1], 1)))
+    return float(np.sqrt(np.min(squares) / max(half * m.fit_check.samples_tau.shape[1], 1)))
 
 
 @compiled
-def distance(m: Any, s: int) -> float:
+def distance(m: Memory, s: int) -> float:
     """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of step s and the fit; inf if there is none.
 
     In units of the square roots of P_0's diagonal. Leaves the Cholesky factor in `factor`, and in `apart` the vector
     whose square the distance is.
     """
-    P_0, P, L, x = m["steps_P"][s], m["P_belief"], m["factor"], m["apart"]
+    P_0, P, L, x = m.fit_check.steps_P[s], m.models.P_belief, m.fit_check.factor, m.fit_check.apart
     for j in range(x.shape[0]):
         scale = np.sqrt(P_0[j, j])
-        x[j] = (m["belief"][j] - m["steps_theta"][s, j]) / scale
+        x[j] = (m.models.belief[j] - m.fit_check.steps_theta[s, j]) / scale
         for n in range(j + 1):
             L[j, n] = ((1.0 + REGULAR) * P_0[j, n] - P[j, n]) / (scale * np.sqrt(P_0[n, n]))
     if not linalg.factor(L, 0.0):
@@ -279,24 +267,24 @@ def distance(m: Any, s: int) -> float:
 
 
 @compiled
-def find_later(m: Any, s: int) -> bool:
+def find_later(m: Memory, s: int) -> bool:
     """Fill `later` (p,): the model of what came after step s less that of the fit; False if there is none."""
     if not distance(m, s) < np.inf:
         return False
-    x, P_0 = m["apart"], m["steps_P"][s]
-    linalg.solve_upper(m["factor"], x)
+    x, P_0 = m.fit_check.apart, m.fit_check.steps_P[s]
+    linalg.solve_upper(m.fit_check.factor, x)
     for j in range(x.shape[0]):
         x[j] /= np.sqrt(P_0[j, j])
     for j in range(x.shape[0]):
-        m["later"][j] = linalg.dot(m["P_belief"][j], x)
+        m.fit_check.later[j] = linalg.dot(m.models.P_belief[j], x)
     return True
 
 
 @compiled
-def _later_variance(m: Any, s: int, w: Vector) -> float:
+def _later_variance(m: Memory, s: int, w: Vector) -> float:
     """Return w P (P_0 - P)^-1 P w', with what `distance` has left in `factor`."""
-    x = m["apart"]
+    x = m.fit_check.apart
     for j in range(x.shape[0]):
-        x[j] = linalg.dot(m["P_belief"][j], w) / np.sqrt(m["steps_P"][s, j, j])
-    linalg.solve_lower(m["factor"], x)
+        x[j] = linalg.dot(m.models.P_belief[j], w) / np.sqrt(m.fit_check.steps_P[s, j, j])
+    linalg.solve_lower(m.fit_check.factor, x)
     return float(np.sum(x * x))

@@ -25,13 +25,13 @@ that came to a torque by place, all 0 if none did; missing_rms_Nm (n,): what was
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.memory import Constants, Memory, TermConstants
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.model.regressor import PLACE_TERMS
 from adacd_hil.settings.configuration import Settings
@@ -50,53 +50,37 @@ FIRST_S, LONGEST_S = 2.0, 16.0
 """Learnt samples of which the first question is asked while the arm monitors, and each later one."""
 
 
-def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
+def constants_of(settings: Settings, prior_std: Vector) -> TermConstants:
     """Return `evidence_std` (f,), and `evidence_first`, `evidence_longest` in learnt samples. prior_std (p,)."""
     learn_s = settings.bus.period_s * settings.certified.learn_every
-    return {
-        "evidence_std": np.concatenate([prior_std, np.full(JOINTS * PLACE_TERMS, EXPECTED_NM)]),
-        "evidence_first": np.array(round(FIRST_S / learn_s)),
-        "evidence_longest": np.array(round(LONGEST_S / learn_s)),
-    }
-
-
-def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name, of a model with this many parameters and a ring so long."""
-    full = count + JOINTS * PLACE_TERMS
-    columns = (JOINTS, PLACE_TERMS)
-    return {
-        "X_old": columns, "X_f": columns, "X_learnt": columns, "ring_X": (waiting, *columns),
-        "evidence_L": (JOINTS, full, full), "evidence_M": (full, full),
-        "evidence_b": (full,), "evidence_basic": (full,), "evidence_full": (full,), "evidence_row": (full,),
-        "evidence_scale": (full,),
-        "evidence_said": (JOINTS * PLACE_TERMS,),
-        "evidence_yy": (), "evidence_weight": (JOINTS,), "evidence_ways": (JOINTS, 2),
-        "evidence_samples": (), "evidence_wanted": (),
-        "missing_rms_Nm": (JOINTS,),
-    }  # fmt: skip
+    return TermConstants(
+        prior_std=np.concatenate([prior_std, np.full(JOINTS * PLACE_TERMS, EXPECTED_NM)]),
+        first=round(FIRST_S / learn_s),
+        longest=round(LONGEST_S / learn_s),
+    )
 
 
 @compiled
-def forget(m: Any) -> None:
+def forget(m: Memory) -> None:
     """Forget the columns that were filtered."""
-    m["X_f"][:] = 0.0
-    m["X_learnt"][:] = 0.0
+    m.missing_torque.X_f[:] = 0.0
+    m.missing_torque.X_learnt[:] = 0.0
 
 
 @compiled
-def rest(m: Any) -> None:
+def rest(m: Memory) -> None:
     """Begin with a filter that has seen this pose for ever."""
-    m["X_f"][:] = m["X"]
+    m.missing_torque.X_f[:] = m.regressor.X
 
 
 @compiled
-def follow(m: Any, rates: Vector, smoothing: float, is_seen: bool) -> None:
+def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
     """Take the columns X (n, PLACE_TERMS) over one period to what is learnt from; after a gap the filter resumes.
 
     rates (3,): what one period does to the filter, see `filter_bank.FirstOrderHold`; smoothing: to the pole behind it.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
-    X, X_old, X_f, X_learnt = m["X"], m["X_old"], m["X_f"], m["X_learnt"]
+    X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt
     for i in range(X.shape[0]):
         for term in range(PLACE_TERMS):
             if is_seen:
@@ -106,94 +90,94 @@ def follow(m: Any, rates: Vector, smoothing: float, is_seen: bool) -> None:
 
 
 @compiled
-def keep(m: Any, slot: int) -> None:
+def keep(m: Memory, slot: int) -> None:
     """Put the columns of this sample into a slot of the ring, where they wait with the row of the regressor."""
-    m["ring_X"][slot] = m["X_learnt"]
+    m.missing_torque.ring_X[slot] = m.missing_torque.X_learnt
 
 
 @compiled
-def clear(k: Any, m: Any) -> None:
+def clear(k: Constants, m: Memory) -> None:
     """Begin anew: with another arm, as one with another payload, or with a certificate."""
     _clear_sums(m)
-    m["evidence_said"][:] = 0.0
-    m["missing_rms_Nm"][:] = 0.0
-    m["evidence_wanted"] = k["evidence_first"]
+    m.missing_torque.said[:] = 0.0
+    m.missing_torque.rms_Nm[:] = 0.0
+    m.missing_torque.wanted = k.missing_torque.first
 
 
 @compiled
-def _clear_sums(m: Any) -> None:
-    m["evidence_L"][:] = 0.0
-    m["evidence_b"][:] = 0.0
-    m["evidence_yy"] = 0.0
-    m["evidence_weight"][:] = 0.0
-    m["evidence_ways"][:] = 0.0
-    m["evidence_samples"] = 0.0
+def _clear_sums(m: Memory) -> None:
+    m.missing_torque.L[:] = 0.0
+    m.missing_torque.b[:] = 0.0
+    m.missing_torque.yy = 0.0
+    m.missing_torque.weight[:] = 0.0
+    m.missing_torque.ways[:] = 0.0
+    m.missing_torque.samples = 0.0
 
 
 @compiled
-def add(k: Any, m: Any, slot: int, joint: int) -> None:
+def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
     """Take in the row of a joint from a slot of the ring, which is learnt; one that moves slowly tells nothing."""
-    if m["ring_still"][slot, joint] > STILL:
+    if m.ring.still[slot, joint] > STILL:
         return
-    v, count = m["evidence_row"], m["belief"].shape[0]
-    R = m["ring_R"][slot, joint] + k["correlated"] * _rough_variance(k, m, joint)
+    v, count = m.missing_torque.row, m.models.belief.shape[0]
+    R = m.ring.R[slot, joint] + k.correlated * _rough_variance(k, m, joint)
     v[:] = 0.0
-    v[:count] = m["ring_W"][slot, joint]
-    v[count + PLACE_TERMS * joint : count + PLACE_TERMS * (joint + 1)] = m["ring_X"][slot, joint]
-    r = -linalg.misfit(v, k["prior"], m["ring_tau"][slot, joint])
-    L, b = m["evidence_L"][joint], m["evidence_b"]
+    v[:count] = m.ring.W[slot, joint]
+    v[count + PLACE_TERMS * joint : count + PLACE_TERMS * (joint + 1)] = m.missing_torque.ring_X[slot, joint]
+    r = -linalg.misfit(v, k.prior, m.ring.tau[slot, joint])
+    L, b = m.missing_torque.L[joint], m.missing_torque.b
     for j in range(v.shape[0]):
         if v[j] != 0.0:
             b[j] += v[j] * r / R
             for n in range(j + 1):
                 L[j, n] += v[j] * v[n] / R
-    m["evidence_ways"][joint, 1 if v[int(k["first_coulomb"]) + joint] > 0.0 else 0] += 1.0
-    m["evidence_yy"] += r * r / R
-    m["evidence_weight"][joint] += 1.0 / R
+    m.missing_torque.ways[joint, 1 if v[int(k.first_coulomb) + joint] > 0.0 else 0] += 1.0
+    m.missing_torque.yy += r * r / R
+    m.missing_torque.weight[joint] += 1.0 / R
 
 
 @compiled
-def _rough_variance(k: Any, m: Any, joint: int) -> float:
+def _rough_variance(k: Constants, m: Memory, joint: int) -> float:
     """Return what a velocity that is noisier than the settings say leaves in what is learnt, Nm²: an encoder's steps.
 
     At low speed they come slowly, so they count as the model's error does.
     """
     total = 0.0
-    for j in range(m["M"].shape[1]):
-        total += (m["velocity_roughness"][j] - 1.0) * m["M"][joint, j] ** 2
-    return float(filter_bank.VELOCITY_STD_SHARE**2 * k["velocity_variance"][filter_bank.LEARNT] * total)
+    for j in range(m.regressor.M.shape[1]):
+        total += (m.sensitivity.velocity_roughness[j] - 1.0) * m.regressor.M[joint, j] ** 2
+    return float(filter_bank.VELOCITY_STD_SHARE**2 * k.noise.velocity_variance[filter_bank.LEARNT] * total)
 
 
 @compiled
-def is_found_in_time(k: Any, m: Any) -> bool:
+def is_found_in_time(k: Constants, m: Memory) -> bool:
     """Take in that a sample was learnt while the arm monitors; once in a while tell whether two stretches agree."""
-    m["evidence_samples"] += 1.0
-    if m["evidence_samples"] < m["evidence_wanted"]:
+    m.missing_torque.samples += 1.0
+    if m.missing_torque.samples < m.missing_torque.wanted:
         return False
     is_said = is_found(k, m)
-    said = m["evidence_full"][m["belief"].shape[0] :].copy()
+    said = m.missing_torque.full[m.models.belief.shape[0] :].copy()
     is_agreed = _is_said_again(k, m)
     if is_said:
-        m["evidence_said"][:] = said
-    m["evidence_wanted"] = min(2.0 * m["evidence_wanted"], k["evidence_longest"])
+        m.missing_torque.said[:] = said
+    m.missing_torque.wanted = min(2.0 * m.missing_torque.wanted, k.missing_torque.longest)
     _clear_sums(m)
     return is_agreed
 
 
 @compiled
-def is_found(k: Any, m: Any) -> bool:
+def is_found(k: Constants, m: Memory) -> bool:
     """Tell whether the place explains what the model leaves of all samples; fill `missing_rms_Nm` (n,)."""
-    m["missing_rms_Nm"][:] = 0.0
-    if k["position_torque_Nm"] != 0.0:
+    m.missing_torque.rms_Nm[:] = 0.0
+    if k.position_torque_Nm != 0.0:
         return False
-    basic, full = m["evidence_basic"], m["evidence_full"]
-    without = _log_evidence(m, m["evidence_b"], _scale_of(k, m, False), basic)
-    gain = _log_evidence(m, m["evidence_b"], _scale_of(k, m, True), full) - without
+    basic, full = m.missing_torque.basic, m.missing_torque.full
+    without = _log_evidence(m, m.missing_torque.b, _scale_of(k, m, False), basic)
+    gain = _log_evidence(m, m.missing_torque.b, _scale_of(k, m, True), full) - without
     if not (gain > GAIN and _squares_left(m, full) < (1.0 - SHARE) * _squares_left(m, basic)):
         return False
     largest = 0.0
-    for i in range(m["missing_rms_Nm"].shape[0]):
-        ways = m["evidence_ways"][i]
+    for i in range(m.missing_torque.rms_Nm.shape[0]):
+        ways = m.missing_torque.ways[i]
         if np.min(ways) >= LEAST_BACK * np.sum(ways):
             largest = max(largest, _rms_Nm(m, i))
     if largest > LEAST_NM:
@@ -202,28 +186,33 @@ def is_found(k: Any, m: Any) -> bool:
 
 
 @compiled
-def _scale_of(k: Any, m: Any, is_by_place: bool) -> Vector:
+def _scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
     """Return the prior's deviations (f,) of the model, and of the columns by place or 0 for them."""
-    scale, count = m["evidence_scale"], m["belief"].shape[0]
-    scale[:] = k["evidence_std"]
+    scale, count = m.missing_torque.scale, m.models.belief.shape[0]
+    scale[:] = k.missing_torque.prior_std
     if not is_by_place:
         scale[count:] = 0.0
-    return scale  # type: ignore[no-any-return]
+    return scale
 
 
 @compiled
-def _is_said_again(k: Any, m: Any) -> bool:
+def _is_said_again(k: Constants, m: Memory) -> bool:
     """Tell whether what an earlier stretch has said explains this one, of which `evidence_basic` is the model."""
-    m["missing_rms_Nm"][:] = 0.0
-    said, count, basic, full = m["evidence_said"], m["belief"].shape[0], m["evidence_basic"], m["evidence_full"]
-    if k["position_torque_Nm"] != 0.0 or not np.any(said != 0.0):
+    m.missing_torque.rms_Nm[:] = 0.0
+    said, count, basic, full = (
+        m.missing_torque.said,
+        m.models.belief.shape[0],
+        m.missing_torque.basic,
+        m.missing_torque.full,
+    )
+    if k.position_torque_Nm != 0.0 or not np.any(said != 0.0):
         return False
-    b = m["evidence_row"]
-    b[:] = m["evidence_b"]
-    for i in range(m["evidence_L"].shape[0]):
+    b = m.missing_torque.row
+    b[:] = m.missing_torque.b
+    for i in range(m.missing_torque.L.shape[0]):
         for j in range(count):
             for n in range(said.shape[0]):
-                b[j] -= m["evidence_L"][i, count + n, j] * said[n]
+                b[j] -= m.missing_torque.L[i, count + n, j] * said[n]
     _log_evidence(m, b, _scale_of(k, m, False), full)
     full[count : count + said.shape[0]] = said
     left = _squares_left(m, basic)
@@ -235,31 +224,31 @@ def _is_said_again(k: Any, m: Any) -> bool:
 
 
 @compiled
-def _fill_missing(m: Any) -> None:
-    for i in range(m["missing_rms_Nm"].shape[0]):
-        m["missing_rms_Nm"][i] = _rms_Nm(m, i)
+def _fill_missing(m: Memory) -> None:
+    for i in range(m.missing_torque.rms_Nm.shape[0]):
+        m.missing_torque.rms_Nm[i] = _rms_Nm(m, i)
 
 
 @compiled
-def _rms_Nm(m: Any, joint: int) -> float:
+def _rms_Nm(m: Memory, joint: int) -> float:
     """Return by how much the two models differ on a joint's samples."""
-    apart = m["evidence_row"]
+    apart = m.missing_torque.row
     for j in range(apart.shape[0]):
-        apart[j] = m["evidence_full"][j] - m["evidence_basic"][j]
-    square = linalg.quadratic(m["evidence_L"][joint], apart)
-    return float(np.sqrt(square / max(m["evidence_weight"][joint], 1e-12)))
+        apart[j] = m.missing_torque.full[j] - m.missing_torque.basic[j]
+    square = linalg.quadratic(m.missing_torque.L[joint], apart)
+    return float(np.sqrt(square / max(m.missing_torque.weight[joint], 1e-12)))
 
 
 @compiled
-def _log_evidence(m: Any, b: Vector, s: Vector, x: Vector) -> float:
+def _log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
     """Return the log evidence of the columns with a deviation s (f,) above 0, up to what all have; fill x (f,)."""
-    M, count, log_det = m["evidence_M"], s.shape[0], 0.0
+    M, count, log_det = m.missing_torque.M, s.shape[0], 0.0
     for j in range(count):
         x[j] = s[j] * b[j]
         for n in range(j + 1):
             total = 0.0
-            for i in range(m["evidence_L"].shape[0]):
-                total += m["evidence_L"][i, j, n]
+            for i in range(m.missing_torque.L.shape[0]):
+                total += m.missing_torque.L[i, j, n]
             M[j, n] = s[j] * total * s[n] + (1.0 if n == j else 0.0)
     linalg.factor(M, 1e-12)
     for j in range(count):
@@ -273,17 +262,17 @@ def _log_evidence(m: Any, b: Vector, s: Vector, x: Vector) -> float:
 
 
 @compiled
-def _squares_left(m: Any, x: Vector) -> float:
+def _squares_left(m: Memory, x: Vector) -> float:
     """Return Σ (r - v x)² / R."""
-    total = m["evidence_yy"] - 2.0 * linalg.dot(x, m["evidence_b"])
-    for i in range(m["evidence_L"].shape[0]):
-        total += linalg.quadratic(m["evidence_L"][i], x)
+    total = m.missing_torque.yy - 2.0 * linalg.dot(x, m.missing_torque.b)
+    for i in range(m.missing_torque.L.shape[0]):
+        total += linalg.quadratic(m.missing_torque.L[i], x)
     return float(max(total, 0.0))
 
 
-def describe(m: Any) -> list[str]:
+def describe(m: Memory) -> list[str]:
     """Say how large the torque is that the model lacks, in one line; none where none was found."""
-    missing_Nm = m["missing_rms_Nm"].tolist()
+    missing_Nm = m.missing_torque.rms_Nm.tolist()
     if not any(missing_Nm):
         return []
     torques = " and ".join(f"{rms:.3f} Nm rms in joint {i + 1}" for i, rms in enumerate(missing_Nm))

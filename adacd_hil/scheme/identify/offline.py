@@ -36,7 +36,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -453,11 +453,11 @@ def _fit_trace(
     estimate: ModelEstimate,
     settings: OfflineSettings,
     theta_M: Vector,
-    **options: Any,
+    **options: bool | int | Vector | _Rows,
 ) -> _Trace:
-    """Run a record through the smoothed filter of the fit."""
+    """Run a record through the smoothed filter of the fit; options: of `_trace`."""
     cutoff_rad_s = settings.fit_cutoff_rad_s
-    return _trace(model, record, estimate, settings, cutoff_rad_s, theta_M, is_smoothed=True, **options)
+    return _trace(model, record, estimate, settings, cutoff_rad_s, theta_M, is_smoothed=True, **options)  # type: ignore[arg-type]
 
 
 def _trace(

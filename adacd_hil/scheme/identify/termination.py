@@ -29,12 +29,11 @@ A fit is complete after its shortest time when
 Then the model is frozen, friction coefficients below zero put to zero, and tested on motion that it was not fitted to.
 """
 
-from typing import Any
-
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import Vector
+from adacd_hil.scheme.memory import Constants, Memory, Motion
 
 EXCITATION_EVERY = 64
 """Samples between two looks at the smallest eigenvalue: it takes 4 µs, the rest of a step less than 1 µs."""
@@ -43,24 +42,15 @@ _SWEEPS = 12
 """Most sweeps of Jacobi's method. Convergence is quadratic; 6 sweeps reach rounding for 9 x 9."""
 
 
-def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name, of the certified scheme with this many parameters."""
-    return {
-        **dict.fromkeys(("samples", "tested", "test_limit_Nm", "excitation", "condition"), ()),
-        **dict.fromkeys(("q_low", "q_high", "dq_low", "dq_high"), (JOINTS,)),
-        **dict.fromkeys(("information", "scratch"), (count, count)),
-    }
-
-
 @compiled
-def begin(m: Any) -> None:
+def begin(motion: Motion) -> None:
     """Forget the evidence: where and how fast the joints have been, and what motion has shown."""
-    m["samples"] = 0.0
-    m["q_low"][:] = np.inf
-    m["q_high"][:] = -np.inf
-    m["dq_low"][:] = np.inf
-    m["dq_high"][:] = -np.inf
-    m["information"][:] = 0.0
+    motion.samples = 0.0
+    motion.q_low[:] = np.inf
+    motion.q_high[:] = -np.inf
+    motion.dq_low[:] = np.inf
+    motion.dq_high[:] = -np.inf
+    motion.information[:] = 0.0
 
 
 @compiled
@@ -103,13 +93,13 @@ def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
 
 
 @compiled
-def gather(m: Any, q: Vector, dq: Vector, W_f: Vector, period_s: float) -> bool:
+def gather(motion: Motion, q: Vector, dq: Vector, W_f: Vector, period_s: float) -> bool:
     """Take a sample into the ranges of motion and the information; tell whether a look at its eigenvalues is due."""
-    widen(q, m["q_low"], m["q_high"])
-    widen(dq, m["dq_low"], m["dq_high"])
-    add_information(W_f, period_s, m["information"])
-    m["samples"] += 1.0
-    return bool(m["samples"] % EXCITATION_EVERY == 0.0)
+    widen(q, motion.q_low, motion.q_high)
+    widen(dq, motion.dq_low, motion.dq_high)
+    add_information(W_f, period_s, motion.information)
+    motion.samples += 1.0
+    return bool(motion.samples % EXCITATION_EVERY == 0.0)
 
 
 @compiled
@@ -166,47 +156,47 @@ def _rotate(matrix: Vector, j: int, k: int) -> None:
 
 
 @compiled
-def begin_fit(m: Any) -> None:
+def begin_fit(m: Memory) -> None:
     """Begin a fit of the certified scheme."""
-    begin(m)
-    m["excitation"] = 0.0
-    m["condition"] = np.inf
+    begin(m.motion)
+    m.fit.excitation = 0.0
+    m.fit.condition = np.inf
 
 
 @compiled
-def follow(k: Any, m: Any, q: Vector, dq: Vector, W_f: Vector) -> bool:
+def follow(k: Constants, m: Memory, q: Vector, dq: Vector, W_f: Vector) -> bool:
     """Take a sample, W_f (n, p), into the evidence of a fit; tell whether that is complete."""
-    if gather(m, q, dq, W_f, k["period_s"]):
-        smallest, largest = eigenvalue_range(m["information"], k["scale"], m["scratch"])
-        m["excitation"] = smallest
-        m["condition"] = largest / smallest if smallest > 0.0 else np.inf
+    if gather(m.motion, q, dq, W_f, k.period_s):
+        smallest, largest = eigenvalue_range(m.motion.information, k.scale, m.motion.scratch)
+        m.fit.excitation = smallest
+        m.fit.condition = largest / smallest if smallest > 0.0 else np.inf
     return is_complete(k, m)
 
 
 @compiled
-def begin_test(k: Any, m: Any, square: float) -> None:
+def begin_test(k: Constants, m: Memory, square: float) -> None:
     """Begin the test of a frozen model. square: mean square of the fit's residuals over that of the settings."""
-    m["tested"] = 0.0
-    m["test_limit_Nm"] = test_limit_Nm(k, square)
-    m["dq_low"][:] = np.inf
-    m["dq_high"][:] = -np.inf
+    m.fit.tested = 0.0
+    m.fit.test_limit_Nm = test_limit_Nm(k, square)
+    m.motion.dq_low[:] = np.inf
+    m.motion.dq_high[:] = -np.inf
 
 
 @compiled
-def test(k: Any, m: Any, dq: Vector, tau_ext_hat: Vector) -> int:
+def test(k: Constants, m: Memory, dq: Vector, tau_ext_hat: Vector) -> int:
     """Take a sample into the test; return whether it is refuted, -1, passed, 1, or goes on, 0.
 
     Where a joint rests nothing is proven.
     """
-    m["tested"] += 1.0
-    widen(dq, m["dq_low"], m["dq_high"])
+    m.fit.tested += 1.0
+    widen(dq, m.motion.dq_low, m.motion.dq_high)
     has_moved = True
     for i in range(dq.shape[0]):
-        if not (abs(tau_ext_hat[i]) <= m["test_limit_Nm"]):
+        if not (abs(tau_ext_hat[i]) <= m.fit.test_limit_Nm):
             return -1
-        fastest = max(m["dq_high"][i], -m["dq_low"][i])
-        has_moved = has_moved and fastest >= k["velocity_rad_s"]
-    is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
+        fastest = max(m.motion.dq_high[i], -m.motion.dq_low[i])
+        has_moved = has_moved and fastest >= k.velocity_rad_s
+    is_long = m.fit.tested >= k.test_cycles[int(m.models.is_payload)]
     return 1 if is_long and has_moved else 0
 
 
@@ -216,63 +206,65 @@ TEST_SHARE = 6.0
 
 
 @compiled
-def is_complete(k: Any, m: Any) -> bool:
+def is_complete(k: Constants, m: Memory) -> bool:
     """Tell whether the evidence for a fit is complete, from the constants `k` and the state `m` of the kernel."""
-    is_payload = m["is_payload"] != 0.0
-    if m["samples"] < k["fit_cycles"][1 if is_payload else 0]:
+    is_payload = m.models.is_payload != 0.0
+    if m.motion.samples < k.fit_cycles[1 if is_payload else 0]:
         return False
-    for j in range(m["belief"].shape[0]):
-        if not (m["P_belief"][j, j] <= k["enough_std"][j] ** 2):
+    for j in range(m.models.belief.shape[0]):
+        if not (m.models.P_belief[j, j] <= k.enough_std[j] ** 2):
             return False
     if is_payload:
         return True
-    if not (m["excitation"] >= k["excitation_Nm2s"] and m["condition"] <= k["condition"]):
+    if not (m.fit.excitation >= k.excitation_Nm2s and m.fit.condition <= k.condition):
         return False
-    return bool(has_moved(m["q_low"], m["q_high"], m["dq_low"], m["dq_high"], k["travel_rad"], k["velocity_rad_s"]))
+    return bool(
+        has_moved(m.motion.q_low, m.motion.q_high, m.motion.dq_low, m.motion.dq_high, k.travel_rad, k.velocity_rad_s)
+    )
 
 
 @compiled
-def test_limit_Nm(k: Any, square: float) -> float:
+def test_limit_Nm(k: Constants, square: float) -> float:
     """Return how large |tau_ext_hat| of the slowest filter may become in a test.
 
     square: mean square of the fit's residuals over that of the settings. An arm that its fit explains well is asked for
     as much in the test: what stays below `beta_Nm` only may be a touch that was half learnt.
     """
-    return float(min(k["beta_Nm"], TEST_NM + TEST_SHARE * k["residual_Nm"] * np.sqrt(square)))
+    return float(min(k.beta_Nm, TEST_NM + TEST_SHARE * k.residual_Nm * np.sqrt(square)))
 
 
-def describe_missing(k: Any, m: Any, names: tuple[str, ...], units: dict[str, str]) -> list[str]:
+def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dict[str, str]) -> list[str]:
     """Say, a line each, what a fit waits for and which motion would show it; `k`, `m` as for `is_complete`."""
     lines = []
-    joints = m["q_low"].shape[0]
-    travel, speed = float(np.degrees(k["travel_rad"])), float(np.degrees(k["velocity_rad_s"]))
-    enough_samples = k["fit_cycles"][int(m["is_payload"])]
-    if m["samples"] < enough_samples:
-        lines.append(f"{m['samples']:.0f} samples in a row are undisturbed, {enough_samples:.0f} needed")
-    if m["is_payload"] == 0.0:
-        if not m["excitation"] >= k["excitation_Nm2s"]:
+    joints = m.motion.q_low.shape[0]
+    travel, speed = float(np.degrees(k.travel_rad)), float(np.degrees(k.velocity_rad_s))
+    enough_samples = k.fit_cycles[int(m.models.is_payload)]
+    if m.motion.samples < enough_samples:
+        lines.append(f"{m.motion.samples:.0f} samples in a row are undisturbed, {enough_samples:.0f} needed")
+    if m.models.is_payload == 0.0:
+        if not m.fit.excitation >= k.excitation_Nm2s:
             lines.append(
-                f"the motion excites the parameters by {m['excitation']:.2g} Nm² s, certified.excitation_Nm2s = "
-                f"{k['excitation_Nm2s']:.2g} needed: move the arm further and faster"
+                f"the motion excites the parameters by {m.fit.excitation:.2g} Nm² s, certified.excitation_Nm2s = "
+                f"{k.excitation_Nm2s:.2g} needed: move the arm further and faster"
             )
-        if not m["condition"] <= k["condition"]:
+        if not m.fit.condition <= k.condition:
             lines.append(
-                f"the parameters can't be told apart: condition {m['condition']:.2g}, certified.condition = "
-                f"{k['condition']:.2g} allowed: a motion that shows each of them, or a model with fewer "
+                f"the parameters can't be told apart: condition {m.fit.condition:.2g}, certified.condition = "
+                f"{k.condition:.2g} allowed: a motion that shows each of them, or a model with fewer "
                 "(estimator.gravity of an arm that hardly feels it)"
             )
         for i in range(joints):
-            travelled = max(float(np.degrees(m["q_high"][i] - m["q_low"][i])), 0.0)
+            travelled = max(float(np.degrees(m.motion.q_high[i] - m.motion.q_low[i])), 0.0)
             if not travelled >= travel:
                 lines.append(f"joint {i + 1} has travelled {travelled:.1f} deg of {travel:g}: move it further")
-            fastest, slowest = float(np.degrees(m["dq_high"][i])), float(np.degrees(m["dq_low"][i]))
+            fastest, slowest = float(np.degrees(m.motion.dq_high[i])), float(np.degrees(m.motion.dq_low[i]))
             if not (fastest >= speed and slowest <= -speed):
                 lines.append(
                     f"joint {i + 1} has moved at {min(slowest, 0.0):.1f} to {max(fastest, 0.0):.1f} deg/s, "
                     f"{speed:g} both ways needed: move it back and forth"
                 )
     for j, name in enumerate(names):
-        std, enough = float(np.sqrt(m["P_belief"][j, j])), float(k["enough_std"][j])
+        std, enough = float(np.sqrt(m.models.P_belief[j, j])), float(k.enough_std[j])
         if not std <= enough:
             unit = units.get(name, "")
             lines.append(f"{name} is known to {std:.3g} {unit}, {enough:.3g} needed: {_motion_for(name)}")

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled
+from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import (
@@ -39,6 +39,7 @@ from adacd_hil.scheme.kernel.kernel_samples import (
     observe,
     put_between,
 )
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.supervisor.transitions import (
     AT_REST,
@@ -53,6 +54,7 @@ from adacd_hil.scheme.supervisor.transitions import (
     UNSEEN,
     WITHHELD,
 )
+from adacd_hil.structured import Structured
 
 # What a cycle does, as bits.
 MEASURE = 1  # the arm is at rest: measure the torque sensors' noise and zero
@@ -76,12 +78,12 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     k, m = constants[0], memory[0]
     if is_first:
         missing_torque.clear(k, m)
-    m["has_gap"] = 1.0
+    m.gaps.has_gap = 1.0
     filter_bank.forget(m)
     missing_torque.forget(m)
-    external_torque.forget(m)
+    external_torque.forget(m.wide)
     belief.begin_fit(k, m, is_payload)
-    if is_payload and int(k["base"]) > regressor.A5:
+    if is_payload and int(k.first_offset) > regressor.A5:
         filter_bank.rest(m)
         missing_torque.rest(m)
     fit_check.begin(m)
@@ -124,10 +126,10 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
             anchor.measure(k, m, out["tau_J"], observation & AT_REST != 0)
         if _filter(k, m, out, steps):
             observation &= ~UNSEEN
-        if not (np.all(np.isfinite(m["r"])) and np.all(np.isfinite(m["theta"]))):
+        if not (np.all(np.isfinite(m.filters.r)) and np.all(np.isfinite(m.models.theta))):
             observation |= NOT_A_NUMBER
     elif is_complete != 0:
-        m["has_gap"] = 1.0
+        m.gaps.has_gap = 1.0
     if mode & MEASURE and anchor.is_rest_refused(k, m):
         certificate.withhold(m, certificate.ANCHOR)
         observation |= WITHHELD
@@ -146,44 +148,44 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 
 
 @compiled
-def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
+def _filter(k: Constants, m: Memory, out: Any, steps: int) -> bool:
     """Take the bank to this sample and estimate the external torque that each filter sees.
 
     Return whether the filters took it in; after a gap they only resume.
     """
-    nominal_s: float = k["period_s"]
+    nominal_s: float = k.period_s
     period_s: float = out["period_s"][0]
-    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
+    is_seen = m.gaps.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
     each_s = period_s / steps if is_seen else period_s
     if is_seen:
         filter_bank.choose_rates(k, m, each_s)
         for between in range(1, steps):
-            put_between(m["last"], out["q"], out["dq"], out["tau_J"], between / steps, m["between"])
-            m["is_steady"] = 0.0
-            q, dq, tau_J = m["between"][0], m["between"][1], m["between"][2]
+            put_between(m.gaps.last, out["q"], out["dq"], out["tau_J"], between / steps, m.gaps.between)
+            m.gaps.is_steady = 0.0
+            q, dq, tau_J = m.gaps.between[0], m.gaps.between[1], m.gaps.between[2]
             _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
     sensitivity.follow_lost(k, m, out["dq"], max(steps, 1), period_s, is_seen)
     sensitivity.follow_torque_step(k, m, out["tau_J"])
     if not is_seen and np.max(np.abs(out["dq"])) > regressor.SLOW_RAD_S:
-        belief.pause(m, k["settle_cycles"])
-    m["is_steady"] = 1.0 if is_seen and steps == 1 else 0.0
+        belief.pause(m, k.settle_cycles)
+    m.gaps.is_steady = 1.0 if is_seen and steps == 1 else 0.0
     q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays as those above: it is compiled once
     _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
-    m["has_gap"] = 0.0
-    keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
-    out["tau_f"][:] = m["tau_f"][filter_bank.SLOW]
-    external_torque.predict(m["W_f"][filter_bank.SLOW], k["theta_cad"], out["tau_f_cad"])
+    m.gaps.has_gap = 0.0
+    keep_sample(out["q"], out["dq"], out["tau_J"], m.gaps.last)
+    out["tau_f"][:] = m.filters.tau_f[filter_bank.SLOW]
+    external_torque.predict(m.filters.W_f[filter_bank.SLOW], k.theta_cad, out["tau_f_cad"])
     for i in range(out["q"].shape[0]):
-        out["tau_ext_hat"][i] = m["r"][filter_bank.SLOW, i]
-        out["tau_f_hat"][i] = m["r"][filter_bank.SLOW, i] + out["tau_f"][i]
+        out["tau_ext_hat"][i] = m.filters.r[filter_bank.SLOW, i]
+        out["tau_f_hat"][i] = m.filters.r[filter_bank.SLOW, i] + out["tau_f"][i]
         out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
     return bool(is_seen)
 
 
 @compiled
 def _take_sample(
-    k: Any,
-    m: Any,
+    k: Constants,
+    m: Memory,
     q: Vector,
     dq: Vector,
     tau_J: Vector,
@@ -192,47 +194,56 @@ def _take_sample(
     tau_ext_wide_hat: Vector,
 ) -> None:
     """Take the bank over one period to a sample, or let it resume from there, and compare with the model in use."""
-    cutoff = k["cutoff"]
+    cutoff = k.cutoff
     regressor.fill(k, m, q, dq, tau_J, period_s)
     filter_bank.take_sample(k, m, tau_J, is_seen)
-    missing_torque.follow(m, m["rates"][:, filter_bank.LEARNT], k["smoothing"], is_seen)
-    filter_bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
-    if k["has_cross_talk"] != 0.0:
-        filter_bank.fill_cross_talk(m["tau_f"], int(k["first_cross_talk"]), m["W_f"])
-    filter_bank.smooth_learnt(k["smoothing"], m["W_f"], m["tau_f"], m["W_learnt"], m["tau_learnt"])
-    filter_bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
-    filter_bank.smooth(k["smoothing"], m["r"], m["y"])
-    still_rad_s, decay, smoothing = k["still_rad_s"], k["decay"], k["smoothing"]
+    missing_torque.follow(m, m.filters.rates[:, filter_bank.LEARNT], k.smoothing, is_seen)
+    filter_bank.fill_lag(cutoff, tau_J, m.filters.tau_f, int(k.first_offset) + q.shape[0], m.filters.W_f)
+    if k.has_cross_talk != 0.0:
+        filter_bank.fill_cross_talk(m.filters.tau_f, int(k.first_cross_talk), m.filters.W_f)
+    filter_bank.smooth_learnt(k.smoothing, m.filters.W_f, m.filters.tau_f, m.filters.W_learnt, m.filters.tau_learnt)
+    filter_bank.estimate_external(m.filters.tau_f, m.filters.W_f, m.models.theta, m.filters.r)
+    filter_bank.smooth(k.smoothing, m.filters.r, m.filters.y)
+    still_rad_s, decay, smoothing = k.still_rad_s, k.decay, k.smoothing
     sensitivity.follow_standstill(
-        dq, m["dq_old"], still_rad_s, decay, smoothing, m["still"], m["still_smooth"], m["low_speed"]
+        dq,
+        m.sensitivity.dq_old,
+        still_rad_s,
+        decay,
+        smoothing,
+        m.sensitivity.still,
+        m.sensitivity.still_smooth,
+        m.sensitivity.low_speed,
     )
-    sensitivity.follow_velocity_noise(k, m, dq, m["is_steady"] != 0.0)
+    sensitivity.follow_velocity_noise(k, m, dq, m.gaps.is_steady != 0.0)
     sensitivity.follow_friction(k, m, tau_J)
-    external_torque.undo_filter(m["r"][filter_bank.WIDE], k["decay"][filter_bank.WIDE], m["history"], tau_ext_wide_hat)
+    external_torque.undo_filter(
+        m.filters.r[filter_bank.WIDE], k.decay[filter_bank.WIDE], m.wide.history, tau_ext_wide_hat
+    )
 
 
 @compiled
-def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
+def _watch(k: Constants, m: Memory, out: Any, is_fresh: bool) -> int:
     """Compare with the thresholds; return CONTACT, COLLISION and the joints that are over, if any."""
     if is_fresh:
-        sensitivity.fill_thresholds(k, m, m["h"])
-        out["threshold"][:] = m["h"][filter_bank.SLOW]
+        sensitivity.fill_thresholds(k, m, m.sensitivity.h)
+        out["threshold"][:] = m.sensitivity.h[filter_bank.SLOW]
         sensitivity.fill_wide(k, m, filter_bank.WIDE)
-    joints = sensitivity.joints_over(m["y"], m["h"])
+    joints = sensitivity.joints_over(m.filters.y, m.sensitivity.h)
     if not joints:
         return 0
     observation = CONTACT | joints << CONTACT_SHIFT
-    for c in range(m["r"].shape[0], m["y"].shape[0]):
-        for i in range(m["y"].shape[1]):
-            if not (abs(m["y"][c, i]) <= max(k["collision_Nm"][i], m["h"][c, i])):
+    for c in range(m.filters.r.shape[0], m.filters.y.shape[0]):
+        for i in range(m.filters.y.shape[1]):
+            if not (abs(m.filters.y[c, i]) <= max(k.collision_Nm[i], m.sensitivity.h[c, i])):
                 observation |= COLLISION
     return observation
 
 
 @compiled
-def improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
+def improve(k: Constants, m: Memory, out: Any, is_touched: bool, mode: int) -> int:
     """Learn, test or refine by this sample; return what that has come to."""
-    was_free = m["recovering_cycles"] == 0.0
+    was_free = m.models.recovering_cycles == 0.0
     is_free = belief.is_free(k, m, is_touched)
     if is_touched and was_free and mode & (LEARN | TEST):
         sensitivity.strain(m, sensitivity.LARGEST_STRAIN)
@@ -244,18 +255,18 @@ def improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
         return _test(k, m, out["dq"])
     if mode & REFINE:
         return _refine(k, m) if is_free else 0
-    W_f, tau_f = m["W_f"][filter_bank.SLOW], m["tau_f"][filter_bank.SLOW]
+    W_f, tau_f = m.filters.W_f[filter_bank.SLOW], m.filters.tau_f[filter_bank.SLOW]
     if is_free and belief.learn_and_use(k, m):
         fit_check.follow(k, m, W_f, tau_f)
     is_complete = is_free and termination.follow(k, m, out["q"], out["dq"], W_f)
-    if not (is_complete and regressor.is_positive_definite(m["belief"])):
+    if not (is_complete and regressor.is_positive_definite(m.models.belief)):
         return 0
     certificate.withhold(m, certificate.contradicted_by(k, m))
-    return FITTED if m["withheld_by"] == certificate.NOTHING else WITHHELD
+    return FITTED if m.certificate.withheld_by == certificate.NOTHING else WITHHELD
 
 
 @compiled
-def _follow_noise(k: Any, m: Any, is_free: bool, mode: int) -> None:
+def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
     """Take in the noise of a sample that nothing touches, or throw away what waits to be told from a contact."""
     if not is_free:
         belief.discard(m)
@@ -267,14 +278,14 @@ def _follow_noise(k: Any, m: Any, is_free: bool, mode: int) -> None:
 
 
 @compiled
-def _test(k: Any, m: Any, dq: Vector) -> int:
+def _test(k: Constants, m: Memory, dq: Vector) -> int:
     """Take this sample into the test of the frozen model; return what that has come to."""
-    sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_test_share"], False)
+    sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_test_share, False)
     margin.follow_test(k, m)
-    result = termination.test(k, m, dq, m["r"][filter_bank.SLOW])
+    result = termination.test(k, m, dq, m.filters.r[filter_bank.SLOW])
     if result >= 0:
         return CERTIFIED if result > 0 else 0
-    if m["is_payload"] == 0.0:  # of a new one hands have been on the arm, and friction may depend on it
+    if m.models.is_payload == 0.0:  # of a new one hands have been on the arm, and friction may depend on it
         earlier.keep(k, m)
     is_by_place = missing_torque.is_found(k, m)
     certificate.withhold(m, certificate.BY_PLACE if is_by_place else certificate.NOTHING)
@@ -282,13 +293,13 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
 
 
 @compiled
-def _refine(k: Any, m: Any) -> int:
+def _refine(k: Constants, m: Memory) -> int:
     """Learn on beside the model in use, and let what was learnt take over after its test; return what is against it."""
-    sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_share"], True)
+    sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_share, True)
     sensitivity.relax(k, m)
     cause = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
     if belief.learn(k, m):
-        belief.wander(k["drift_std"], m["W_learnt"], k["period_s"] * k["learn_every"], m["P_belief"])
+        belief.wander(k.drift_std, m.filters.W_learnt, k.period_s * k.learn_every, m.models.P_belief)
         if missing_torque.is_found_in_time(k, m):
             cause = certificate.BY_PLACE
     if belief.test_candidate(k, m):
@@ -298,21 +309,21 @@ def _refine(k: Any, m: Any) -> int:
 
 
 @compiled
-def _fill_model(k: Any, m: Any, out: Any) -> None:
+def _fill_model(k: Constants, m: Memory, out: Any) -> None:
     """Fill what the block says of the model and the bank."""
-    base, joints = int(k["base"]), m["y"].shape[1]
-    for j in range(m["theta"].shape[0]):
+    base, joints = int(k.first_offset), m.filters.y.shape[1]
+    for j in range(m.models.theta.shape[0]):
         if j < base:
-            out["theta_hat"][j] = m["theta"][j]
+            out["theta_hat"][j] = m.models.theta[j]
         else:
-            out["theta_further"][j - base] = m["theta"][j]
-        out["theta_std"][j] = np.sqrt(max(m["P"][j, j], 0.0))
-    for c in range(m["y"].shape[0]):
+            out["theta_further"][j - base] = m.models.theta[j]
+        out["theta_std"][j] = np.sqrt(max(m.models.P[j, j], 0.0))
+    for c in range(m.filters.y.shape[0]):
         for i in range(joints):
-            out["tau_ext_bank"][c * joints + i] = m["y"][c, i]
+            out["tau_ext_bank"][c * joints + i] = m.filters.y[c, i]
             if out["threshold"][i] != np.inf:
-                out["threshold_bank"][c * joints + i] = m["h"][c, i]
-    out["excitation"][0] = m["excitation"]
-    out["condition"][0] = m["condition"]
-    out["promotions"][0] = m["promotions"]
-    out["quiet_s"][0] = m["tested"] * k["period_s"]
+                out["threshold_bank"][c * joints + i] = m.sensitivity.h[c, i]
+    out["excitation"][0] = m.fit.excitation
+    out["condition"][0] = m.fit.condition
+    out["promotions"][0] = m.models.promotions
+    out["quiet_s"][0] = m.fit.tested * k.period_s

@@ -5,11 +5,9 @@ Three structured arrays of one element, as in `kernel_samples`; the block is
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, packed, zeroed
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector, certified_layout
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import (
@@ -21,12 +19,13 @@ from adacd_hil.scheme.identify import (
     evidence,
     fit_check,
     missing_torque,
-    termination,
 )
 from adacd_hil.scheme.kernel.kernel_samples import Numbers, block_dtype, limits_of
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import CROSS_TALK, FRICTION_TERMS
+from adacd_hil.structured import Structured, packed, zeros_of
 
 SETTLED = 3.0
 """Time constants of the learnt filter for which a moving arm teaches nothing after a gap: the filter begins anew with a
@@ -111,110 +110,111 @@ def constants_of(settings: Settings) -> Structured:
     inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
     correlated = 2.0 / (cutoff[filter_bank.LEARNT] * period_s * certified.learn_every)
     prior_std = prior_std_of(settings)
-    values: dict[str, Any] = {
-        "period_s": period_s,
-        "second_cycles": round(1.0 / period_s),
-        "level_rad": settings.level_rad,
-        "cutoff": cutoff,
-        "decay": decay,
-        "weight_old": weight_old,
-        "weight_new": weight_new,
-        "base": base,
-        "first_coulomb": PARAMETER_NAMES.index("F_c1"),
-        "first_term": base + 2 * JOINTS,
-        "has_cross_talk": certified.cross_talk_std > 0.0,
-        "first_cross_talk": _first_of(CROSS_TALK, names),
-        "first_position": _first_of(POSITION_TERMS[0], names),
-        "position_torque_Nm": settings.arm.position_torque_Nm,
-        "width_rad_s": certified.coulomb_width_rad_s,
-        "stribeck_rad_s": certified.stribeck_rad_s,
-        "terms": [FRICTION_TERMS.index(term) for term in certified.friction_terms],
-        "dahl_rad": certified.dahl_rad,
-        "theta_cad": theta_cad,
-        "prior": prior_of(settings),
-        "prior_std": prior_std,
-        "enough_std": _enough_std_of(settings),
-        "drift_std": _drift_std_of(settings),
-        "model_error": _by_kind(certified.model_error, names),
-        "payload_direction": regressor.payload_direction(settings.arm.link_length_m, len(names), settings.gravity_m_s2),
-        "payload_std_kg": certified.payload_std_kg,
-        "payload_rest_std": _payload_rest_std_of(settings, len(names)),
-        "correlated": max(correlated, 1.0),
-        "residual_Nm": certified.residual_Nm,
-        "learn_every": certified.learn_every,
-        "recover_cycles": round(certified.recover_s / period_s),
-        "settle_cycles": round(SETTLED / (cutoff[filter_bank.LEARNT] * period_s)),
-        "fit_cycles": [round(fit_s / period_s) for fit_s in certified.fit_s],
-        "test_cycles": [round(test_s / period_s) for test_s in certified.test_s],
-        "beta_Nm": certified.beta_Nm,
-        "refine_cycles": round(certified.refine_s / period_s),
-        "excitation_Nm2s": certified.excitation_Nm2s,
-        "condition": certified.condition,
-        "scale": _by_kind((inertia, viscous, coulomb, gravity, coulomb, 0.005, coulomb), names)[: base + 2 * JOINTS],
-        "travel_rad": np.radians(settings.termination.travel_deg),
-        "velocity_rad_s": np.radians(settings.termination.velocity_deg_s),
-        "smoothing": math.exp(-certified.smoothing_rad_s * period_s),
-        **sensitivity.noise_constants(certified, period_s),
-        **anchor.constants_of(settings),
-        **doubt.constants_of(settings, len(names)),
-        **evidence.constants_of(settings, prior_std),
-        **fit_check.constants_of(settings),
-        **earlier.constants_of(),
-        **certificate.constants_of(settings),
-        **margin.constants_of(settings),
-        **missing_torque.constants_of(settings, prior_std),
-        "model_sigmas": certified.model_sigmas,
-        "torque_noise_Nm": certified.torque_noise_Nm,
-        "noise_sigmas": certified.noise_sigmas,
-        "still_rad_s": certified.still_rad_s,
-        "standstill_share": certified.standstill_share,
-        "collision_Nm": settings.detector.collision_Nm,
-        **limits_of(settings),
+    return packed(
+        Constants(
+            period_s=period_s,
+            second_cycles=round(1.0 / period_s),
+            level_rad=settings.level_rad,
+            cutoff=cutoff,
+            decay=decay,
+            weight_old=weight_old,
+            weight_new=weight_new,
+            first_offset=base,
+            first_coulomb=PARAMETER_NAMES.index("F_c1"),
+            first_term=base + 2 * JOINTS,
+            has_cross_talk=certified.cross_talk_std > 0.0,
+            first_cross_talk=_first_of(CROSS_TALK, names),
+            first_position=_first_of(POSITION_TERMS[0], names),
+            position_torque_Nm=settings.arm.position_torque_Nm,
+            width_rad_s=certified.coulomb_width_rad_s,
+            stribeck_rad_s=certified.stribeck_rad_s,
+            terms=np.array([FRICTION_TERMS.index(term) for term in certified.friction_terms]),
+            dahl_rad=np.array(certified.dahl_rad),
+            theta_cad=theta_cad,
+            prior=prior_of(settings),
+            prior_std=prior_std,
+            enough_std=_enough_std_of(settings),
+            drift_std=_drift_std_of(settings),
+            model_error=_by_kind(certified.model_error, names),
+            payload_direction=regressor.payload_direction(
+                settings.arm.link_length_m, len(names), settings.gravity_m_s2
+            ),
+            payload_std_kg=certified.payload_std_kg,
+            payload_rest_std=_payload_rest_std_of(settings, len(names)),
+            correlated=max(correlated, 1.0),
+            residual_Nm=certified.residual_Nm,
+            learn_every=certified.learn_every,
+            recover_cycles=round(certified.recover_s / period_s),
+            settle_cycles=round(SETTLED / (cutoff[filter_bank.LEARNT] * period_s)),
+            fit_cycles=np.array([round(fit_s / period_s) for fit_s in certified.fit_s]),
+            test_cycles=np.array([round(test_s / period_s) for test_s in certified.test_s]),
+            beta_Nm=certified.beta_Nm,
+            refine_cycles=round(certified.refine_s / period_s),
+            excitation_Nm2s=certified.excitation_Nm2s,
+            condition=certified.condition,
+            scale=_by_kind((inertia, viscous, coulomb, gravity, coulomb, 0.005, coulomb), names)[: base + 2 * JOINTS],
+            travel_rad=np.radians(settings.termination.travel_deg),
+            velocity_rad_s=np.radians(settings.termination.velocity_deg_s),
+            smoothing=math.exp(-certified.smoothing_rad_s * period_s),
+            noise=sensitivity.noise_constants(certified, period_s),
+            anchor=anchor.constants_of(settings),
+            doubt=doubt.constants_of(settings, len(names)),
+            evidence=evidence.constants_of(settings, prior_std),
+            fit_check=fit_check.constants_of(settings),
+            earlier=earlier.constants_of(),
+            last=certificate.constants_of(settings),
+            margin=margin.constants_of(settings),
+            missing_torque=missing_torque.constants_of(settings, prior_std),
+            model_sigmas=certified.model_sigmas,
+            torque_noise_Nm=certified.torque_noise_Nm,
+            noise_sigmas=certified.noise_sigmas,
+            still_rad_s=certified.still_rad_s,
+            standstill_share=certified.standstill_share,
+            collision_Nm=np.array(settings.detector.collision_Nm),
+            limits=limits_of(settings),
+        )
+    )
+
+
+def sizes_of(settings: Settings) -> dict[str, int]:
+    """Return the sizes that the records of `Memory` name."""
+    learn_s = settings.bus.period_s * settings.certified.learn_every
+    count = len(parameter_names(settings))
+    return {
+        "n": JOINTS,
+        "p": count,
+        "t": regressor.PLACE_TERMS,
+        "f": count + JOINTS * regressor.PLACE_TERMS,
+        "places": JOINTS * regressor.PLACE_TERMS,
+        "filters": settings.filter_count,
+        "channels": settings.channel_count,
+        "wide": external_torque.WIDE_SAMPLES + 1,
+        "waiting": max(round(settings.certified.hold_back_s / learn_s), 1),
+        "kinds": anchor.KINDS,
+        "sources": evidence.SOURCES,
+        "quantities": evidence.QUANTITIES,
+        "steps": fit_check.STEPS,
+        "room": fit_check.ROOM,
+        "causes": doubt.CAUSES,
+        "bins": margin.BINS,
     }
-    return packed(values)
 
 
 def new_memory(settings: Settings) -> Structured:
     """Return the memory before the first sample: a gap, and a belief that is the prior."""
-    certified = settings.certified
-    filter_count, channel_count = settings.filter_count, settings.channel_count
-    count = len(parameter_names(settings))
-    learn_s = settings.bus.period_s * certified.learn_every
-    waiting = max(round(certified.hold_back_s / learn_s), 1)
-    shapes: dict[str, tuple[int, ...]] = {
-        # of the kernel
-        **dict.fromkeys(("has_gap", "is_steady"), ()),
-        **dict.fromkeys(("last", "between"), (3, JOINTS)),
-        # each the module's own
-        **regressor.shapes_of(count),
-        **filter_bank.shapes_of(filter_count, channel_count, count),
-        **external_torque.shapes_of(),
-        **sensitivity.shapes_of(filter_count, channel_count),
-        **margin.shapes_of(channel_count),
-        **belief.shapes_of(count, waiting),
-        **termination.shapes_of(count),
-        **evidence.shapes_of(),
-        # beside the numbers: the work that is left to Python
-        **dict.fromkeys(("has_forgotten", "monitored_cycles", "until_push_cycles"), ()),
-        **anchor.shapes_of(),
-        **fit_check.shapes_of(count),
-        **earlier.shapes_of(),
-        **certificate.shapes_of(),
-        **doubt.shapes_of(),
-        **missing_torque.shapes_of(count, waiting),
-    }
-    memory = zeroed(shapes)
-    memory["has_gap"] = 1.0
-    memory["last"] = np.nan
-    state, constants = memory[0], constants_of(settings)[0]
+    memory = zeros_of(Memory, sizes_of(settings))
+    k: Constants = constants_of(settings)[0]
+    m: Memory = memory[0]
+    m.gaps.has_gap = 1.0
+    m.gaps.last[:] = np.nan
     prior, prior_std = prior_of(settings), prior_std_of(settings)
-    belief.begin(prior, prior_std, state["belief"], state["P_belief"])
-    belief.begin(prior, prior_std, state["theta"], state["P"])
-    sensitivity.begin(state)
-    evidence.begin(state)
-    anchor.begin(constants, state)
-    missing_torque.clear(constants, state)
-    certificate.begin(constants, state)
+    belief.begin(prior, prior_std, m.models.belief, m.models.P_belief)
+    belief.begin(prior, prior_std, m.models.theta, m.models.P)
+    sensitivity.begin(m)
+    evidence.begin(m)
+    anchor.begin(k, m)
+    missing_torque.clear(k, m)
+    certificate.begin(k, m)
     return memory
 
 

@@ -10,20 +10,23 @@ Samples and decisions are structured arrays with an element per cycle, `kernel_s
 (n, size). Course: constants and memory of what is common to both schemes, one element each.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled, record_of, released
-from adacd_hil.records import Request, SchemeState, Vector
+from adacd_hil.compiled import compiled, released
+from adacd_hil.records import JOINTS, ContactLevel, Request, SchemeState, Vector
 from adacd_hil.scheme.contact import contact_report, course
+from adacd_hil.scheme.contact.course import CourseConstants, CourseMemory
 from adacd_hil.scheme.kernel import certified_kernel, paper_kernel
-from adacd_hil.scheme.kernel.kernel_samples import INTERVAL, interval_s, put_sample
+from adacd_hil.scheme.kernel.kernel_samples import Interval, interval_s, put_sample
+from adacd_hil.scheme.memory import Sample
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.supervisor import supervisor
-from adacd_hil.scheme.supervisor.supervisor import IS_REACTING, LEARNING, among
+from adacd_hil.scheme.supervisor.supervisor import IS_REACTING, LEARNING, SupervisorConstants, SupervisorMemory, among
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, WITHHELD
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.structured import Structured, described, zeros_of
 
 # What Python has to do in a cycle, as bits.
 LEFT = 1  # a state was left
@@ -36,23 +39,43 @@ SECOND = 64  # a second of monitoring is over
 PUSHED = 128  # something pushes the arm at rest
 BEFORE_CONTACT = LEFT | REFUSED | TOOK_OVER | ACCEPTED
 
-DECISION = record_of(
-    *((name, np.uint8) for name in ("state", "previous_state", "fault", "reaction")),
-    *((name, np.int64) for name in ("contact_joints", "observation")),
-    ("is_model_valid", np.bool_),
-)
-"""What a cycle comes to. observation: bits of `Observation`."""
 
-_CONSTANTS = record_of(("supervisor", supervisor.CONSTANTS), ("contact", course.CONSTANTS))
-_MEMORY = record_of(
-    ("supervisor", supervisor.MEMORY),
-    ("contact", course.MEMORY),
-    ("interval", INTERVAL),
-    ("is_model_valid", np.int64),
-    ("is_refusing", np.int64),
-)
-"""is_model_valid: the model may be fed forward. is_refusing: there is something that the user may accept."""
+class Decision:
+    """What a cycle comes to. observation: bits of `Observation`."""
 
+    state: Annotated[int, np.uint8]
+    previous_state: Annotated[int, np.uint8]
+    fault: Annotated[int, np.uint8]
+    reaction: Annotated[int, np.uint8]
+    contact_joints: int
+    observation: int
+    is_model_valid: bool
+
+
+DECISION = described(Decision, {})
+
+
+class RunConstants:
+    """Constants of all that is common to both schemes."""
+
+    supervisor: SupervisorConstants
+    contact: CourseConstants
+
+
+class RunMemory:
+    """Memory of all that is common to both schemes.
+
+    is_model_valid: the model may be fed forward. is_refusing: there is something that the user may accept.
+    """
+
+    supervisor: SupervisorMemory
+    contact: CourseMemory
+    interval: Interval
+    is_model_valid: int
+    is_refusing: int
+
+
+_SIZES = {"n": JOINTS, "states": len(SchemeState), "levels": len(ContactLevel)}
 _IS_LEARNING = among(LEARNING)
 _CERTIFIED_MODE = np.zeros(len(SchemeState), np.int64)
 for _state, _mode in (
@@ -73,7 +96,7 @@ _PAPER_MODE[[SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED]] = pap
 
 def new_course(settings: Settings) -> tuple[Structured, Structured]:
     """Return constants and memory (1,) before the first cycle; when reports are due, the policy fills in."""
-    constants, memory = np.zeros(1, _CONSTANTS), np.zeros(1, _MEMORY)
+    constants, memory = zeros_of(RunConstants, _SIZES), zeros_of(RunMemory, _SIZES)
     supervisor.fill_constants(settings, constants["supervisor"][0])
     supervisor.begin(memory["supervisor"][0])
     course.begin(memory["contact"][0])
@@ -109,13 +132,13 @@ def certified_cycle(
     if run.supervisor.state == SchemeState.REACT and run.supervisor.origin == SchemeState.MONITOR:
         mode |= certified_kernel.WEIGH
     put_sample(block, sample, period_s)
-    promotions = memory[0]["promotions"]
+    promotions = memory[0].models.promotions
     observation = certified_kernel.step(constants, memory, block, sample.is_complete, sample.steps, mode)
     paper_kernel.step_beside(paper_constants, paper_memory, paper_block, sample, period_s, block[0])
     for j in range(values.size):
         blocks[place, j] = values[j]
     asked = decide(course_constants[0], run, sample, observation, decision)
-    if memory[0]["promotions"] != promotions:
+    if memory[0].models.promotions != promotions:
         asked |= TOOK_OVER
     if asked:
         return asked
@@ -138,25 +161,30 @@ def end_certified(
     k, m, out, run = constants[0], memory[0], block[0], course_memory[0]
     decision, contact, state = decisions[place], run.contact, run.supervisor.state
     contact_report.put_row(
-        rows, contact.kept_rows, out["q"], out["tau_ext_wide_hat"], m["wide_sigma"], m["wide_threshold"]
+        rows,
+        contact.kept_rows,
+        out["q"],
+        out["tau_ext_wide_hat"],
+        m.sensitivity.wide_sigma,
+        m.sensitivity.wide_threshold,
     )
     contact.kept_rows += 1
     asked = follow_contact(
-        course_constants[0], run, samples[place], decision, m["y"][filter_bank.WIDE], out["tau_ext_wide_hat"]
+        course_constants[0], run, samples[place], decision, m.filters.y[filter_bank.WIDE], out["tau_ext_wide_hat"]
     )
     is_disturbed = IS_REACTING[state] and _IS_LEARNING[run.supervisor.origin]
     is_reported = is_disturbed and contact.is_open == 0
-    if is_reported and m["has_forgotten"] == 0.0:
+    if is_reported and m.watch.has_forgotten == 0.0:
         asked |= FORGET
-    m["has_forgotten"] = 1.0 if is_reported else 0.0
+    m.watch.has_forgotten = 1.0 if is_reported else 0.0
     if state == SchemeState.MONITOR:
-        m["monitored_cycles"] += 1.0
-        if m["monitored_cycles"] >= k["second_cycles"]:
-            m["monitored_cycles"] = 0.0
+        m.watch.monitored_cycles += 1.0
+        if m.watch.monitored_cycles >= k.second_cycles:
+            m.watch.monitored_cycles = 0.0
             asked |= SECOND
-    if m["until_push_cycles"] > 0.0:
-        m["until_push_cycles"] = m["until_push_cycles"] - 1.0 if state == SchemeState.STOPPED else 0.0
-        if m["until_push_cycles"] == 0.0 and decision.contact_joints != 0 and state == SchemeState.STOPPED:
+    if m.watch.until_push_cycles > 0.0:
+        m.watch.until_push_cycles = m.watch.until_push_cycles - 1.0 if state == SchemeState.STOPPED else 0.0
+        if m.watch.until_push_cycles == 0.0 and decision.contact_joints != 0 and state == SchemeState.STOPPED:
             asked |= PUSHED
     return asked
 
@@ -207,7 +235,7 @@ def end_paper(
 
 
 @compiled
-def decide(k: Any, m: Any, sample: Any, observation: int, decision: Any) -> int:
+def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, decision: Decision) -> int:
     """Let the supervisor take in what the numbers say; return what asks Python for something before the contact."""
     asked, previous = 0, m.supervisor.state
     if sample.request == Request.ACCEPT:
@@ -227,7 +255,9 @@ def decide(k: Any, m: Any, sample: Any, observation: int, decision: Any) -> int:
 
 
 @compiled
-def follow_contact(k: Any, m: Any, sample: Any, decision: Any, tau_ext_hat: Vector, tau_ext: Vector) -> int:
+def follow_contact(
+    k: RunConstants, m: RunMemory, sample: Sample, decision: Decision, tau_ext_hat: Vector, tau_ext: Vector
+) -> int:
     """Take the contact's course on, and fill the decision; return REPORT if one is due."""
     is_due = course.follow(
         k.contact,

@@ -7,15 +7,17 @@ q, dq, tau_J and the measured period_s into the block; a period_s of 0 was not m
 Shapes: n joints; q, dq, tau_J (n,); last, between (3, n).
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured, compiled, float_fields, record_of
+from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, ArmBatch, ArmState, Layout, Vector
+from adacd_hil.scheme.memory import Limits, Sample
 from adacd_hil.scheme.supervisor.transitions import AT_REST, NOT_A_NUMBER, OVER_LIMIT, UNLOADED, UNSEEN
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.structured import Structured, described, float_fields
 
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.5, 1.5
 """Of the nominal period: the shortest and the longest interval of two samples that follow each other."""
@@ -30,14 +32,15 @@ class Numbers(NamedTuple):
     values: Vector
 
 
-SAMPLE = record_of(
-    *((name, np.int64) for name in ("cycle", "periods", "steps", "sampled_ns", "age", "fault", "request")),
-    *((name, np.int64) for name in ("is_complete", "is_enabled", "is_late")),
-    *((name, np.float64, (JOINTS,)) for name in ("q", "dq", "tau_J")),
-)
-"""What a cycle takes in: an ArmState, `age` that of its oldest value, and what is asked in this cycle."""
-INTERVAL = record_of(("is_measured", np.int64), ("is_known", np.int64), ("sampled_ns", np.int64))
-"""Whether intervals are measured, and when the last fresh sample was taken, if there was one."""
+SAMPLE = described(Sample, {"n": JOINTS})
+
+
+class Interval:
+    """Whether intervals are measured, and when the last fresh sample was taken, if there was one."""
+
+    is_measured: int
+    is_known: int
+    sampled_ns: int
 
 
 def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
@@ -61,11 +64,8 @@ def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
 
 
 @compiled
-def interval_s(m: Any, sample: Any) -> float:
-    """Return the time since the last fresh sample, s; 0 of the first, of none, and where it isn't measured.
-
-    m: a record of INTERVAL.
-    """
+def interval_s(m: Interval, sample: Sample) -> float:
+    """Return the time since the last fresh sample, s; 0 of the first, of none, and where it isn't measured."""
     if m.is_measured == 0 or sample.is_complete == 0:
         return 0.0
     period_s = (sample.sampled_ns - m.sampled_ns) * 1e-9 if m.is_known != 0 else 0.0
@@ -74,7 +74,7 @@ def interval_s(m: Any, sample: Any) -> float:
 
 
 @compiled
-def put_sample(block: Structured, sample: Any, period_s: float) -> None:
+def put_sample(block: Structured, sample: Sample, period_s: float) -> None:
     """Put a sample where the next step of a kernel finds it."""
     out = block[0]
     for i in range(out["q"].shape[0]):
@@ -89,36 +89,48 @@ def block_dtype(layout: Layout) -> np.dtype[np.void]:
     return float_fields({field.name: (field.size,) for field in layout.fields})
 
 
-def limits_of(settings: Settings) -> dict[str, Any]:
+def limits_of(settings: Settings) -> Limits:
     """Return the constants with which measurements alone are judged."""
-    return {
-        "position_limit_rad": settings.arm.position_limit_rad,
-        "velocity_limit_rad_s": settings.arm.velocity_limit_rad_s,
-        "rest_velocity_rad_s": settings.safety.rest_velocity_rad_s,
-        "rest_torque_Nm": settings.safety.rest_torque_Nm,
-    }
+    return Limits(
+        position_limit_rad=settings.arm.position_limit_rad,
+        velocity_limit_rad_s=settings.arm.velocity_limit_rad_s,
+        rest_velocity_rad_s=settings.safety.rest_velocity_rad_s,
+        rest_torque_Nm=settings.safety.rest_torque_Nm,
+    )
+
+
+class Judging(Protocol):
+    """Constants of either scheme."""
+
+    @property
+    def period_s(self) -> float:
+        """Nominal period, s."""
+
+    @property
+    def limits(self) -> Limits:
+        """By which measurements are judged."""
 
 
 @compiled
-def observe(k: Any, out: Any, steps: int, too_fast: int) -> int:
+def observe(k: Judging, out: Any, steps: int, too_fast: int) -> int:
     """Return what the measurements alone say, and UNSEEN; fill period_s with the nominal one where not measured.
 
     steps: periods since the fresh sample before it. too_fast: the bit of a joint beyond its velocity limit.
     """
     if out["period_s"][0] == 0.0:
-        out["period_s"][0] = max(steps, 1) * k["period_s"]
+        out["period_s"][0] = max(steps, 1) * k.period_s
     observation = AT_REST | UNLOADED | UNSEEN
     for i in range(out["q"].shape[0]):
         q, dq, tau_J = out["q"][i], out["dq"][i], out["tau_J"][i]
         if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):
             observation |= NOT_A_NUMBER
-        if not (abs(q) <= k["position_limit_rad"][i]):
+        if not (abs(q) <= k.limits.position_limit_rad[i]):
             observation |= OVER_LIMIT
-        if not (abs(dq) <= k["velocity_limit_rad_s"][i]):
+        if not (abs(dq) <= k.limits.velocity_limit_rad_s[i]):
             observation |= too_fast
-        if not (abs(dq) < k["rest_velocity_rad_s"]):
+        if not (abs(dq) < k.limits.rest_velocity_rad_s):
             observation &= ~AT_REST
-        if not (abs(tau_J) < k["rest_torque_Nm"]):
+        if not (abs(tau_J) < k.limits.rest_torque_Nm):
             observation &= ~UNLOADED
     return observation
 

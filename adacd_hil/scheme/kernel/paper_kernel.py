@@ -15,11 +15,12 @@ counts: T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is
 eq. (15) holds, then compares with its thresholds. What it comes to is in the block of the scheme in charge.
 """
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled, packed, zeroed
+from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector, scheme_layout
 from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.identify import estimator, termination
@@ -33,6 +34,7 @@ from adacd_hil.scheme.kernel.kernel_samples import (
     put_between,
     put_sample,
 )
+from adacd_hil.scheme.memory import Limits, Motion, Sample, Wide
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.supervisor.transitions import (
     ADAPTED,
@@ -43,6 +45,7 @@ from adacd_hil.scheme.supervisor.transitions import (
     UNSEEN,
 )
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.structured import Columns, PerJoint, PerParameter, Square, Structured, packed, zeros_of
 
 # What a cycle does, as bits: the estimator learns; thresholds are in force; a collision's report is not final yet.
 LEARN = 1
@@ -55,6 +58,56 @@ MOST_FILLED = 4
 5 ms the line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
 
 
+class PaperMemory:
+    """The memory of the paper's scheme. mode: of a step beside another scheme."""
+
+    has_gap: float
+    mode: float
+    Y_p: Columns
+    Y_h: Columns
+    input_old: Columns
+    S: Columns
+    W_f: Columns
+    tau_old: PerJoint
+    last: Annotated[Vector, "3 n"]
+    between: Annotated[Vector, "3 n"]
+    v: PerParameter
+    K: PerParameter
+    P: Square
+    motion: Motion
+    quiet_cycles: float
+    standstill: PerJoint
+    integral: PerJoint
+    peak: PerJoint
+    wide: Wide
+
+
+@dataclass(frozen=True)
+class PaperConstants:
+    """The constants of the paper's scheme: the filter b / (s + a) of eq. (3), and the settings."""
+
+    period_s: float
+    level_rad: float
+    a_rad_s: float
+    b_rad_s: float
+    dc_gain: float
+    decay: float
+    weight_old: float
+    weight_new: float
+    is_least_squares: float
+    P0: Vector
+    theta_cad: Vector
+    beta_Nm: float
+    hold_cycles: float
+    travel_rad: float
+    velocity_rad_s: float
+    excitation_Nm2s: float
+    scale: Vector
+    threshold_Nm: Vector
+    standstill_rad_s: float
+    limits: Limits
+
+
 def constants_of(settings: Settings) -> Structured:
     """Put the settings into the form that the compiled step reads."""
     count = len(settings.estimator.parameter_names)
@@ -62,54 +115,37 @@ def constants_of(settings: Settings) -> Structured:
     hold = filter_bank.first_order_hold(settings.filter.a_rad_s, settings.filter.b_rad_s, period_s)
     inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
     scale = (inertia,) * 3 + (viscous,) * 2 + (coulomb,) * 2 + (gravity,) * 2
-    values: dict[str, Any] = {
-        "period_s": period_s,
-        "level_rad": settings.level_rad,
-        "a_rad_s": settings.filter.a_rad_s,
-        "b_rad_s": settings.filter.b_rad_s,
-        "dc_gain": settings.filter.b_rad_s / settings.filter.a_rad_s,
-        "decay": hold.decay,
-        "weight_old": hold.weight_old,
-        "weight_new": hold.weight_new,
-        "is_least_squares": float(settings.estimator.law == "least_squares"),
-        "P0": settings.estimator.P0,
-        "theta_cad": settings.cad_theta if settings.arm.cad_theta else np.zeros(count),
-        "beta_Nm": settings.termination.beta_Nm,
-        "hold_cycles": round(settings.termination.hold_s / period_s),
-        "travel_rad": np.radians(settings.termination.travel_deg),
-        "velocity_rad_s": np.radians(settings.termination.velocity_deg_s),
-        "excitation_Nm2s": settings.termination.excitation_Nm2s,
-        "scale": scale[:count],
-        "threshold_Nm": settings.detector.threshold_Nm,
-        "standstill_rad_s": settings.detector.standstill_rad_s,
-        **limits_of(settings),
-    }
-    return packed(values)
+    return packed(
+        PaperConstants(
+            period_s=period_s,
+            level_rad=settings.level_rad,
+            a_rad_s=settings.filter.a_rad_s,
+            b_rad_s=settings.filter.b_rad_s,
+            dc_gain=settings.filter.b_rad_s / settings.filter.a_rad_s,
+            decay=hold.decay,
+            weight_old=hold.weight_old,
+            weight_new=hold.weight_new,
+            is_least_squares=float(settings.estimator.law == "least_squares"),
+            P0=np.array(settings.estimator.P0),
+            theta_cad=settings.cad_theta if settings.arm.cad_theta else np.zeros(count),
+            beta_Nm=settings.termination.beta_Nm,
+            hold_cycles=round(settings.termination.hold_s / period_s),
+            travel_rad=np.radians(settings.termination.travel_deg),
+            velocity_rad_s=np.radians(settings.termination.velocity_deg_s),
+            excitation_Nm2s=settings.termination.excitation_Nm2s,
+            scale=np.array(scale[:count]),
+            threshold_Nm=np.array(settings.detector.threshold_Nm),
+            standstill_rad_s=settings.detector.standstill_rad_s,
+            limits=limits_of(settings),
+        )
+    )
 
 
 def new_memory(parameter_count: int) -> Structured:
     """Return the memory before the first sample: a gap, with tau_f = 0, W_f = 0 and theta_hat = 0."""
-    joint, parameter = (JOINTS,), (parameter_count,)
-    columns, square = (JOINTS, parameter_count), (parameter_count, parameter_count)
-    shapes: dict[str, tuple[int, ...]] = {
-        **dict.fromkeys(("has_gap", "mode"), ()),
-        # filters
-        **dict.fromkeys(("Y_p", "Y_h", "input_old", "S", "W_f"), columns),
-        **dict.fromkeys(("last", "between"), (3, JOINTS)),
-        "tau_old": joint,
-        # estimator
-        **dict.fromkeys(("v", "K"), parameter),
-        "P": square,
-        # termination
-        **dict.fromkeys(("q_low", "q_high", "dq_low", "dq_high"), joint),
-        **dict.fromkeys(("information", "scratch"), square),
-        **dict.fromkeys(("samples", "quiet_cycles"), ()),
-        # contact
-        **dict.fromkeys(("standstill", "integral", "peak"), joint),
-        **external_torque.shapes_of(),
-    }
-    memory = zeroed(shapes)
-    memory["has_gap"] = 1.0
+    memory = zeros_of(PaperMemory, {"n": JOINTS, "p": parameter_count, "wide": external_torque.WIDE_SAMPLES + 1})
+    m: PaperMemory = memory[0]
+    m.has_gap = 1.0
     return memory
 
 
@@ -134,14 +170,14 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
     """
     c, m, out = constants[0], memory[0], block[0]
-    m["has_gap"] = 1.0
-    m["W_f"][:] = 0.0
+    m.has_gap = 1.0
+    m.W_f[:] = 0.0
     out["tau_f"][:] = 0.0
-    external_torque.forget(m)
-    m["mode"] = LEARN  # of a step beside; where it is in charge, the state says it
-    estimator.reset_gain(c["P0"], m["P"])
-    termination.begin(m)
-    m["quiet_cycles"] = 0.0
+    external_torque.forget(m.wide)
+    m.mode = LEARN  # of a step beside; where it is in charge, the state says it
+    estimator.reset_gain(c.P0, m.P)
+    termination.begin(m.motion)
+    m.quiet_cycles = 0.0
     out["quiet_s"][0] = 0.0
     out["excitation"][0] = 0.0
 
@@ -154,7 +190,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     REPORTING.
     """
     c, m, out = constants[0], memory[0], block[0]
-    period_s = c["period_s"]
+    period_s = c.period_s
     observation = observe(c, out, steps, OVER_LIMIT)
     is_fresh = is_complete != 0 and observation & NOT_A_NUMBER == 0
     if is_fresh:
@@ -166,95 +202,101 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
         if not (np.all(np.isfinite(out["tau_ext_hat"])) and np.all(np.isfinite(out["theta_hat"]))):
             observation |= NOT_A_NUMBER
     elif is_complete != 0:
-        m["has_gap"] = 1.0
+        m.has_gap = 1.0
     if mode & ARMED:
         return observation | _watch(c, m, out, period_s, is_fresh, mode & REPORTING != 0)
     out["threshold"][:] = np.inf
-    m["integral"][:] = 0.0
-    m["peak"][:] = 0.0
+    m.integral[:] = 0.0
+    m.peak[:] = 0.0
     return observation
 
 
 @compiled
-def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
+def _filter(c: PaperConstants, m: PaperMemory, out: Any, steps: int) -> tuple[bool, float]:
     """Take the filters to this sample and estimate the external torque with both models.
 
     Return whether they took it in, and the time that it stands for: the measured interval, after a gap the nominal one.
     """
-    a, b = c["a_rad_s"], c["b_rad_s"]
-    nominal_s: float = c["period_s"]
+    a, b = c.a_rad_s, c.b_rad_s
+    nominal_s: float = c.period_s
     period_s: float = out["period_s"][0]
     q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays as those of `between`: all is compiled once
-    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
+    is_seen = m.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
     if is_seen:
         step_s = period_s / steps
-        hold = filter_bank.FirstOrderHold(c["decay"], c["weight_old"], c["weight_new"])
+        hold = filter_bank.FirstOrderHold(c.decay, c.weight_old, c.weight_new)
         if step_s != nominal_s:
             hold = filter_bank.first_order_hold(a, b, step_s)
         for k in range(1, steps):
-            put_between(m["last"], out["q"], out["dq"], out["tau_J"], k / steps, m["between"])
-            _advance(c, m, m["between"][0], m["between"][1], m["between"][2], hold, out["tau_f"])
-            _compare(c, m, m["between"][1], hold.decay, out)
+            put_between(m.last, out["q"], out["dq"], out["tau_J"], k / steps, m.between)
+            _advance(c, m, m.between[0], m.between[1], m.between[2], hold, out["tau_f"])
+            _compare(c, m, m.between[1], hold.decay, out)
         _advance(c, m, q, dq, tau_J, hold, out["tau_f"])
         _compare(c, m, dq, hold.decay, out)
     else:
         period_s = nominal_s
-        regressor.fill_momentum(q, dq, m["Y_p"])
-        regressor.fill_remainder(q, dq, c["level_rad"], m["Y_h"])
-        filter_bank.resume(a, b, m["Y_p"], m["Y_h"], tau_J, m["input_old"], m["tau_old"], m["S"], m["W_f"])
-        m["has_gap"] = 0.0
-        _compare(c, m, dq, c["decay"], out)
-    keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
+        regressor.fill_momentum(q, dq, m.Y_p)
+        regressor.fill_remainder(q, dq, c.level_rad, m.Y_h)
+        filter_bank.resume(a, b, m.Y_p, m.Y_h, tau_J, m.input_old, m.tau_old, m.S, m.W_f)
+        m.has_gap = 0.0
+        _compare(c, m, dq, c.decay, out)
+    keep_sample(out["q"], out["dq"], out["tau_J"], m.last)
     return is_seen, period_s
 
 
 @compiled
 def _advance(
-    c: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector, hold: filter_bank.FirstOrderHold, tau_f: Vector
+    c: PaperConstants,
+    m: PaperMemory,
+    q: Vector,
+    dq: Vector,
+    tau_J: Vector,
+    hold: filter_bank.FirstOrderHold,
+    tau_f: Vector,
 ) -> None:
     """Take the filters over one period to a sample."""
-    a, b = c["a_rad_s"], c["b_rad_s"]
-    regressor.fill_momentum(q, dq, m["Y_p"])
-    regressor.fill_remainder(q, dq, c["level_rad"], m["Y_h"])
-    filter_bank.advance_torque(hold, m["tau_old"], tau_J, tau_f)
-    filter_bank.advance_regressor(hold, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"])
+    a, b = c.a_rad_s, c.b_rad_s
+    regressor.fill_momentum(q, dq, m.Y_p)
+    regressor.fill_remainder(q, dq, c.level_rad, m.Y_h)
+    filter_bank.advance_torque(hold, m.tau_old, tau_J, tau_f)
+    filter_bank.advance_regressor(hold, a, b, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
 
 
 @compiled
-def _compare(c: Any, m: Any, dq: Vector, decay: float, out: Any) -> None:
+def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: Any) -> None:
     """Compare the filtered torque with both predictions."""
-    external_torque.follow_standstill(dq, c["standstill_rad_s"], decay, m["standstill"])
-    external_torque.predict(m["W_f"], out["theta_hat"], out["tau_f_hat"])
-    external_torque.predict(m["W_f"], c["theta_cad"], out["tau_f_cad"])
-    external_torque.estimate_external(out["tau_f"], out["tau_f_hat"], c["dc_gain"], out["tau_ext_hat"])
-    external_torque.estimate_external(out["tau_f"], out["tau_f_cad"], c["dc_gain"], out["tau_ext_hat_cad"])
-    external_torque.undo_filter(out["tau_ext_hat"], c["decay"], m["history"], out["tau_ext_wide_hat"])
+    external_torque.follow_standstill(dq, c.standstill_rad_s, decay, m.standstill)
+    external_torque.predict(m.W_f, out["theta_hat"], out["tau_f_hat"])
+    external_torque.predict(m.W_f, c.theta_cad, out["tau_f_cad"])
+    external_torque.estimate_external(out["tau_f"], out["tau_f_hat"], c.dc_gain, out["tau_ext_hat"])
+    external_torque.estimate_external(out["tau_f"], out["tau_f_cad"], c.dc_gain, out["tau_ext_hat_cad"])
+    external_torque.undo_filter(out["tau_ext_hat"], c.decay, m.wide.history, out["tau_ext_wide_hat"])
 
 
 @compiled
-def _learn(c: Any, m: Any, out: Any, period_s: float) -> int:
+def _learn(c: PaperConstants, m: PaperMemory, out: Any, period_s: float) -> int:
     """Judge the estimate of this sample by eq. (15), then correct it; return ADAPTED if the adaptation is over."""
-    if termination.gather(m, out["q"], out["dq"], m["W_f"], period_s):
-        out["excitation"][0] = termination.eigenvalue_range(m["information"], c["scale"], m["scratch"])[0]
-    m["quiet_cycles"] = m["quiet_cycles"] + 1.0 if termination.is_quiet(out["tau_ext_hat"], c["beta_Nm"]) else 0.0
-    out["quiet_s"][0] = m["quiet_cycles"] * c["period_s"]
+    if termination.gather(m.motion, out["q"], out["dq"], m.W_f, period_s):
+        out["excitation"][0] = termination.eigenvalue_range(m.motion.information, c.scale, m.motion.scratch)[0]
+    m.quiet_cycles = m.quiet_cycles + 1.0 if termination.is_quiet(out["tau_ext_hat"], c.beta_Nm) else 0.0
+    out["quiet_s"][0] = m.quiet_cycles * c.period_s
     is_over = (
-        m["quiet_cycles"] >= c["hold_cycles"]
-        and out["excitation"][0] >= c["excitation_Nm2s"]
+        m.quiet_cycles >= c.hold_cycles
+        and out["excitation"][0] >= c.excitation_Nm2s
         and termination.has_moved(
-            m["q_low"], m["q_high"], m["dq_low"], m["dq_high"], c["travel_rad"], c["velocity_rad_s"]
+            m.motion.q_low, m.motion.q_high, m.motion.dq_low, m.motion.dq_high, c.travel_rad, c.velocity_rad_s
         )
     )
     R = 1.0 / period_s
-    estimator.update(m["W_f"], out["tau_f"], R, c["is_least_squares"] != 0.0, out["theta_hat"], m["P"], m["v"], m["K"])
+    estimator.update(m.W_f, out["tau_f"], R, c.is_least_squares != 0.0, out["theta_hat"], m.P, m.v, m.K)
     return ADAPTED if is_over else 0
 
 
 @compiled
-def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporting: bool) -> int:
+def _watch(c: PaperConstants, m: PaperMemory, out: Any, period_s: float, is_fresh: bool, is_reporting: bool) -> int:
     """Compare with the thresholds; return the joints that are over, and that any of it is a collision."""
     F_c = out["theta_hat"][regressor.F_C1 : regressor.F_C2 + 1]
-    external_torque.fill_threshold(c["threshold_Nm"], m["standstill"], F_c, out["threshold"])
+    external_torque.fill_threshold(c.threshold_Nm, m.standstill, F_c, out["threshold"])
     if is_fresh:
         external_torque.follow_contact(
             out["tau_ext_hat"],
@@ -262,8 +304,8 @@ def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporti
             out["threshold"],
             period_s,
             is_reporting,
-            m["integral"],
-            m["peak"],
+            m.integral,
+            m.peak,
         )
     joints = external_torque.joints_over(out["tau_ext_hat"], out["threshold"])
     return ANY_CONTACT | joints << CONTACT_SHIFT if joints else 0
@@ -271,7 +313,7 @@ def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporti
 
 @compiled
 def step_beside(
-    constants: Structured, memory: Structured, block: Structured, sample: Any, period_s: float, main: Any
+    constants: Structured, memory: Structured, block: Structured, sample: Sample, period_s: float, main: Any
 ) -> None:
     """Take a sample in beside the scheme in charge, and fill that one's block with what it comes to.
 
@@ -279,10 +321,10 @@ def step_beside(
     """
     m, own = memory[0], block[0]
     put_sample(block, sample, period_s)
-    observation = step(constants, memory, block, sample.is_complete, sample.steps, int(m["mode"]))
+    observation = step(constants, memory, block, sample.is_complete, sample.steps, int(m.mode))
     if observation & ADAPTED:
-        m["mode"] = ARMED
-    main["paper_is_armed"][0] = 1.0 if m["mode"] == ARMED else 0.0
+        m.mode = ARMED
+    main["paper_is_armed"][0] = 1.0 if m.mode == ARMED else 0.0
     for i in range(JOINTS):
         main["paper_tau_ext_hat"][i] = own["tau_ext_hat"][i]
         main["paper_threshold"][i] = own["threshold"][i]

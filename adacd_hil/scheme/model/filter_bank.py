@@ -51,11 +51,12 @@ tau_f (C, n); S, W_f, input_old (C, n, p); W_learnt (n, p), tau_learnt (n,). Uni
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import Vector
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.settings.configuration import Settings
 
 
@@ -154,49 +155,36 @@ def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> floa
     return 1.0 - (b * math.exp(-a * after_s) - a * math.exp(-b * after_s)) / (b - a)
 
 
-def shapes_of(filters: int, channels: int, count: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name, of a model with this many parameters."""
-    columns = (JOINTS, count)
-    return {
-        **dict.fromkeys(("input_old", "S", "W_f"), (filters, *columns)),
-        **dict.fromkeys(("tau_f", "tau_old", "r"), (filters, JOINTS)),
-        "rates": (3, filters),
-        "W_learnt": columns,
-        "tau_learnt": (JOINTS,),
-        "y": (channels, JOINTS),
-    }
-
-
 @compiled
-def forget(m: Any) -> None:
+def forget(m: Memory) -> None:
     """Forget the torque and the motion that were filtered."""
-    m["W_f"][:] = 0.0
-    m["tau_f"][:] = 0.0
-    m["W_learnt"][:] = 0.0
-    m["tau_learnt"][:] = 0.0
+    m.filters.W_f[:] = 0.0
+    m.filters.tau_f[:] = 0.0
+    m.filters.W_learnt[:] = 0.0
+    m.filters.tau_learnt[:] = 0.0
 
 
 @compiled
-def rest(m: Any) -> None:
+def rest(m: Memory) -> None:
     """Begin with filters that have seen this pose, and the torque that gravity makes there, for ever.
 
     From 0, that torque would be a step: the columns of the lag would have its derivative.
     """
-    for c in range(m["tau_f"].shape[0]):
-        m["W_f"][c] = m["Y_h"]
-        m["tau_f"][c] = m["tau_old"][c]
+    for c in range(m.filters.tau_f.shape[0]):
+        m.filters.W_f[c] = m.regressor.Y_h
+        m.filters.tau_f[c] = m.filters.tau_old[c]
 
 
 @compiled
-def choose_rates(k: Any, m: Any, period_s: float) -> None:
+def choose_rates(k: Constants, m: Memory, period_s: float) -> None:
     """Fill what one period does to each filter."""
-    decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
-    if period_s == k["period_s"]:
-        decay[:] = k["decay"]
-        old[:] = k["weight_old"]
-        new[:] = k["weight_new"]
+    decay, old, new = m.filters.rates[0], m.filters.rates[1], m.filters.rates[2]
+    if period_s == k.period_s:
+        decay[:] = k.decay
+        old[:] = k.weight_old
+        new[:] = k.weight_new
     else:
-        discretise(k["cutoff"], period_s, decay, old, new)
+        discretise(k.cutoff, period_s, decay, old, new)
 
 
 @compiled
@@ -207,20 +195,26 @@ def discretise(cutoff_rad_s: Vector, period_s: float, decay: Vector, weight_old:
 
 
 @compiled
-def take_sample(k: Any, m: Any, tau_J: Vector, is_seen: bool) -> None:
+def take_sample(k: Constants, m: Memory, tau_J: Vector, is_seen: bool) -> None:
     """Take all filters over one period to a sample, Y_p, Y_h of `m` and tau_J (n,); after a gap they resume from it.
 
     `rates` (3, C) of `m`: what the period does to each filter, see `FirstOrderHold`.
     """
-    rates = m["rates"]
-    for c in range(k["cutoff"].shape[0]):
-        a, tau_old, input_old, S, W_f = k["cutoff"][c], m["tau_old"][c], m["input_old"][c], m["S"][c], m["W_f"][c]
+    rates = m.filters.rates
+    for c in range(k.cutoff.shape[0]):
+        a, tau_old, input_old, S, W_f = (
+            k.cutoff[c],
+            m.filters.tau_old[c],
+            m.filters.input_old[c],
+            m.filters.S[c],
+            m.filters.W_f[c],
+        )
         if is_seen:
             hold = FirstOrderHold(rates[0, c], rates[1, c], rates[2, c])
-            advance_torque(hold, tau_old, tau_J, m["tau_f"][c])
-            advance_regressor(hold, a, a, m["Y_p"], m["Y_h"], input_old, S, W_f)
+            advance_torque(hold, tau_old, tau_J, m.filters.tau_f[c])
+            advance_regressor(hold, a, a, m.regressor.Y_p, m.regressor.Y_h, input_old, S, W_f)
         else:
-            resume(a, a, m["Y_p"], m["Y_h"], tau_J, input_old, tau_old, S, W_f)
+            resume(a, a, m.regressor.Y_p, m.regressor.Y_h, tau_J, input_old, tau_old, S, W_f)
 
 
 @compiled

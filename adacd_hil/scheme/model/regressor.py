@@ -36,13 +36,13 @@ on the last link of a tilted base; on the links before it are among the first tw
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.settings.scheme_settings import FRICTION_TERMS
 
 # Columns of the regressors, named so that no offset is written by hand.
@@ -218,32 +218,22 @@ def put_position_columns(X: Vector, first_column: int, Y_h: Vector) -> None:
             Y_h[i, first_column + term * joints + i] = X[i, term]
 
 
-def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name, of a model with this many parameters."""
-    return {
-        **dict.fromkeys(("Y_p", "Y_h"), (JOINTS, count)),
-        "M": (JOINTS, JOINTS),
-        "X": (JOINTS, PLACE_TERMS),
-        "bent": (2, JOINTS),
-    }
-
-
 @compiled
-def fill(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector, period_s: float) -> None:
+def fill(k: Constants, m: Memory, q: Vector, dq: Vector, tau_J: Vector, period_s: float) -> None:
     """Fill Y_p, Y_h (n, p), offsets and further friction included, X, and M (n, n) of the model in use."""
-    base, first_coulomb, count = int(k["base"]), int(k["first_coulomb"]), q.shape[0]
-    bend_bristles(dq, period_s, k["still_rad_s"], k["dahl_rad"], m["bent"])
-    fill_momentum(q, dq, m["Y_p"][:, :base])
-    fill_remainder(q, dq, k["level_rad"], m["Y_h"][:, :base])
+    base, first_coulomb, count = int(k.first_offset), int(k.first_coulomb), q.shape[0]
+    bend_bristles(dq, period_s, k.still_rad_s, k.dahl_rad, m.regressor.bent)
+    fill_momentum(q, dq, m.regressor.Y_p[:, :base])
+    fill_remainder(q, dq, k.level_rad, m.regressor.Y_h[:, :base])
     for i in range(count):
-        m["Y_h"][i, first_coulomb + i] = smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
-        m["Y_h"][i, base + i] = 1.0
-    speeds = k["still_rad_s"], k["width_rad_s"], k["stribeck_rad_s"]
-    fill_terms(dq, tau_J, k["terms"], speeds, m["bent"], base + 2 * count, m["Y_h"])
-    fill_position(q, m["X"])
-    if k["position_torque_Nm"] != 0.0:
-        put_position_columns(m["X"], int(k["first_position"]), m["Y_h"])
-    fill_mass_matrix(q, m["theta"], m["M"])
+        m.regressor.Y_h[i, first_coulomb + i] = smooth_sign(dq[i], k.still_rad_s, k.width_rad_s)
+        m.regressor.Y_h[i, base + i] = 1.0
+    speeds = k.still_rad_s, k.width_rad_s, k.stribeck_rad_s
+    fill_terms(dq, tau_J, k.terms, speeds, m.regressor.bent, base + 2 * count, m.regressor.Y_h)
+    fill_position(q, m.regressor.X)
+    if k.position_torque_Nm != 0.0:
+        put_position_columns(m.regressor.X, int(k.first_position), m.regressor.Y_h)
+    fill_mass_matrix(q, m.models.theta, m.regressor.M)
 
 
 def payload_direction(link_length_m: tuple[float, float], count: int, gravity_m_s2: float) -> Vector:

@@ -5,13 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.compiled import Structured
 from adacd_hil.records import JOINTS, BriefedEvent, Event, SchemeState, Vector
 from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.identify import anchor, certificate, earlier, missing_torque
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import CommonCause
 from adacd_hil.scheme.model.regressor import A5
+from adacd_hil.structured import Structured
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
@@ -109,7 +109,7 @@ class CertificateWatch:
         by_place = anchor.describe_place(k, m)
         text = f"{anchor.describe(k, m)}; {margin.describe_sight(m)}; {known_by}{by_place}"
         self._is_standing = True
-        self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))
+        self._certified.append(_Certified(m.models.theta.copy(), m.models.P.copy(), bool(m.models.is_payload), text))
         return BriefedEvent.of(Event(level, "certificate", text), self._certified_in_brief(known_by))
 
     def _certified_in_brief(self, known_by: str) -> str:
@@ -123,7 +123,7 @@ class CertificateWatch:
     def _known_by(self) -> str:
         if self._vouched_against:
             return BY_WORD + self._vouched_against
-        if self._memory["has_lapsed"]:
+        if self._memory.earlier.has_lapsed:
             return BY_FITS_THAT_AGREE
         is_compared = certificate.is_compared(self._memory)
         return f"friction and inertia: within what {self._last} allows" if is_compared else THIS_RUN_ONLY
@@ -131,12 +131,12 @@ class CertificateWatch:
     def refuse(self, is_reading: bool) -> Event | None:
         """Take in, before its traces are gone, that the reading at rest or a fit is refused; return what is said."""
         before = self._refusal
-        cause = _Cause.READING if is_reading else _CAUSES[int(self._memory["withheld_by"])]
-        offsets = slice(int(self._constants["base"]), int(self._constants["base"]) + JOINTS)
+        cause = _Cause.READING if is_reading else _CAUSES[int(self._memory.certificate.withheld_by)]
+        offsets = slice(int(self._constants.first_offset), int(self._constants.first_offset) + JOINTS)
         self._refusal = _Refusal(
             cause,
             anchor.judged_Nm(self._memory),
-            np.sqrt(np.diag(self._memory["P_belief"])[offsets]),
+            np.sqrt(np.diag(self._memory.models.P_belief)[offsets]),
             self._describe(cause),
             1 if before is None else before.times + 1,
         )
@@ -180,7 +180,7 @@ class CertificateWatch:
 
     def contradiction(self) -> CommonCause:
         """Return what contradicts the certificate while the arm monitors: offset, torque by place, too little sight."""
-        cause = _CAUSES[int(self._memory["withheld_by"])]
+        cause = _CAUSES[int(self._memory.certificate.withheld_by)]
         return CommonCause("; ".join(self._describe(cause)), is_payload=False)
 
     def _describe(self, cause: _Cause) -> list[str]:
@@ -191,7 +191,7 @@ class CertificateWatch:
             case _Cause.ANCHOR:
                 lines = anchor.describe_refused(m, is_reading=False)
             case _Cause.CHANGED:
-                lines = [_CHANGED + (_OR_MOUNTING if k["base"] > A5 else "")]
+                lines = [_CHANGED + (_OR_MOUNTING if k.first_offset > A5 else "")]
             case _Cause.MORE:
                 lines = earlier.describe_more(m)
             case _Cause.BY_PLACE:

@@ -47,7 +47,7 @@ class CertifiedPolicy(SchemePolicy):
         self.numbers = certified_memory.numbers_of(settings)
         self._m = m = self.numbers.memory[0]
         self._names = certified_memory.parameter_names(settings)
-        self.tau_ext_hat = m["y"][filter_bank.WIDE]  # what a reaction goes by: fast, and smooth
+        self.tau_ext_hat = m.filters.y[filter_bank.WIDE]  # what a reaction goes by: fast, and smooth
         self.evidence = evidence = RecalledContact(settings, self._contact)
         course.fill_constants(settings, evidence.due_cycles, self._course_constants["contact"][0])
         self._paper = paper_kernel.numbers_of(settings)[:3]
@@ -81,7 +81,7 @@ class CertifiedPolicy(SchemePolicy):
         earlier.forget(memory[0])
         certificate.forget(memory[0])
         anchor.accept(memory[0], np.zeros(JOINTS), np.ones(JOINTS))
-        belief.pause(memory[0], constants[0]["recover_cycles"])
+        belief.pause(memory[0], constants[0].recover_cycles)
         begin_doubt(constants[0], memory[0], 0.0)
         anchor.tightest(constants[0], memory[0], 0)
         self._doubt.compile()
@@ -140,7 +140,7 @@ class CertifiedPolicy(SchemePolicy):
         if asked & SECOND:
             self._judge_margin()
         if asked & PUSHED:
-            self._events.append(self._watch.push(self._m["y"][filter_bank.SLOW]))
+            self._events.append(self._watch.push(self._m.filters.y[filter_bank.SLOW]))
         return contact
 
     def _say(self, event: Event | None) -> None:
@@ -170,7 +170,7 @@ class CertifiedPolicy(SchemePolicy):
             again = self._doubt.describe_again()
             self._say(Event("info", "touch", again) if again else None)
             if is_touched and state is SchemeState.STOPPED:
-                self._m["until_push_cycles"] = self._push_cycles
+                self._m.watch.until_push_cycles = self._push_cycles
         if state is SchemeState.MONITOR:
             self._doubt.go_on(cycle)
         return state
@@ -221,4 +221,4 @@ class CertifiedPolicy(SchemePolicy):
 
     def _feed_forward(self) -> None:
         """Take the model in use for the feedforward from now on."""
-        self.theta_ff = np.array(self._m["theta"][: self.theta_ff.size])
+        self.theta_ff = np.array(self._m.models.theta[: self.theta_ff.size])

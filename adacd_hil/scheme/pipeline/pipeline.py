@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured
 from adacd_hil.records import (
     ArmBatch,
     ArmState,
@@ -39,6 +38,7 @@ from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.pipeline.certified_policy import CertifiedPolicy
 from adacd_hil.scheme.pipeline.scheme_policy import PaperPolicy, SchemePolicy
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.structured import Structured
 
 
 class SchemeBatch(NamedTuple):

@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from adacd_hil.compiled import Structured
 from adacd_hil.records import ContactReport, Event, SchemeState, Vector, scheme_layout
 from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.contact.contact_report import ContactEvidence, IntegratedContact, report_of
@@ -22,6 +21,7 @@ from adacd_hil.scheme.supervisor import supervisor
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.scheme.supervisor.transitions import SchemeEvent
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.structured import Structured
 
 
 class SchemePolicy(ABC):

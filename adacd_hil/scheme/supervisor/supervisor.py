@@ -18,13 +18,14 @@ acknowledged, but for one that is announced in STOPPED itself. `KeptRequest` out
 
 from collections.abc import Collection, Iterable
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured, compiled, record_of
+from adacd_hil.compiled import compiled
 from adacd_hil.records import FaultReason, Request, SchemeState
+from adacd_hil.scheme.memory import Sample
 from adacd_hil.scheme.supervisor.transitions import (
     ADAPTED,
     ANY_CONTACT,
@@ -44,6 +45,7 @@ from adacd_hil.scheme.supervisor.transitions import (
     next_state,
 )
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.structured import Structured
 
 REST_HOLD_S = 0.05
 """How long |dq| stays below the rest velocity until the arm counts as at rest. At the reversal of a withdrawal with
@@ -104,27 +106,52 @@ _OVERDUE[SchemeState.ENABLE] = FaultReason.ENABLE_TIMEOUT
 _OVERDUE[[SchemeState.ADAPT, SchemeState.CERTIFY]] = FaultReason.ADAPT_TIMEOUT
 """The fault of a phase that takes too long; NONE of one that may take for ever."""
 
-CONSTANTS = record_of(
-    *((name, np.int64) for name in ("has_gravity", "max_age_cycles", "blind_limit", "commission_cycles")),
-    *((name, np.int64) for name in ("rest_cycles", "unrest_cycles", "clear_cycles", "patience_cycles")),
-    ("rebound_cycles", np.int64),
-    ("limit_periods", np.int64, (len(SchemeState),)),
-)
-"""limit_periods: by state, of those that may take too long."""
-MEMORY = record_of(
-    *((name, np.int64) for name in ("state", "origin", "cause", "fault", "is_latched", "is_doubted")),
-    *((name, np.int64) for name in ("pending", "is_weight_told", "is_told_here")),
-    *((name, np.int64) for name in ("phase_periods", "learning_periods", "commissioned_cycles", "still_cycles")),
-    *((name, np.int64) for name in ("moving_cycles", "cleared_cycles", "blind_cycles", "stale_cycles")),
-)
-"""origin: where the arm goes on after REACT or STOPPED: where it came from, but from a broken test to learn anew.
-cause: the event by which the state was entered. is_latched: what REACT and STOPPED are about is to be acknowledged.
-is_doubted: the model is wrong. pending: bits of the requests that wait. is_weight_told: of a payload, since REACT.
-is_told_here: of a new payload, in this state. periods, cycles: counts up to now."""
+
+class SupervisorConstants:
+    """Counts of cycles and periods. limit_periods: by state, of those that may take too long."""
+
+    has_gravity: int
+    max_age_cycles: int
+    blind_limit: int
+    commission_cycles: int
+    rest_cycles: int
+    unrest_cycles: int
+    clear_cycles: int
+    patience_cycles: int
+    rebound_cycles: int
+    limit_periods: Annotated[NDArray[np.int64], "states"]
 
 
-def fill_constants(settings: Settings, k: Any) -> None:
-    """Fill a record of CONSTANTS."""
+class SupervisorMemory:
+    """Where the scheme stands.
+
+    origin: where the arm goes on after REACT or STOPPED: where it came from, but from a broken test to learn anew.
+    cause: the event by which the state was entered. is_latched: the user must acknowledge what REACT and STOPPED are
+    about. is_doubted: the model is wrong. pending: bits of the requests that wait. is_weight_told: of a payload, since
+    REACT. is_told_here: of a new payload, in this state. periods, cycles: counts up to now.
+    """
+
+    state: int
+    origin: int
+    cause: int
+    fault: int
+    is_latched: int
+    is_doubted: int
+    pending: int
+    is_weight_told: int
+    is_told_here: int
+    phase_periods: int
+    learning_periods: int
+    commissioned_cycles: int
+    still_cycles: int
+    moving_cycles: int
+    cleared_cycles: int
+    blind_cycles: int
+    stale_cycles: int
+
+
+def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
+    """Fill the constants."""
     period_s, safety = settings.bus.period_s, settings.safety
     k.has_gravity = settings.estimator.gravity
     k.max_age_cycles = settings.bus.max_age_cycles
@@ -141,16 +168,18 @@ def fill_constants(settings: Settings, k: Any) -> None:
     limits[[SchemeState.ADAPT, SchemeState.CERTIFY]] = round(settings.termination.timeout_s / period_s)
 
 
-def begin(m: Any) -> None:
-    """Fill a record of MEMORY before the first cycle."""
+def begin(m: SupervisorMemory) -> None:
+    """Fill the memory before the first cycle."""
     m.state, m.origin = SchemeState.INIT, SchemeState.MONITOR
 
 
 @compiled
-def supervise(k: Any, m: Any, arm: Any, observation: int, is_reporting: bool, goes_on: bool) -> None:
+def supervise(
+    k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
+) -> None:
     """Take in one cycle and go to the new state.
 
-    arm: a record of `kernel_samples.SAMPLE`. observation: bits of `Observation`. is_reporting: a contact's report is
+    observation: bits of `Observation`. is_reporting: a contact's report is
     not final yet. goes_on: the reaction in force lets the arm move on, so that a contact clears without rest.
     """
     _count(m, arm, observation)
@@ -164,7 +193,7 @@ def supervise(k: Any, m: Any, arm: Any, observation: int, is_reporting: bool, go
 
 
 @compiled
-def doubt(m: Any) -> None:
+def doubt(m: SupervisorMemory) -> None:
     """Take in, once a contact is over, that the model is wrong: hold the arm until the user says how to go on.
 
     An acknowledgement then takes back what is known of the arm; a payload may change without an announcement.
@@ -176,7 +205,7 @@ def doubt(m: Any) -> None:
 
 
 @compiled
-def _count(m: Any, arm: Any, observation: int) -> None:
+def _count(m: SupervisorMemory, arm: Sample, observation: int) -> None:
     """Count this cycle, and what goes on in it."""
     m.phase_periods += arm.periods
     if _IS_LEARNING[m.state]:
@@ -189,7 +218,7 @@ def _count(m: Any, arm: Any, observation: int) -> None:
 
 
 @compiled
-def _take(m: Any, request: int) -> None:
+def _take(m: SupervisorMemory, request: int) -> None:
     """Keep a request if this state serves it sooner or later."""
     if _keeps(m, request, m.state):
         m.pending |= 1 << request
@@ -200,7 +229,7 @@ def _take(m: Any, request: int) -> None:
 
 
 @compiled
-def _keeps(m: Any, request: int, state: int) -> bool:
+def _keeps(m: SupervisorMemory, request: int, state: int) -> bool:
     """Tell whether a request waits in a state; hands that change a payload may touch the arm."""
     if request == Request.PAYLOAD_CHANGED and IS_REACTING[state]:
         return bool(m.is_doubted != 0 or m.origin == SchemeState.PAYLOAD)
@@ -208,26 +237,26 @@ def _keeps(m: Any, request: int, state: int) -> bool:
 
 
 @compiled
-def _is_pending(m: Any, request: int) -> bool:
+def _is_pending(m: SupervisorMemory, request: int) -> bool:
     return bool(m.pending & 1 << request)
 
 
 @compiled
-def _has_grown(k: Any, m: Any, arm: Any, observation: int) -> bool:
+def _has_grown(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> bool:
     """Tell whether a contact that would clear itself has become one to be acknowledged."""
     is_over = observation & COLLISION != 0 or arm.is_late != 0 or m.phase_periods >= k.patience_cycles
     return bool(is_over or _is_told_of_payload(k, m))
 
 
 @compiled
-def _is_announced(m: Any) -> bool:
+def _is_announced(m: SupervisorMemory) -> bool:
     """Tell whether a change of payload is to be served in MONITOR or STOPPED; a stop ends only by a word about it."""
     is_awaited = _is_pending(m, Request.PAYLOAD) and m.state == SchemeState.MONITOR
     return bool(m.is_told_here != 0 or is_awaited)
 
 
 @compiled
-def _is_told_of_payload(k: Any, m: Any) -> bool:
+def _is_told_of_payload(k: SupervisorConstants, m: SupervisorMemory) -> bool:
     """Tell whether the user has said that what looks like a contact is the payload: its weight, where gravity acts.
 
     A weight is meant only by a word since the contact began: one of before knows nothing of who touches the arm.
@@ -237,7 +266,7 @@ def _is_told_of_payload(k: Any, m: Any) -> bool:
 
 
 @compiled
-def _enter(m: Any, state: int, event: int) -> None:
+def _enter(m: SupervisorMemory, state: int, event: int) -> None:
     """Go to a state, and drop the requests that it has served or that mean nothing there."""
     if state == m.state:
         return
@@ -260,7 +289,9 @@ def _enter(m: Any, state: int, event: int) -> None:
 
 
 @compiled
-def _event(k: Any, m: Any, arm: Any, observation: int, is_reporting: bool, goes_on: bool) -> int:
+def _event(
+    k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
+) -> int:
     """Return the first event of this cycle that means something in this state."""
     fault = 0
     if _IS_CHECKED[m.state]:
@@ -279,7 +310,7 @@ def _event(k: Any, m: Any, arm: Any, observation: int, is_reporting: bool, goes_
 
 
 @compiled
-def _touch(m: Any, arm: Any, observation: int) -> int:
+def _touch(m: SupervisorMemory, arm: Sample, observation: int) -> int:
     """Return COLLISION or CONTACT where this state reacts to it, or none; an arm without torque can't react."""
     if observation & ANY_CONTACT == 0 or arm.is_enabled == 0:
         return SchemeEvent.NONE
@@ -288,7 +319,9 @@ def _touch(m: Any, arm: Any, observation: int) -> int:
 
 
 @compiled
-def _progress(k: Any, m: Any, arm: Any, observation: int, is_reporting: bool, goes_on: bool) -> int:
+def _progress(
+    k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
+) -> int:
     """Return the event with which this state is left as it should be, or none."""
     state = m.state
     event: int = SchemeEvent.NONE
@@ -313,7 +346,7 @@ def _progress(k: Any, m: Any, arm: Any, observation: int, is_reporting: bool, go
 
 
 @compiled
-def _released(k: Any, m: Any, arm: Any, observation: int, is_still: bool) -> int:
+def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_still: bool) -> int:
     """Return how STOPPED ends in this cycle by a word of the user's, or none."""
     event: int = SchemeEvent.NONE
     is_late = arm.is_late != 0
@@ -344,7 +377,7 @@ def _verdict(state: int, observation: int) -> int:
 
 
 @compiled
-def _begun(k: Any, m: Any, arm: Any, observation: int) -> int:
+def _begun(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> int:
     """Return how a phase before the drives are enabled ends in this cycle, or none."""
     state = m.state
     event: int = SchemeEvent.NONE
@@ -360,7 +393,7 @@ def _begun(k: Any, m: Any, arm: Any, observation: int) -> int:
 
 
 @compiled
-def _settled(k: Any, m: Any, is_still: bool, goes_on: bool) -> int:
+def _settled(k: SupervisorConstants, m: SupervisorMemory, is_still: bool, goes_on: bool) -> int:
     """Return how REACT ends in this cycle, or none."""
     event: int = SchemeEvent.NONE
     if m.is_latched != 0:
@@ -372,7 +405,7 @@ def _settled(k: Any, m: Any, is_still: bool, goes_on: bool) -> int:
 
 
 @compiled
-def _is_commissioned(k: Any, m: Any, arm: Any, observation: int) -> bool:
+def _is_commissioned(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> bool:
     """Count this cycle if all is well in it, and tell whether enough have been counted in a row.
 
     One whose data are not complete doesn't count and breaks nothing: how many may be missing, `_check` says.
@@ -384,7 +417,7 @@ def _is_commissioned(k: Any, m: Any, arm: Any, observation: int) -> bool:
 
 
 @compiled
-def _overdue(k: Any, m: Any) -> int:
+def _overdue(k: SupervisorConstants, m: SupervisorMemory) -> int:
     """Return the fault of a phase that has taken too long, or NONE. A learning arm's clock stops in REACT."""
     spent = m.learning_periods if _IS_LEARNING[m.state] else m.phase_periods
     is_over = spent >= k.limit_periods[m.state]
@@ -392,7 +425,7 @@ def _overdue(k: Any, m: Any) -> int:
 
 
 @compiled
-def _check(k: Any, m: Any, arm: Any, observation: int) -> int:
+def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> int:
     """Return why the arm must not go on, or NONE."""
     state = m.state
     fault: int = FaultReason.NONE

@@ -1,0 +1,475 @@
+"""Constants and memory of the certified scheme's compiled code, each declared once with its type and shape.
+
+Each record of memory belongs to one module, which alone writes it; any module may read. In compiled code, and where
+its results become words, k is `Constants` and m is `Memory`.
+
+Sizes: n joints; p parameters (dynamic ones, torque offsets, lags, further friction); t terms by place, f = p + n t;
+filters of the bank, channels of its detection. The others are constants of the module that owns the record.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from adacd_hil.records import Vector
+from adacd_hil.structured import Columns, PerJoint, PerParameter, Square
+
+EachFilter = Annotated[Vector, "filters n"]
+EachChannel = Annotated[Vector, "channels n"]
+PlaceColumns = Annotated[Vector, "n t"]
+EachTerm = Annotated[Vector, "f"]
+
+
+class Sample:
+    """What a cycle takes in: an ArmState, `age` that of its oldest value, and what is asked in this cycle."""
+
+    cycle: int
+    periods: int
+    steps: int
+    sampled_ns: int
+    age: int
+    fault: int
+    request: int
+    is_complete: int
+    is_enabled: int
+    is_late: int
+    q: PerJoint
+    dq: PerJoint
+    tau_J: PerJoint
+
+
+class Gaps:
+    """Samples before this one: written by `certified_kernel`, at first by `certified_memory`."""
+
+    has_gap: float
+    is_steady: float
+    last: Annotated[Vector, "3 n"]
+    between: Annotated[Vector, "3 n"]
+
+
+class Regressor:
+    """The regressor of a sample: written by `regressor`."""
+
+    Y_p: Columns
+    Y_h: Columns
+    M: Annotated[Vector, "n n"]
+    X: PlaceColumns
+    bent: Annotated[Vector, "2 n"]
+
+
+class Filters:
+    """The filter bank, and the external torque that each filter sees, bare and smoothed: written by `filter_bank`."""
+
+    input_old: Annotated[Vector, "filters n p"]
+    S: Annotated[Vector, "filters n p"]
+    W_f: Annotated[Vector, "filters n p"]
+    tau_f: EachFilter
+    tau_old: EachFilter
+    r: EachFilter
+    rates: Annotated[Vector, "3 filters"]
+    W_learnt: Columns
+    tau_learnt: PerJoint
+    y: EachChannel
+
+
+class Wide:
+    """External torques of the widest filter, of which the filter is undone: written by `external_torque`."""
+
+    history: Annotated[Vector, "wide n"]
+
+
+class Models:
+    """Model in use, certified model, belief and candidate: written by `belief`."""
+
+    theta: PerParameter
+    certified: PerParameter
+    belief: PerParameter
+    candidate: PerParameter
+    v: PerParameter
+    K: PerParameter
+    P: Square
+    P_certified: Square
+    P_belief: Square
+    P_candidate: Square
+    promotions: float
+    candidate_cycles: float
+    candidate_square: float
+    candidate_worst: float
+    frozen_square: float
+    since_learnt: float
+    are_lags_held: float
+    recovering_cycles: float
+    is_payload: float
+
+
+class Ring:
+    """Learnt samples that wait until no contact can have bent them: written by `belief`."""
+
+    W: Annotated[Vector, "waiting n p"]
+    tau: Annotated[Vector, "waiting n"]
+    R: Annotated[Vector, "waiting n"]
+    still: Annotated[Vector, "waiting n"]
+    used: float
+    next: float
+
+
+class Motion:
+    """Where and how fast the joints have been in a fit, and what that has shown: written by `termination`."""
+
+    q_low: PerJoint
+    q_high: PerJoint
+    dq_low: PerJoint
+    dq_high: PerJoint
+    information: Square
+    scratch: Square
+    samples: float
+
+
+class Fit:
+    """How far a fit and its test have come: written by `termination`."""
+
+    tested: float
+    test_limit_Nm: float
+    excitation: float
+    condition: float
+
+
+class Sensitivity:
+    """Noise, standstill and thresholds: written by `sensitivity`."""
+
+    still: EachFilter
+    still_smooth: EachFilter
+    low_speed: EachFilter
+    doubt: EachFilter
+    held: EachFilter
+    lost: EachFilter
+    h: EachChannel
+    h_model: EachChannel
+    roughness: PerJoint
+    roughness_now: PerJoint
+    roughness_kept: PerJoint
+    velocity_roughness: PerJoint
+    unit: PerJoint
+    strain: PerJoint
+    used: PerJoint
+    peak_share: PerJoint
+    hold: PerJoint
+    dq_old: PerJoint
+    ddq_old: PerJoint
+    torque_changes: PerJoint
+    torque_change_Nm: PerJoint
+    torque_step_Nm: PerJoint
+    torque_pull_Nm: PerJoint
+    rest_tau: PerJoint
+    rest_square: PerJoint
+    wide_sigma: PerJoint
+    wide_threshold: PerJoint
+    unit_by_sign: Annotated[Vector, "2 n"]
+    rest_samples: float
+
+
+class Margin:
+    """Largest residuals of free motion, and which push would be found: written by `margin`."""
+
+    peak: Annotated[Vector, "2 channels n"]
+    peak_now: Annotated[Vector, "2 channels n"]
+    peak_last: Annotated[Vector, "2 channels n"]
+    tail_Nm: EachChannel
+    block_used: float
+    tail_s: float
+    seen_worst_Nm: PerJoint
+    seen_push_Nm: PerJoint
+    sum_push_Nm: PerJoint
+    sum_cycles: PerJoint
+    mean_push_Nm: PerJoint
+    dim_s: PerJoint
+    seen: Annotated[Vector, "bins n"]
+
+
+class Evidence:
+    """What each source says of each quantity, and what of it a fit contradicts: written by `evidence`."""
+
+    said: Annotated[Vector, "sources quantities"]
+    said_variance: Annotated[Vector, "sources quantities"]
+    said_floor: Annotated[Vector, "sources quantities"]
+    said_slack: Annotated[Vector, "sources quantities"]
+    difference: Annotated[Vector, "sources quantities"]
+    limit: Annotated[Vector, "sources quantities"]
+    said_age_s: Annotated[Vector, "sources"]
+    fitted: Annotated[Vector, "quantities"]
+    fitted_variance: Annotated[Vector, "quantities"]
+
+
+class Anchor:
+    """What holds a torque offset in its place: written by `anchor`."""
+
+    rest_count: float
+    anchor_Nm: Annotated[Vector, "kinds n"]
+    anchor_std: Annotated[Vector, "kinds n"]
+    by_place_Nm: PerJoint
+
+
+class FitCheck:
+    """Steps and samples of a fit, to be explained by its end: written by `fit_check`."""
+
+    fit_square: float
+    fit_rows: float
+    fit_samples: float
+    steps_used: float
+    samples_kept: float
+    samples_every: float
+    samples_left_out: float
+    samples_W: Annotated[Vector, "room n p"]
+    samples_tau: Annotated[Vector, "room n"]
+    steps_theta: Annotated[Vector, "steps p"]
+    steps_P: Annotated[Vector, "steps p p"]
+    steps_square: Annotated[Vector, "steps"]
+    steps_rows: Annotated[Vector, "steps"]
+    factor: Square
+    apart: PerParameter
+    later: PerParameter
+
+
+class Earlier:
+    """How many beliefs of before a disturbance are kept: written by `earlier`."""
+
+    kept_count: float
+    refused_fits: float
+    has_lapsed: float
+
+
+class Certificate:
+    """Why a certificate is withheld: written by `certificate`."""
+
+    withheld_by: float
+
+
+class Doubt:
+    """What the contacts of a certified model look like: written by `doubt`."""
+
+    cause_rw: Annotated[Vector, "causes"]
+    cause_ww: Annotated[Vector, "causes"]
+    cause_ws: Annotated[Vector, "causes n"]
+    contact_rr: float
+    contact_rows: float
+    contact_peak: float
+    contact_rs: PerJoint
+    contact_ss: PerJoint
+    load_ww: Annotated[Vector, "2"]
+
+
+class MissingTorque:
+    """Evidence for torque that the model lacks: written by `missing_torque`."""
+
+    X_old: PlaceColumns
+    X_f: PlaceColumns
+    X_learnt: PlaceColumns
+    ring_X: Annotated[Vector, "waiting n t"]
+    L: Annotated[Vector, "n f f"]
+    M: Annotated[Vector, "f f"]
+    b: EachTerm
+    basic: EachTerm
+    full: EachTerm
+    row: EachTerm
+    scale: EachTerm
+    said: Annotated[Vector, "places"]
+    yy: float
+    weight: PerJoint
+    ways: Annotated[Vector, "n 2"]
+    samples: float
+    wanted: float
+    rms_Nm: PerJoint
+
+
+class Watch:
+    """What of the cycles is left to Python once in a while: written by `cycle` and `certified_policy`."""
+
+    has_forgotten: float
+    monitored_cycles: float
+    until_push_cycles: float
+
+
+class Memory:
+    """The memory of the certified scheme."""
+
+    gaps: Gaps
+    regressor: Regressor
+    filters: Filters
+    wide: Wide
+    models: Models
+    ring: Ring
+    motion: Motion
+    fit: Fit
+    sensitivity: Sensitivity
+    margin: Margin
+    evidence: Evidence
+    anchor: Anchor
+    fit_check: FitCheck
+    earlier: Earlier
+    certificate: Certificate
+    doubt: Doubt
+    missing_torque: MissingTorque
+    watch: Watch
+
+
+@dataclass(frozen=True)
+class NoiseConstants:
+    """Of `sensitivity`: by channel (2 C - 1,) (k_tau sigma_tau)² in Nm², and nu² in rad²/s⁴."""
+
+    torque_variance: Vector
+    torque_gain: Vector
+    velocity_variance: Vector
+    velocity_noise_rad_s: float
+    roughness_share: float
+    roughness_loss: float
+    strain_share: float
+    unit_share: float
+    unit_test_share: float
+    velocity_std_rad_s: float
+
+
+@dataclass(frozen=True)
+class AnchorConstants:
+    """Of `anchor`: torque offsets and how well each is known (n,), inf where it is not."""
+
+    zero_Nm: Vector
+    last_zero_Nm: Vector
+    last_zero_std_Nm: Vector
+    holding_Nm: Vector
+    zero_std_Nm: Vector
+    zero_drift_Nm2_s: float
+    rest_cycles: float
+
+
+@dataclass(frozen=True)
+class DoubtConstants:
+    """Of `doubt`: causes (h, p), a payload of 1 kg, then by joint Coulomb and viscous friction."""
+
+    causes: Vector
+
+
+@dataclass(frozen=True)
+class EvidenceConstants:
+    """Of `evidence`: columns (Q, p), prior variances and largest torques (Q,), sigmas (S,), less_counts (S, Q)."""
+
+    columns: Vector
+    columns_prior: Vector
+    torque_Nm: Vector
+    sigmas: Vector
+    less_counts: Vector
+
+
+@dataclass(frozen=True)
+class FitCheckConstants:
+    """Of `fit_check`: learnt samples from one step to the next."""
+
+    step_samples: float
+
+
+@dataclass(frozen=True)
+class EarlierConstants:
+    """Of `earlier`: by quantity, a difference and a share of the value that count as none."""
+
+    kept_floor: Vector
+    kept_share: Vector
+
+
+@dataclass(frozen=True)
+class LastConstants:
+    """Of `certificate`: values of the last certificate (Q,), variances, inf where it says nothing, and slack."""
+
+    value: Vector
+    variance: Vector
+    slack: Vector
+
+
+@dataclass(frozen=True)
+class MarginConstants:
+    """Of `margin`: excursions of white noise (2 C - 1,) and what a step of torque shows in each channel."""
+
+    excursions_Hz: Vector
+    block_cycles: float
+    mean_cycles: float
+    shown: Vector
+
+
+@dataclass(frozen=True)
+class TermConstants:
+    """Of `missing_torque`: prior deviations (f,), and counts of learnt samples."""
+
+    prior_std: Vector
+    first: float
+    longest: float
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds by which measurements alone are judged."""
+
+    position_limit_rad: Vector
+    velocity_limit_rad_s: Vector
+    rest_velocity_rad_s: float
+    rest_torque_Nm: float
+
+
+@dataclass(frozen=True)
+class Constants:
+    """The constants of the certified scheme; names as in `CertifiedSettings` and the other sections."""
+
+    period_s: float
+    second_cycles: float
+    level_rad: float
+    cutoff: Vector
+    decay: Vector
+    weight_old: Vector
+    weight_new: Vector
+    first_offset: float
+    first_coulomb: float
+    first_term: float
+    has_cross_talk: float
+    first_cross_talk: float
+    first_position: float
+    position_torque_Nm: float
+    width_rad_s: float
+    stribeck_rad_s: float
+    terms: Vector
+    dahl_rad: Vector
+    theta_cad: Vector
+    prior: Vector
+    prior_std: Vector
+    enough_std: Vector
+    drift_std: Vector
+    model_error: Vector
+    payload_direction: Vector
+    payload_std_kg: float
+    payload_rest_std: Vector
+    correlated: float
+    residual_Nm: float
+    learn_every: float
+    recover_cycles: float
+    settle_cycles: float
+    fit_cycles: Vector
+    test_cycles: Vector
+    beta_Nm: float
+    refine_cycles: float
+    excitation_Nm2s: float
+    condition: float
+    scale: Vector
+    travel_rad: float
+    velocity_rad_s: float
+    smoothing: float
+    model_sigmas: float
+    torque_noise_Nm: float
+    noise_sigmas: float
+    still_rad_s: float
+    standstill_share: float
+    collision_Nm: Vector
+    noise: NoiseConstants
+    anchor: AnchorConstants
+    doubt: DoubtConstants
+    evidence: EvidenceConstants
+    fit_check: FitCheckConstants
+    earlier: EarlierConstants
+    last: LastConstants
+    margin: MarginConstants
+    missing_torque: TermConstants
+    limits: Limits

@@ -1,0 +1,104 @@
+"""Records that compiled code works on, declared as typed classes.
+
+A class of record names its fields, their types and their shapes once::
+
+    class Ring:
+        tau: Annotated[Vector, "waiting n"]  # an array, by the names of its sizes
+        used: float  # a number, as int, bool, and others by Annotated[int, np.uint8]
+
+`zeros_of` makes the memory, `packed` puts an instance of a dataclass into it. Compiled code and Python read and write
+the same fields as attributes, `m.ring.tau`, and mypy checks them.
+
+At each call of compiled code numba looks up the types of the arguments: in 0.2 us if the description of the record is
+the object that it knows, in 5 to 10 us if it is another one that is equal, field by field. So equal descriptions are
+one and the same object.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from functools import cache
+from typing import Annotated, Any, get_args, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+Structured = np.ndarray[Any, np.dtype[np.void]]
+Record = np.dtype[np.void]
+"""The description of a record."""
+Shape = tuple[int, ...]
+_Field = tuple[str, Any, Shape]
+
+_Array = NDArray[np.float64]
+PerJoint = Annotated[_Array, "n"]
+PerParameter = Annotated[_Array, "p"]
+Columns = Annotated[_Array, "n p"]
+Square = Annotated[_Array, "p p"]
+
+_NUMBERS: dict[Any, type[np.generic]] = {float: np.float64, int: np.int64, bool: np.bool_}
+
+
+def described(kind: type[Any], sizes: Mapping[str, int]) -> Record:
+    """Describe a record of a class. sizes: of the dimensions that it and the classes in it name."""
+    return _described(
+        tuple(_field_of(name, hint, sizes) for name, hint in get_type_hints(kind, include_extras=True).items())
+    )
+
+
+def zeros_of(kind: type[Any], sizes: Mapping[str, int], count: int = 1) -> Structured:
+    """Return records (count,) of zeros, see `described`."""
+    return np.zeros(count, described(kind, sizes))
+
+
+def packed(values: Any) -> Structured:
+    """Put an instance of a dataclass into one record (1,); its fields are numbers, arrays and such instances."""
+    record = np.zeros(1, _described_as(values))
+    _fill(record[0], values)
+    return record
+
+
+def float_fields(shapes: Mapping[str, Shape]) -> Record:
+    """Describe a record of float64 fields of these shapes, whose names are given as data: `record["name"]`."""
+    return _flat(tuple(shapes.items()))
+
+
+@cache
+def _flat(shapes: tuple[tuple[str, Shape], ...]) -> Record:
+    return np.dtype([(name, np.float64, shape) for name, shape in shapes])
+
+
+def _field_of(name: str, hint: Any, sizes: Mapping[str, int]) -> _Field:
+    if hasattr(hint, "__metadata__"):
+        array, dimensions = get_args(hint)
+        if isinstance(dimensions, type):
+            return name, dimensions, ()
+        (number,) = get_args(get_args(array)[1])
+        return name, number, tuple(int(d) if d.isdigit() else sizes[d] for d in dimensions.split())
+    if hint in _NUMBERS:
+        return name, _NUMBERS[hint], ()
+    return name, described(hint, sizes), ()
+
+
+def _described_as(values: Any) -> Record:
+    found = ((field.name, getattr(values, field.name)) for field in dataclasses.fields(values))
+    return _described(
+        tuple(
+            (name, _described_as(value), ()) if dataclasses.is_dataclass(value) else (name, np.float64, np.shape(value))
+            for name, value in found
+        )
+    )
+
+
+def _fill(record: Any, values: Any) -> None:
+    for field in dataclasses.fields(values):
+        value = getattr(values, field.name)
+        if dataclasses.is_dataclass(value):
+            _fill(record[field.name], value)
+        else:
+            record[field.name] = value
+
+
+@cache
+def _described(fields: tuple[_Field, ...]) -> Record:
+    if taken := [name for name, _, _ in fields if hasattr(np.record, name)]:
+        raise ValueError(f"field {', '.join(taken)}: numpy's own attribute of a record")
+    return np.dtype((np.record, list(fields)))
