@@ -10,7 +10,7 @@ from enum import Enum, IntEnum
 from typing import NamedTuple
 
 from adacd_hil.device.cyclic_device import CyclicDevice
-from adacd_hil.device.profile import ProfileSettings
+from adacd_hil.device.profile import PlausibilitySettings, ProfileSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
 
@@ -19,7 +19,7 @@ MODE_CYCLIC_SYNCHRONOUS_TORQUE = 10
 DISABLE_CYCLES = 20
 """Cycles of disabling at the end of a run: drives need two, the rest shows in the log that they did."""
 
-IMPLAUSIBLE_JUMP_RAD = 0.02
+IMPLAUSIBLE_JUMP_RAD = PlausibilitySettings().position_jump_rad
 """Position against velocity, per frame. The drive's velocity lags 1.6 ms, so 100 rad/s² leave 0.3 mrad; a flipped
 high bit of the unprotected frame is at least 0.1 rad."""
 
