@@ -38,7 +38,7 @@ class CyclicDevice(ABC):
         self._received_cycle = 0
 
     def accept_cyclic(self, data: bytes, cycle: int) -> bool:
-        """Take one cyclic frame of `cycle`; False when a check fails and it changes nothing."""
+        """Take one cyclic frame of `cycle`; return False when a check fails: the frame is ignored."""
         if len(data) != self.cyclic_length:
             self.implausible_frames += 1
             return False
@@ -57,7 +57,7 @@ class CyclicDevice(ABC):
         return True
 
     def accept_status(self, data: bytes, cycle: int) -> bool:
-        """Take one status frame of `cycle`; False when its length or check is wrong and it changes nothing."""
+        """Take one status frame of `cycle`; return False when its length or check is wrong: the frame is ignored."""
         message, receiver = self.status_message, self._status_receiver
         if message is None or receiver is None or len(data) != message.length:
             return False

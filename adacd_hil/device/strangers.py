@@ -1,13 +1,14 @@
-"""Somebody else on the bus: who sends what only this host sends, or what only one device of the arm sends.
+"""Another sender on the bus: it sends frames that only this host, or only one device of the arm, may send.
 
-A CAN frame doesn't say who sent it. What only one sender may send gives another one away:
+A CAN frame doesn't name its sender. A frame that only one node may send reveals a second sender:
 
-- commands, SYNC, NMT, the host's heartbeat and SDO requests to the arm's devices come from this host alone. One that is
-  received has another sender. Who only reads objects, as a survey of the bus does, is named, and stops nothing.
-- a device answers each SYNC with one cyclic frame. A second one that is right by length and CRC but not the same frame
-  again has another sender: a second device with that node id, or an attack.
+- Commands, SYNC, NMT, the host's heartbeat and SDO requests to the arm's devices come from this host alone. If the host
+  receives one, it has another sender. A sender that only reads objects, as a survey of the bus does, is reported but
+  doesn't stop the arm.
+- A device answers each SYNC with one cyclic frame. A second, different frame with correct length and CRC has another
+  sender: a second device with that node id, or an attack.
 
-CRC and alive counter are no secret: they find errors, not intent. See `docs/threat-model.md`.
+CRC and alive counter find errors; they don't protect against intent. See `docs/threat-model.md`.
 """
 
 from collections import deque
@@ -36,7 +37,7 @@ _READING = (2, 3, 5)
 
 
 def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
-    """Say by identifier what somebody does who sends what only this host sends."""
+    """Return, by identifier of each frame that only this host sends, a description of another sender's action."""
     doing = {
         codec.message(HOST_HEARTBEAT).can_id: "sends this host's heartbeat",
         NMT_ID: "sends NMT commands",
@@ -52,9 +53,9 @@ def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
 
 
 def listen_for_hosts(bus: Bus, clock: Clock, settings: Settings, codec: Codec, duration_s: float) -> list[str]:
-    """Listen to the bus and say what somebody does who runs the arm already, one line each. Raises BusError.
+    """Listen to the bus and describe the actions of another host that runs the arm, one line each. Raises BusError.
 
-    Who only reads objects, and commands to nodes of other arms, are not among it.
+    Requests that only read objects, and commands to nodes of other arms, are ignored.
     """
     strangers = Strangers(settings, codec)
     end_ns = clock.now_ns() + round(duration_s * 1e9)
