@@ -16,7 +16,7 @@ _FIELDS: Final = frozenset(member.name for member in ARM.head)
 
 
 def has_arms(path: Path) -> bool:
-    """Tell whether a log has the arm's states. Logs of earlier versions have none. Raises LogError."""
+    """Return whether a log has the arm's states. Logs of earlier versions lack them. Raises LogError."""
     for piece in LogStream(path, (ARM.name, "/scheme"), cycles_per_piece=1, is_ahead=False):
         if len(piece.series["/scheme"]):
             arms = piece.series[ARM.name]

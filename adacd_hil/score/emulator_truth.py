@@ -67,7 +67,7 @@ class TruthTable(NamedTuple):
     """Kept rows of the truth (m,), on the emulator's own cycles; attempt (m,): of the run, from 0.
 
     model_attempt, model_cycle (k,): from when on payload and parameters are as they are. metadata: of the log; problem:
-    missing parts; is_complete: it is whole and nothing was dropped on the way to it.
+    missing parts; is_complete: it is whole and no record was dropped on the way to it.
     """
 
     attempt: Cycles
@@ -267,9 +267,9 @@ _PLAYED = ("scenario", "seed")
 
 
 def foreign_truth(log: Path, truth: Path) -> str:
-    """Say in one line why a truth is of another run than a log; "" where nothing says so.
+    """Return in one line why a truth is of another run than a log; "" if no field contradicts the log.
 
-    Both name scenario and seed where one process played host and arm, and the truth has a digest of the host's
+    Both name scenario and seed if one process played host and arm, and the truth has a digest of the host's
     configuration: in lockstep, the same three make the same run. On a bus the host doesn't know the scenario.
     """
     ours, theirs = run_metadata(log), _played(truth)
@@ -283,10 +283,10 @@ def foreign_truth(log: Path, truth: Path) -> str:
 
 
 def config_digest(config: str) -> str:
-    """Give the digest by which a truth names its host's configuration. Raises ConfigError.
+    """Return the digest by which a truth names its host's configuration. Raises ConfigError.
 
-    Of `realtime` a session makes what the host grants, and of `safety.enable_timeout_s` what the devices' profiles ask
-    for, so that they don't count.
+    The digest leaves out `realtime`, which a session sets to the host's abilities, and `safety.enable_timeout_s`, which
+    it sets by the devices' profiles.
     """
     table = {key: value for key, value in parse_toml(config).items() if key != "realtime"}
     if isinstance(safety := table.get("safety"), dict):

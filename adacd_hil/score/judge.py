@@ -1,4 +1,4 @@
-"""The judge: which alarm is about which true contact; contacts found, how late, or missed; false alarms.
+"""The judge: the true contact of each alarm; contacts found, their delay, or missed; false alarms.
 
 A scheme raises an *alarm* with a transition to REACT by a contact, in whatever state: the certified scheme detects
 while it adapts and while it parks, too. While it is in REACT or STOPPED it is still about the contact before. REACT
@@ -7,12 +7,12 @@ without a joint over its threshold and without a report is an arm that is held f
 A true contact explains alarms from its onset until it is forgotten: until one time constant after its true torque,
 filtered, is back within the threshold (`forgotten_after_s`). An alarm is about the last contact that began
 before it, as long as that contact, or one before it, is not forgotten; so an alarm is about one contact at most. The
-first alarm about a contact finds it. An alarm about none is *false*, in whatever state it was raised, unless the
-emulator did not record that time: such an alarm is not judged. Where gravity acts, an alarm in PAYLOAD
+first alarm about a contact finds it. An alarm about no contact is *false*, in whatever state it was raised, unless the
+emulator did not record that time: such an alarm is not judged. Under gravity, an alarm in PAYLOAD
 about a payload that is not that of the last MONITOR is about its weight, and not false.
 
 A contact is *armed* if detection was armed in the logged cycle before its onset. It is *missed* if it is armed and
-nothing found it. A contact that began before the log did is not armed.
+no alarm found it. A contact that began before the log did is not armed.
 
 Of a run: its true contacts, the detections of its scheme, and the response of an ideal detector with its filters.
 
@@ -141,7 +141,7 @@ def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
 
 
 def owners(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times:
-    """Give the place of the contact that each of n alarms is about (n,), -1 for none; until: of `explained_until`."""
+    """Return the place of the contact that each of n alarms is about (n,), -1: false; until: of `explained_until`."""
     places = np.searchsorted(onsets, at, side="right") - 1
     if not len(onsets):
         return np.asarray(places)
@@ -307,7 +307,7 @@ class TruthTouch(NamedTuple):
 
 
 def true_contacts(run: Run) -> tuple[TruthTouch, ...]:
-    """Find the true contacts in the truth record; without one there are none to be known."""
+    """Find the true contacts in the truth record; return () without one."""
     truth = run.truth
     if truth is None or truth.cycle.size == 0 or run.cycle.size == 0:
         return ()

@@ -93,7 +93,7 @@ class BesideGatherer:
         )
 
     def add(self, piece: Run, time_s: Vector, free: Mask) -> None:
-        """Take in the next cycles, at such times (n,); free: those in which nothing touches the arm (n,)."""
+        """Take in the next cycles, at such times (n,); free: those free of contact (n,)."""
         stream = piece.beside
         assert stream is not None
         armed = stream.is_armed & ~_parked(time_s, self._sections, self._end_s)
@@ -116,7 +116,7 @@ class BesideGatherer:
                 self._largest[section.label] = larger(self._largest[section.label], values)
 
     def beside(self) -> Beside:
-        """Sum up what has been taken in."""
+        """Return the sums over all cycles taken so far."""
         score = self._judge.score()
         zero_ns = self._zero_ns
         false_s = tuple((alarm.t_ns - zero_ns) * 1e-9 for alarm in score.false_alarms)
@@ -214,7 +214,7 @@ class MarginGatherer:
         self._thresholds = [[Distribution() for _ in range(JOINTS)] for _ in self._channels]
 
     def add(self, tau_ext: Vector, threshold: Vector) -> None:
-        """Take in cycles in which nothing touches the arm: residuals and thresholds (k, channels, 2), k > 0."""
+        """Take in cycles free of contact: residuals and thresholds (k, channels, 2), k > 0."""
         self._residual = larger(self._residual, tau_ext)
         self._share = larger(self._share, np.abs(tau_ext) / threshold)
         for place, distributions in enumerate(self._thresholds):
@@ -222,7 +222,7 @@ class MarginGatherer:
                 distribution.add(threshold[:, place, joint])
 
     def margins(self) -> tuple[ChannelMargin, ...]:
-        """Sum up each channel; nothing has to have been gathered for none."""
+        """Sum up each channel; return () before the first cycle."""
         if self._residual is None or self._share is None:
             return ()
         found = []
@@ -307,7 +307,7 @@ class UntouchedGatherer:
             self._push.add(piece.certified.tau_ext[rows][armed], threshold[armed])
 
     def _close(self, label: str) -> None:
-        """Sum up a section that nothing will be added to: its values need not be kept."""
+        """Sum up a section that is complete: its values need not be kept."""
         if label in self._margins:
             self._done[label] = self._margins.pop(label).margins()
 
@@ -317,7 +317,7 @@ class UntouchedGatherer:
         self._promoted = float(promotions[-1])
 
     def gathered(self) -> Untouched:
-        """Sum up what has been taken in."""
+        """Return the sums over all cycles taken so far."""
         for label in list(self._margins):
             self._close(label)
         labels = [section.label for section in self._sections]
@@ -374,7 +374,7 @@ class _Free:
 
 
 class PushGatherer:
-    """Gathers the cycles of MONITOR in which nothing touches the arm."""
+    """Gathers the cycles of MONITOR that are free of contact."""
 
     def __init__(self, settings: Settings) -> None:
         self._shown = detect_margin.constants_of(settings).shown
@@ -394,7 +394,7 @@ class PushGatherer:
             self._threshold[joint].add(in_force[:, joint])
 
     def smallest_push(self) -> SmallestPush | None:
-        """Sum up; None where nothing has been taken in."""
+        """Sum up; return None before the first cycle."""
         if not self._push[0].count:
             return None
         seen_s = self._push[0].count * self._period_s

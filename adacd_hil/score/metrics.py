@@ -7,15 +7,15 @@ that a torque step tau crosses the threshold h after t = -ln(1 - h / |tau|) / a.
 **Sections** are lettered A, B, C, … in order, see `adacd_hil.log.logged_run`. An adaptation's time is that of its
 section: up to MONITOR, the test of the frozen model and contacts on the way included.
 
-**Frozen residual**: largest |tau_ext_hat| of each joint where nobody touches the arm. A cycle counts unless it lies in
+**Frozen residual**: largest |tau_ext_hat| of each joint free of contact. A cycle counts unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
 5 Nm. In a detection section only armed cycles (MONITOR) count; in an adaptation section all do, and only the CAD
 model's residual is given, because theta_hat still moves. Without the truth, [detection - 10/a, detection + 10/a]
 stands for the contact. After the request to finish the arm parks and stands, where friction may hold any torque up
 to F_c: those cycles don't count.
 
-**A detection** is an alarm of `adacd_hil.score.judge`. Which contacts were found or missed, and which
-detections are false alarms: `adacd_hil.score.judge`; detection is armed in MONITOR.
+**A detection** is an alarm of `adacd_hil.score.judge`. That module decides which contacts were found or missed, and
+which detections are false alarms; detection is armed in MONITOR.
 
 **Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
 those of the fastest channel of its bank. Its other results: `adacd_hil.score.margins`; the paper's
@@ -190,7 +190,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class ChannelMargin:
-    """A channel of the bank over a section: cut-off and smoothing, rad/s; then per joint, where nothing touches.
+    """A channel of the bank over a section: cut-off and smoothing, rad/s; then per joint, in cycles free of contact.
 
     residual_max_Nm: largest. threshold_Nm: median of the threshold. margin: see the module's first lines.
     """
@@ -206,10 +206,10 @@ class ChannelMargin:
 class CertifiedEvidence:
     """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
 
-    margins: by section. promotions: refined models that took over in the run. is_anchored: whether each certificate
-    says what anchors all its offsets; logs from before there were anchors say nothing. revoked: why certificates were
-    taken back, in order. smallest_push: None where nothing was armed. certificates: those that were not taken back, as
-    the log has them at its end; none in a log that lacks its end, or of an earlier version.
+    margins: by section. promotions: refined models that took over in the run. is_anchored: for each certificate,
+    whether it names the anchor of all its offsets; logs of versions without anchors lack it. revoked: why
+    certificates were withdrawn, in order. smallest_push: None where the scheme was never armed. certificates: those
+    that were not withdrawn, as the log has them at its end; () for a log without its end, or of an earlier version.
     """
 
     tests: dict[str, int]
@@ -257,7 +257,7 @@ class Residual:
 class Untouched:
     """Sums over free cycles, by section. promotions: refined models that took over; beside: None where none ran.
 
-    smallest_push: None of the paper's scheme, and where nothing was armed.
+    smallest_push: None for the paper's scheme, and for a run that never armed detection.
     """
 
     residuals: dict[str, Residual]
@@ -281,10 +281,10 @@ class PaperRow(NamedTuple):
 
 
 class ReportSource(NamedTuple):
-    """The log that a run was read from; `is_complete`: it is whole and nothing was dropped on the way to it."""
+    """The log that a run was read from; `is_complete`: it is whole and no record was dropped on the way to it."""
 
     log_name: str
-    problem: str = ""  # what is missing, one line
+    problem: str = ""  # the missing parts, one line
     is_complete: bool = True
 
 

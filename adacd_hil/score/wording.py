@@ -81,7 +81,7 @@ def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: 
 
 
 def why_not_found(is_armed: bool) -> str:
-    """Say why nothing found a contact."""
+    """Return why a contact was not found."""
     return "missed" if is_armed else "not armed"
 
 
