@@ -22,7 +22,7 @@ class LogExistsError(LogError):
 
 @contextmanager
 def failing_as(what: str) -> Iterator[None]:
-    """Raise LogError for an OSError in the block: `what` failed, and the reason."""
+    """Raise LogError for an OSError in the block: the failed operation, and the reason."""
     try:
         yield
     except OSError as error:
@@ -141,12 +141,12 @@ class TimeWindow(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether it bounds nothing."""
+        """Whether it is unbounded."""
         return self == TimeWindow()
 
     @property
     def text(self) -> str:
-        """Say it as a command is asked for it; nothing of the whole log."""
+        """The window in a command's words, such as "from 3 s until 5 s"; "" for the whole log."""
         words = (("from", self.start_s), ("until", self.end_s))
         return " ".join(f"{word} {bound_s:g} s" for word, bound_s in words if math.isfinite(bound_s))
 

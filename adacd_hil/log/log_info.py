@@ -292,7 +292,7 @@ def _payloads(contents: Contents, channel: int) -> Iterator[bytes]:
 
 
 def attachment(path: Path, name: str) -> bytes | None:
-    """Return an attachment of an MCAP file by its name; None when it isn't among what precedes the first chunk."""
+    """Return an attachment of an MCAP file by its name; None when no record before the first chunk has it."""
     for record in _records_before_chunks(path):
         if isinstance(record, Attachment) and record.name == name:
             return record.data
@@ -300,7 +300,7 @@ def attachment(path: Path, name: str) -> bytes | None:
 
 
 def run_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of the run in an MCAP file; empty when they aren't among what precedes the first chunk."""
+    """Return the metadata of the run in an MCAP file; empty when no record before the first chunk has it."""
     for record in _records_before_chunks(path):
         if isinstance(record, Metadata) and record.name == RUN_METADATA:
             return record.metadata

@@ -321,7 +321,7 @@ class Run:
     log_start_ns: int | None = None  # the beginning of its log
     stretch: StretchOfRun | None = None  # None: the whole log
     checks: CheckCounts | None = None  # None: not in the log
-    broken_off: str = ""  # what ended the log, where that was not meant to
+    broken_off: str = ""  # the reason for an unintended end of the log
 
     @property
     def first_contact(self) -> int:

@@ -38,7 +38,7 @@ class FrameSource(Protocol):
 
 
 def open_frames(path: Path) -> FrameSource:
-    """Open a recording; its suffix says what it is.
+    """Open a recording; its suffix gives its format.
 
     Raises LogError when it can't be read, also from the iteration.
     """
