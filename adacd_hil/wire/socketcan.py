@@ -258,7 +258,7 @@ class SocketCanBus(Bus):
         self._socket.close()
 
     def close(self) -> None:
-        """Close the socket; a second call does nothing."""
+        """Close the socket; ignore a second call."""
         self._is_closed = True
         self._retire_socket()
 
