@@ -196,7 +196,7 @@ class Cycle:
 
     @property
     def reached(self) -> tuple[int, SchemeState]:
-        """How many cycles there have been, and the state they have come to."""
+        """Number of cycles so far, and the present state."""
         return self._arm.cycle + 1, self._state
 
     def _look_after_devices(self, arm: ArmState, output: SchemeOutput) -> None:

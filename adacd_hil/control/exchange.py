@@ -86,7 +86,7 @@ class Exchange:
         return arm.state()
 
     def _say_late(self, cycle: int) -> None:
-        """Say that commands still wait as the SYNC goes out at which they act; they act one later."""
+        """Report commands that still wait when the SYNC at which they act goes out; they act one SYNC later."""
         count, from_cycle = self._commands_late, cycle - self._acts_after
         what = f"1 command of cycle {from_cycle}" if count == 1 else f"{count} commands of cycle {from_cycle}"
         text = f"{what} missed SYNC {cycle}, so acting one later"

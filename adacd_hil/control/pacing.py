@@ -44,7 +44,7 @@ class HostLatency:
         self._drawn: list[int] = []
 
     def draw_ns(self) -> int:
-        """Give the latency of the next cycle, ns."""
+        """Return the latency of the next cycle, ns."""
         if self._is_constant:
             return self._constant_ns
         if not self._drawn:

@@ -76,7 +76,7 @@ class AnswerClock:
         return newest if self._follows_lost_ones(newest - answered, offset_ns, position_error) else answered + 1
 
     def _is_newer(self, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
-        """Tell whether a second frame without counter on the same SYNC is its answer, and the first was a late one."""
+        """Return whether a second frame without counter on one SYNC answers it, and the first one was late."""
         if not self._is_usual(offset_ns):
             return False
         return position_error is None or position_error(1) <= position_error(-1) + CLEAR_RAD
@@ -85,16 +85,16 @@ class AnswerClock:
         return not self._usual_count or offset_ns <= self._latest_ns + TOLERANCE_NS
 
     def _follows_lost_ones(self, owed: int, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
-        """Tell whether a frame without counter answers the last SYNC, and those before it have lost their answers."""
+        """Return whether a frame without counter answers the last SYNC: answers to earlier SYNCs were lost."""
         advantage_rad = 0.0 if position_error is None else position_error(1) - position_error(owed)
         if abs(advantage_rad) > CLEAR_RAD:
             return advantage_rad > 0.0
         return self._is_usual(offset_ns)
 
     def is_straggler(self, behind: int) -> bool:
-        """Tell whether a frame that answers no SYNC is one that was overtaken. `behind`: by its counter, 0 without one.
+        """Return whether a frame that answers no SYNC was overtaken. `behind`: by its counter, 0 without one.
 
-        Each straggler is believed once.
+        Each straggler counts once.
         """
         if behind == 0:
             was_guess, self._is_guess = self._is_guess, False

@@ -173,7 +173,7 @@ class ArmReport:
         return ages
 
     def describe_gaps(self) -> list[str]:
-        """Say of which devices no usable frame came in time in how many of the last cycles, one line each."""
+        """Count, per device, the last cycles without a usable frame in time, in words, one line each."""
         present = [~self._arm.received >> place & 1 for place in range(len(self._arm.devices))]
         gaps = [bits << 1 | now for bits, now in zip(self._arm.gaps, present, strict=True)]
         cycles = REMEMBERED_GAPS.bit_length() + 1
@@ -184,7 +184,7 @@ class ArmReport:
         ]
 
     def describe_checks(self) -> list[str]:
-        """Say how many cyclic frames of each device passed and failed their checks, one line each."""
+        """Count the cyclic frames of each device that passed and failed their checks, in words, one line each."""
         return [_describe_checks(device) for device in self._arm.devices]
 
     def describe_faults(self) -> list[str]:
@@ -211,7 +211,7 @@ class ArmReport:
         return lines
 
     def describe_disabled(self) -> list[str]:
-        """Say which drive is not enabled, one line each; empty when both are."""
+        """Name each drive that is not enabled, with its state and mode, one line each; empty when both are enabled."""
         return [line for drive in self._arm.drives for line in _describe_disabled(drive)]
 
     def describe_excess(self) -> list[str]:

@@ -24,14 +24,14 @@ from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 
 
 class Recurrence:
-    """Something that is done every so many cycles, and after skipped ones as soon as there is a cycle again."""
+    """Recurs every so many cycles; if its cycle is skipped, in the next cycle."""
 
     def __init__(self, interval_s: float, period_s: float) -> None:
         self._cycles = max(1, round(interval_s / period_s))
         self._due_cycle = 0
 
     def is_due(self, cycle: int) -> bool:
-        """Whether it is to be done in this cycle; asked once per cycle."""
+        """Return whether it is due in this cycle; call once per cycle."""
         if cycle < self._due_cycle:
             return False
         self._due_cycle = cycle - cycle % self._cycles + self._cycles
@@ -101,7 +101,7 @@ class ArmWatch:
 
 PATIENCE_PERIODS = 2.5
 """Periods without a heartbeat until a node counts as silent, on the host and in 0x1016 of the devices: one heartbeat
-may be lost and the next one be late by half a period, and yet nobody waits for a third."""
+may be lost and the next one be late by half a period, without waiting for a third."""
 OPERATIONAL = 5
 _STATES = {0: "boot-up", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
 
@@ -215,7 +215,7 @@ class DeadlineWatch:
         self._verdict = ""
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Take in one cycle; return it as it is, or as that of a host which has missed too many."""
+        """Take in one cycle; return its state, with the fault set if the host has missed too many periods."""
         misses = self._misses
         if arm.periods > 1:
             misses.append((arm.cycle, arm.periods - 1))
@@ -230,5 +230,5 @@ class DeadlineWatch:
         return arm._replace(fault=FaultReason.DEADLINE) if arm.fault is FaultReason.NONE else arm
 
     def describe(self) -> str:
-        """Say how many misses the last verdict was about; empty without one."""
+        """Return the number of misses of the last verdict in words; empty without one."""
         return self._verdict

@@ -1,4 +1,4 @@
-"""A device with one frame per SYNC: its checks, and whatever of it is the same for drives and sensors."""
+"""A device with one frame per SYNC: its checks, and the parts that drives and sensors share."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ class CyclicDevice(ABC):
 
     @abstractmethod
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
-        """Say whether a frame may come so many cycles after one with the main value `last`."""
+        """Return whether a frame may come so many cycles after one with the main value `last`."""
 
     @abstractmethod
     def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:

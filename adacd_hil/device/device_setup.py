@@ -532,7 +532,7 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
 
 
 def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
-    """Say where a PDO of the device is not as its profile has it; empty where it is so."""
+    """Describe the difference between a PDO and its profile; empty without one."""
     index = pdo.communication_index
     identifier = slave.read(index, _COB_ID)
     found, expected = identifier & ~RTR_NOT_ALLOWED, slave.device.can_id(pdo)
@@ -551,7 +551,7 @@ def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
 
 
 def _mapping_difference(slave: Slave, pdo: PdoSettings) -> str:
-    """Say where the mapping of a PDO is not as its profile has it; empty where it is so."""
+    """Describe the difference between the mapping of a PDO and its profile; empty without one."""
     mapping_index, entries = pdo.mapping_index, slave.device.mapping(pdo)
     text = slave.difference(mapping_index, 0, len(entries), "number of mapped objects")
     for sub, entry in enumerate(entries, 1):
@@ -626,7 +626,7 @@ def _read_number(node: Any, index: int, subindex: int) -> int | None:
 
 
 def contract_differences(device: PlacedDevice, pdos: list[Pdo]) -> list[str]:
-    """Say where the PDOs of a device are not those of its profile, from which the contract follows, one line each."""
+    """List the differences between a device's PDOs and its profile, from which the contract follows, one line each."""
     by_id = {pdo.can_id: pdo for pdo in pdos}
     lines = []
     for pdo in device.settings.pdo:

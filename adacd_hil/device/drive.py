@@ -25,7 +25,7 @@ high bit of the unprotected frame is at least 0.1 rad."""
 
 
 class Cia402State(IntEnum):
-    """States of the power drive system. Each value says how to get out of it."""
+    """States of the power drive system. The comment beside each value names the way out of it."""
 
     NOT_READY_TO_SWITCH_ON = 0  # by itself, after the drive's self test
     SWITCH_ON_DISABLED = 1  # shutdown
@@ -154,7 +154,7 @@ _NO_STATUS = _StatusPlaces()
 
 
 def option_codes(settings: Settings, profile: ProfileSettings) -> tuple[int | None, int | None]:
-    """Return 0x605A and 0x605E: the configuration's, else the profile's, None where neither says."""
+    """Return 0x605A and 0x605E: the configuration's, else the profile's, None where neither gives one."""
     chosen = settings.devices
     quick_stop, fault_reaction = chosen.quick_stop_option, chosen.fault_reaction_option
     return (
@@ -259,7 +259,7 @@ class Drive(CyclicDevice):
         return bool(self.statusword & _INTERNAL_LIMIT)
 
     def position_error(self, data: bytes, periods: int) -> float:
-        """Say by how much a frame's position is off, rad, if so many periods lie between it and the last that came."""
+        """Return the error of a frame's position, rad, if so many periods lie between it and the last frame."""
         if self._received is None or len(data) != self.feedback_message.length:
             return 0.0
         values = self.feedback_message.decode_values(data)

@@ -51,7 +51,7 @@ class Master:
         """Load the profiles. Raises ConfigError when one can't be used.
 
         `watch_host`: devices shall watch the host by time: its heartbeat, and its commands where they count ms. Not in
-        lockstep: there cycles take as long as they take, and a device that waits goes by the wall clock.
+        lockstep: cycles have no fixed duration there, and a device waits by the wall clock.
         """
         self._watch_host = watch_host
         self._settings = settings
@@ -281,5 +281,5 @@ class Master:
         return self._heartbeats.watch(t_ns)
 
     def send_heartbeat(self) -> None:
-        """Say that the host lives, 0x700 + its node id. Raises BusError."""
+        """Send the host's heartbeat, 0x700 + its node id. Raises BusError."""
         self._bus.send(self._heartbeat_id, bytes((OPERATIONAL,)))

@@ -450,7 +450,7 @@ class PlacedDevice:
         return [name.index << 16 | name.sub << 8 | self.variable(name).bits for name in names]
 
     def header(self, pdo: PdoSettings) -> list[SignalSettings]:
-        """Return the header objects of a PDO; none where it is unprotected."""
+        """Return the header objects of a PDO; () for an unprotected one."""
         if not pdo.data_ids:
             return []
         return [SignalSettings(object=text, signal="e2e") for text in self.settings.header]

@@ -42,7 +42,7 @@ class Ticks(NamedTuple):
     """The beginnings of n cycles, as columns (n,) of int64.
 
     `t_ns`: when SYNC went out or came, as all messages of the cycle carry it; so do its frames, as cycle_t_ns.
-    `periods`: since the cycle before, 1 unless some were skipped; the pause before an attempt counts for none.
+    `periods`: since the cycle before, 1 unless some were skipped; the pause before an attempt is not counted.
     """
 
     cycle: NDArray[np.int64]

@@ -26,14 +26,14 @@ from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, NMT_ID, SDO_REQUEST_I
 HOSTS_LISTEN_S = 0.3
 """How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats."""
 HOLD_S = 1.0
-"""How long after such a frame the arm counts as somebody else's, too: ten heartbeats of a host."""
+"""How long after such a frame the arm counts as another host's, too: ten heartbeats of a host."""
 CONTRADICTIONS = 2
 """Second frames of a device that are no accident."""
 CONTRADICTION_WINDOW_S = 0.1
 """In which they are counted."""
 _NMT_WORDS = {1: "start", 2: "stop", 128: "pre-operational", 129: "reset node", 130: "reset communication"}
 _READING = (2, 3, 5)
-"""SDO client commands that change nothing: upload initiate, segment, block. Source: CiA 301 (4.2), clause 7.2.4.3."""
+"""SDO client commands that only read: upload initiate, segment, block. Source: CiA 301 (4.2), clause 7.2.4.3."""
 
 
 def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
@@ -67,7 +67,7 @@ def listen_for_hosts(bus: Bus, clock: Clock, settings: Settings, codec: Codec, d
 
 
 def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
-    """Raise DeviceError when somebody else runs the arm: a reset would take it out of their hands. Raises BusError.
+    """Raise DeviceError when another host runs the arm: a reset would take it from that host. Raises BusError.
 
     Only where time passes by itself: in lockstep it does by this host's own frames.
     """
@@ -95,7 +95,7 @@ class Strangers(RateLimitedEvents):
         self._contradictions: dict[str, deque[int]] = {}
 
     def accept(self, frame: Frame, cycle: int) -> bool:
-        """Take a frame that was received in a cycle; False when it may be somebody else's."""
+        """Take a frame that was received in a cycle; return False when another sender may have sent it."""
         doing = self._doing.get(frame.can_id)
         if doing is None:
             return False
@@ -129,9 +129,9 @@ class Strangers(RateLimitedEvents):
         self.say(frame.t_ns, text, Event("error", "bus", text))
 
     def are_heard(self, cycle: int) -> bool:
-        """Tell whether somebody else has acted on the arm of late."""
+        """Return whether another sender has acted on the arm of late."""
         return cycle <= self._until_cycle
 
     def describe(self, cycle: int) -> list[str]:
-        """Say who has acted on the arm of late, one line each."""
+        """Describe the actions of other senders on the arm of late, one line each."""
         return [text for text, heard in self._complaints.items() if cycle <= heard + self._hold_cycles]

@@ -67,7 +67,7 @@ def function_name(can_id: int) -> str:
 
 @dataclass
 class Node:
-    """One CANopen node. None: not told (it didn't answer, or has no such object).
+    """One CANopen node. None: unknown (it didn't answer, or has no such object).
 
     nmt_state: 0, 4, 5, 127 from its heartbeat or boot-up. emergencies: (error code, error register), oldest first.
     answers: whether it answered SDO.
@@ -101,7 +101,7 @@ class Node:
 
     @property
     def state_text(self) -> str:
-        """Describe the NMT state, as told by heartbeats or as PDOs, which only an operational node sends, show it."""
+        """Describe the NMT state by heartbeats, or by PDOs, which only an operational node sends."""
         if self.has_pdos and self.nmt_state in (None, 0):
             return "operational (sends PDOs)"
         if self.nmt_state is None:
@@ -111,7 +111,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Expected:
-    """A node that the configuration expects. None: its EDS doesn't say, so anything will do."""
+    """A node that the configuration expects. None: its EDS doesn't give it, so any value will do."""
 
     name: str
     node_id: int
@@ -204,7 +204,7 @@ def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
 
 
 def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
-    """Give each identifier to the node that produces it by the predefined connection set; return the rest."""
+    """Assign each identifier to the node that produces it by the predefined connection set; return the rest."""
     others = []
     for talk in traffic.sorted():
         node = nodes.get(talk.can_id & 0x7F) if talk.can_id <= MAX_STANDARD_ID else None
@@ -235,7 +235,7 @@ def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[
 
 
 def compare(found: Survey, expected: list[Expected]) -> dict[int, str]:
-    """Say for each node, found or expected, how it fits the configuration: "" when it does."""
+    """Describe how each node, found or expected, differs from the configuration: "" when it fits."""
     wanted = {node.node_id: node for node in expected}
     present = {node.node_id: node for node in found.nodes}
     verdicts = {}
@@ -287,7 +287,7 @@ _WINDOW_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class NodeView:
-    """One node. state: as its last heartbeat says; age in s since then."""
+    """One node. state: by its last heartbeat; age in s since then."""
 
     node_id: int
     name: str

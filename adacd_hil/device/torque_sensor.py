@@ -82,7 +82,7 @@ class TorqueSensor(CyclicDevice):
         elif self.torque_range_Nm:
             self._cyclic_bits = _judge_range(torque, self.torque_range_Nm)
         else:
-            self._slow_bits = self._heard_bits  # nothing else says it
+            self._slow_bits = self._heard_bits  # only the status frame carries it
         self.status = _STATUSES[self._cyclic_bits | self._slow_bits]
         self._slow_bits = self._heard_bits
 

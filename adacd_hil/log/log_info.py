@@ -308,7 +308,7 @@ def run_metadata(path: Path) -> dict[str, str]:
 
 
 def _records_before_chunks(path: Path) -> Iterator[Attachment | Metadata]:
-    """Give the records before the first chunk, as far as they are sound: the reader of the log reports damage."""
+    """Yield the records before the first chunk, as far as they are sound: the reader of the log reports damage."""
     try:
         with open_input(path) as file:
             if file.read(len(MAGIC)) != MAGIC:

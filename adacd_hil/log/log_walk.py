@@ -1,7 +1,7 @@
 """A walk over all parts of a log, as if they were one file.
 
-The intact messages of a cut or damaged file are kept; a part that is missing or damaged costs only itself and raises
-nothing.
+The intact messages of a cut or damaged file are kept; a missing or damaged part costs only itself and raises no
+error.
 """
 
 import contextlib
@@ -293,7 +293,7 @@ class _PartWalk:
         yield from self._builder.add(block.contents, messages, slots)
 
     def _define(self, record: RawRecord | None) -> None:
-        """Take in a definition. Raises LogError for one that makes no sense, and for None, which is no record."""
+        """Take in a definition. Raises LogError for an invalid one and for None."""
         if record is None:
             raise LogError("no record")
         definition = self._definitions.take(record)

@@ -110,7 +110,7 @@ class Series:
         return np.asarray(stamp_ns - self._epoch_ns, np.int64)
 
     def part(self, rows: slice | NDArray[np.bool_]) -> "Series":
-        """Give some of the messages."""
+        """Return some of the messages."""
         return Series(self.records[rows], self._epoch_ns)
 
     @property
@@ -259,7 +259,7 @@ def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
 def _series_of(
     rows: Mapping[str, NDArray[np.uint8]], topics: Mapping[str, Topic], own: Mapping[str, Topic], epoch_ns: int
 ) -> dict[str, Series]:
-    """Make a series of each topic of fixed size: of our own ones, present or not, and of the others that there are.
+    """Make a series of each topic of fixed size: of our own ones, present or not, and of the others present.
 
     rows: the records of topics (n, size).
     """
@@ -279,7 +279,7 @@ _STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": 
 
 
 def check_states(scheme: Series) -> None:
-    """Raise LogError for a record of /scheme with a state or a fault that there is not."""
+    """Raise LogError for a record of /scheme with an unknown state or fault."""
     for name, kind in _STATES.items():
         if name in scheme.fields:
             odd = np.flatnonzero(~np.isin(scheme.records[name], [int(member) for member in kind]))
@@ -289,7 +289,7 @@ def check_states(scheme: Series) -> None:
 
 
 def contacts_of(series: Series) -> list[LoggedContact]:
-    """Give the reports of /contact. Raises LogError for an unknown level, kind, reaction or place."""
+    """Return the reports of /contact. Raises LogError for an unknown level, kind, reaction or place."""
     contacts = []
     members = [member for member in CONTACT.head if member.name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
@@ -358,7 +358,7 @@ class LogStream:
         return self._walk.attachments
 
     def empty(self) -> Piece:
-        """Give a piece without messages, with our own topics."""
+        """Return a piece without messages, with our own topics."""
         return Piece(_series_of({}, {}, self._own_topics(), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
 
     @property
@@ -395,7 +395,7 @@ class LogStream:
         return self._walk.parts
 
     def joint_states(self, piece: Piece) -> dict[str, list[bytes]]:
-        """Give the payloads of joint states of others, by topic."""
+        """Return the payloads of joint states of others, by topic."""
         found = self._walk.topics
         return {name: each for name, each in piece.payloads.items() if found[name].type_name == JOINT_STATE.name}
 

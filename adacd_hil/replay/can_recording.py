@@ -244,12 +244,12 @@ class RecordingAlone:
         return int(self._t_ns()[0])
 
     def _t_ns(self) -> Places:
-        """Give the time of each cycle (n,): of its SYNC, or where the bus was in lockstep by its number."""
+        """Return the time of each cycle (n,): of its SYNC, or where the bus was in lockstep by its number."""
         recording = self._recording
         return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
 
     def parts(self, with_frames: bool) -> Iterator[Part]:  # noqa: ARG002 (there are only frames)
-        """Give one part."""
+        """Yield one part."""
         yield Part(list(self._stretches()), {}, (), frozenset())
 
     def _stretches(self) -> Iterator[CycleStretch]:

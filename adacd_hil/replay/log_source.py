@@ -102,7 +102,7 @@ class AttemptSplitter:
         self._tail = np.zeros(0, np.uint8)  # counters of the SYNCs after that cycle
 
     def split(self, piece: Piece) -> Iterator[CycleStretch]:
-        """Give the stretches of the next piece."""
+        """Yield the stretches of the next piece."""
         paired = self._pair(piece)
         frames = piece.frames
         if self._frames is not None:
@@ -144,7 +144,7 @@ class AttemptSplitter:
         return sorted(begins.items())
 
     def _named_begins(self, paired: _Paired) -> NDArray[np.bool_]:
-        """Say which cycles belong to another attempt than the one before (n,)."""
+        """Return whether each cycle belongs to another attempt than the one before (n,)."""
         first = paired.other["first_cycle"].astype(np.int64)
         is_new = np.diff(first, prepend=self._first_cycle) != 0
         if len(first):
@@ -153,7 +153,7 @@ class AttemptSplitter:
         return np.asarray(is_new)
 
     def _shown_begins(self, scheme: NDArray[Any]) -> NDArray[np.bool_]:
-        """Say in which cycles the scheme begins anew, after a fault or with the log (n,)."""
+        """Return whether the scheme begins anew in each cycle, after a fault or with the log (n,)."""
         before = np.concatenate(([self._state], scheme["state"][:-1])) if len(scheme) else scheme["state"]
         is_anew = (scheme["previous_state"] == SchemeState.INIT) & (scheme["state"] <= SchemeState.COMMISSION)
         is_after_fault = before == SchemeState.FAULT
@@ -239,7 +239,7 @@ class AttemptSplitter:
 
 
 def _join(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
-    """Put frames behind each other, as long as the longer of them."""
+    """Join frames of two lengths, in the layout of the longer."""
     wider = max(first.dtype, second.dtype, key=lambda dtype: dtype.itemsize)
     joined = np.zeros(len(first) + len(second), wider)
     for part, frames in ((joined[: len(first)], first), (joined[len(first) :], second)):
@@ -272,7 +272,7 @@ _TOPICS: Final = ("/scheme", "/contact", "/events")
 CYCLES_PER_PIECE: Final = 8_000
 _SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
 _SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
-"""Names of the events that the scheme itself says."""
+"""Names of the events that the scheme itself reports."""
 
 
 class ReplaySource(Protocol):
@@ -288,7 +288,7 @@ class ReplaySource(Protocol):
     is_recording: bool
 
     def parts(self, with_frames: bool) -> Iterator["Part"]:
-        """Give the parts, in order. with_frames: stretches have their frames, else none."""
+        """Return the parts, in order. with_frames: stretches have their frames, else none."""
 
     @property
     def start_ns(self) -> int:
@@ -330,7 +330,7 @@ class LogSource:
         return LogStream(self._path, topics, self._cycles_per_piece, is_ahead=False)  # replay reads in a thread
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
-        """Give the parts, in order. with_frames: stretches have their frames, else none."""
+        """Yield the parts, in order. with_frames: stretches have their frames, else none."""
         self._stream = self._open(with_frames)
         for read in self._stream:
             piece = self._piece(read)
@@ -377,7 +377,7 @@ def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
 
 
 def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
-    """Tell whether the run that the settings are of knew anchors: since then they say how a zero drifts."""
+    """Return whether the run that the settings are of knew anchors: since then they say how a zero drifts."""
     tare = parse_toml(attachments["config.toml"]).get("tare")
     return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare
 

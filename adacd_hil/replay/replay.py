@@ -142,7 +142,7 @@ class _Player:
         part: Part,
         events: Sequence[Event],
     ) -> None:
-        """Compare a stretch with the log, where there is something to compare with."""
+        """Compare a stretch with the log, if the log has its decisions."""
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
         ticks = stretch.ticks
@@ -332,7 +332,7 @@ def _rows_of(stretch: CycleStretch, rows: slice) -> CycleStretch:
 
 
 class _ArmReader:
-    """Gives the arm's states: the log's, or those of frames, decoded once for all settings that make the same of them.
+    """Gives the arm's states: the log's, or those of frames, decoded once for all settings with equal decoding.
 
     needs_frames: whether any are decoded.
     """
@@ -359,7 +359,7 @@ class _ArmReader:
 
 
 def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
-    """Say why frames must be decoded, which takes longer, one line; empty where the log's states serve."""
+    """Return why frames must be decoded, which takes longer, one line; empty if the log's states serve."""
     if source.is_recording:
         return ""
     if not source.has_arms:

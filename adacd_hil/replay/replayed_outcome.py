@@ -232,7 +232,7 @@ class Replay:
 
     @property
     def is_identical(self) -> bool:
-        """Whether something was compared and all of it was the same."""
+        """Whether a decision was compared and every compared one was the same."""
         return self.compared > 0 and self.mismatch_count == 0
 
     @property
@@ -246,7 +246,7 @@ class Replay:
         return tuple(adaptation.took_s for adaptation in self.adaptations)
 
     def time_s(self, t_ns: int) -> float:
-        """Give a time since motion start."""
+        """Return a time since motion start."""
         return (t_ns - self.zero_ns) * 1e-9
 
 
@@ -348,7 +348,7 @@ def _end(found: Replay) -> str:
 
 
 def as_json(found: Replay) -> dict[str, Any]:
-    """Give a replay in plain values; times in s since motion start."""
+    """Return a replay in plain values; times in s since motion start."""
     return {
         "cycles": found.cycles,
         "attempts": found.attempts,

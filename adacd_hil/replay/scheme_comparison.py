@@ -247,7 +247,7 @@ ScriptOf = Callable[[OperatorSettings], Script]
 
 
 class Asking:
-    """Plays the script along a replay: cycle by cycle, or where it could ask for something."""
+    """Plays the script along a replay: cycle by cycle, or in the cycles in which it could make a request."""
 
     def __init__(self, settings: Settings, script_of: ScriptOf) -> None:
         operator = settings.operator
@@ -272,7 +272,7 @@ class Asking:
         return carried or self._script.request(elapsed_s, state)
 
     def note(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
-        """Take note of a request, of the state that it met and of the one that the cycle has led to."""
+        """Note a request, the state before the cycle and the state after it."""
         self._kept.ask(request, previous)
         self._kept.serve((state,))
         if state is SchemeState.ADAPT and self._enabled is None:

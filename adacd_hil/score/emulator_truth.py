@@ -173,7 +173,7 @@ class _Gathering:
         self._contact = _OneContact(_BEGINNING[self._kept_rows > _PLENTY])
 
     def done(self, stream: LogStream) -> TruthTable:
-        """Give the kept rows."""
+        """Return the kept rows."""
         rows = np.concatenate([np.zeros(0, _ROW), *self._kept, self._contact.rows()])
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
         models = zip(nothing, *self._models, strict=True)
@@ -232,13 +232,13 @@ class _OneContact:
             self._chosen.append(middle[extreme_rows(series, np.arange(0, len(middle), _BUCKET))])
 
     def rows(self) -> NDArray[Any]:
-        """Give the rows that are kept."""
+        """Return the rows that are kept."""
         self._choose()
         return np.concatenate([*self._chosen, self._waiting])
 
 
 def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
-    """Give the truth on the host's cycles; None where the emulator never cycled.
+    """Return the truth on the host's cycles; None where the emulator never cycled.
 
     begins: first cycle of each attempt of the run; last: of the run; time_s: of the rows (m,).
 
@@ -302,7 +302,7 @@ def _digest(config: bytes) -> str | None:
 
 
 def _played(truth: Path) -> dict[str, str]:
-    """Give scenario and seed of a truth; old ones have them in an attachment alone."""
+    """Return scenario and seed of a truth; old ones have them in an attachment alone."""
     said = run_metadata(truth)
     try:
         table = parse_toml(attachment(truth, "scenario.toml") or b"")
@@ -351,7 +351,7 @@ class HostCycles(NamedTuple):
 
 
 def windows_of(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TouchWindow]:
-    """Give those contacts, on the host's cycles, that begin before these end, as they are judged.
+    """Return those contacts, on the host's cycles, that begin before these end, as they are judged.
 
     host: has the cycles that each onset and each end lies between.
     """

@@ -1,4 +1,4 @@
-"""Sums over a run's cycles in which nobody touches the arm: residuals, margins, and the paper's scheme beside.
+"""Sums over a run's cycles free of contact: residuals, margins, and the paper's scheme beside.
 
 Cycles are taken piece by piece, in order; a run in memory is one piece. A cycle is *free* unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
@@ -15,7 +15,7 @@ large as at the worst moment all were, after 59 ms at most.
 have been a false alarm. Per section, adaptations included, since detection is on there too.
 
 **The paper's scheme beside** the certified one adapts when that one does, ends by eq. (15) and compares with its own
-thresholds, but decides nothing: a contact that is reacted to has been found by the other. So its residual is judged as
+thresholds, but raises no alarm: the other scheme has found every contact with a reaction. So its residual is judged as
 a stream (`judge.StreamJudge`), with a pause of 10 time constants; a false alarm counts until the user asks to finish.
 While the payload is changed it does not detect.
 """
@@ -56,9 +56,9 @@ SETTLING_TIME_CONSTANTS = 10.0
 
 
 def larger(largest: Vector | None, values: Vector) -> Vector | None:
-    """Give the larger of the sizes of `values` (k, …) and the largest of each so far (…).
+    """Return the larger of the sizes of `values` (k, …) and the largest of each so far (…).
 
-    None so far: none. NaN stays.
+    None before the first value. NaN stays.
     """
     if values.shape[0] == 0:
         return largest
@@ -142,7 +142,7 @@ class BesideGatherer:
 
 
 def _left_s(adaptation: Section, sections: Sequence[Section]) -> float:
-    """Give when an adaptation and the detection after it are left, s; infinite at the end of the run."""
+    """Return when an adaptation and the detection after it are left, s; infinite at the end of the run."""
     later = (section for section in sections if section.start_s > adaptation.start_s and section.kind != "detection")
     return next((section.start_s for section in later), np.inf)
 
@@ -178,14 +178,14 @@ def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouch
 
 
 def last_row(run: Run, section: Section) -> int:
-    """Give the row with an adaptation's result: the next section's first cycle, which still learns."""
+    """Return the row with an adaptation's result: the next section's first cycle, which still learns."""
     time_s = run.time_s()
     end = int(rows_of(time_s, section, float(time_s[-1])).stop)
     return end - 1 + int(section.is_complete)
 
 
 def _tests(run: Run, section: Section) -> list[float]:
-    """Give the lengths of the stays in CERTIFY of a section, s."""
+    """Return the lengths of the stays in CERTIFY of a section, s."""
     time_s = run.time_s()
     rows = rows_of(time_s, section, float(time_s[-1]))
     inside = np.concatenate(([False], run.state[rows] == SchemeState.CERTIFY, [False]))

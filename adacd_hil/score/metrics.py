@@ -78,7 +78,7 @@ class TimingEvidence:
     counts: Mapping[str, Count | None]
 
     def as_json(self) -> dict[str, Any]:
-        """Give the evidence in plain values."""
+        """Return the evidence in plain values."""
         times = {name: found for name, found in self.times.items() if found is not None}
         absent = dict.fromkeys(self.times)
         reaction = self.reaction
@@ -137,7 +137,7 @@ class CyclicData:
     excesses: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
+        """Return it in plain values."""
         devices = {name: vars(shares) for name, shares in self.devices.items()}
         return {**vars(self), "devices": devices, "excesses": list(self.excesses)}
 
@@ -231,7 +231,7 @@ class CertifiedEvidence:
 
 
 def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
-    """Give the certificates that events, by name and message, have as numbers; unreadable ones are left out."""
+    """Return the certificates that events, by name and message, have as numbers; unreadable ones are left out."""
     from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
 
     for name, message in told:
@@ -246,7 +246,7 @@ def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
 
 @dataclass(frozen=True)
 class Residual:
-    """Largest |tau_ext_hat| of a section, Nm per joint, over `cycles` cycles free of contact; None if none."""
+    """Largest |tau_ext_hat| of a section, Nm per joint, over `cycles` cycles free of contact; None without a cycle."""
 
     identified: tuple[float, float] | None
     cad: tuple[float, float] | None
@@ -255,7 +255,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class Untouched:
-    """Sums over free cycles, by section. promotions: refined models that took over; beside: None where none ran.
+    """Sums over free cycles, by section. promotions: refined models that took over; beside: None if it didn't run.
 
     smallest_push: None for the paper's scheme, and for a run that never armed detection.
     """
@@ -271,7 +271,7 @@ class PaperRow(NamedTuple):
     """One line of *paper against measured*.
 
     paper: None where the run is not of the paper's experiment; beside: the paper's scheme on the same stream, None
-    where none ran.
+    if it didn't run.
     """
 
     quantity: str
@@ -355,7 +355,7 @@ class CycleStatistics:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Everything that the report says, see the module's first lines for the definitions.
+    """The content of the report, see the module's first lines for the definitions.
 
     fault, fault_s: the first one of the run. findings: a clause each, the gravest first.
     """

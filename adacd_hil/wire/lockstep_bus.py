@@ -334,7 +334,7 @@ class LockstepBus(Bus):
         return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
 
     def _let_pass(self, limit_ns: int) -> bool:
-        """Ask the devices to let time pass; tell whether that may have brought something."""
+        """Ask the devices to let time pass; return whether that may have brought a frame."""
         now_ns = self._clock.now_ns()
         if self._is_cyclic(now_ns):
             return False
@@ -343,7 +343,7 @@ class LockstepBus(Bus):
         return self._ask(limit_ns) or self._granted_ns < limit_ns
 
     def _ask(self, until_ns: int) -> bool:
-        """Let the devices live until then, or until they send something; tell whether they did."""
+        """Let the devices run until then, or until they send a frame; return whether they sent one."""
         self._bus.send(HOST_MARK, pack_mark(MarkKind.ADVANCE, until_ns))
         return self._await_grant()
 

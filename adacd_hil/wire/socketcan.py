@@ -244,7 +244,7 @@ class SocketCanBus(Bus):
         self._open()
 
     def _carries_frames(self) -> bool:
-        """Tell whether any frame is received within 0.25 s, including transmitted frames of other programs."""
+        """Return whether any frame is received within 0.25 s, including transmitted frames of other programs."""
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as listener:
             listener.bind((self.channel,))
             return bool(select.select([listener], [], [], _LIVE_S)[0])

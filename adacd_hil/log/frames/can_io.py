@@ -102,7 +102,7 @@ class TimedMessage(can.Message):
 
 
 def time_ns(message: can.Message) -> int:
-    """Return the time of a message: in whole nanoseconds if it knows it and nobody has changed `timestamp` since."""
+    """Return the time of a message: in whole nanoseconds if it has them and `timestamp` is unchanged."""
     seconds = message.timestamp or 0.0
     t_ns = getattr(message, "t_ns", None)
     if t_ns is not None and t_ns / 1_000_000_000 == seconds:
@@ -211,7 +211,7 @@ _ASC_FRAME = re.compile(r"-?\d+[.,]\d+\s+(CANFD\s+)?\d+\s+\S+\s+(Rx|Tx|TxRq)\s",
 
 
 def _asc_lines(lines: Iterable[str], is_relative: bool) -> Iterator[str]:
-    """Give the lines of an ASC, with stamps from the beginning; say which frames python-can will pass over."""
+    """Yield the lines of an ASC, with stamps from the beginning; say which frames python-can will pass over."""
     time_s = Decimal(0)
     for number, text in enumerate(lines, 1):
         line = text.strip()
@@ -231,7 +231,7 @@ _ERROR_FLAG = 0x20000000
 
 
 class _CandumpReader(can.CanutilsLogReader):
-    """python-can's, but a line that is no frame ends nothing, and error frames keep their class.
+    """python-can's, but it skips lines without a frame, and error frames keep their class.
 
     Of an error frame python-can makes data of a 29-bit identifier, or drops all but the time.
     """

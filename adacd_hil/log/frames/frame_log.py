@@ -34,7 +34,7 @@ class FrameSource(Protocol):
     problem: str
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Give the frames, (n,) of RECORDED_FRAME_DTYPE, in the order of the recording."""
+        """Return the frames, (n,) of RECORDED_FRAME_DTYPE, in the order of the recording."""
 
 
 def open_frames(path: Path) -> FrameSource:

@@ -114,7 +114,7 @@ class McapFrames:
                 first.seek(0)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Give the frames of each chunk, (n,) of RECORDED_FRAME_DTYPE."""
+        """Yield the frames of each chunk, (n,) of RECORDED_FRAME_DTYPE."""
         for source in self._files:
             if not isinstance(source, Path):
                 yield from self._read(source, "the file")
@@ -191,7 +191,7 @@ class McapFrames:
         )
 
     def _frames(self, contents: Contents) -> NDArray[Any]:
-        """Read the frames of a chunk in the order of the file. Raises ValueError for a frame that is none."""
+        """Read the frames of a chunk in the order of the file. Raises ValueError for an invalid frame."""
         places, found = [], []
         for number in np.unique(contents.channels).tolist():
             source = self._sources.get(number)

@@ -64,12 +64,12 @@ LEAST_MESSAGE = 22
 
 
 def has_shape(opcode: int) -> bool:
-    """Say whether records of this kind repeat their length."""
+    """Return whether records of this kind repeat their length."""
     return opcode in _SHAPES
 
 
 def fits(opcode: int, length: int, read: Callable[[int, int], bytes]) -> bool:
-    """Say whether a record of this kind can be `length` bytes long; `read` gives bytes of it, by place and count."""
+    """Return whether a record of this kind can be `length` bytes long; `read` gives bytes of it, by place and count."""
     if opcode not in _SHAPES:
         return opcode == Opcode.MESSAGE and length >= LEAST_MESSAGE
     position = 0
@@ -240,7 +240,7 @@ def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap | Trailer]:
 
 
 def read_header(path: Path) -> Header | None:
-    """Read the header of a file; None where it has none that can be trusted."""
+    """Read the header of a file; None without one that can be trusted."""
     try:
         with open_input(path) as file:
             first = next(scan(file), None)
@@ -295,7 +295,7 @@ class _Scan:
         return (opcode, length) if is_there else None
 
     def _is_shaped(self, position: int) -> bool:
-        """Say whether a record that repeats its length is at `position`."""
+        """Return whether a record that repeats its length is at `position`."""
         head = self._read(position, HEAD.size)
         if len(head) < HEAD.size or not has_shape(head[0]):
             return False
@@ -335,8 +335,8 @@ class FileEnd(NamedTuple):
     """Position and CRC of the data section, and the summary, by the end of the file."""
 
     data_end: int  # where the DataEnd begins
-    data_crc: int  # stored there; 0: none
-    summary: list[RawRecord]  # empty where its CRC doesn't fit, or where it has none and its records no shape
+    data_crc: int  # stored there; 0: no CRC
+    summary: list[RawRecord]  # empty if its CRC doesn't fit, or if both its CRC and its records' shape are missing
 
 
 def read_end(file: IO[bytes]) -> FileEnd | None:
@@ -358,13 +358,13 @@ def read_end(file: IO[bytes]) -> FileEnd | None:
 
 
 def _has_shape(record: RawRecord) -> bool:
-    """Say whether a record is one that repeats its length, and does so."""
+    """Return whether a record is of a kind that repeats its length, and does so."""
     body = record.body
     return has_shape(record.opcode) and fits(record.opcode, len(body), lambda place, count: body[place : place + count])
 
 
 def summary_of(file: IO[bytes]) -> list[RawRecord]:
-    """Read the summary of a file, whether or not it has a CRC that fits; empty where there is none."""
+    """Read the summary of a file, whether or not it has a CRC that fits; empty without a summary."""
     found = _find(file)
     if found is None or found[0] - found[1] > MOST_RECORD_BYTES:
         return []
@@ -373,7 +373,7 @@ def summary_of(file: IO[bytes]) -> list[RawRecord]:
 
 
 def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
-    """Find where the footer is, and where the summary begins; None where there is no end."""
+    """Find where the footer is, and where the summary begins; None for a file without an end."""
     size = file.seek(0, os.SEEK_END)
     place = size - len(MAGIC) - _FOOTER
     tail = _read(file, max(0, place), _FOOTER + len(MAGIC))
