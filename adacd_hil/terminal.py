@@ -27,7 +27,7 @@ _CONTROL = re.compile(
 _MOST_LETTERS = 2000
 _POLL_MS = 100
 _PATIENCE_POLLS = 5
-"""Polls of a blocked output after the user has asked for the end: 0.5 s."""
+"""Polls of a blocked output after the user's request to end: 0.5 s."""
 _NOBODY_READS = (errno.EPIPE, errno.EIO)
 """The other end of the pipe is closed, or the terminal has hung up."""
 _MOMENT_S = 0.02

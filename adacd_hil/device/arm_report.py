@@ -5,7 +5,7 @@ The shares of cycles whose cyclic data came in time are compared, second by seco
 After MOST_IN_A_ROW cycles without a sample for the model, a warning follows at once: a contact is detected so much
 later.
 
-Cycles are counted only while the drives are enabled: a device may be silent before and after a run.
+Cycles are counted only while the drives are enabled: data from before and after don't count for a run.
 """
 
 import math

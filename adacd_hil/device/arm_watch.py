@@ -215,7 +215,7 @@ class DeadlineWatch:
         self._verdict = ""
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Take in one cycle; return its state, with the fault set if the host has missed too many periods."""
+        """Take in one cycle; return its state, marked late or faulted if the host has missed too many periods."""
         misses = self._misses
         if arm.periods > 1:
             misses.append((arm.cycle, arm.periods - 1))

@@ -276,7 +276,7 @@ class CheckCounts:
 
 
 class StretchOfRun(NamedTuple):
-    """A stretch of a log: as asked for, as found, widened so that it cuts nothing, and the contacts before it.
+    """A stretch of a log: as requested, as found, widened so that it cuts nothing, and the contacts before it.
 
     motion_start_s: s since the beginning of the log.
     """
@@ -309,7 +309,7 @@ class Run:
     metadata: Mapping[str, str]
     frames: int | None
     dropped: int | None
-    finish_cycle: int | None = None  # in which the user asked to finish; None: never
+    finish_cycle: int | None = None  # cycle of the request to finish; None: never
     contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
     certified: CertifiedStream | None = None  # None of the paper's scheme
     beside: PaperStream | None = None
