@@ -119,7 +119,7 @@ def _make(folder: Path) -> os.stat_result:
 
 
 def _is_own(status: os.stat_result) -> bool:
-    """Tell whether it is a folder in which only this user can write."""
+    """Return whether it is a folder in which only this user can write."""
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
 
@@ -212,7 +212,7 @@ class _SharedCache(FunctionCache):
             _claims.release(self._claim(sig))
 
     def version(self) -> int | None:
-        """Return a number that changes whenever any process saves code of this function; None: none is saved."""
+        """Return a number that changes whenever any process saves code of this function; None: no code is saved."""
         try:
             return Path(self._cache_file._index_path).stat().st_mtime_ns
         except OSError:

@@ -56,7 +56,7 @@ def read_input(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
 
 
 def exists(path: Path) -> bool:
-    """Tell whether a file or folder of that name exists; False for a name that no file can have."""
+    """Return whether a file or folder of that name exists; False for a name that no file can have."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -110,7 +110,7 @@ def _owner(descriptor: int) -> str:
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Tell whether an error, or an error that caused it, means that the disk or the quota is full."""
+    """Return whether an error, or an error that caused it, means that the disk or the quota is full."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in _NO_ROOM:
             return True
@@ -211,7 +211,7 @@ def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Pa
 
 
 def is_anothers(path: Path, head: bytes) -> bool:
-    """Tell whether the file exists, isn't empty, and doesn't begin with `head`: then it may not be replaced.
+    """Return whether the file exists, isn't empty, and doesn't begin with `head`: then it may not be replaced.
 
     Raises OSError.
     """

@@ -27,7 +27,7 @@ _CONTROL = re.compile(
 _MOST_LETTERS = 2000
 _POLL_MS = 100
 _PATIENCE_POLLS = 5
-"""Polls of a blocked output after the user has asked for the end: 0.5 s."""
+"""Polls of a blocked output after the user's request to end: 0.5 s."""
 _NOBODY_READS = (errno.EPIPE, errno.EIO)
 """The other end of the pipe is closed, or the terminal has hung up."""
 _MOMENT_S = 0.02
@@ -267,12 +267,12 @@ def write_result(text: str) -> None:
 
 
 def moves_cursor(stream: "TextIO | Terminal") -> bool:
-    """Tell whether a stream is a terminal that can overwrite a line; not with TERM=dumb."""
+    """Return whether a stream is a terminal that can overwrite a line; not with TERM=dumb."""
     return _is_terminal(stream) and os.environ.get("TERM", "dumb") != "dumb"
 
 
 def has_colour(stream: "TextIO | Terminal") -> bool:
-    """Tell whether colours may be written: to terminals except with TERM=dumb.
+    """Return whether colours may be written: to terminals except with TERM=dumb.
 
     NO_COLOR, set to any value, forbids them; otherwise FORCE_COLOR or CLICOLOR_FORCE, other than 0, force them.
     """
@@ -315,7 +315,7 @@ def open_terminals() -> None:
 
 
 def is_interrupted(error: BaseException | None) -> bool:
-    """Tell whether Ctrl-C caused an error: importing a compiled module turns it into an ImportError."""
+    """Return whether Ctrl-C caused an error: importing a compiled module turns it into an ImportError."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True

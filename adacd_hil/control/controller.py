@@ -37,7 +37,7 @@ class Controller:
         )
 
     def feed_forward(self, theta: Vector) -> None:
-        """Blend the feedforward to these parameters (p,); the same array again changes nothing."""
+        """Blend the feedforward to these parameters (p,); ignore the same array again."""
         if theta is self._new or not self._has_feedforward:
             return
         self._old, self._new = self._theta, theta

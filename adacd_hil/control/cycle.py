@@ -57,7 +57,7 @@ FAULT_LINGER_S = 0.5
 FINISH_S = 10.0
 """How long an arm may take to park once it is to finish, three times the longest way; then it ends where it is."""
 FRAME_CHECKS_S = 1.0
-"""How often the log gets what the checks of frames have counted."""
+"""How often the counts of the frame checks are logged."""
 
 _ENABLING = POWERED | {SchemeState.ENABLE}
 
@@ -89,7 +89,7 @@ class Cycle:
         clock: Clock,
         touched_ns: Callable[[], int | None] = lambda: None,
     ) -> None:
-        """Prepare. `clock`: what durations within a cycle are measured by; `touched_ns`: as of `RunNarration`."""
+        """Prepare. `clock`: measures durations within a cycle; `touched_ns`: as of `RunNarration`."""
         self._period_s = settings.bus.period_s
         self._frame_checks = Recurrence(FRAME_CHECKS_S, self._period_s)
         self._progress = progress
@@ -134,12 +134,12 @@ class Cycle:
         self._kept = KeptRequest()
 
     def carry(self, request: Request) -> None:
-        """Ask what was asked of an attempt before and not served, once the drives are enabled. Before `run`."""
+        """Repeat an unserved request of the attempt before, once the drives are enabled. Call before `run`."""
         self._kept = KeptRequest(request)
 
     @property
     def unserved(self) -> Request:
-        """What the user has asked for and not got: the end of the run, or a stop to change the payload; else NONE."""
+        """The user's request that was not served: the end of the run, or a stop to change the payload; else NONE."""
         return self._kept.request
 
     @property
@@ -196,18 +196,18 @@ class Cycle:
 
     @property
     def reached(self) -> tuple[int, SchemeState]:
-        """How many cycles there have been, and the state they have come to."""
+        """Number of cycles so far, and the present state."""
         return self._arm.cycle + 1, self._state
 
     def _look_after_devices(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Stop drives that a command has not stopped; else read again what was written into the devices."""
+        """Stop drives that a command has not stopped; else read the devices' parameters again."""
         if self._faulted_cycle is not None:
             self._escalation.step(arm.cycle - self._faulted_cycle, arm.t_ns, output.fault)
         elif output.state in POWERED:
             self._master.parameters.step(arm.cycle, arm.t_ns)
 
     def _request(self, cycle: int) -> Request:
-        """Ask the operator; what concerns the end of the run stays here."""
+        """Return the scheme's request of this cycle; act on a request to end the run."""
         if self._interrupts and not self._is_finishing:
             return self._finish()
         elapsed_s = None if self._enabled_cycle is None else (cycle - self._enabled_cycle) * self._period_s
@@ -225,7 +225,7 @@ class Cycle:
         return Request.FINISH
 
     def _follow(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Turn the desired motion, or what gives way to a push, into a desired torque."""
+        """Turn the desired motion, or the arm's yielding to a push, into a desired torque."""
         if output.is_model_valid:
             self._controller.feed_forward(output.theta_ff)
         if self._reference.is_floating:
@@ -237,7 +237,8 @@ class Cycle:
     def _limit(self, arm: ArmState, output: SchemeOutput, now_ns: int) -> tuple[ArmCommand, GateFlag]:
         """Turn the desired torque into a limited command, to be sent now.
 
-        A cycle that took so long, as when the process was stopped, that its torque belongs to the past has none.
+        A command without torque follows a cycle that took so long, as when the process was stopped, that its torque is
+        stale.
         """
         is_stale = now_ns - self._exchange.sync_ns > self._stale_ns
         is_open = output.state in POWERED and arm.is_enabled and not is_stale

@@ -109,7 +109,7 @@ class Reading(NamedTuple):
         return 0 if (self.position[0], self.torque[0], self.motor[0]) != (1.0, 1.0, 1.0) else 1
 
     def allows(self, found: Sequence[TorqueRatio | None], error: float) -> bool:
-        """Tell whether it predicts the ratios of sensed to commanded torque that were found, by node; None: unknown.
+        """Return whether it predicts the ratios of sensed to commanded torque that were found, by node; None: unknown.
 
         error: possible relative error of a torque constant or a scale, 0 to 1.
         """
@@ -418,7 +418,7 @@ class DeviceReadings:
 
 
 def may_be_arm(theta: Vector, slack: Vector) -> bool:
-    """Tell whether M(q) is positive definite for some parameters within `slack` of theta."""
+    """Return whether M(q) is positive definite for some parameters within `slack` of theta."""
     a1, a2 = theta[A1] + slack[A1], max(abs(theta[A2]) - slack[A2], 0.0)
     a3 = min(max(0.5 * a1, theta[A3] - slack[A3]), theta[A3] + slack[A3])
     return bool(a3 > 0.0 and a3 * (a1 - a3) > a2**2)

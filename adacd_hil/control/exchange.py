@@ -1,6 +1,6 @@
-"""What every cycle begins and ends with, torque or no torque: SYNC out, feedback in; commands out, a record.
+"""The common begin and end of every cycle, with or without torque: SYNC out, feedback in; commands out, a record.
 
-SYNC comes in, too, where another host sends it. A cycle is `turn`, its own decision, `leave`, `end`.
+If another host sends SYNC, this host receives it. A cycle is `turn`, its own decision, `leave`, `end`.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ QUEUES_S = 0.01
 
 
 class Turn(NamedTuple):
-    """How a cycle began, and what the arm reported in it."""
+    """How a cycle began, and the arm's state in it."""
 
     tick: Tick
     arm: ArmState
@@ -35,11 +35,11 @@ class Exchange:
     """
 
     def __init__(self, settings: Settings, bus: Tap, arm: Arm, master: Master, pacer: Pacer, clock: Clock) -> None:
-        """`clock`: what durations within a cycle are measured by."""
+        """`clock`: measures durations within a cycle."""
         self.sync_ns = 0
         self.feedback_ns = 0
         self.queues = NOTHING_QUEUED
-        """What waited just after SYNC, SYNC included where it is sent here; looked at every 10 ms, a system call."""
+        """Queues just after SYNC, with SYNC if it is sent here; read every 10 ms, as each reading is a system call."""
         self.events = RateLimitedEvents()
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._clock = pacer, clock
@@ -59,7 +59,7 @@ class Exchange:
         return Turn(tick, self.read(tick))
 
     def read(self, tick: Tick) -> ArmState:
-        """Begin with SYNC and take in what the devices sampled on it.
+        """Begin with SYNC and take in the devices' samples of it.
 
         Raises BusError, of it SilenceError in lockstep.
         """
@@ -86,7 +86,7 @@ class Exchange:
         return arm.state()
 
     def _say_late(self, cycle: int) -> None:
-        """Say that commands still wait as the SYNC goes out at which they act; they act one later."""
+        """Report commands that still wait when the SYNC at which they act goes out; they act one SYNC later."""
         count, from_cycle = self._commands_late, cycle - self._acts_after
         what = f"1 command of cycle {from_cycle}" if count == 1 else f"{count} commands of cycle {from_cycle}"
         text = f"{what} missed SYNC {cycle}, so acting one later"
@@ -119,7 +119,7 @@ class Exchange:
         return self._clock.now_ns()
 
     def _take_late_frames(self) -> None:
-        """Take what the cycle before lacks and has come by now."""
+        """Take frames that the cycle before lacks and that have arrived by now."""
         for _ in range(MOST_FRAMES):
             late = self._bus.receive(0.0)
             if late is None:
@@ -131,7 +131,7 @@ class Exchange:
             self._pass_on(frame)
 
     def _pass_on(self, frame: Frame) -> None:
-        """Take a frame that is none of the arm's."""
+        """Take a frame that isn't one of the arm's."""
         if frame.is_error:
             say_trouble(self.events, frame)
         else:
@@ -143,9 +143,9 @@ class Exchange:
         return leaving_ns
 
     def end(self, turn: Turn, command: ArmCommand, log_queue_bytes: int = 0) -> CycleRecord:
-        """Hand the commands to the bus, and a heartbeat when it is due; tell how the cycle went. Raises BusError.
+        """Hand the commands to the bus, and a heartbeat when it is due; return the record of the cycle.
 
-        `log_queue_bytes`: what waits for the log's writer.
+        `log_queue_bytes`: bytes that wait for the log's writer. Raises BusError.
         """
         self._arm.write(command)
         record = self._record(turn, log_queue_bytes)
@@ -161,7 +161,7 @@ class Exchange:
             what = "1 received frame" if count == 1 else f"{count} received frames"
             text = f"{what} dropped by the kernel: this host reads too late"
             self.events.say(command_ns, "lost", Event("warning", "bus", text))
-        # Where SYNC is followed, it is the grid point itself, however late this host woke up for it.
+        # If SYNC is followed, it is the grid point itself, however late this host woke up for it.
         late_ns = 0 if self._is_following else tick.lateness_ns
         return CycleRecord(
             cycle=tick.cycle,
@@ -182,9 +182,9 @@ class Exchange:
 
 
 def say_trouble(events: RateLimitedEvents, frame: Frame) -> None:
-    """Say what the bus's controller reports in an error frame.
+    """Report the errors that the bus's controller signals in an error frame.
 
-    A controller that nobody answers reports thousands of times a second; every frame is in the log anyway.
+    A controller without an acknowledging node signals thousands a second; every frame is in the log anyway.
     """
     trouble = decode_error(frame)
     level = "info" if trouble.kind is TroubleKind.ERROR_ACTIVE else "warning"

@@ -74,7 +74,7 @@ _COLUMNS: Final = 7
 
 
 def is_shown(event: Event) -> bool:
-    """Tell whether the operator sees an event as it happens."""
+    """Return whether the operator sees an event as it happens."""
     return event.name == GEOMETRY or (event.name == "first motion" and event.level == "warning")
 
 
@@ -362,7 +362,7 @@ class _Blocks:
 
 
 def is_of_other(ratio: TorqueRatio) -> bool:
-    """Tell whether the sensor measures the other joint's torque instead of its own."""
+    """Return whether the sensor measures the other joint's torque instead of its own."""
     is_known = max(ratio.own_std, ratio.other_std) < 2.0 * _SURE
     return is_known and abs(ratio.own) < 0.4 and abs(ratio.other) > 0.6
 

@@ -127,7 +127,7 @@ class ConsoleOperator:
                     self._tell(_unknown(word))
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return what the user asked first, else what the script asks; of a faulted arm, leave it to `answer_fault`."""
+        """Return the user's first request, else the script's; for a faulted arm, leave it to `answer_fault`."""
         if state is not self._state:
             self._state = state
             if state in _AWAITED and not self._asked:

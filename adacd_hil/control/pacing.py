@@ -1,6 +1,6 @@
-"""When a cycle begins: on a fixed grid, of the host's clock in real time, of a virtual one in lockstep.
+"""The begin of a cycle: on a fixed grid, of the host's clock in real time, of a virtual one in lockstep.
 
-Where another host on the bus sends SYNC, with that.
+If another host on the bus sends SYNC, a cycle begins with that SYNC.
 """
 
 import math
@@ -44,7 +44,7 @@ class HostLatency:
         self._drawn: list[int] = []
 
     def draw_ns(self) -> int:
-        """Give the latency of the next cycle, ns."""
+        """Return the latency of the next cycle, ns."""
         if self._is_constant:
             return self._constant_ns
         if not self._drawn:
@@ -74,7 +74,7 @@ _PERIOD_TOLERANCE = 0.1
 _CALIBRATION_SLEEPS = 50
 _CALIBRATION_LOW_NS, _CALIBRATION_HIGH_NS = 200_000, 1_000_000
 _SPIN_SHARE = 0.95
-"""Of the measured sleeps, how many the spin makes up for: what comes later than that is not the timer's doing."""
+"""Share of the measured sleeps whose lateness the spin covers: greater lateness is not due to the timer."""
 _MOST_SPIN_NS = 100_000
 _MOST_SPIN_SHARE = 0.1
 
@@ -187,7 +187,7 @@ class FollowingPacer:
         self._periods_ns: list[float] = []
 
     def next(self) -> Tick:
-        """Wait for SYNC. Raises BusError when none comes in time, or at another period than the configured one."""
+        """Wait for SYNC. Raises BusError when SYNC is overdue, or has another period than the configured one."""
         frames, place = self._receive()
         sync = frames[place]
         periods = self._count(sync)
@@ -204,7 +204,7 @@ class FollowingPacer:
         return self._clock.now_ns()
 
     def resume(self) -> None:
-        """Count no overruns for what was passed over."""
+        """Leave the periods up to the next SYNC out of the overruns."""
         self._is_resuming = True
 
     def _receive(self) -> tuple[list[Frame], int]:
@@ -268,8 +268,8 @@ class FollowingPacer:
 def calibrate(clock: Clock, period_ns: int, cpu_count: int) -> SpinCalibration:
     """Measure how late this process wakes up from sleeps of 0.2 to 1 ms, and choose how long to spin; takes 30 ms.
 
-    cpu_count: processors that others can use while this process spins. With one, nothing else would run meanwhile, not
-    even the kernel's threads that hand over received frames: what spinning gains at SYNC it would cost at the feedback.
+    cpu_count: processors that others can use while this process spins. With one, spinning blocks all other work, even
+    the kernel's threads that hand over received frames: the time gained at SYNC would be lost at the feedback.
     """
     step_ns = (_CALIBRATION_HIGH_NS - _CALIBRATION_LOW_NS) // (_CALIBRATION_SLEEPS - 1)
     lateness_ns = []

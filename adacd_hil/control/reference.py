@@ -169,7 +169,7 @@ class Reference:
             self._approach()
 
     def _is_yielding(self, arm: ArmState, output: SchemeOutput) -> bool:
-        """Fill the desired motion of a reaction without a plan, or plan again after a blow; tell whether it is full."""
+        """Fill the desired motion of a reaction without a plan, or plan anew after a blow; return whether full."""
         if self._reaction is Reaction.FLOAT:
             self._stay(arm)
             return True
@@ -261,7 +261,7 @@ class Reference:
             self._warn_beyond(self._stop_from(self._q_d, self._dq_d))
 
     def _is_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> bool:
-        """Tell whether an ending blow has made the arm faster than planned, away from the contact.
+        """Return whether an ending blow has made the arm faster than planned, away from the contact.
 
         During the push the controller resists. False while the arm learns, because an adaptation that restarts forgets
         a push that continues.

@@ -1,22 +1,22 @@
-"""Which SYNC a cyclic frame answers, device by device, and what all devices sampled on the same SYNC.
+"""The SYNC that each cyclic frame answers, and the values that all devices sampled on one SYNC.
 
-A device answers every SYNC with one frame. A frame that comes in time answers the last SYNC. One that comes later than
-the host waits, or behind the next SYNC, answers an earlier one, and its value is as old as that: taken for the last
-SYNC's, the model would compare torque and motion of different moments.
+A device answers every SYNC with one frame. A frame that arrives in time answers the last SYNC. A frame that arrives
+after the host's wait, or after the next SYNC, answers an earlier SYNC, and its value is as old as that SYNC. If the
+host took it for the last SYNC's answer, the model would compare torque and motion of different moments.
 
-SYNCs have ordinals, counted by those that were sent. Of the SYNCs that are owed an answer, a frame answers
+SYNCs have ordinals, counted over the SYNCs that were sent. Of the SYNCs without an answer, a frame answers
 
-- the one that its alive counter says, where it has one: that counter goes by one a frame;
-- else the oldest, unless a lost frame explains it better: it comes when the device usually answers, or its position
-  fits the motion over that time and not over a shorter one. It can't answer a SYNC sooner than the device ever did, but
-  for the frames that it used to wait for and that are missing now.
+- the one that its alive counter gives, if it has a counter: the counter advances by one per frame;
+- else the oldest, unless a lost frame is the better explanation: the frame arrives when the device usually answers, or
+  its position fits the motion over that time and not over a shorter one. An answer can't arrive sooner after its SYNC
+  than any answer of the device before, except when frames that the device used to wait for are missing.
 
-A frame whose counter is behind the last one's is a straggler where an answer is missing there; else somebody sends an
-old frame again.
+If a frame's counter is behind the last frame's, the frame is a straggler if the answer with that counter is missing.
+Otherwise another sender repeats an old frame.
 
-What no frame can tell: whether a device with a counter has missed a SYNC or answers a whole period late. It counts as
-late. And whether a frame without counter that comes when it usually does is a period late or follows a lost one, unless
-the arm moves. It counts as the latter; a second frame on the same SYNC shows that it was the former.
+Two questions can't be decided from frames. First: a device with a counter missed a SYNC, or answers a whole period
+late; it counts as late. Second: a frame without counter that arrives at the usual time is a period late, or follows a
+lost frame. If the arm doesn't move, it counts as the latter; a second frame on the same SYNC shows that it was late.
 """
 
 from collections.abc import Callable
@@ -57,10 +57,11 @@ class AnswerClock:
     ) -> int | None:
         """Return the ordinal of the SYNC that a frame answers; None when every SYNC has its answer already.
 
-        newest: the last SYNC before the frame came, `offset_ns` later. step: of its alive counter since the last frame;
-        None without one, and at the beginning. position_error: by how much the frame's position differs from what its
-        velocity makes of the last one, rad, if so many SYNCs lie between. soonest_ns: how soon an answer can come;
-        None: as soon as the device ever did.
+        newest: ordinal of the last SYNC before the frame, which came `offset_ns` after it. step: advance of its alive
+        counter since the last frame; None without a counter, and at the beginning. position_error: returns, for a
+        number of SYNCs between the last frame and this one, the difference between the frame's position and the
+        position extrapolated with its velocity, rad. soonest_ns: least time from SYNC to an answer; None: the device's
+        least so far.
         """
         answered = self.answered
         if answered is None or answered == newest - 1:
@@ -75,7 +76,7 @@ class AnswerClock:
         return newest if self._follows_lost_ones(newest - answered, offset_ns, position_error) else answered + 1
 
     def _is_newer(self, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
-        """Tell whether a second frame without counter on the same SYNC is its answer, and the first was a late one."""
+        """Return whether a second frame without counter on one SYNC answers it, and the first one was late."""
         if not self._is_usual(offset_ns):
             return False
         return position_error is None or position_error(1) <= position_error(-1) + CLEAR_RAD
@@ -84,16 +85,16 @@ class AnswerClock:
         return not self._usual_count or offset_ns <= self._latest_ns + TOLERANCE_NS
 
     def _follows_lost_ones(self, owed: int, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
-        """Tell whether a frame without counter answers the last SYNC, and those before it have lost their answers."""
+        """Return whether a frame without counter answers the last SYNC: answers to earlier SYNCs were lost."""
         advantage_rad = 0.0 if position_error is None else position_error(1) - position_error(owed)
         if abs(advantage_rad) > CLEAR_RAD:
             return advantage_rad > 0.0
         return self._is_usual(offset_ns)
 
     def is_straggler(self, behind: int) -> bool:
-        """Tell whether a frame that answers no SYNC is one that was overtaken. `behind`: by its counter, 0 without one.
+        """Return whether a frame that answers no SYNC was overtaken. `behind`: by its counter, 0 without one.
 
-        Each straggler is believed once.
+        Each straggler counts once.
         """
         if behind == 0:
             was_guess, self._is_guess = self._is_guess, False
@@ -103,7 +104,7 @@ class AnswerClock:
         return is_missing
 
     def note(self, ordinal: int, newest: int, offset_ns: int, is_counted: bool) -> None:
-        """Take note that a frame which `find` was asked about has answered a SYNC. `is_counted`: it has a counter."""
+        """Note that a frame answers the SYNC `ordinal`, as `find` returned it. `is_counted`: it has a counter."""
         before, self.answered = self.answered, ordinal
         if before is not None and ordinal > before:
             passed = ordinal - before
@@ -118,7 +119,7 @@ class AnswerClock:
         self._usual_count += 1
 
     def begin_anew(self, newest: int) -> None:
-        """Take note that the device's counter says nothing of before: every SYNC up to this one counts as answered."""
+        """Count every SYNC up to `newest` as answered: the device restarted its counter."""
         self.answered = newest
         self._is_guess = False
         self._unanswered = 0
@@ -138,8 +139,8 @@ class Sample(NamedTuple):
 class SampleAlignment:
     """The last values of each device by the SYNC that they answer.
 
-    The model compares torque with motion, so all values of a sample must be of one moment. Where a device answers late,
-    the sample is complete a cycle or more later than it was taken: it is used then, with its age.
+    The model compares torque with motion, so all values of a sample must be of one moment. If a device answers late,
+    its sample is complete one or more cycles after it was taken. The sample is used then, with its age.
     """
 
     def __init__(self, devices: int) -> None:

@@ -65,7 +65,7 @@ class Arm:
         self.max_age_cycles = settings.bus.max_age_cycles
         self.gear_ratios = tuple(device.settings.scale.gear_ratio for device in devices[:JOINTS])
         self.status_age_limits = tuple(_status_age_limit(device, period_s) for device in devices[:JOINTS])
-        """How old each drive's status may be, in cycles; infinite where nothing is expected."""
+        """Greatest permitted age of each drive's status, in cycles; infinite for a drive that has no status period."""
         self._places = {device.can_id: place for place, device in enumerate(self.devices)}  # of cyclic frames
         self._status_takers: dict[int, _Take] = {
             device.status_message.can_id: device.accept_status
@@ -142,9 +142,9 @@ class Arm:
         self._has_gaps = any(self.gaps)
 
     def accept(self, frame: Frame, is_late: bool = False) -> bool:
-        """Take one frame; False when it is not one of the arm's. A frame that fails a check changes nothing.
+        """Take one frame; return False when it is not one of the arm's. A frame that fails a check is ignored.
 
-        `is_late`: it came before SYNC, so it answers an earlier one.
+        `is_late`: it arrived before SYNC, so it answers an earlier one.
         """
         if frame.is_error:
             return False
@@ -167,7 +167,7 @@ class Arm:
     def _answer(self, frame: Frame, place: int, newest: int) -> None:
         """Take a cyclic frame for the SYNC that it answers; `newest`: the last one before it came."""
         if newest < 0:
-            return  # before any SYNC there is nothing to answer
+            return  # no SYNC was sent yet
         device, clock, data = self.devices[place], self._clocks[place], frame.data
         offset_ns = frame.t_ns - self._sync_ns[newest % KEPT]
         step = device.end_to_end.step_of(data)
@@ -183,7 +183,7 @@ class Arm:
         if is_present and len(data) == device.cyclic_length:
             self._seen |= 1 << place
             self.has_all_frames = self._seen == _COMPLETE
-        is_revised = clock.answered == ordinal  # what was taken for it was the one before
+        is_revised = clock.answered == ordinal  # the frame taken for this answer was the previous SYNC's
         if is_revised:
             self._alignment.put(place, ordinal - 1, device.values)
         if device.accept_cyclic(data, self._sync_cycles[ordinal % KEPT]):
@@ -193,7 +193,7 @@ class Arm:
             if is_present:
                 self.received |= 1 << place
         elif device.end_to_end.status is E2eStatus.WRONG_SEQUENCE:
-            clock.begin_anew(newest)  # the device has begun anew, so that its counter says nothing of before
+            clock.begin_anew(newest)  # the device restarted its counter
         elif device.end_to_end.status is E2eStatus.SYNC or (not device.is_protected and is_present):
             clock.note(ordinal, newest, offset_ns, device.is_protected)
 
@@ -205,8 +205,8 @@ class Arm:
     def _refuse(self, frame: Frame, place: int, step: int | None, is_second: bool) -> None:
         """Judge a frame that answers no SYNC; its values are not used.
 
-        The same frame twice says nothing new, a counter that stands still nothing true. Another frame, whose check is
-        right, beside the one that has answered the SYNC (`is_second`) has another sender.
+        A repeated frame or a counter that stands still carries no new value. A different frame that passes its check
+        and follows the answer to the same SYNC (`is_second`) comes from another sender.
         """
         device, data = self.devices[place], frame.data
         is_right = len(data) == device.cyclic_length and device.end_to_end.is_signed(data)
@@ -246,7 +246,7 @@ class Arm:
         return [name for bit, name in enumerate(names) if not self.received & (1 << bit)]
 
     def state(self) -> ArmState:
-        """Join what has been received into the state of this cycle: the newest complete sample, else what is newest."""
+        """Return the state of this cycle from the newest complete sample, else from the newest value of each device."""
         cycle = self._cycle
         if self.received == _COMPLETE:
             return self._state_of(self._ordinal, [device.values for device in self.devices], (cycle,) * 4)
@@ -304,9 +304,9 @@ class Arm:
         return FaultReason.FOREIGN_FRAMES if self.strangers.are_heard(self._cycle) else FaultReason.NONE
 
     def write(self, command: ArmCommand) -> None:
-        """Send the commands of this cycle, to act at the next SYNC; pipelined, keep them until then. Raises BusError.
+        """Send the commands of this cycle, to act at the next SYNC; if pipelined, keep them until then.
 
-        What has been kept for longer than a value may be old carries no torque.
+        Commands that were kept for longer than the age limit of a value are sent without torque. Raises BusError.
         """
         values = command.tau_c.tolist(), command.enable, command.quick_stop
         if self._is_pipelined:
@@ -322,7 +322,7 @@ class Arm:
         )
 
     def frame_checks(self) -> FrameChecks:
-        """Return what the checks have said of all cyclic frames so far."""
+        """Return the counts of the checks of all cyclic frames so far."""
         return FrameChecks(
             self._cycle,
             tuple(tuple(device.end_to_end.counts) for device in self.devices),

@@ -1,10 +1,11 @@
-"""What there is to say of an arm's devices and data: ages, gaps, checks and faults in words, shares of cycles.
+"""Messages about an arm's devices and data: ages, gaps, checks and faults in words, shares of cycles.
 
-How much of the cyclic data comes in time: shares of cycles, second by second, against the limits of `[data]`.
+The shares of cycles whose cyclic data came in time are compared, second by second, with the limits of `[data]`.
 
-MOST_IN_A_ROW cycles without a sample for the model are said at once, too: a contact is found so much later.
+After MOST_IN_A_ROW cycles without a sample for the model, a warning follows at once: a contact is detected so much
+later.
 
-Counted while the drives are enabled: what a device does before and after is no measure of a run.
+Cycles are counted only while the drives are enabled: data from before and after don't count for a run.
 """
 
 import math
@@ -29,8 +30,8 @@ class DataShares:
     """Shares of a run's cycles with enabled drives, 0…1.
 
     incomplete: some cyclic frame was missing, late or wrong. late: the scheme's sample was older than the cycle.
-    no_new_data, repeated: by device; its frame was not in time, or came again. excesses: what was over its limit in
-    some second, a line each with the worst.
+    no_new_data, repeated: by device; its frame was not in time, or came again. excesses: quantities that exceeded
+    their limit in some second, one line each with the worst value.
     """
 
     cycles: int
@@ -82,7 +83,7 @@ class DataWatch:
             self._end_window()
 
     def _note_row(self) -> None:
-        """Take in that the model waits for a sample; say so, until a window was without."""
+        """Count MOST_IN_A_ROW cycles without a sample; warn once, again only after a window without such a row."""
         self._rows += 1
         if not self._has_rows:
             self._has_rows = True
@@ -90,7 +91,7 @@ class DataWatch:
             self._events.append(Event("warning", "data", text))
 
     def _end_window(self) -> None:
-        """Judge the cycles since the last window; say what is over its limit now, and what is no longer."""
+        """Judge the cycles of a window; report shares that now exceed their limit, and those that are back below."""
         repeats = [now - before for now, before in zip(self._arm.repeats, self._repeats_before, strict=True)]
         for name, count in zip(self._limits, [self._incomplete, *self._missing, *repeats], strict=True):
             share, limit = count / self._cycles, self._limits[name]
@@ -152,7 +153,7 @@ class SignalAge(NamedTuple):
 
 
 class ArmReport:
-    """Says in words what is wrong with an arm, from what it has received so far."""
+    """Describes in words the faults of an arm, from the frames that it has received so far."""
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
@@ -172,7 +173,7 @@ class ArmReport:
         return ages
 
     def describe_gaps(self) -> list[str]:
-        """Say of which devices no usable frame came in time in how many of the last cycles, one line each."""
+        """Count, per device, the last cycles without a usable frame in time, in words, one line each."""
         present = [~self._arm.received >> place & 1 for place in range(len(self._arm.devices))]
         gaps = [bits << 1 | now for bits, now in zip(self._arm.gaps, present, strict=True)]
         cycles = REMEMBERED_GAPS.bit_length() + 1
@@ -183,13 +184,13 @@ class ArmReport:
         ]
 
     def describe_checks(self) -> list[str]:
-        """Say how many cyclic frames of each device passed and failed their checks, one line each."""
+        """Count the cyclic frames of each device that passed and failed their checks, in words, one line each."""
         return [_describe_checks(device) for device in self._arm.devices]
 
     def describe_faults(self) -> list[str]:
-        """Say what is wrong with each device, one line each; empty when nothing is.
+        """Describe the fault of each device, one line each; empty without a fault.
 
-        A drive's fault with the name of its error, a sensor's status, and signals that are older than their limit.
+        Lines name a drive's fault with its error's name, a sensor's status, and signals older than their limit.
         """
         lines = []
         for drive in self._arm.drives:
@@ -210,11 +211,11 @@ class ArmReport:
         return lines
 
     def describe_disabled(self) -> list[str]:
-        """Say which drive is not enabled, one line each; empty when both are."""
+        """Name each drive that is not enabled, with its state and mode, one line each; empty when both are enabled."""
         return [line for drive in self._arm.drives for line in _describe_disabled(drive)]
 
     def describe_excess(self) -> list[str]:
-        """Say which joint is beyond which of the arm's limits, one line each; empty when none is."""
+        """Name each joint that exceeds a limit of the arm, and the limit, one line each; empty without an excess."""
         lines = []
         for joint, (drive, sign) in enumerate(zip(self._arm.drives, self._arm.sign, strict=True)):
             for quantity, value, bound, unit in (

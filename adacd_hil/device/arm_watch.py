@@ -1,15 +1,15 @@
-"""The second look at an ArmState: what the devices' heartbeats and the host's own lateness make of it.
+"""A second check of an ArmState: faults by the devices' heartbeats and by the host's own lateness.
 
 The heartbeat consumer finds nodes that are silent, or not in the state that they should be in. Source: CiA 301 (4.2),
 clause 7.2.8.2.2 (heartbeat protocol); t_ns is the host's time, the frames' stamps included.
 
-The deadline policy says what is done when the host misses too many periods. A miss is a period that was skipped whole:
-its SYNC was never sent. A SYNC that is late by less than a period is none; the devices sample late, and the scheme
-counts with the interval that was measured. Pauses that are meant, as between two attempts, are no misses.
+The deadline policy decides the reaction when the host misses too many periods. A miss is a period that was skipped
+whole: its SYNC was never sent. A SYNC that is late by less than a period is not a miss; the devices sample late, and
+the scheme computes with the measured interval. Intended pauses, as between two attempts, are not misses.
 `realtime.misses` of them within `realtime.misses_window_s` are too many. By `realtime.on_misses` the run then faults,
-or the arm brakes to rest and holds its place until the user acknowledges, where the scheme knows such a state.
+or the arm brakes to rest and holds its place until the user acknowledges, if the scheme has such a state.
 
-Events that come again and again are said once a second, with a count (`RateLimitedEvents`).
+A repeated event is reported at most once a second, with a count (`RateLimitedEvents`).
 """
 
 from collections import deque
@@ -24,14 +24,14 @@ from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 
 
 class Recurrence:
-    """Something that is done every so many cycles, and after skipped ones as soon as there is a cycle again."""
+    """Recurs every so many cycles; if its cycle is skipped, in the next cycle."""
 
     def __init__(self, interval_s: float, period_s: float) -> None:
         self._cycles = max(1, round(interval_s / period_s))
         self._due_cycle = 0
 
     def is_due(self, cycle: int) -> bool:
-        """Whether it is to be done in this cycle; asked once per cycle."""
+        """Return whether it is due in this cycle; call once per cycle."""
         if cycle < self._due_cycle:
             return False
         self._due_cycle = cycle - cycle % self._cycles + self._cycles
@@ -63,7 +63,7 @@ class RateLimitedEvents:
         self._events.append(event._replace(message=f"{event.message} (and {more} before)") if more else event)
 
     def is_due(self, kind: Hashable, t_ns: int) -> bool:
-        """Tell whether an event of a kind would be said at once."""
+        """Return whether an event of a kind would be reported at once."""
         said_ns = self._said_ns.get(kind)
         return said_ns is None or t_ns - said_ns >= REPEAT_NS
 
@@ -78,20 +78,20 @@ _LOOKS = 0.1
 
 
 class ArmWatch:
-    """Takes for a fault of the arm a device that has fallen silent or left Operational, or a host that is late.
+    """Sets the arm's fault when a device falls silent or leaves OPERATIONAL, or when the host is late.
 
-    `lost`: what is wrong with which device, one line each.
+    `lost`: the failed devices and their failures, one line each.
     """
 
     def __init__(self, settings: Settings, watch: Callable[[int], list[str]]) -> None:
-        """`watch` names what is wrong with the heartbeats at a time in ns."""
+        """`watch` returns the heartbeat failures at a time in ns, one line each."""
         self.lost: list[str] = []
         self.deadline = DeadlineWatch(settings)
         self._watch = watch
         self._looks = Recurrence(_LOOKS * settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Take in one cycle; return it as it is, or with what is wrong."""
+        """Take in one cycle; return its state unchanged, or with the fault set."""
         if self._looks.is_due(arm.cycle):
             self.lost = self._watch(arm.t_ns)
         if self.lost and arm.fault is FaultReason.NONE:
@@ -101,7 +101,7 @@ class ArmWatch:
 
 PATIENCE_PERIODS = 2.5
 """Periods without a heartbeat until a node counts as silent, on the host and in 0x1016 of the devices: one heartbeat
-may be lost and the next one be late by half a period, and yet nobody waits for a third."""
+may be lost and the next one be late by half a period, without waiting for a third."""
 OPERATIONAL = 5
 _STATES = {0: "boot-up", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
 
@@ -130,7 +130,7 @@ class HeartbeatWatch:
         self._since_ns: int | None = None
 
     def start(self) -> None:
-        """Expect OPERATIONAL from now on; what was heard before says nothing."""
+        """Expect OPERATIONAL from now on; forget earlier heartbeats."""
         self._is_watching = True
         self._since_ns = None
         for node in self._nodes.values():
@@ -139,11 +139,11 @@ class HeartbeatWatch:
             node.complaint = ""
 
     def stop(self) -> None:
-        """Expect nothing more."""
+        """Stop watching."""
         self._is_watching = False
 
     def accept(self, frame: Frame) -> None:
-        """Take a heartbeat; other frames change nothing."""
+        """Take a heartbeat; ignore other frames."""
         node = self._nodes.get(frame.can_id)
         if node is None or frame.is_error or len(frame.data) != 1:
             return
@@ -155,7 +155,7 @@ class HeartbeatWatch:
             node.left_to = node.state
 
     def watch(self, t_ns: int) -> list[str]:
-        """Name what is wrong now, one line per node; empty when nothing is or nothing is expected."""
+        """Describe nodes that fail now, one line each; empty if all are well or the watch is stopped."""
         if not self._is_watching:
             return []
         if self._since_ns is None:
@@ -215,7 +215,7 @@ class DeadlineWatch:
         self._verdict = ""
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Take in one cycle; return it as it is, or as that of a host which has missed too many."""
+        """Take in one cycle; return its state, marked late or faulted if the host has missed too many periods."""
         misses = self._misses
         if arm.periods > 1:
             misses.append((arm.cycle, arm.periods - 1))
@@ -230,5 +230,5 @@ class DeadlineWatch:
         return arm._replace(fault=FaultReason.DEADLINE) if arm.fault is FaultReason.NONE else arm
 
     def describe(self) -> str:
-        """Say how many misses the last verdict was about; empty without one."""
+        """Return the number of misses of the last verdict in words; empty without one."""
         return self._verdict

@@ -1,7 +1,7 @@
 """canopen over our own bus: NMT, SDO, EMCY and heartbeats of any node. The host's only door to `canopen`.
 
-No threads: a request is sent, then the bus is read until its answer is in. What arrives meanwhile goes to whom it
-concerns. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
+No threads: a request is sent, then the bus is read until its answer is in. Other frames that arrive meanwhile are
+handed to their consumers. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
 """
 
 import configparser
@@ -28,7 +28,7 @@ from adacd_hil.wire.contract_frames import NMT_ID, SDO_REQUEST_ID
 from adacd_hil.wire.eds_text import readable_eds
 
 ANSWER_TIMEOUT_S = 0.5
-"""Longest wait for an answer. CiA 301 gives none; drives answer within 100 ms."""
+"""Longest wait for an answer. CiA 301 gives no value; drives answer within 100 ms."""
 _MAX_UNRELATED_FRAMES = 10_000
 SDO_ABORT = 0x80
 _UNFORESEEN = (
@@ -41,14 +41,14 @@ _UNFORESEEN = (
     RuntimeError,
     AssertionError,
 )
-"""What canopen raises when an answer isn't what it expects: it trusts lengths, toggle bits and types."""
+"""Exceptions of canopen on an unexpected answer: canopen trusts lengths, toggle bits and types."""
 _ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index: CiA 301, table 22
 
 _EDS_CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x19\x1b-\x1f\x7f]")
 """All but tab, the ends of lines and the end of a file under DOS."""
 _EDS_OBJECT = re.compile("[0-9A-Fa-f]{4}(?:[Ss]ub[0-9A-Fa-f]+)?")
 _MAKERS_OBJECTS = range(0x2000, 0x6000)
-"""Those that a profile names have a default or none; of the others no value matters."""
+"""Manufacturer objects: those that a profile names have a default or no value; the others' values don't matter."""
 _EDS_INTEGERS = {
     form
     for number in canopen.objectdictionary.INTEGER_TYPES
@@ -59,13 +59,13 @@ _EDS_NUMBERS = ("DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
 _EDS_NUMBER = re.compile(r"(?i:\s*(?:\$NODEID\s*\+?)?\s*[-+]?\s*(?:0x[0-9a-f]+|[0-9]+)?\s*(?:\+?\s*\$NODEID)?\s*)")
 """CiA 306, 4.5.1: decimal, octal or hexadecimal, the node id before or after it."""
 
-# canopen reports what it also raises; the raised form is ours to print.
+# canopen logs each error that it raises; the host prints the raised form only.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 logging.getLogger("canopen").propagate = False
 
 
 class DeviceError(RuntimeError):
-    """A device is missing, not the expected one, or refuses its set-up; one line. `remedy`: what to do; "": unknown."""
+    """A device is missing, not the expected one, or refuses its set-up; one line. `remedy`: the cure; "": unknown."""
 
     def __init__(self, text: str, remedy: str = "") -> None:
         super().__init__(text)
@@ -73,7 +73,7 @@ class DeviceError(RuntimeError):
 
     @property
     def line(self) -> str:
-        """What is wrong, and what to do about it."""
+        """The error and its remedy in one line."""
         return f"{self}; {self.remedy}" if self.remedy else str(self)
 
 
@@ -92,7 +92,7 @@ _SILENT = (
 
 
 class EdsVariable(NamedTuple):
-    """One object of an EDS. bits: its size in a PDO, 0 for what has no fixed size. is_writable: over SDO.
+    """One object of an EDS. bits: its size in a PDO, 0 without a fixed size. is_writable: over SDO.
 
     is_mappable: whether a PDO may carry it.
     """
@@ -109,7 +109,7 @@ class EdsVariable(NamedTuple):
 def read_eds(path: Path, node_id: int | None) -> Any:
     """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`, None: that of a DCF. Raises ConfigError.
 
-    canopen leaves out what it can't read as a number: without its default an object is not looked at.
+    canopen drops values that it can't read as a number. An object without a default is not compared.
     """
     try:
         text = read_input(path).decode("utf-8", "replace").removeprefix("\ufeff")
@@ -126,7 +126,7 @@ def read_eds(path: Path, node_id: int | None) -> Any:
 
 
 def _check_eds(text: str) -> None:
-    """Refuse control characters, and integers of standard objects that are no numbers.
+    """Refuse control characters, and integers of standard objects that can't be read as numbers.
 
     Raises ConfigError, configparser.Error.
     """
@@ -192,7 +192,7 @@ class CanopenBus:
         self._network = _BusNetwork(self._send)
         self._patience: dict[int, tuple[float, float]] = {}
         self.malformed_frames = 0
-        """Frames so far whose length or content doesn't fit what their identifier says they are."""
+        """Frames so far whose length or content doesn't fit the service of their identifier."""
 
     def add_node(
         self,
@@ -205,7 +205,7 @@ class CanopenBus:
         """Return canopen's node with the objects of `read_eds`.
 
         With None it has no objects, and SDO goes by index through `node.sdo.upload`. `answer_s`: longest wait for an
-        answer. `pause_s`: before each request, for a device that loses what comes soon after its answer.
+        answer. `pause_s`: wait before each request, for a device that loses a request soon after its answer.
         """
         node = canopen.RemoteNode(node_id, canopen.ObjectDictionary() if objects is None else objects)  # type: ignore[no-untyped-call]
         self._network.add_node(node)
@@ -247,7 +247,7 @@ class CanopenBus:
         return False
 
     def accept(self, frame: Frame) -> None:
-        """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY. What canopen can't read is dropped, counted."""
+        """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY. Drop and count unreadable frames."""
         if frame.is_error:
             return
         try:

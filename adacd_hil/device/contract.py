@@ -1,6 +1,6 @@
 """The contract of one arm: the DBC that describes its frames, loaded, or composed from the devices' profiles.
 
-What is composed has the layout of a DBC written by hand for the same devices, bit for bit, and its layout digest.
+A composed contract has the layout of a DBC written by hand for the same devices, bit for bit, and its layout digest.
 Source: Vector DBC file format; CiA 301 clause 7.3.3 (predefined connection set).
 """
 
@@ -91,7 +91,7 @@ def load_contract(settings: Settings) -> Codec:
 
 
 def write_contract(codec: Codec, folder: Path) -> Path:
-    """Return the file of the contract; one that is composed or moved has none and is written to `folder`.
+    """Return the file of the contract; write a composed or moved contract, which has no file, to `folder`.
 
     Raises OSError, also when another file of that name is there.
     """

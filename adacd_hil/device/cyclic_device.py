@@ -1,4 +1,4 @@
-"""A device with one frame per SYNC: its checks, and whatever of it is the same for drives and sensors."""
+"""A device with one frame per SYNC: its checks, and the parts that drives and sensors share."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ class CyclicDevice(ABC):
         self._received_cycle = 0
 
     def accept_cyclic(self, data: bytes, cycle: int) -> bool:
-        """Take one cyclic frame of `cycle`; False when a check fails and it changes nothing."""
+        """Take one cyclic frame of `cycle`; return False when a check fails: the frame is ignored."""
         if len(data) != self.cyclic_length:
             self.implausible_frames += 1
             return False
@@ -57,7 +57,7 @@ class CyclicDevice(ABC):
         return True
 
     def accept_status(self, data: bytes, cycle: int) -> bool:
-        """Take one status frame of `cycle`; False when its length or check is wrong and it changes nothing."""
+        """Take one status frame of `cycle`; return False when its length or check is wrong: the frame is ignored."""
         message, receiver = self.status_message, self._status_receiver
         if message is None or receiver is None or len(data) != message.length:
             return False
@@ -68,7 +68,7 @@ class CyclicDevice(ABC):
 
     @abstractmethod
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
-        """Say whether a frame may come so many cycles after one with the main value `last`."""
+        """Return whether a frame may come so many cycles after one with the main value `last`."""
 
     @abstractmethod
     def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:

@@ -1,4 +1,4 @@
-"""A device as its master sees it; what it must be and is told over SDO before a run; what of it is read again later.
+"""A device as its master sees it: objects compared and written over SDO before a run, objects read again during it.
 
 A failure is one line with device, object and value. Sources: CiA 402-2 / IEC 61800-7-201 (drives); CiA 404, CiA 303-2
 (sensors and units); CiA 301 (4.2), clause 7.2.4 (SDO; 7.2.4.3: expedited upload, a request of 8 bytes and its answer),
@@ -43,7 +43,7 @@ class Slave:
         self.name = device.name
         self.node_id = device.node_id
         self.known: dict[tuple[int, int], int] = {}
-        """What the set-up has written or compared, by index and sub-index."""
+        """Values that the set-up has written or compared, by index and sub-index."""
         self._node = node
         self._answer_s = device.settings.patience.answer_s
 
@@ -57,7 +57,7 @@ class Slave:
         return variable is not None and variable.is_writable
 
     def default(self, index: int, sub: int = 0) -> int | None:
-        """Return the value that the EDS gives, None when it gives none."""
+        """Return the default that the EDS gives, None without one."""
         variable = find_variable(self._node.object_dictionary, index, sub)
         return None if variable is None else variable.default
 
@@ -86,7 +86,7 @@ class Slave:
     def difference(
         self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False
     ) -> str:
-        """Say how an object differs from what it must be, "" where it doesn't. Raises DeviceError."""
+        """Describe the difference between an object and its expected value, "" if equal. Raises DeviceError."""
         found = self.read(index, sub)
         self.known[index, sub] = expected
         if found == expected:
@@ -95,7 +95,7 @@ class Slave:
         return f"{quantity} {ObjectName(index, sub)} = {values[0]}, {values[1]} expected"
 
     def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", remedy: str = "") -> None:
-        """Compare an object with what it must be. Raises DeviceError."""
+        """Compare an object with its expected value. Raises DeviceError, also for a difference."""
         if text := self.difference(index, sub, expected, quantity, unit):
             self.fail(text, remedy)
 
@@ -105,7 +105,7 @@ class Slave:
         return str(ObjectName(index, sub)) + ("" if variable is None else f" {variable.name}")
 
     def fail(self, text: str, remedy: str = "") -> NoReturn:
-        """Raise DeviceError with the device's name. `remedy`: what to do about it."""
+        """Raise DeviceError with the device's name. `remedy`: how the user can correct it."""
         raise DeviceError(f"{self.name} (node {self.node_id}): {text}", remedy)
 
     def _entry(self, index: int, sub: int) -> Any:
@@ -275,9 +275,9 @@ _MODE_POLL_S = 0.02
 
 
 def _enter_mode(slave: Slave, codec: Codec) -> None:
-    """Ask for cyclic synchronous torque. 0x6061 may show it later, once the drive is enabled: the cycle compares it.
+    """Request cyclic synchronous torque. 0x6061 may show it later, once the drive is enabled: the cycle compares it.
 
-    Where no frame shows the mode, 0x6061 must show it now. Raises DeviceError.
+    If no frame shows the mode, 0x6061 must show it now. Raises DeviceError.
     """
     if not slave.can_write(0x6060):
         return
@@ -315,7 +315,7 @@ PREFIX_SHIFT = 24  # of 0x6131: power of ten, signed
 
 
 def set_up_sensor(slave: Slave, codec: Codec) -> str:
-    """Compare unit and decimal digits with the contract; return what the status says, empty when nothing.
+    """Compare unit and decimal digits with the contract; return the status in words, empty for a good one.
 
     Raises DeviceError.
     """
@@ -368,10 +368,10 @@ class _KnownObject(NamedTuple):
 
 
 class ParameterWatch(RateLimitedEvents):
-    """Reads what the set-up has written or compared again, one object after the other, without waiting for it.
+    """Reads again the objects that the set-up has written or compared, one at a time, without waiting for answers.
 
-    A device that has reset itself to its defaults, or into which somebody else has written, runs the arm with other
-    limits and other watchdogs than the host believes.
+    A device that has reset itself to its defaults, or into which another program has written, runs the arm with other
+    limits and other watchdogs than the host assumes.
     """
 
     def __init__(self, settings: Settings, bus: Bus) -> None:
@@ -383,16 +383,16 @@ class ParameterWatch(RateLimitedEvents):
         self._asked_cycle = 0
         self._pause_cycles: dict[int, int] = {}
         self._last_cycle: dict[int, int] = {}
-        """By node id: how long it wants to be left alone, and when it was asked last."""
+        """By node id: least pause between requests, and cycle of the last request."""
         self._period_s = settings.bus.period_s
         self._answer_cycles = round(_ANSWER_S / settings.bus.period_s)
         self._due = Recurrence(settings.devices.reread_ms * 1e-3, settings.bus.period_s)
         self._is_on = settings.devices.reread_ms > 0
         self.difference = ""
-        """The first object that is no longer what it was, in one line; empty while none is."""
+        """The first object whose value differs from the set-up, in one line; empty without a difference."""
 
     def follow(self, slaves: Iterable[Slave]) -> None:
-        """Read again from now on what the set-up of these devices has left in them."""
+        """Read again, from now on, the values that the set-up of these devices has written or compared."""
         found = [[_KnownObject(slave, place, value) for place, value in slave.known.items()] for slave in slaves]
         # By turns, so that no device waits for all objects of another.
         longest = max(map(len, found), default=0)
@@ -423,7 +423,7 @@ class ParameterWatch(RateLimitedEvents):
         self._bus.send(SDO_REQUEST_ID + chosen.slave.node_id, request)
 
     def accept(self, frame: Frame) -> bool:
-        """Take an answer; False when it is none that was asked for."""
+        """Take the answer to the open request and compare it; return False for any other frame."""
         asked, data = self._asked, frame.data
         if asked is None or frame.can_id != SDO_RESPONSE_ID + asked.slave.node_id or len(data) != 8:
             return False
@@ -497,7 +497,7 @@ def _switch_off_others(slave: Slave) -> None:
 
 
 def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
-    """Write what differs, or all: invalid first, the mapping emptied, valid last."""
+    """Write the objects of a PDO that differ, or all: invalid first, the mapping emptied, valid last."""
     index, mapping_index = pdo.communication_index, pdo.mapping_index
     kept = slave.read(index, _COB_ID) & RTR_NOT_ALLOWED
     cob_id = slave.device.can_id(pdo) | kept
@@ -532,7 +532,7 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
 
 
 def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
-    """Say where a PDO of the device is not as its profile has it; empty where it is so."""
+    """Describe the difference between a PDO and its profile; empty without one."""
     index = pdo.communication_index
     identifier = slave.read(index, _COB_ID)
     found, expected = identifier & ~RTR_NOT_ALLOWED, slave.device.can_id(pdo)
@@ -551,7 +551,7 @@ def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
 
 
 def _mapping_difference(slave: Slave, pdo: PdoSettings) -> str:
-    """Say where the mapping of a PDO is not as its profile has it; empty where it is so."""
+    """Describe the difference between the mapping of a PDO and its profile; empty without one."""
     mapping_index, entries = pdo.mapping_index, slave.device.mapping(pdo)
     text = slave.difference(mapping_index, 0, len(entries), "number of mapped objects")
     for sub, entry in enumerate(entries, 1):
@@ -626,7 +626,7 @@ def _read_number(node: Any, index: int, subindex: int) -> int | None:
 
 
 def contract_differences(device: PlacedDevice, pdos: list[Pdo]) -> list[str]:
-    """Say where the PDOs of a device are not those of its profile, from which the contract follows, one line each."""
+    """List the differences between a device's PDOs and its profile, from which the contract follows, one line each."""
     by_id = {pdo.can_id: pdo for pdo in pdos}
     lines = []
     for pdo in device.settings.pdo:

@@ -25,7 +25,7 @@ high bit of the unprotected frame is at least 0.1 rad."""
 
 
 class Cia402State(IntEnum):
-    """States of the power drive system. Each value says how to get out of it."""
+    """States of the power drive system. The comment beside each value names the way out of it."""
 
     NOT_READY_TO_SWITCH_ON = 0  # by itself, after the drive's self test
     SWITCH_ON_DISABLED = 1  # shutdown
@@ -50,7 +50,7 @@ class Controlword(IntEnum):
 
 
 class Goal(Enum):
-    """Where the host wants a drive to be."""
+    """State into which the host leads a drive."""
 
     OPERATION_ENABLED = "operation enabled"
     SWITCHED_ON = "switched on"
@@ -100,7 +100,7 @@ TRANSITIONS: dict[tuple[Cia402State, Controlword], Cia402Transition] = {
     # With 0x605A from 5 on; never sent by us: torque would be back at once.
     (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): Cia402Transition(16, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
 }
-"""What each command does in each state, where it does anything; by the drive itself: 0, 1, 12, 13, 14.
+"""Effect of each command in each state, if it has one; the drive itself makes 0, 1, 12, 13, 14.
 
 IEC 61800-7-201, figure of the power drive system finite state automaton and its table of transitions.
 """
@@ -130,7 +130,7 @@ rules of their own."""
 
 _FIRST_STAYING_OPTION = 5
 """0x605A: from 5 on the drive stays in QUICK_STOP_ACTIVE; below it goes on to SWITCH_ON_DISABLED at standstill."""
-_INTERNAL_LIMIT = 1 << 11  # of the statusword; torque: the drive has less than it is told
+_INTERNAL_LIMIT = 1 << 11  # of the statusword; torque: the drive has less than commanded
 _RECENT_COMMANDS = 8
 """Commands with which a drive's actual torque is compared: it is of some cycles ago, through a current loop."""
 _TARGET_REACHED = 1 << 10  # of the statusword; in QUICK_STOP_ACTIVE with such an option: the drive stands still
@@ -139,7 +139,7 @@ _STANDSTILL_RAD_S = 0.02
 
 
 class _StatusPlaces(NamedTuple):
-    """Where the signals of a status are among a message's values; -1: not in it."""
+    """Places of a status's signals among a message's values; -1: not in the message."""
 
     statusword: int = -1
     mode_display: int = -1
@@ -154,7 +154,7 @@ _NO_STATUS = _StatusPlaces()
 
 
 def option_codes(settings: Settings, profile: ProfileSettings) -> tuple[int | None, int | None]:
-    """Return 0x605A and 0x605E: the configuration's, else the profile's, None where neither says."""
+    """Return 0x605A and 0x605E: the configuration's, else the profile's, None where neither gives one."""
     chosen = settings.devices
     quick_stop, fault_reaction = chosen.quick_stop_option, chosen.fault_reaction_option
     return (
@@ -225,7 +225,7 @@ class Drive(CyclicDevice):
         """Cycle in which the status in use came; -1 before the first."""
         self.state = Cia402State.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
-        # Where no frame shows the mode, the master has compared 0x6061 before the start.
+        # If no frame shows the mode, the master has compared 0x6061 before the start.
         self.mode = 0 if shows_mode(codec, name) else MODE_CYCLIC_SYNCHRONOUS_TORQUE
         self.is_enabled = False
         """Whether the drive produces the commanded torque."""
@@ -255,11 +255,11 @@ class Drive(CyclicDevice):
 
     @property
     def is_limited(self) -> bool:
-        """Whether the drive says that a limit of its own keeps it from the commanded torque."""
+        """Whether the drive reports that a limit of its own keeps it from the commanded torque."""
         return bool(self.statusword & _INTERNAL_LIMIT)
 
     def position_error(self, data: bytes, periods: int) -> float:
-        """Say by how much a frame's position is off, rad, if so many periods lie between it and the last that came."""
+        """Return the error of a frame's position, rad, if so many periods lie between it and the last frame."""
         if self._received is None or len(data) != self.feedback_message.length:
             return 0.0
         values = self.feedback_message.decode_values(data)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 Number = Callable[[int, int], int | None]
-"""Gives the value of an object by index and sub-index; None where there is none."""
+"""Returns the value of an object by index and sub-index; None without one."""
 
 LEAST_INCREMENTS = 360
 """Per revolution of a joint, 1 deg. A drive with factory values of 1 : 1 has 1."""
@@ -78,7 +78,7 @@ def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
 
 
 def _angle_rad(unit: int | None) -> float | None:
-    """Return one count of a position unit; None for increments and other units that are no angle."""
+    """Return one count of a position unit, rad; None for increments and other units that don't measure an angle."""
     if not unit:
         return None
     angle_rad = _ANGLES_RAD.get(unit >> 16 & 0xFF)

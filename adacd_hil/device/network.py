@@ -34,7 +34,7 @@ _MOST_OLD_FRAMES = 10_000  # more than any queue holds; a bus that somebody floo
 
 
 class Identity(NamedTuple):
-    """Object 0x1018 of one node, with its name in the DBC; 0 for what the EDS doesn't list."""
+    """Object 0x1018 of one node, with its name in the DBC; 0 for an entry that the EDS doesn't list."""
 
     name: str
     node_id: int
@@ -51,7 +51,7 @@ class Master:
         """Load the profiles. Raises ConfigError when one can't be used.
 
         `watch_host`: devices shall watch the host by time: its heartbeat, and its commands where they count ms. Not in
-        lockstep: there cycles take as long as they take, and a device that waits goes by the wall clock.
+        lockstep: cycles have no fixed duration there, and a device waits by the wall clock.
         """
         self._watch_host = watch_host
         self._settings = settings
@@ -96,13 +96,13 @@ class Master:
         self._canopen.pump(lambda _: False, duration_s)
 
     def take_events(self) -> list[Event]:
-        """Return what the devices reported since the last call."""
+        """Return the events that the devices reported since the last call."""
         events = self._events.copy()
         self._events.clear()
         return events
 
     def describe_checks(self) -> list[str]:
-        """Say how many frames fitted no CANopen service and were dropped; empty when none."""
+        """Return in one line how many frames fitted no CANopen service and were dropped; empty without such frames."""
         count = self._canopen.malformed_frames
         return [f"{count} frames dropped that are not what their identifier says"] if count else []
 
@@ -112,7 +112,7 @@ class Master:
 
     def reset(self) -> None:
         """Reset the communication of the arm's nodes and wait until each has booted. Raises DeviceError, BusError."""
-        for _ in range(_MOST_OLD_FRAMES):  # from before the reset; a full queue has no room for what follows
+        for _ in range(_MOST_OLD_FRAMES):  # from before the reset; a full queue has no room for new frames
             if self._bus.receive(0.0) is None:
                 break
         timeout_s = self._settings.devices.boot_timeout_s
@@ -157,7 +157,7 @@ class Master:
 
     @staticmethod
     def _check_identity(slave: Slave, device_type: int, read: dict[int, int]) -> None:
-        """Compare what the EDS gives; what it leaves open may be anything."""
+        """Compare type, vendor, product and revision with the EDS; accept any value that the EDS leaves open."""
         kind, name = slave.device.settings.kind, slave.device.profile.name
         another = (
             f"another device has this node id, or profile {name} is of another: `adacd-hil scan` lists the nodes; "
@@ -191,7 +191,7 @@ class Master:
             )
 
     def configure(self) -> None:
-        """Write communication and application parameters, and read back what matters. Raises DeviceError, BusError."""
+        """Write communication and application parameters; read important ones back. Raises DeviceError, BusError."""
         for slave in self.slaves:
             self._set_up_sync(slave)
             self._set_up_heartbeats(slave)
@@ -274,12 +274,12 @@ class Master:
             self._canopen.command(nmt_command, node_id)
 
     def watch(self, t_ns: int) -> list[str]:
-        """Name what is wrong with the nodes' heartbeats now, one line per node; empty when nothing is.
+        """Describe failures of the nodes' heartbeats now, one line per node; empty without a failure.
 
         Between `start` and `stop` only: a node that is silent for 2.5 heartbeat periods, or that isn't OPERATIONAL.
         """
         return self._heartbeats.watch(t_ns)
 
     def send_heartbeat(self) -> None:
-        """Say that the host lives, 0x700 + its node id. Raises BusError."""
+        """Send the host's heartbeat, 0x700 + its node id. Raises BusError."""
         self._bus.send(self._heartbeat_id, bytes((OPERATIONAL,)))

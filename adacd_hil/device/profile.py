@@ -2,8 +2,8 @@
 
 A profile is a short TOML that, with an EDS, describes a drive or a sensor well enough to be run.
 
-The EDS says which objects a device has and of what type. The profile says the rest: which of them travel in which
-frame under which signal name, what one count is worth, how frames are protected, what the device can do.
+The EDS lists a device's objects and their types. The profile adds the rest: the frame and signal name of each object
+that travels on the bus, the worth of one count, the protection of frames, the device's abilities.
 Source: CiA 306 (EDS), CiA 301 clause 7.5.2 (PDO parameters), CiA 402-2, CiA 404.
 """
 
@@ -33,7 +33,7 @@ FEATURES = (
     "sync_tolerance",
     "watchdog_in_emcy",
 )
-"""What a profile may name: the host uses an object of these kinds only where the EDS lists it too.
+"""Kinds of object that a profile may name; the host uses such an object only if the EDS lists it too.
 
 heartbeat_consumer 0x1016; sync_counter 0x1019; option_codes 0x605A, 0x605E; torque_limits 0x6072, 0x60E0, 0x60E1;
 sync_tolerance 0x2201; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4 to 7 the
@@ -81,7 +81,7 @@ _TOGETHER = {
 }
 """Signals that are one sample or one command, and so travel in one frame."""
 HOST_SIGNALS = ("controlword", "target_torque", "torque_offset", "max_torque", "mode")
-"""What the host can fill in a command frame."""
+"""Signals that the host can fill in a command frame."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class PdoSettings:
 
 @dataclass(frozen=True)
 class ScaleSettings:
-    """What one count of the device is worth."""
+    """The worth of one count of the device."""
 
     increments_per_joint_rev: float = setting(
         0.0,
@@ -351,7 +351,7 @@ def profile_names() -> list[str]:
 
 
 def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
-    """Load a device profile by built-in name or file; `kind` is what it must be, drive or sensor.
+    """Load a device profile by built-in name or file; `kind`: the required kind, drive or sensor.
 
     Raises ConfigError for an unknown name or key, a value outside its bounds, an EDS that isn't there, another kind.
     """
@@ -406,7 +406,7 @@ class PlacedDevice:
 
     @property
     def settings(self) -> ProfileSettings:
-        """What its profile says."""
+        """The settings of its profile."""
         return self.profile.settings
 
     @property
@@ -450,7 +450,7 @@ class PlacedDevice:
         return [name.index << 16 | name.sub << 8 | self.variable(name).bits for name in names]
 
     def header(self, pdo: PdoSettings) -> list[SignalSettings]:
-        """Return the header objects of a PDO; none where it is unprotected."""
+        """Return the header objects of a PDO; () for an unprotected one."""
         if not pdo.data_ids:
             return []
         return [SignalSettings(object=text, signal="e2e") for text in self.settings.header]

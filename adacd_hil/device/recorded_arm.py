@@ -1,19 +1,19 @@
 """The arm from recorded frames: the ArmState of each cycle, as the live loop had it before the scheme's step.
 
-A log has every frame in the order in which the host took or sent it, and with it the time of the cycle that it was
-logged with. That is all that the live loop went by:
+A log has every frame in the order in which the host received or sent it, each with the time of the cycle that logged
+it. The live loop used no other information:
 
-- SYNC is the host's own where it sends it; where it follows another host's, the last one received with the time of the
-  cycle. That one may have been logged with the cycle before, as its last frame.
-- What was received before SYNC was taken for the cycle before, whatever its stamp.
-- What was received after SYNC came for that SYNC or an earlier one, for an earlier one where its stamp is older than
-  SYNC: `answer_clock`. Frames that came once all cyclic ones were in, or when the time for them was over, were read in
-  the next cycle and stand there.
-- Before the host's NMT start nothing counts: a heartbeat of before it says no more than none.
-- An attempt begins with the host's NMT reset; nothing of what was before survives it.
+- If the host sends SYNC, SYNC is the host's own. If it follows another host's, SYNC is the last one received with the
+  time of the cycle. That frame may have been logged with the cycle before, as its last frame.
+- A frame received before SYNC counts for the cycle before, whatever its stamp.
+- A frame received after SYNC answers that SYNC or an earlier one; an earlier one if its stamp is older than SYNC:
+  `answer_clock`. Frames that arrived after all cyclic ones were in, or after the wait was over, were read in the next
+  cycle and are logged there.
+- Frames before the host's NMT start are ignored: an earlier heartbeat counts as no heartbeat.
+- An attempt begins with the host's NMT reset; it discards all earlier state.
 
-Error frames change nothing. Of a cycle whose packet the logger dropped nothing is known, its frames included: from
-there on the states may differ until every counter and age has been renewed.
+Error frames are ignored. Of a cycle whose packet the logger dropped, all frames are unknown: from there on the states
+may differ until every counter and age has been renewed.
 """
 
 from collections.abc import Iterable, Iterator
@@ -42,7 +42,7 @@ class Ticks(NamedTuple):
     """The beginnings of n cycles, as columns (n,) of int64.
 
     `t_ns`: when SYNC went out or came, as all messages of the cycle carry it; so do its frames, as cycle_t_ns.
-    `periods`: since the cycle before, 1 unless some were skipped; the pause before an attempt counts for none.
+    `periods`: since the cycle before, 1 unless some were skipped; the pause before an attempt is not counted.
     """
 
     cycle: NDArray[np.int64]
@@ -51,7 +51,7 @@ class Ticks(NamedTuple):
 
 
 class RecordedArm:
-    """Turns what a log has of one run into what its arm reported, attempt after attempt."""
+    """Turns the logged frames of one run into the states that its arm reported, attempt after attempt."""
 
     def __init__(self, settings: Settings, codec: Codec) -> None:
         """Place the devices. Raises ConfigError and CodecError as `Arm`."""
@@ -72,7 +72,7 @@ class RecordedArm:
         """Return the states of some cycles, given all frames that were logged with them, before or between them.
 
         `frames`: FRAME_DTYPE or LONG_FRAME_DTYPE of the log's reader. Consecutive calls take up a run piece by piece;
-        what was logged after the last cycle of a piece may come with this call or with the next.
+        frames that were logged after the last cycle of a piece may come with this call or with the next.
         """
         passed = _unpack(frames)
         states: list[ArmState] = []
@@ -86,9 +86,9 @@ class RecordedArm:
         return _batch_of(states)
 
     def _bounds(self, ticks: Ticks, frames: NDArray[Any]) -> tuple[list[int], list[int]]:
-        """Find the frames of n cycles, from SYNC on: where they begin and end.
+        """Return where the frames of n cycles begin and end, from SYNC on.
 
-        Where SYNC was logged before the cycle's frames, they begin with the first of these.
+        If SYNC was logged before a cycle's frames, the range begins with the first of these.
         """
         cycle_t_ns, is_tx = frames["cycle_t_ns"], frames["is_tx"]
         is_sync = (frames["can_id"] == self._arm.sync_id) & (is_tx != self._is_following) & ~frames["is_error"]
@@ -100,7 +100,7 @@ class RecordedArm:
         return np.minimum(begin, end).tolist(), end.tolist()
 
     def _exchange(self, cycle: int, t_ns: int, periods: int, passed: _Passed) -> ArmState:
-        """Do what Exchange.read did with the frames of a cycle, and judge the state as the cycle did."""
+        """Do to a cycle's frames as Exchange.read did, and judge the state as the cycle did."""
         if not self._is_running:  # a log whose beginning was cut off
             self._start()
         arm = self._arm
@@ -119,7 +119,7 @@ class RecordedArm:
                 self._command(frame.data[0])
 
     def _command(self, nmt_command: int) -> None:
-        """Follow what the host told the devices: it does so at the beginning of an attempt and after its end only."""
+        """Follow the host's NMT commands; the host sends them only at the beginning of an attempt and after its end."""
         if nmt_command == RESET_COMMUNICATION and self._is_running:
             self._begin()
         elif nmt_command == START and not self._is_running:

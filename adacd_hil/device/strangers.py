@@ -1,13 +1,14 @@
-"""Somebody else on the bus: who sends what only this host sends, or what only one device of the arm sends.
+"""Another sender on the bus: it sends frames that only this host, or only one device of the arm, may send.
 
-A CAN frame doesn't say who sent it. What only one sender may send gives another one away:
+A CAN frame doesn't name its sender. A frame that only one node may send reveals a second sender:
 
-- commands, SYNC, NMT, the host's heartbeat and SDO requests to the arm's devices come from this host alone. One that is
-  received has another sender. Who only reads objects, as a survey of the bus does, is named, and stops nothing.
-- a device answers each SYNC with one cyclic frame. A second one that is right by length and CRC but not the same frame
-  again has another sender: a second device with that node id, or an attack.
+- Commands, SYNC, NMT, the host's heartbeat and SDO requests to the arm's devices come from this host alone. If the host
+  receives one, it has another sender. A sender that only reads objects, as a survey of the bus does, is reported but
+  doesn't stop the arm.
+- A device answers each SYNC with one cyclic frame. A second, different frame with correct length and CRC has another
+  sender: a second device with that node id, or an attack.
 
-CRC and alive counter are no secret: they find errors, not intent. See `docs/threat-model.md`.
+CRC and alive counter find errors; they don't protect against intent. See `docs/threat-model.md`.
 """
 
 from collections import deque
@@ -25,18 +26,18 @@ from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, NMT_ID, SDO_REQUEST_I
 HOSTS_LISTEN_S = 0.3
 """How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats."""
 HOLD_S = 1.0
-"""How long after such a frame the arm counts as somebody else's, too: ten heartbeats of a host."""
+"""How long after such a frame the arm counts as another host's, too: ten heartbeats of a host."""
 CONTRADICTIONS = 2
 """Second frames of a device that are no accident."""
 CONTRADICTION_WINDOW_S = 0.1
 """In which they are counted."""
 _NMT_WORDS = {1: "start", 2: "stop", 128: "pre-operational", 129: "reset node", 130: "reset communication"}
 _READING = (2, 3, 5)
-"""SDO client commands that change nothing: upload initiate, segment, block. Source: CiA 301 (4.2), clause 7.2.4.3."""
+"""SDO client commands that only read: upload initiate, segment, block. Source: CiA 301 (4.2), clause 7.2.4.3."""
 
 
 def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
-    """Say by identifier what somebody does who sends what only this host sends."""
+    """Return, by identifier of each frame that only this host sends, a description of another sender's action."""
     doing = {
         codec.message(HOST_HEARTBEAT).can_id: "sends this host's heartbeat",
         NMT_ID: "sends NMT commands",
@@ -52,9 +53,9 @@ def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
 
 
 def listen_for_hosts(bus: Bus, clock: Clock, settings: Settings, codec: Codec, duration_s: float) -> list[str]:
-    """Listen to the bus and say what somebody does who runs the arm already, one line each. Raises BusError.
+    """Listen to the bus and describe the actions of another host that runs the arm, one line each. Raises BusError.
 
-    Who only reads objects, and commands to nodes of other arms, are not among it.
+    Requests that only read objects, and commands to nodes of other arms, are ignored.
     """
     strangers = Strangers(settings, codec)
     end_ns = clock.now_ns() + round(duration_s * 1e9)
@@ -66,7 +67,7 @@ def listen_for_hosts(bus: Bus, clock: Clock, settings: Settings, codec: Codec, d
 
 
 def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
-    """Raise DeviceError when somebody else runs the arm: a reset would take it out of their hands. Raises BusError.
+    """Raise DeviceError when another host runs the arm: a reset would take it from that host. Raises BusError.
 
     Only where time passes by itself: in lockstep it does by this host's own frames.
     """
@@ -94,7 +95,7 @@ class Strangers(RateLimitedEvents):
         self._contradictions: dict[str, deque[int]] = {}
 
     def accept(self, frame: Frame, cycle: int) -> bool:
-        """Take a frame that was received in a cycle; False when it may be somebody else's."""
+        """Take a frame that was received in a cycle; return False when another sender may have sent it."""
         doing = self._doing.get(frame.can_id)
         if doing is None:
             return False
@@ -128,9 +129,9 @@ class Strangers(RateLimitedEvents):
         self.say(frame.t_ns, text, Event("error", "bus", text))
 
     def are_heard(self, cycle: int) -> bool:
-        """Tell whether somebody else has acted on the arm of late."""
+        """Return whether another sender has acted on the arm of late."""
         return cycle <= self._until_cycle
 
     def describe(self, cycle: int) -> list[str]:
-        """Say who has acted on the arm of late, one line each."""
+        """Describe the actions of other senders on the arm of late, one line each."""
         return [text for text, heard in self._complaints.items() if cycle <= heard + self._hold_cycles]

@@ -1,11 +1,11 @@
-"""Who is on the bus: CANopen nodes found by asking and by listening, every identifier that is heard, a listener's view.
+"""A survey of the bus: CANopen nodes found by asking and by listening, every identifier received, a listener's view.
 
 A survey sends SDO uploads only and changes no node's state, so it works beside a running master. Source: CiA 301 (4.2),
 clauses 7.2.4 (SDO), 7.2.8 (NMT, boot-up, heartbeat), 7.3.3 (predefined connection set), objects 0x1000, 0x1001, 0x1008,
-0x1018. Of nodes whose profile says that they have it, 0x2000 is read as well: wire version and layout digest.
+0x1018. It also reads 0x2000, wire version and layout digest, of nodes whose profile has it.
 
-The view of a listener sends nothing: nodes with their NMT state, messages with rate, age, checks and values, load.
-Everything is counted frame by frame; values are decoded when a `Snapshot` is asked for.
+The listener's view sends no frame: nodes with their NMT state, messages with rate, age, checks and values, load.
+Everything is counted frame by frame; values are decoded when a caller requests a `Snapshot`.
 """
 
 import struct
@@ -40,7 +40,7 @@ _CONTRACT = ("wire_version", "layout_digest")
 NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
 _PROFILES = {401: "I/O", 402: "drive", 404: "measuring device", 405: "PLC", 406: "encoder", 408: "hydraulic drive"}
 
-# Predefined connection set, CiA 301 table 38: function code to what a node sends with it.
+# Predefined connection set, CiA 301 table 38: function code to the service that a node sends with it.
 _PRODUCED = {
     0x080: "EMCY",
     0x180: "TPDO1",
@@ -56,7 +56,7 @@ _TPDOS = (0x180, 0x280, 0x380, 0x480)
 
 
 def function_name(can_id: int) -> str:
-    """Name what CiA 301's predefined connection set uses an identifier for; "" when it is not one of them."""
+    """Name the service of an identifier in CiA 301's predefined connection set; "" for an identifier outside it."""
     if can_id > MAX_STANDARD_ID:
         return ""
     function, node_id = can_id & 0x780, can_id & 0x7F
@@ -67,7 +67,7 @@ def function_name(can_id: int) -> str:
 
 @dataclass
 class Node:
-    """One CANopen node. None: not told (it didn't answer, or has no such object).
+    """One CANopen node. None: unknown (it didn't answer, or has no such object).
 
     nmt_state: 0, 4, 5, 127 from its heartbeat or boot-up. emergencies: (error code, error register), oldest first.
     answers: whether it answered SDO.
@@ -101,7 +101,7 @@ class Node:
 
     @property
     def state_text(self) -> str:
-        """Describe the NMT state, as told by heartbeats or as PDOs, which only an operational node sends, show it."""
+        """Describe the NMT state by heartbeats, or by PDOs, which only an operational node sends."""
         if self.has_pdos and self.nmt_state in (None, 0):
             return "operational (sends PDOs)"
         if self.nmt_state is None:
@@ -111,7 +111,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Expected:
-    """A node that the configuration expects. None: its EDS doesn't say, so anything will do."""
+    """A node that the configuration expects. None: its EDS doesn't give it, so any value will do."""
 
     name: str
     node_id: int
@@ -123,7 +123,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class Survey:
-    """What was found. `others`: identifiers that belong to no node found; `duration_s`: how long it was listened."""
+    """Nodes found. `others`: identifiers that belong to no node found; `duration_s`: length of the listening."""
 
     nodes: list[Node]
     others: list[Talk]
@@ -162,7 +162,7 @@ def survey(
 
 
 def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
-    """Make the nodes that were heard, ascending."""
+    """Return the nodes that sent frames, ascending by node id."""
     found: dict[int, Node] = {}
     for is_sent, frame in tap.take():
         function, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
@@ -186,7 +186,7 @@ def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
 
 
 def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
-    """Read what a node says of itself; what it doesn't tell stays None."""
+    """Read a node's identity objects into its record; an object that the node doesn't give stays None."""
     remote = canopen.add_node(node.node_id, None, pause_s=BETWEEN_READS_S)
     try:
         name = read_object(remote, 0x1008)
@@ -200,11 +200,11 @@ def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
             value = read_object(remote, 0x2000, subindex) if has_contract else None
             setattr(node, what, None if value is None else int.from_bytes(value, "little"))
     except DeviceError:
-        node.answers = False  # it fell silent or refuses: what was read stands
+        node.answers = False  # it fell silent or refuses: values read so far stay
 
 
 def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
-    """Give each identifier to the node that produces it by the predefined connection set; return the rest."""
+    """Assign each identifier to the node that produces it by the predefined connection set; return the rest."""
     others = []
     for talk in traffic.sorted():
         node = nodes.get(talk.can_id & 0x7F) if talk.can_id <= MAX_STANDARD_ID else None
@@ -217,9 +217,9 @@ def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
 
 
 def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[Expected]:
-    """List what the master of an arm expects: vendor and product of the EDS, None where any will do.
+    """List the nodes that the master of an arm expects: vendor and product of the EDS, None where any will do.
 
-    With a codec also its wire version and layout digest, of nodes that tell them.
+    With a codec, entries also have its wire version and layout digest, for nodes that give them.
     """
     expected = []
     for slave in slaves:
@@ -235,7 +235,7 @@ def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[
 
 
 def compare(found: Survey, expected: list[Expected]) -> dict[int, str]:
-    """Say for each node, found or expected, how it fits the configuration: "" when it does."""
+    """Describe how each node, found or expected, differs from the configuration: "" when it fits."""
     wanted = {node.node_id: node for node in expected}
     present = {node.node_id: node for node in found.nodes}
     verdicts = {}
@@ -287,7 +287,7 @@ _WINDOW_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class NodeView:
-    """One node. state: as its last heartbeat says; age in s since then."""
+    """One node. state: by its last heartbeat; age in s since then."""
 
     node_id: int
     name: str

@@ -57,10 +57,10 @@ class TorqueSensor(CyclicDevice):
         self.values = (0.0,)
         """Torque, Nm, as the device gives it: its sign, its own auto-zero, not tared."""
         self.status = SensorStatus(0)
-        """What either of its frames says: a sensor that contradicts itself isn't believed.
+        """Status by both of its frames: a sensor whose frames contradict each other isn't trusted.
 
-        A status frame counts until the next one. One that is taken back before the second torque frame after it doesn't
-        count: so a sensor begins.
+        A status frame counts until the next one. It doesn't count if another status frame withdraws it before the
+        second torque frame after it: a sensor may start so.
         """
         self._cyclic_bits = 0
         self._slow_bits = 0
@@ -82,7 +82,7 @@ class TorqueSensor(CyclicDevice):
         elif self.torque_range_Nm:
             self._cyclic_bits = _judge_range(torque, self.torque_range_Nm)
         else:
-            self._slow_bits = self._heard_bits  # nothing else says it
+            self._slow_bits = self._heard_bits  # only the status frame carries it
         self.status = _STATUSES[self._cyclic_bits | self._slow_bits]
         self._slow_bits = self._heard_bits
 

@@ -22,7 +22,7 @@ class LogExistsError(LogError):
 
 @contextmanager
 def failing_as(what: str) -> Iterator[None]:
-    """Raise LogError for an OSError in the block: `what` failed, and the reason."""
+    """Raise LogError for an OSError in the block: the failed operation, and the reason."""
     try:
         yield
     except OSError as error:
@@ -73,7 +73,7 @@ def part_path(path: Path, number: int) -> Path:
 
 
 def is_part_name(path: Path) -> bool:
-    """Tell whether a file of this name would be taken for a part of a log that lies beside it."""
+    """Return whether a file of this name would be taken for a part of a log that lies beside it."""
     match = re.fullmatch(rf"(.+)_\d{{{_DIGITS},{_MOST_DIGITS}}}", path.stem)
     return match is not None and path.with_name(f"{match[1]}{path.suffix}").exists()
 
@@ -105,7 +105,7 @@ DROPPED_KEY = "dropped"
 
 
 def parts_of(path: Path) -> dict[int, Path]:
-    """Find the parts of the log `path` by their numbers; `path` alone where none can be found: opening it says why."""
+    """Find the parts of the log `path` by their numbers; `path` alone without any: opening it gives the error."""
     try:
         return find_parts(path) or {0: path}
     except OSError:
@@ -141,22 +141,22 @@ class TimeWindow(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether it bounds nothing."""
+        """Whether it is unbounded."""
         return self == TimeWindow()
 
     @property
     def text(self) -> str:
-        """Say it as a command is asked for it; nothing of the whole log."""
+        """The window in a command's words, such as "from 3 s until 5 s"; "" for the whole log."""
         words = (("from", self.start_s), ("until", self.end_s))
         return " ".join(f"{word} {bound_s:g} s" for word, bound_s in words if math.isfinite(bound_s))
 
     def bounds_ns(self, start_ns: int) -> tuple[int, int]:
-        """Give its bounds on a clock on which the log begins at `start_ns`."""
+        """Return its bounds on a clock on which the log begins at `start_ns`."""
         first_ns, end_ns = (start_ns + round(min(max(bound_s, -_CENTURY_S), _CENTURY_S) * 1e9) for bound_s in self)
         return first_ns, end_ns
 
     def as_json(self) -> dict[str, float | None]:
-        """Give its bounds, s; None where it is not bounded."""
+        """Return its bounds, s; None where it is not bounded."""
         bounds = (("from_s", self.start_s), ("until_s", self.end_s))
         return {name: bound_s if math.isfinite(bound_s) else None for name, bound_s in bounds}
 

@@ -292,7 +292,7 @@ def _payloads(contents: Contents, channel: int) -> Iterator[bytes]:
 
 
 def attachment(path: Path, name: str) -> bytes | None:
-    """Return an attachment of an MCAP file by its name; None when it isn't among what precedes the first chunk."""
+    """Return an attachment of an MCAP file by its name; None when no record before the first chunk has it."""
     for record in _records_before_chunks(path):
         if isinstance(record, Attachment) and record.name == name:
             return record.data
@@ -300,7 +300,7 @@ def attachment(path: Path, name: str) -> bytes | None:
 
 
 def run_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of the run in an MCAP file; empty when they aren't among what precedes the first chunk."""
+    """Return the metadata of the run in an MCAP file; empty when no record before the first chunk has it."""
     for record in _records_before_chunks(path):
         if isinstance(record, Metadata) and record.name == RUN_METADATA:
             return record.metadata
@@ -308,7 +308,7 @@ def run_metadata(path: Path) -> dict[str, str]:
 
 
 def _records_before_chunks(path: Path) -> Iterator[Attachment | Metadata]:
-    """Give the records before the first chunk, as far as they are sound: the reader of the log reports damage."""
+    """Yield the records before the first chunk, as far as they are sound: the reader of the log reports damage."""
     try:
         with open_input(path) as file:
             if file.read(len(MAGIC)) != MAGIC:

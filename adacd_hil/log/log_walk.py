@@ -1,7 +1,7 @@
 """A walk over all parts of a log, as if they were one file.
 
-The intact messages of a cut or damaged file are kept; a part that is missing or damaged costs only itself and raises
-nothing.
+The intact messages of a cut or damaged file are kept; a missing or damaged part costs only itself and raises no
+error.
 """
 
 import contextlib
@@ -131,14 +131,14 @@ class LogWalk:
     ) -> None:
         """Find the parts of the log whose first is `path`; of the messages only those of `topics` are read if given.
 
-        Raises LogError when nothing of it can be read.
+        Raises LogError when no part of it can be read.
         """
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, str] = {}
         self.summary: dict[str, str] = {}
         self.parts = 0
         self.topics: dict[str, Topic] = {}
-        """Those that were asked for and are defined, as far as has been walked."""
+        """The requested topics that are defined in the parts walked so far."""
         self._path = path
         self._layout = layout
         self._wanted = topics
@@ -192,7 +192,7 @@ class LogWalk:
         """Read the messages of all parts, so many cycles at a time; topics, summary and problems grow meanwhile.
 
         epoch_ns: offset of the times in the file from those of frames; has_frame_records: of frames the records
-        are gathered, too; is_ahead: a thread opens chunks before they are asked for.
+        are gathered, too; is_ahead: a thread opens chunks in advance.
         """
         builder = PieceBuilder(cycles, epoch_ns, has_frame_records)
         self._problems, self.summary, self.parts = [], {}, 0
@@ -293,7 +293,7 @@ class _PartWalk:
         yield from self._builder.add(block.contents, messages, slots)
 
     def _define(self, record: RawRecord | None) -> None:
-        """Take in a definition. Raises LogError for one that makes no sense, and for None, which is no record."""
+        """Take in a definition. Raises LogError for an invalid one and for None."""
         if record is None:
             raise LogError("no record")
         definition = self._definitions.take(record)
@@ -327,7 +327,7 @@ class _PartWalk:
 
 
 def _message_counts(path: Path) -> dict[int, int]:
-    """Read how many messages each channel of a file has, by its statistics; nothing where these can't be had."""
+    """Read how many messages each channel of a file has, by its statistics; return {} if these can't be read."""
     with contextlib.suppress(OSError, LogError), open_input(path) as file:
         most = path.stat().st_size // INDEX_ENTRY.itemsize  # each has an entry in an index
         for record in summary_of(file):

@@ -78,7 +78,7 @@ class CycleColumns:
         return name in self.columns
 
     def rows(self, rows: Cycles) -> "CycleColumns":
-        """Give some of the cycles."""
+        """Return some of the cycles."""
         return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
 
     @staticmethod
@@ -89,7 +89,7 @@ class CycleColumns:
         return CycleColumns(np.concatenate([part.t_ns for part in parts]), columns)
 
     def times_us(self, quantity: Quantity) -> Vector | None:
-        """Give a time of the cycles that have it, µs; None where the log does not have it."""
+        """Return a time of the cycles that have it, µs; None where the log does not have it."""
         if quantity.column not in self:
             return None
         values_ns = self[quantity.column]
@@ -98,7 +98,7 @@ class CycleColumns:
         return np.asarray(values_ns / 1000.0, dtype=np.float64)
 
     def steps(self, name: str, before: int = 0) -> Cycles:
-        """Give the increments of a running count (n,); a count that began anew begins at 0.
+        """Return the increments of a running count (n,); a count that began anew begins at 0.
 
         before: the count in the cycle before the first.
         """
@@ -228,7 +228,7 @@ class Truth:
         return self.span is None or bool(self.span.covers(np.array(cycle)))
 
     def model_row(self, cycle: int) -> int | None:
-        """Give the row of payload and parameters in a cycle; None without any."""
+        """Return the row of payload and parameters in a cycle; None without any."""
         cycles = self.cycle if self.model_cycle is None else self.model_cycle
         return max(int(np.searchsorted(cycles, cycle, side="right")) - 1, 0) if cycles.size else None
 
@@ -276,7 +276,7 @@ class CheckCounts:
 
 
 class StretchOfRun(NamedTuple):
-    """A stretch of a log: as asked for, as found, widened so that it cuts nothing, and the contacts before it.
+    """A stretch of a log: as requested, as found, widened so that it cuts nothing, and the contacts before it.
 
     motion_start_s: s since the beginning of the log.
     """
@@ -309,7 +309,7 @@ class Run:
     metadata: Mapping[str, str]
     frames: int | None
     dropped: int | None
-    finish_cycle: int | None = None  # in which the user asked to finish; None: never
+    finish_cycle: int | None = None  # cycle of the request to finish; None: never
     contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
     certified: CertifiedStream | None = None  # None of the paper's scheme
     beside: PaperStream | None = None
@@ -321,7 +321,7 @@ class Run:
     log_start_ns: int | None = None  # the beginning of its log
     stretch: StretchOfRun | None = None  # None: the whole log
     checks: CheckCounts | None = None  # None: not in the log
-    broken_off: str = ""  # what ended the log, where that was not meant to
+    broken_off: str = ""  # the reason for an unintended end of the log
 
     @property
     def first_contact(self) -> int:
@@ -355,18 +355,18 @@ class Run:
         return int(self.t_ns[int(np.argmax(adapting)) if adapting.any() else 0])
 
     def time_s(self) -> Vector:
-        """Give the time of every cycle since motion start, s (n,)."""
+        """Return the time of every cycle since motion start, s (n,)."""
         # Subtracted as integers: float64 resolves only 256 ns of an absolute time.
         return np.asarray((self.t_ns - self.zero_ns) * 1e-9, dtype=np.float64)
 
     def time_of_s(self, cycle: NDArray[Any]) -> Vector:
-        """Give the time of any cycle numbers since motion start, s; between logged cycles by interpolation."""
+        """Return the time of any cycle numbers since motion start, s; between logged cycles by interpolation."""
         if self.cycle.size == 0:
             return np.zeros(len(cycle))
         return np.asarray(np.interp(cycle, self.cycle, self.time_s()), dtype=np.float64)
 
     def truth_time_s(self, rows: slice = slice(None)) -> Vector:
-        """Give the time of the cycles of the truth, or of some rows of it, since motion start, s (k,)."""
+        """Return the time of the cycles of the truth, or of some rows of it, since motion start, s (k,)."""
         if self.truth is None:
             return np.zeros(0)
         time_s = self.truth.time_s
@@ -405,7 +405,7 @@ def section_label(index: int) -> str:
 
 
 def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Give for each cycle (n,) the state, where it is REACT or STOPPED the one that was interrupted."""
+    """Return for each cycle (n,) the state, where it is REACT or STOPPED the one that was interrupted."""
     rows = np.arange(state.size)
     own = np.maximum.accumulate(np.where(is_interrupted(state), -1, rows))
     return np.where(own < 0, np.uint8(SchemeState.MONITOR), state[np.maximum(own, 0)])
@@ -417,7 +417,7 @@ def is_interrupted(state: NDArray[np.uint8]) -> Mask:
 
 
 def split_sections(run: Run) -> tuple[Section, ...]:
-    """Split a run into lettered sections; cycles before the first ADAPT belong to none."""
+    """Split a run into lettered sections; cycles before the first ADAPT belong to no section."""
     if run.state.size == 0:
         return ()
     kinds = np.array([_KINDS.get(SchemeState(value), "") for value in range(len(SchemeState))])[origins(run.state)]
@@ -441,7 +441,7 @@ def section_at(sections: Iterable[Section], time_s: float) -> str | None:
 
 
 def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
-    """Give the rows of a section among cycles at such times (n,), which ascend.
+    """Return the rows of a section among cycles at such times (n,), which ascend.
 
     end_s: when the run ends. Its last cycle belongs to the last section; the first one of the next section to that.
     """
@@ -461,7 +461,7 @@ def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
 
 
 def is_realtime(run: Run) -> bool:
-    """Tell whether the host's own clock drove the cycles."""
+    """Return whether the host's own clock drove the cycles."""
     return run.metadata.get("clock") == "realtime"
 
 

@@ -1,10 +1,10 @@
 """A log as a stream of pieces (`LogStream`), or as one piece (`read_log`).
 
 A piece has one structured array per topic, frames in the order of the bus, and events. Cut and damaged files are read
-as far as they are intact; `is_complete` and `problem` say so.
+as far as they are intact; `is_complete` and `problem` report the damage.
 
-On two processors one reads, checks and decompresses ahead while the other gathers the messages; topics that weren't
-asked for cost nothing but their decompression.
+On two processors one reads, checks and decompresses ahead while the other gathers the messages; topics outside the
+request cost only their decompression.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -110,7 +110,7 @@ class Series:
         return np.asarray(stamp_ns - self._epoch_ns, np.int64)
 
     def part(self, rows: slice | NDArray[np.bool_]) -> "Series":
-        """Give some of the messages."""
+        """Return some of the messages."""
         return Series(self.records[rows], self._epoch_ns)
 
     @property
@@ -139,7 +139,7 @@ class RunLog:
     """A log, all its parts as one. Topics that it lacks are empty."""
 
     path: Path
-    problem: str  # what is missing, one line; "" for a whole file
+    problem: str  # the missing parts, one line; "" for a whole file
     metadata: dict[str, str]  # of the run
     summary: dict[str, str]  # frames, messages, dropped, ending, as far as the parts have their ends
     attachments: dict[str, bytes]
@@ -259,7 +259,7 @@ def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
 def _series_of(
     rows: Mapping[str, NDArray[np.uint8]], topics: Mapping[str, Topic], own: Mapping[str, Topic], epoch_ns: int
 ) -> dict[str, Series]:
-    """Make a series of each topic of fixed size: of our own ones, present or not, and of the others that there are.
+    """Make a series of each topic of fixed size: of our own ones, present or not, and of the others present.
 
     rows: the records of topics (n, size).
     """
@@ -279,7 +279,7 @@ _STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": 
 
 
 def check_states(scheme: Series) -> None:
-    """Raise LogError for a record of /scheme with a state or a fault that there is not."""
+    """Raise LogError for a record of /scheme with an unknown state or fault."""
     for name, kind in _STATES.items():
         if name in scheme.fields:
             odd = np.flatnonzero(~np.isin(scheme.records[name], [int(member) for member in kind]))
@@ -289,7 +289,7 @@ def check_states(scheme: Series) -> None:
 
 
 def contacts_of(series: Series) -> list[LoggedContact]:
-    """Give the reports of /contact. Raises LogError for an unknown level, kind, reaction or place."""
+    """Return the reports of /contact. Raises LogError for an unknown level, kind, reaction or place."""
     contacts = []
     members = [member for member in CONTACT.head if member.name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
@@ -309,17 +309,17 @@ class Piece(NamedTuple):
     """
 
     series: Mapping[str, Series]
-    """Topics of fixed size that were asked for, but those of bus frames; our own ones are there even when empty."""
+    """Requested topics of fixed size without those of bus frames; our own ones are there even when empty."""
     frames: NDArray[Any]
     """(n,) of reader.FRAME_DTYPE, or LONG_FRAME_DTYPE in a piece with FD frames; both ways, in the order of the bus."""
     payloads: Mapping[str, list[bytes]]
-    """Topics of varying size that were asked for, such as /events."""
+    """Requested topics of varying size, such as /events."""
 
 
 class LogStream:
     """A log read once from front to back in constant memory, all parts as one.
 
-    Damaged and missing parts are left out; `problem` says so.
+    Damaged and missing parts are left out; `problem` names them.
     """
 
     def __init__(
@@ -332,9 +332,9 @@ class LogStream:
     ) -> None:
         """Begin to read the log whose first part is `path`, of the messages only those of `topics` when given.
 
-        A folder stands for the run's log in it. is_ahead: a thread opens chunks ahead, for a caller that has none of
+        A folder stands for the run's log in it. is_ahead: a thread opens chunks ahead, for a caller without a thread of
         its own for the reading. has_every_topic: pieces have series of bus frames, too, and empty ones of our own
-        topics that were not asked for. Raises LogError when nothing of it can be read.
+        topics outside the request. Raises LogError when no part of it can be read.
         """
         self.path = log_in(path)
         self._walk = LogWalk(self.path, self._layout_of, topics)
@@ -358,7 +358,7 @@ class LogStream:
         return self._walk.attachments
 
     def empty(self) -> Piece:
-        """Give a piece without messages, with our own topics."""
+        """Return a piece without messages, with our own topics."""
         return Piece(_series_of({}, {}, self._own_topics(), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
 
     @property
@@ -386,7 +386,7 @@ class LogStream:
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """Those that were asked for and are defined, as far as has been read."""
+        """The requested topics that are defined in the parts read so far."""
         return self._walk.topics
 
     @property
@@ -395,7 +395,7 @@ class LogStream:
         return self._walk.parts
 
     def joint_states(self, piece: Piece) -> dict[str, list[bytes]]:
-        """Give the payloads of joint states of others, by topic."""
+        """Return the payloads of joint states of others, by topic."""
         found = self._walk.topics
         return {name: each for name, each in piece.payloads.items() if found[name].type_name == JOINT_STATE.name}
 

@@ -37,18 +37,18 @@ from adacd_hil.log.mcap.mcap_records import (
 )
 
 _NOTES = 20
-"""Damages that are told one by one."""
+"""Damages that are listed one by one."""
 
 
 class Hole(NamedTuple):
-    """Where messages are missing: log times before and after."""
+    """A gap without messages: log times before and after."""
 
     start_ns: int
     end_ns: int
 
     @property
     def seconds(self) -> float:
-        """How long nothing was saved."""
+        """Length of the gap."""
         return max(0, self.end_ns - self.start_ns) * 1e-9
 
 
@@ -75,11 +75,11 @@ class Losses:
 
     @property
     def holes_s(self) -> float:
-        """How long, all holes together, nothing was saved between the saved messages."""
+        """Total length of the gaps between the saved messages."""
         return sum(hole.seconds for hole in self.holes)
 
     def describe(self) -> str:
-        """Say in words what is lost; "" for nothing. Holes are told of with what made them."""
+        """Describe the losses in words; "" without a loss. Gaps are named only beside the losses behind them."""
         messages = "an unknown number of messages" if self.messages is None else f"{self.messages} messages"
         head = [
             ("the end", self.is_cut),
@@ -104,7 +104,7 @@ class Losses:
             self.notes.append(text)
 
     def add(self, other: "Losses") -> None:
-        """Add what another file lost."""
+        """Add the losses of another file."""
         self.chunks += other.chunks
         self.bytes += other.bytes
         is_known = self.messages is not None and other.messages is not None
@@ -138,9 +138,9 @@ class Salvage:
         self._is_hole = False
         self._is_explained = False  # why the CRC of the data section doesn't fit
         self._has_data_end = self._has_footer = False
-        self._chunk: tuple[Contents, NDArray[np.void]] | None = None  # the latest one, and what its index must say
+        self._chunk: tuple[Contents, NDArray[np.void]] | None = None  # the latest one, and the index that it must have
         self._data_end = RawRecord(0, Opcode.DATA_END, b"")
-        self._left_out = 0  # messages for lack of what vouches for them, or of their channel
+        self._left_out = 0  # messages that no CRC vouches for, or without their channel
         with failing_as(f"log {path} can't be read"), open_input(path) as file:
             self._look_at_end(file)
 
@@ -173,7 +173,7 @@ class Salvage:
         self._sum_up()
 
     def _take(self, record: RawRecord) -> Iterator[Attachment | Metadata | Contents]:
-        """Give what is in a record and can be trusted."""
+        """Yield the content of a record that can be trusted."""
         opcode = record.opcode
         is_trusted = self.is_vouched or (self._is_unchecked and not self.losses.bytes)
         try:
@@ -245,7 +245,7 @@ class Salvage:
             self._is_explained |= body[6:] != entries[is_own].tobytes()
 
     def _doubt(self, file: IO[bytes]) -> None:
-        """Say so when the CRC of the data section fails though nothing was found that is wrong."""
+        """Note a doubt when the CRC of the data section fails and no damage that was found explains it."""
         stored = int.from_bytes(self._data_end.body, "little")
         if stored and stored != crc_of(file, 0, self._data_end.offset):
             self.losses.is_doubtful = True
@@ -258,7 +258,7 @@ class Salvage:
         self._is_explained = True
 
     def _sum_up(self) -> None:
-        """Say what is lost, by the statistics where they can be trusted."""
+        """Count the losses, by the statistics where they can be trusted."""
         losses, statistics = self.losses, self._statistics
         losses.is_cut = not self._has_data_end and not self._has_footer and statistics is None
         if losses.is_cut:

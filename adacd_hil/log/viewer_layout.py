@@ -12,7 +12,7 @@ LAYOUT_NAME = "viewer-layout.json"
 
 
 def _titled(title: str, panel: dict[str, Any]) -> dict[str, Any]:
-    """Give a panel its title: each of the two viewers has a key of its own."""
+    """Return a panel with its title: each of the two viewers has a key of its own."""
     return {"lichtblickPanelTitle": title, "foxglovePanelTitle": title, **panel}
 
 

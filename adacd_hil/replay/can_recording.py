@@ -1,13 +1,13 @@
-"""Frames that somebody else recorded on the bus, as the cycles of a run: candump, BLF, ASC, MF4, or our own log.
+"""Frames recorded on the bus by another program, as the cycles of a run: candump, BLF, ASC, MF4, or our own log.
 
 A recording has the frames of the bus and their times; a log of ours has the host's decisions too. So the replay orders
-a recording as the host would have met it. SYNC begins a cycle, and its counter gives the cycle's number. The host would
-have read in the next cycle the frames that come after all cyclic frames of a cycle, or when the host no longer waits
-for them.
+a recording as the host would have read it. SYNC begins a cycle, and its counter gives the cycle's number. The host
+would have read a frame in the next cycle if it came after all cyclic frames of a cycle, or after the host's wait for
+them.
 
 **With a run's log** (`against`) cycles, times and requests are the run's, and all decisions are compared with it; the
-frames are the recording's. **Without** one, the user is played by the script of the configuration; cycles at the end in
-which the drives are told to be off are taken for the host's disabling, in which the scheme has no part.
+frames are the recording's. **Without** one, the configuration's script plays the user; cycles at the end in which the
+drives are commanded off are taken for the host's disabling, in which the scheme doesn't run.
 """
 
 from collections.abc import Iterator, Mapping
@@ -99,7 +99,7 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording
     if is_realtime:
         is_after |= offset_ns > FEEDBACK_SHARE * period_ns
     resets = np.cumsum(_is_reset(frames))
-    is_boot = resets > resets[sync][since]  # what comes before the first SYNC of an attempt is read at once
+    is_boot = resets > resets[sync][since]  # frames before the first SYNC of an attempt are read at once
     is_moved = is_after & ~frames["is_tx"] & (before >= 0) & ~is_boot
     numbers = np.concatenate(([number[0] - 1], number, [number[-1] + 1]))
     owner = numbers[before + 1 + is_moved]
@@ -120,7 +120,7 @@ def _of_busiest_channel(frames: NDArray[Any], sync_id: int) -> NDArray[Any]:
 
 
 def _unwrap(counter: Places, t_ns: Places, period_ns: int) -> Places:
-    """Count the cycles by the counter 1…240 of their SYNC; time says how often it went round, where it says so."""
+    """Count the cycles by the counter 1…240 of their SYNC; times give its number of turns where they determine it."""
     steps = np.diff(counter) % SYNC_OVERFLOW
     if period_ns:
         periods = np.rint(np.diff(t_ns) / period_ns)
@@ -185,7 +185,7 @@ class RecordingAgainstLog(LogSource):
         )
 
     def notes(self) -> list[str]:
-        """Say what is missing."""
+        """List the missing parts, a line each."""
         notes = super().notes()
         if self._missing:
             notes.insert(0, f"{self._missing} cycles of the run are not in {self._recorded.name}")
@@ -195,9 +195,9 @@ class RecordingAgainstLog(LogSource):
 
 
 def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
-    """Return the cycle of the run that a recording begins with: where the devices answered the same, bit for bit.
+    """Return the cycle of the run with which a recording begins: the devices' answers are equal, bit for bit.
 
-    The counter tells the cycle but for multiples of 240. Where no cycle fits, it is the nearest to the run's first.
+    The counter gives the cycle but for multiples of 240. If no cycle fits, return the one nearest to the run's first.
     """
     wanted = _answers(recording.frames[recording.owner == recording.number[0]], codec)
     first = int(recording.number[0])
@@ -222,7 +222,7 @@ def _answers(frames: NDArray[Any], codec: Codec) -> dict[int, bytes]:
 
 
 class RecordingAlone:
-    """A recording without a log: nothing to compare with, and a user whom the configuration's script plays."""
+    """A recording without a log: its decisions are not compared, and the configuration's script plays the user."""
 
     has_arms = False
     is_recording = True
@@ -244,12 +244,12 @@ class RecordingAlone:
         return int(self._t_ns()[0])
 
     def _t_ns(self) -> Places:
-        """Give the time of each cycle (n,): of its SYNC, or where the bus was in lockstep by its number."""
+        """Return the time of each cycle (n,): of its SYNC, or where the bus was in lockstep by its number."""
         recording = self._recording
         return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
 
     def parts(self, with_frames: bool) -> Iterator[Part]:  # noqa: ARG002 (there are only frames)
-        """Give one part."""
+        """Yield one part."""
         yield Part(list(self._stretches()), {}, (), frozenset())
 
     def _stretches(self) -> Iterator[CycleStretch]:
@@ -281,7 +281,7 @@ class RecordingAlone:
                 )
 
     def notes(self) -> list[str]:
-        """Say what is missing."""
+        """List the missing parts, a line each."""
         notes = [self._recording.problem] if self._recording.problem else []
         if self._is_headless:
             notes.append(f"{self._path.name} begins in the middle of a run: the scheme begins with INIT there")
@@ -289,7 +289,7 @@ class RecordingAlone:
 
 
 def _disabling(frames: NDArray[Any], t_ns: Places, codec: Codec) -> int:
-    """Count the last cycles of an attempt in which both drives are told to be off; at most as many as a host sends."""
+    """Count the last cycles of an attempt in which both drives are commanded off; at most as many as a host sends."""
     commands = [codec.message(name) for name in ("Drive1Command", "Drive2Command")]
     for count, cycle_ns in enumerate(t_ns[: -DISABLE_CYCLES - 1 : -1].tolist()):
         for message in commands:

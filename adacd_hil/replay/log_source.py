@@ -26,7 +26,7 @@ from adacd_hil.wire.codec import Codec, parse_codec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 
 NMT_ID, RESET_COMMUNICATION = 0x000, 0x82
-"""What an attempt begins with on the bus. Source: CiA 301 (4.2), clause 7.2.8.3.1."""
+"""NMT identifier and command that begin an attempt on the bus. Source: CiA 301 (4.2), clause 7.2.8.3.1."""
 SYNC_ID = 0x080
 
 Places = NDArray[np.int64]
@@ -35,9 +35,9 @@ Places = NDArray[np.int64]
 class CycleStretch(NamedTuple):
     """Cycles of one attempt that follow each other without a gap in the log.
 
-    `attempt`: its number in the run, from 0; `is_begin`: it begins with this. `is_exact`: nothing of it is missing so
-    far, so that a replay has to come to the same. arms (n,): as the log has them, None where it doesn't. requests (n,)
-    of Request, None where nobody knows them; scheme: the records of /scheme (n,).
+    `attempt`: its number in the run, from 0; `is_begin`: it begins with this. `is_exact`: no part of it is missing so
+    far, so that a replay must give the same. arms (n,): as the log has them, None if it lacks them. requests (n,)
+    of Request, None if unknown; scheme: the records of /scheme (n,).
     """
 
     attempt: int
@@ -89,7 +89,7 @@ class AttemptSplitter:
     def __init__(self, epoch_ns: int) -> None:
         self.gaps: list[LogGap] = []
         self.headless_cycles = 0
-        """Cycles at the beginning of the log, of an attempt that had begun before: there is nothing to replay from."""
+        """Cycles at the beginning of the log, of an attempt that had begun before: a replay can't start from them."""
         self.unpaired = 0
         """Records of /scheme, /arm and /cycle without the other one of their cycle."""
         self._epoch_ns = epoch_ns
@@ -102,7 +102,7 @@ class AttemptSplitter:
         self._tail = np.zeros(0, np.uint8)  # counters of the SYNCs after that cycle
 
     def split(self, piece: Piece) -> Iterator[CycleStretch]:
-        """Give the stretches of the next piece."""
+        """Yield the stretches of the next piece."""
         paired = self._pair(piece)
         frames = piece.frames
         if self._frames is not None:
@@ -144,7 +144,7 @@ class AttemptSplitter:
         return sorted(begins.items())
 
     def _named_begins(self, paired: _Paired) -> NDArray[np.bool_]:
-        """Say which cycles belong to another attempt than the one before (n,)."""
+        """Return whether each cycle belongs to another attempt than the one before (n,)."""
         first = paired.other["first_cycle"].astype(np.int64)
         is_new = np.diff(first, prepend=self._first_cycle) != 0
         if len(first):
@@ -153,7 +153,7 @@ class AttemptSplitter:
         return np.asarray(is_new)
 
     def _shown_begins(self, scheme: NDArray[Any]) -> NDArray[np.bool_]:
-        """Say in which cycles the scheme begins anew, after a fault or with the log (n,)."""
+        """Return whether the scheme begins anew in each cycle, after a fault or with the log (n,)."""
         before = np.concatenate(([self._state], scheme["state"][:-1])) if len(scheme) else scheme["state"]
         is_anew = (scheme["previous_state"] == SchemeState.INIT) & (scheme["state"] <= SchemeState.COMMISSION)
         is_after_fault = before == SchemeState.FAULT
@@ -201,7 +201,7 @@ class AttemptSplitter:
             )
 
     def _read_periods(self, paired: _Paired, is_begin: NDArray[np.bool_]) -> _Rows:
-        """Take from /arm what was skipped, and what of it the log lacks."""
+        """Return each cycle's periods by /arm, and the number of cycles before it that the log lacks."""
         number, periods = paired.number, np.asarray(paired.other["periods"], np.int64)
         steps = np.diff(number, prepend=self._last_cycle)
         missing = np.where(is_begin, number - paired.other["first_cycle"].astype(np.int64), steps - periods)
@@ -218,7 +218,7 @@ class AttemptSplitter:
         begins: dict[int, int],
         is_begin: NDArray[np.bool_],
     ) -> _Rows:
-        """Count what was skipped by overruns, and for the first cycle of an attempt by the counters of SYNC, too."""
+        """Return each cycle's periods by its overruns; for the first one of an attempt by SYNC's counters, too."""
         number, scheme = paired.number, paired.scheme
         overruns = paired.other["overruns"].astype(np.int64)
         skipped = np.diff(overruns, prepend=self._overruns)
@@ -239,7 +239,7 @@ class AttemptSplitter:
 
 
 def _join(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
-    """Put frames behind each other, as long as the longer of them."""
+    """Join frames of two lengths, in the layout of the longer."""
     wider = max(first.dtype, second.dtype, key=lambda dtype: dtype.itemsize)
     joined = np.zeros(len(first) + len(second), wider)
     for part, frames in ((joined[: len(first)], first), (joined[len(first) :], second)):
@@ -272,13 +272,13 @@ _TOPICS: Final = ("/scheme", "/contact", "/events")
 CYCLES_PER_PIECE: Final = 8_000
 _SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
 _SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
-"""Names of the events that the scheme itself says."""
+"""Names of the events that the scheme itself reports."""
 
 
 class ReplaySource(Protocol):
-    """Where stretches come from: a log of ours, or a recording by others. Read once; notes are complete then.
+    """Source of stretches: a log of ours, or a recording of another program. Read once; notes are complete then.
 
-    has_arms: whether stretches have the arm's states. is_recording: the frames are others' and are always decoded.
+    has_arms: whether stretches have the arm's states. is_recording: frames come from a recording and are all decoded.
     """
 
     settings: Settings
@@ -288,14 +288,14 @@ class ReplaySource(Protocol):
     is_recording: bool
 
     def parts(self, with_frames: bool) -> Iterator["Part"]:
-        """Give the parts, in order. with_frames: stretches have their frames, else none."""
+        """Return the parts, in order. with_frames: stretches have their frames, else none."""
 
     @property
     def start_ns(self) -> int:
         """When it begins, ns of the clock of its cycles."""
 
     def notes(self) -> list[str]:
-        """Say what is missing."""
+        """List the missing parts, a line each."""
 
 
 class Part(NamedTuple):
@@ -330,7 +330,7 @@ class LogSource:
         return LogStream(self._path, topics, self._cycles_per_piece, is_ahead=False)  # replay reads in a thread
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
-        """Give the parts, in order. with_frames: stretches have their frames, else none."""
+        """Yield the parts, in order. with_frames: stretches have their frames, else none."""
         self._stream = self._open(with_frames)
         for read in self._stream:
             piece = self._piece(read)
@@ -343,11 +343,11 @@ class LogSource:
         return begin_of_log(self._path)
 
     def _piece(self, piece: Piece) -> Piece:
-        """Return what is to be replayed of a piece: all of it."""
+        """Return the part of a piece to replay: all of it."""
         return piece
 
     def notes(self) -> list[str]:
-        """Say what is missing."""
+        """List the missing parts, a line each."""
         splitter = self._splitter
         notes = [f"the log is not whole: {self._stream.problem}"] if self._stream.problem else []
         dropped = self._stream.summary.get("dropped", "0")
@@ -377,7 +377,7 @@ def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
 
 
 def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
-    """Tell whether the run that the settings are of knew anchors: since then they say how a zero drifts."""
+    """Return whether the run that the settings are of knew anchors: since then they say how a zero drifts."""
     tare = parse_toml(attachments["config.toml"]).get("tare")
     return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare
 

@@ -16,7 +16,7 @@ _FIELDS: Final = frozenset(member.name for member in ARM.head)
 
 
 def has_arms(path: Path) -> bool:
-    """Tell whether a log has the arm's states. Logs of earlier versions have none. Raises LogError."""
+    """Return whether a log has the arm's states. Logs of earlier versions lack them. Raises LogError."""
     for piece in LogStream(path, (ARM.name, "/scheme"), cycles_per_piece=1, is_ahead=False):
         if len(piece.series["/scheme"]):
             arms = piece.series[ARM.name]
@@ -25,7 +25,7 @@ def has_arms(path: Path) -> bool:
 
 
 def logged_arms(scheme: NDArray[Any], arm: NDArray[Any], ticks: Ticks) -> ArmBatch:
-    """Join the records of n cycles, given their beginnings. Raises LogError for a fault that there is not."""
+    """Join the records of n cycles, given their beginnings. Raises LogError for an unknown fault."""
     odd = np.flatnonzero(~np.isin(arm["fault"], [int(fault) for fault in FaultReason]))
     if odd.size:
         fault, cycle = arm["fault"][odd[0]], arm["cycle"][odd[0]]

@@ -41,7 +41,7 @@ from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
 SCRIPTED: Final = "script"
-"""Of a log's metadata `operator`: nobody could type anything."""
+"""Value of `operator` in a log's metadata: the user could not type."""
 _PROGRESS_CYCLES: Final = 200_000
 
 Watch = Callable[[int, Ticks, SchemeBatch], None]
@@ -59,7 +59,7 @@ def replay(
     """Replay a log with its own settings, or with others. Raises LogError, ConfigError, CodecError.
 
     tolerance: of the comparison; None: exact, or `TOLERANCE` where the log's numbers were computed otherwise.
-    script_of: plays the user of a configuration; with it, the requests of a run that nobody typed into are compared.
+    script_of: plays the user of a configuration; with it, the requests of a run without typed requests are compared.
     """
     source = LogSource(path)
     return replay_source(
@@ -116,7 +116,7 @@ class _Player:
         self._cycles: dict[int, int] = {}
 
     def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
-        """Take in a stretch of a part; return what the scheme decided. is_told: it is compared and counted."""
+        """Take in a stretch of a part; return the scheme's decisions. is_told: they are compared and counted."""
         ticks = stretch.ticks
         if stretch.is_begin:
             self._begin()
@@ -142,7 +142,7 @@ class _Player:
         part: Part,
         events: Sequence[Event],
     ) -> None:
-        """Compare a stretch with the log, where there is something to compare with."""
+        """Compare a stretch with the log, if the log has its decisions."""
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
         ticks = stretch.ticks
@@ -167,7 +167,7 @@ class _Player:
             self._asking.begin()
 
     def _run(self, stretch: CycleStretch, arms: ArmBatch) -> SchemeBatch:
-        """Run the scheme; where nobody knows what was asked, the script says it cycle by cycle."""
+        """Run the scheme on a stretch; if its requests are unknown, the script makes them cycle by cycle."""
         if stretch.requests is not None:
             return self._pipeline.run(arms, _known(stretch.requests))
         outputs = []
@@ -216,11 +216,11 @@ def replay_source(
     stretch: TimeWindow = WHOLE,
     by_frames: bool = False,
 ) -> list[Replay]:
-    """Replay what a source gives, once for each of the settings; shown: mismatches that are kept.
+    """Replay a source, once for each of the settings; shown: mismatches that are kept.
 
-    stretch: what is compared and told; watch sees all from the beginning of the log on. by_frames: decode the frames
-    and compare each state with the log's. Raises LogError, also when nothing in the stretch can be replayed,
-    ConfigError, CodecError.
+    stretch: the part that is compared and reported; watch sees all from the beginning of the log on. by_frames: decode
+    the frames and compare each state with the log's. Raises LogError, also when no cycle of the stretch can be
+    replayed, ConfigError, CodecError.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
@@ -248,7 +248,7 @@ def replay_source(
 
 
 def _decoded(source: ReplaySource, reader: "_ArmReader", end_ns: int) -> Generator[_DecodedPart]:
-    """Read a source part by part, up to the stretch that has the end of what is told."""
+    """Read a source part by part, up to the stretch in which the reported part ends."""
     for part in source.parts(reader.needs_frames):
         stretches: list[CycleStretch] = []
         arms: list[list[ArmBatch]] = []
@@ -265,9 +265,9 @@ def _decoded(source: ReplaySource, reader: "_ArmReader", end_ns: int) -> Generat
 
 
 def _one_ahead(parts: Generator[_DecodedPart]) -> Iterator[_DecodedPart]:
-    """Give what a generator gives, which a thread runs one part ahead; most of either's work needs no Python's lock.
+    """Yield the items of a generator that a thread runs one part ahead; most work of both needs no Python lock.
 
-    That thread opens chunks, too: a third one would take a twentieth more of two processors' time.
+    That thread opens chunks, too: a third thread would take a twentieth more of two processors' time.
     """
     with closing(parts), ThreadPoolExecutor(1, "replay-reader") as thread:
         coming = thread.submit(next, parts, None)
@@ -300,7 +300,7 @@ def _replay_part(
 
 
 def _known(requests: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Give requests (n,), with NONE for what no request has."""
+    """Return requests (n,); a value that isn't a Request becomes NONE."""
     return np.where(requests <= max(Request), requests, np.uint8(Request.NONE))
 
 
@@ -310,9 +310,9 @@ def _arms_of(arms: ArmBatch, rows: slice) -> ArmBatch:
 
 
 def _split(stretch: CycleStretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[CycleStretch, slice, bool]]:
-    """Part a stretch at the beginning of what is told; also give the rows of each part and whether it is told.
+    """Split a stretch at the beginning of the reported part; yield each part, its rows, and whether it is reported.
 
-    What comes after the end of that is left out. The frames stay with the whole.
+    Rows after the end of the reported part are left out. Each part keeps all frames of the stretch.
     """
     first, end = np.searchsorted(stretch.ticks.t_ns, bounds_ns).tolist()
     for rows, is_told in ((slice(0, first), False), (slice(first, end), True)):
@@ -332,7 +332,7 @@ def _rows_of(stretch: CycleStretch, rows: slice) -> CycleStretch:
 
 
 class _ArmReader:
-    """Gives the arm's states: the log's, or those of frames, decoded once for all settings that make the same of them.
+    """Gives the arm's states: the log's, or those of frames, decoded once for all settings with equal decoding.
 
     needs_frames: whether any are decoded.
     """
@@ -359,7 +359,7 @@ class _ArmReader:
 
 
 def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
-    """Say why frames must be decoded, which takes longer, one line; empty where the log's states serve."""
+    """Return why frames must be decoded, which takes longer, one line; empty if the log's states serve."""
     if source.is_recording:
         return ""
     if not source.has_arms:
@@ -371,7 +371,7 @@ def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
 
 
 def _decoding_key(settings: Settings) -> Any:
-    """Return what of the settings the arm goes by."""
+    """Return the settings that determine how frames become the arm's states."""
     arm = settings.arm
     shape = (arm.sign, arm.zero_deg, arm.torque_offset_Nm, settings.safety.tolerated_emergencies)
     return (*shape, settings.bus, settings.devices, settings.realtime)
@@ -380,7 +380,7 @@ def _decoding_key(settings: Settings) -> Any:
 def _result(
     player: _Player, source: ReplaySource, source_notes: Sequence[str], tolerance: float, first_ns: int
 ) -> Replay:
-    """Sum up what a player came to from a time on."""
+    """Return a player's results from a time on."""
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source_notes)
     gatherer.end()
     score = gatherer.score()

@@ -40,7 +40,7 @@ class StateChange(NamedTuple):
 
 
 class Adaptation(NamedTuple):
-    """An adaptation: its beginning, how long it took to MONITOR, None if it never got there, and what it came to."""
+    """An adaptation: its beginning, the time until MONITOR, None if it never got there, and its parameter estimate."""
 
     t_ns: int
     took_s: float | None
@@ -48,7 +48,7 @@ class Adaptation(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What detection sees in MONITOR from the beginning of the log: medians of each joint, Nm.
+    """Sensitivity of the detection in MONITOR from the beginning of the log: medians of each joint, Nm.
 
     threshold: the lowest of all channels, nan where it never monitored. push: the smallest that is found within 100 ms,
     an estimate; () of the paper's scheme.
@@ -59,7 +59,7 @@ class Sight(NamedTuple):
 
 
 class OutcomeGatherer:
-    """Takes in the decisions of one replay. `truth`: the true contacts, None where nobody knows them."""
+    """Takes in the decisions of one replay. `truth`: the true contacts, None if unknown."""
 
     def __init__(self, settings: Settings, truth: TrueContacts | None) -> None:
         self.transitions: list[StateChange] = []
@@ -138,7 +138,7 @@ class OutcomeGatherer:
 
     @property
     def sight(self) -> Sight:
-        """What was seen in MONITOR."""
+        """The detection's sensitivity in MONITOR."""
         pushes = None if self._push is None else self._push.smallest_push()
         seen = tuple(kept.percentiles().get("p50", math.nan) for kept in self._thresholds)
         if pushes is None:
@@ -159,7 +159,7 @@ class OutcomeGatherer:
             self._give_up()
 
     def _give_up(self) -> None:
-        """End an adaptation that came to nothing."""
+        """End an adaptation that never reached MONITOR."""
         if self._began is not None:
             self.adaptations.append(Adaptation(self._began[1], None, self.theta_hat))
             self._began = None
@@ -228,11 +228,11 @@ class Replay:
     ending: StateChange | None
     sight: Sight
     notes: tuple[str, ...] = ()
-    """What of the log could not be compared or judged, a line each."""
+    """Parts of the log that could not be compared or judged, a line each."""
 
     @property
     def is_identical(self) -> bool:
-        """Whether something was compared and all of it was the same."""
+        """Whether a decision was compared and every compared one was the same."""
         return self.compared > 0 and self.mismatch_count == 0
 
     @property
@@ -242,11 +242,11 @@ class Replay:
 
     @property
     def adaptation_s(self) -> tuple[float | None, ...]:
-        """How long each adaptation took; None if it came to nothing."""
+        """Duration of each adaptation; None if it never reached MONITOR."""
         return tuple(adaptation.took_s for adaptation in self.adaptations)
 
     def time_s(self, t_ns: int) -> float:
-        """Give a time since motion start."""
+        """Return a time since motion start."""
         return (t_ns - self.zero_ns) * 1e-9
 
 
@@ -348,7 +348,7 @@ def _end(found: Replay) -> str:
 
 
 def as_json(found: Replay) -> dict[str, Any]:
-    """Give a replay in plain values; times in s since motion start."""
+    """Return a replay in plain values; times in s since motion start."""
     return {
         "cycles": found.cycles,
         "attempts": found.attempts,

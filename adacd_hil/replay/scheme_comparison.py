@@ -6,7 +6,7 @@ Two values are the same if they have the same bits. Between machines whose arith
 real value may be off by `TOLERANCE` of the largest one that its field has had so far, and by as much of one unit; then,
 too, counts, names, switches, and values that are infinite or not a number have to be the same.
 
-Where nobody typed anything, the configuration's script made the requests. The script depends on the time since the
+If the user could not type, the configuration's script made the requests. The script depends on the time since the
 drives were enabled and on the state; the caller hands in its player, `control.operator` live.
 """
 
@@ -37,9 +37,9 @@ _HEAD: Final = ("cycle", "state", "previous_state", "fault", "contact_joints", "
 
 
 def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
-    """Say what a log's numbers were computed with that is another here; empty where they have to be equal bit for bit.
+    """List the parts of the computing environment that differ from a log's; empty if numbers must be equal bit for bit.
 
-    What a log doesn't say counts as the same. Of the machine its architecture counts.
+    A part that the log doesn't name counts as equal. Of the machine, only the architecture counts.
     """
     different = []
     for key, here in arithmetic().items():
@@ -124,7 +124,7 @@ class SchemeComparison:
         replayed: NDArray[Any],
         ticks: Ticks,
     ) -> None:
-        """Count what differs, (n,) or (n, k), and keep the first of it."""
+        """Count the differing values, of (n,) or (n, k), and keep the first of them."""
         is_other, logged, replayed = (each.reshape(len(each), -1) for each in (is_other, logged, replayed))
         rows, columns = np.nonzero(is_other)
         self.count += len(rows)
@@ -232,7 +232,7 @@ class Script(Protocol):
     """The user that the configuration plays."""
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return what it asks in a cycle. `elapsed_s`: since the drives were enabled, None before."""
+        """Return the script's request in a cycle. `elapsed_s`: since the drives were enabled, None before."""
 
 
 _OWN_CHECKS = (
@@ -241,13 +241,13 @@ _OWN_CHECKS = (
     Request.FAULT_TAMPERED,
     Request.FAULT_MISCONFIGURED,
 )
-"""What the host asked for in place of the user; no script has them."""
+"""Requests that the host made in place of the user; a script makes none of them."""
 
 ScriptOf = Callable[[OperatorSettings], Script]
 
 
 class Asking:
-    """Plays the script along a replay: cycle by cycle, or where it could ask for something."""
+    """Plays the script along a replay: cycle by cycle, or in the cycles in which it could make a request."""
 
     def __init__(self, settings: Settings, script_of: ScriptOf) -> None:
         operator = settings.operator
@@ -266,20 +266,20 @@ class Asking:
         self._kept = KeptRequest(self._kept.request)
 
     def ask(self, cycle: int, state: SchemeState) -> Request:
-        """Return what is asked in a cycle; state: that of the cycle before."""
+        """Return the request in a cycle; state: that of the cycle before."""
         elapsed_s = None if self._enabled is None else (cycle - self._enabled) * self._period_s
         carried = Request.NONE if elapsed_s is None else self._kept.take()
         return carried or self._script.request(elapsed_s, state)
 
     def note(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
-        """Take note of a request, of the state that it met and of the one that the cycle has led to."""
+        """Note a request, the state before the cycle and the state after it."""
         self._kept.ask(request, previous)
         self._kept.serve((state,))
         if state is SchemeState.ADAPT and self._enabled is None:
             self._enabled = cycle
 
     def requests(self, ticks: Ticks, batch: SchemeBatch) -> NDArray[np.uint8]:
-        """Return what the script asks in a stretch (n,), given what came of it."""
+        """Return the script's requests in a stretch (n,), given the scheme's states in it."""
         asked = np.zeros(len(ticks.cycle), np.uint8)
         if self._enabled is None:
             enabled = np.flatnonzero(batch.state == SchemeState.ADAPT)
@@ -300,10 +300,10 @@ class Asking:
         return asked
 
     def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
-        """List the rows from the first one on in which something could be asked, or the wait for it begins anew."""
+        """List the rows from `first` on in which the script could make a request, or its wait begins anew."""
         assert self._enabled is not None
         is_due = np.zeros(len(ticks.cycle), np.bool_)
-        is_due[first : first + 1] = True  # what the attempt before has left, in the first cycle of an enabled arm
+        is_due[first : first + 1] = True  # a request left by the attempt before, in the first cycle of an enabled arm
         if self._acknowledges:
             is_stopped = batch.previous_state == SchemeState.STOPPED
             is_due |= is_stopped | np.concatenate(([self._was_stopped], is_stopped[:-1]))

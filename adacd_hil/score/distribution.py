@@ -39,7 +39,7 @@ class LogHistogram(NamedTuple):
         return LogHistogram(self.edges, self.counts + other.counts, self.below + other.below, self.above + other.above)
 
     def as_json(self) -> dict[str, Any]:
-        """Give it in plain values; empty bins at both ends are left out."""
+        """Return it in plain values; empty bins at both ends are left out."""
         filled = np.flatnonzero(self.counts)
         first, end = (int(filled[0]), int(filled[-1]) + 1) if filled.size else (0, 0)
         return {
@@ -150,21 +150,21 @@ class Distribution:
         self._bins[_SIDE + low : _SIDE + low + counts.size] += counts
 
     def percentiles(self) -> dict[str, float]:
-        """Give p50, p99, p99.9 and max; empty without a value."""
+        """Return p50, p99, p99.9 and max; empty without a value."""
         if self._bins is None:
             return percentiles(self._values())
         ranks = [int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
         return dict(zip(PERCENTILE_NAMES, map(self._at, ranks), strict=True))
 
     def low_percentiles(self) -> dict[str, float]:
-        """Give p50, p1, p0.1 and min, for values that must not be small; empty without a value."""
+        """Return p50, p1, p0.1 and min, for values that must not be small; empty without a value."""
         if self._bins is None:
             return low_percentiles(self._values())
         ranks = [self.count - 1 - int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
         return dict(zip(LOW_PERCENTILE_NAMES, map(self._at, ranks), strict=True))
 
     def median(self) -> float:
-        """Give the median, of an even number the mean of the middle two; NaN without a value."""
+        """Return the median, of an even number the mean of the middle two; NaN without a value."""
         if self.count == 0:
             return float("nan")
         if self._bins is None:
@@ -176,7 +176,7 @@ class Distribution:
         return self._kept[0]
 
     def _at(self, rank: int) -> float:
-        """Give the value of a rank from 0: the end of its bin that is nearer to 0."""
+        """Return the value of a rank from 0: the end of its bin that is nearer to 0."""
         if rank in (0, self.count - 1):
             return self._range[rank != 0]
         assert self._bins is not None

@@ -67,7 +67,7 @@ class TruthTable(NamedTuple):
     """Kept rows of the truth (m,), on the emulator's own cycles; attempt (m,): of the run, from 0.
 
     model_attempt, model_cycle (k,): from when on payload and parameters are as they are. metadata: of the log; problem:
-    missing parts; is_complete: it is whole and nothing was dropped on the way to it.
+    missing parts; is_complete: it is whole and no record was dropped on the way to it.
     """
 
     attempt: Cycles
@@ -173,7 +173,7 @@ class _Gathering:
         self._contact = _OneContact(_BEGINNING[self._kept_rows > _PLENTY])
 
     def done(self, stream: LogStream) -> TruthTable:
-        """Give the kept rows."""
+        """Return the kept rows."""
         rows = np.concatenate([np.zeros(0, _ROW), *self._kept, self._contact.rows()])
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
         models = zip(nothing, *self._models, strict=True)
@@ -232,13 +232,13 @@ class _OneContact:
             self._chosen.append(middle[extreme_rows(series, np.arange(0, len(middle), _BUCKET))])
 
     def rows(self) -> NDArray[Any]:
-        """Give the rows that are kept."""
+        """Return the rows that are kept."""
         self._choose()
         return np.concatenate([*self._chosen, self._waiting])
 
 
 def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
-    """Give the truth on the host's cycles; None where the emulator never cycled.
+    """Return the truth on the host's cycles; None where the emulator never cycled.
 
     begins: first cycle of each attempt of the run; last: of the run; time_s: of the rows (m,).
 
@@ -267,9 +267,9 @@ _PLAYED = ("scenario", "seed")
 
 
 def foreign_truth(log: Path, truth: Path) -> str:
-    """Say in one line why a truth is of another run than a log; "" where nothing says so.
+    """Return in one line why a truth is of another run than a log; "" if no field contradicts the log.
 
-    Both name scenario and seed where one process played host and arm, and the truth has a digest of the host's
+    Both name scenario and seed if one process played host and arm, and the truth has a digest of the host's
     configuration: in lockstep, the same three make the same run. On a bus the host doesn't know the scenario.
     """
     ours, theirs = run_metadata(log), _played(truth)
@@ -283,10 +283,10 @@ def foreign_truth(log: Path, truth: Path) -> str:
 
 
 def config_digest(config: str) -> str:
-    """Give the digest by which a truth names its host's configuration. Raises ConfigError.
+    """Return the digest by which a truth names its host's configuration. Raises ConfigError.
 
-    Of `realtime` a session makes what the host grants, and of `safety.enable_timeout_s` what the devices' profiles ask
-    for, so that they don't count.
+    The digest leaves out `realtime`, which a session sets to the host's abilities, and `safety.enable_timeout_s`, which
+    it sets by the devices' profiles.
     """
     table = {key: value for key, value in parse_toml(config).items() if key != "realtime"}
     if isinstance(safety := table.get("safety"), dict):
@@ -302,7 +302,7 @@ def _digest(config: bytes) -> str | None:
 
 
 def _played(truth: Path) -> dict[str, str]:
-    """Give scenario and seed of a truth; old ones have them in an attachment alone."""
+    """Return scenario and seed of a truth; old ones have them in an attachment alone."""
     said = run_metadata(truth)
     try:
         table = parse_toml(attachment(truth, "scenario.toml") or b"")
@@ -351,7 +351,7 @@ class HostCycles(NamedTuple):
 
 
 def windows_of(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TouchWindow]:
-    """Give those contacts, on the host's cycles, that begin before these end, as they are judged.
+    """Return those contacts, on the host's cycles, that begin before these end, as they are judged.
 
     host: has the cycles that each onset and each end lies between.
     """

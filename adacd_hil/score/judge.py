@@ -1,4 +1,4 @@
-"""The judge: which alarm is about which true contact; contacts found, how late, or missed; false alarms.
+"""The judge: the true contact of each alarm; contacts found, their delay, or missed; false alarms.
 
 A scheme raises an *alarm* with a transition to REACT by a contact, in whatever state: the certified scheme detects
 while it adapts and while it parks, too. While it is in REACT or STOPPED it is still about the contact before. REACT
@@ -7,12 +7,12 @@ without a joint over its threshold and without a report is an arm that is held f
 A true contact explains alarms from its onset until it is forgotten: until one time constant after its true torque,
 filtered, is back within the threshold (`forgotten_after_s`). An alarm is about the last contact that began
 before it, as long as that contact, or one before it, is not forgotten; so an alarm is about one contact at most. The
-first alarm about a contact finds it. An alarm about none is *false*, in whatever state it was raised, unless the
-emulator did not record that time: such an alarm is not judged. Where gravity acts, an alarm in PAYLOAD
+first alarm about a contact finds it. An alarm about no contact is *false*, in whatever state it was raised, unless the
+emulator did not record that time: such an alarm is not judged. Under gravity, an alarm in PAYLOAD
 about a payload that is not that of the last MONITOR is about its weight, and not false.
 
 A contact is *armed* if detection was armed in the logged cycle before its onset. It is *missed* if it is armed and
-nothing found it. A contact that began before the log did is not armed.
+no alarm found it. A contact that began before the log did is not armed.
 
 Of a run: its true contacts, the detections of its scheme, and the response of an ideal detector with its filters.
 
@@ -46,9 +46,9 @@ class Alarm(NamedTuple):
 
 
 def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> NDArray[np.bool_]:
-    """Mark of samples over a threshold, at ascending times (n,), those that begin an alarm: after more than a pause.
+    """Mark, of samples over a threshold at ascending times (n,), those that begin an alarm: after more than a pause.
 
-    last: the sample before them, of which they may go on; None: there was none.
+    last: the sample before them, whose alarm they may continue; None: without one.
     """
     begins = np.diff(at, prepend=at[:1] if last is None else [last]) > pause
     if last is None:
@@ -60,7 +60,7 @@ CONFIDENCE: Final = 0.95
 
 
 def share_bounds(found: int, count: int) -> tuple[float, float]:
-    """Give the 95 % interval of a share of which `found` of `count` were seen; (0, 1) of none."""
+    """Return the 95 % interval of a share, seen in `found` of `count` cases; (0, 1) for no case."""
     rest = 0.5 * (1.0 - CONFIDENCE)
     low = float(betaincinv(found, count - found + 1, rest)) if found > 0 else 0.0
     high = float(betaincinv(found + 1, count - found, 1.0 - rest)) if found < count else 1.0
@@ -141,7 +141,7 @@ def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
 
 
 def owners(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times:
-    """Give the place of the contact that each of n alarms is about (n,), -1 for none; until: of `explained_until`."""
+    """Return the place of the contact that each of n alarms is about (n,), -1: false; until: of `explained_until`."""
     places = np.searchsorted(onsets, at, side="right") - 1
     if not len(onsets):
         return np.asarray(places)
@@ -170,10 +170,10 @@ def judge(touches: Sequence[TouchWindow], alarms: Sequence[Alarm], crossings_ns:
 
 
 class StreamJudge:
-    """Judges a statistic that is compared with a threshold sample by sample and decides nothing, piece by piece.
+    """Judges a statistic that is compared with a threshold sample by sample but raises no alarm, piece by piece.
 
-    The first sample over the threshold that is about a contact finds it. Samples about none are a false alarm; those
-    that follow the one before by no more than `pause_ns` belong to the same one.
+    The first sample over the threshold that is about a contact finds it. Samples about no contact are a false alarm;
+    a sample no more than `pause_ns` after the one before belongs to the same false alarm.
     """
 
     def __init__(self, touches: Sequence[TouchWindow], pause_ns: int) -> None:
@@ -205,7 +205,7 @@ def _bounds(touches: Sequence[TouchWindow]) -> tuple[Times, Times]:
 
 
 def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
-    """Give the first time about each contact, by its place."""
+    """Return the first time about each contact, by its place."""
     first = dict(zip(reversed(about), reversed(times_ns), strict=True))
     first.pop(-1, None)
     return first
@@ -216,17 +216,17 @@ def _judged(touches: Sequence[TouchWindow], found: dict[int, int]) -> tuple[Touc
 
 
 def rate_bound_per_h(alarms: int, hours: float) -> float:
-    """Give the upper 95 % bound of a rate, one-sided: 3 / T after T hours without an alarm; infinite without time."""
+    """Return the upper 95 % bound of a rate, one-sided: 3 / T after T hours without an alarm; infinite without time."""
     return float(gammaincinv(alarms + 1, CONFIDENCE)) / hours if hours > 0.0 else math.inf
 
 
 def least_rate_per_h(alarms: int, hours: float) -> float:
-    """Give the lower 95 % bound of a rate, one-sided; 0 after no alarm."""
+    """Return the lower 95 % bound of a rate, one-sided; 0 after no alarm."""
     return float(gammaincinv(alarms, 1.0 - CONFIDENCE)) / hours if alarms > 0 and hours > 0.0 else 0.0
 
 
 def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int, int]]:
-    """Give from which row to before which each contact of a truth lasts; index, attempt (m,): of its rows.
+    """Return from which row to before which each contact of a truth lasts; index, attempt (m,): of its rows.
 
     Another index is another contact, though the touch goes on. A contact that goes on as an attempt begins is another
     one, too: the scheme begins anew.
@@ -254,7 +254,7 @@ def filtered(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float) -> 
 
 
 def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float, threshold: Vector) -> float:
-    """Give how long after its end an alarm may still stem from a contact, s.
+    """Return how long after its end an alarm may still stem from a contact, s.
 
     One time constant after its true torque (k, 2), filtered with `a_rad_s`, is back within the threshold (2,).
     """
@@ -307,7 +307,7 @@ class TruthTouch(NamedTuple):
 
 
 def true_contacts(run: Run) -> tuple[TruthTouch, ...]:
-    """Find the true contacts in the truth record; without one there are none to be known."""
+    """Find the true contacts in the truth record; return () without one."""
     truth = run.truth
     if truth is None or truth.cycle.size == 0 or run.cycle.size == 0:
         return ()
@@ -321,14 +321,14 @@ def true_contacts(run: Run) -> tuple[TruthTouch, ...]:
 
 
 def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
-    """Give the closed-form delay of a torque step, t = -ln(1 - h / |tau|) / a; None if it never crosses."""
+    """Return the closed-form delay of a torque step, t = -ln(1 - h / |tau|) / a; None if it never crosses."""
     if not abs(tau_ext_Nm) > threshold_Nm:
         return None
     return -math.log1p(-threshold_Nm / abs(tau_ext_Nm)) / a_rad_s
 
 
 def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
-    """Give the delay of a torque step behind two first-order low-passes; None if it never crosses.
+    """Return the delay of a torque step behind two first-order low-passes; None if it never crosses.
 
     The response rises steadily, so that bisection finds the crossing.
     """
@@ -352,7 +352,7 @@ class FilterChannel:
     threshold: Vector
 
     def step_delay_s(self, tau_ext: Vector) -> float | None:
-        """Give how long steps of each joint's torque (2,) take over the threshold, the faster joint; None: never."""
+        """Return how long steps of each joint's torque (2,) take over the threshold, the faster joint; None: never."""
         delays_s = []
         for joint in range(JOINTS):
             tau, h = float(tau_ext[joint]), float(self.threshold[joint])
@@ -371,21 +371,21 @@ class FilterChannel:
 
 
 def threshold_at(run: Run, time_s: float) -> Vector:
-    """Give the threshold of `tau_ext_hat` in force at a time, Nm (2,); the configured one where detection is off."""
+    """Return the threshold of `tau_ext_hat` in force at a time, Nm (2,); the configured one where detection is off."""
     row = row_at(run, time_s)
     configured = np.array(run.settings.detector.threshold_Nm)
     return np.where(np.isfinite(run.threshold[row]), run.threshold[row], configured)
 
 
 def row_at(run: Run, time_s: float) -> int:
-    """Give the first cycle's row that is not before a time; the last one after the end."""
+    """Return the first cycle's row that is not before a time; the last one after the end."""
     t_ns, zero_ns = run.t_ns, run.zero_ns
     row = bisect_left(range(len(t_ns)), time_s, key=lambda row: float((t_ns[row] - zero_ns) * 1e-9))
     return min(row, len(t_ns) - 1)
 
 
 def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
-    """Give the filters that detect at a time, with their thresholds: the paper's one, or the bank."""
+    """Return the filters that detect at a time, with their thresholds: the paper's one, or the bank."""
     if run.certified is None:
         return (FilterChannel(run.a_rad_s, None, threshold_at(run, time_s)),)
     thresholds = run.certified.threshold[row_at(run, time_s)]
@@ -404,7 +404,7 @@ def ideal_response(run: Run, touch: TruthTouch, channel: FilterChannel) -> Vecto
 
 
 def touch_window(run: Run, touch: TruthTouch, a_rad_s: float, threshold: Vector, armed: Mask) -> TouchWindow:
-    """Give a contact as it is judged; armed (n,): the cycles of the run in which detection is armed."""
+    """Return a contact as it is judged; armed (n,): the cycles of the run in which detection is armed."""
     truth = run.truth
     assert truth is not None
     rows = slice(touch.first, touch.last + 2)
@@ -423,7 +423,7 @@ def judge_run(run: Run, touches: Sequence[TruthTouch], detections: Sequence[Logg
 
 
 def is_of_weight(run: Run, row: int) -> bool:
-    """Tell whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet."""
+    """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet."""
     truth, armed = run.truth, np.flatnonzero(run.state[:row] == SchemeState.MONITOR)
     if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:
         return False

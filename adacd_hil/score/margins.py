@@ -1,4 +1,4 @@
-"""Sums over a run's cycles in which nobody touches the arm: residuals, margins, and the paper's scheme beside.
+"""Sums over a run's cycles free of contact: residuals, margins, and the paper's scheme beside.
 
 Cycles are taken piece by piece, in order; a run in memory is one piece. A cycle is *free* unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
@@ -15,7 +15,7 @@ large as at the worst moment all were, after 59 ms at most.
 have been a false alarm. Per section, adaptations included, since detection is on there too.
 
 **The paper's scheme beside** the certified one adapts when that one does, ends by eq. (15) and compares with its own
-thresholds, but decides nothing: a contact that is reacted to has been found by the other. So its residual is judged as
+thresholds, but raises no alarm: the other scheme has found every contact with a reaction. So its residual is judged as
 a stream (`judge.StreamJudge`), with a pause of 10 time constants; a false alarm counts until the user asks to finish.
 While the payload is changed it does not detect.
 """
@@ -56,9 +56,9 @@ SETTLING_TIME_CONSTANTS = 10.0
 
 
 def larger(largest: Vector | None, values: Vector) -> Vector | None:
-    """Give the larger of the sizes of `values` (k, …) and the largest of each so far (…).
+    """Return the larger of the sizes of `values` (k, …) and the largest of each so far (…).
 
-    None so far: none. NaN stays.
+    None before the first value. NaN stays.
     """
     if values.shape[0] == 0:
         return largest
@@ -93,7 +93,7 @@ class BesideGatherer:
         )
 
     def add(self, piece: Run, time_s: Vector, free: Mask) -> None:
-        """Take in the next cycles, at such times (n,); free: those in which nothing touches the arm (n,)."""
+        """Take in the next cycles, at such times (n,); free: those free of contact (n,)."""
         stream = piece.beside
         assert stream is not None
         armed = stream.is_armed & ~_parked(time_s, self._sections, self._end_s)
@@ -116,7 +116,7 @@ class BesideGatherer:
                 self._largest[section.label] = larger(self._largest[section.label], values)
 
     def beside(self) -> Beside:
-        """Sum up what has been taken in."""
+        """Return the sums over all cycles taken so far."""
         score = self._judge.score()
         zero_ns = self._zero_ns
         false_s = tuple((alarm.t_ns - zero_ns) * 1e-9 for alarm in score.false_alarms)
@@ -142,7 +142,7 @@ class BesideGatherer:
 
 
 def _left_s(adaptation: Section, sections: Sequence[Section]) -> float:
-    """Give when an adaptation and the detection after it are left, s; infinite at the end of the run."""
+    """Return when an adaptation and the detection after it are left, s; infinite at the end of the run."""
     later = (section for section in sections if section.start_s > adaptation.start_s and section.kind != "detection")
     return next((section.start_s for section in later), np.inf)
 
@@ -178,14 +178,14 @@ def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouch
 
 
 def last_row(run: Run, section: Section) -> int:
-    """Give the row with an adaptation's result: the next section's first cycle, which still learns."""
+    """Return the row with an adaptation's result: the next section's first cycle, which still learns."""
     time_s = run.time_s()
     end = int(rows_of(time_s, section, float(time_s[-1])).stop)
     return end - 1 + int(section.is_complete)
 
 
 def _tests(run: Run, section: Section) -> list[float]:
-    """Give the lengths of the stays in CERTIFY of a section, s."""
+    """Return the lengths of the stays in CERTIFY of a section, s."""
     time_s = run.time_s()
     rows = rows_of(time_s, section, float(time_s[-1]))
     inside = np.concatenate(([False], run.state[rows] == SchemeState.CERTIFY, [False]))
@@ -214,7 +214,7 @@ class MarginGatherer:
         self._thresholds = [[Distribution() for _ in range(JOINTS)] for _ in self._channels]
 
     def add(self, tau_ext: Vector, threshold: Vector) -> None:
-        """Take in cycles in which nothing touches the arm: residuals and thresholds (k, channels, 2), k > 0."""
+        """Take in cycles free of contact: residuals and thresholds (k, channels, 2), k > 0."""
         self._residual = larger(self._residual, tau_ext)
         self._share = larger(self._share, np.abs(tau_ext) / threshold)
         for place, distributions in enumerate(self._thresholds):
@@ -222,7 +222,7 @@ class MarginGatherer:
                 distribution.add(threshold[:, place, joint])
 
     def margins(self) -> tuple[ChannelMargin, ...]:
-        """Sum up each channel; nothing has to have been gathered for none."""
+        """Sum up each channel; return () before the first cycle."""
         if self._residual is None or self._share is None:
             return ()
         found = []
@@ -307,7 +307,7 @@ class UntouchedGatherer:
             self._push.add(piece.certified.tau_ext[rows][armed], threshold[armed])
 
     def _close(self, label: str) -> None:
-        """Sum up a section that nothing will be added to: its values need not be kept."""
+        """Sum up a section that is complete: its values need not be kept."""
         if label in self._margins:
             self._done[label] = self._margins.pop(label).margins()
 
@@ -317,7 +317,7 @@ class UntouchedGatherer:
         self._promoted = float(promotions[-1])
 
     def gathered(self) -> Untouched:
-        """Sum up what has been taken in."""
+        """Return the sums over all cycles taken so far."""
         for label in list(self._margins):
             self._close(label)
         labels = [section.label for section in self._sections]
@@ -374,7 +374,7 @@ class _Free:
 
 
 class PushGatherer:
-    """Gathers the cycles of MONITOR in which nothing touches the arm."""
+    """Gathers the cycles of MONITOR that are free of contact."""
 
     def __init__(self, settings: Settings) -> None:
         self._shown = detect_margin.constants_of(settings).shown
@@ -394,7 +394,7 @@ class PushGatherer:
             self._threshold[joint].add(in_force[:, joint])
 
     def smallest_push(self) -> SmallestPush | None:
-        """Sum up; None where nothing has been taken in."""
+        """Sum up; return None before the first cycle."""
         if not self._push[0].count:
             return None
         seen_s = self._push[0].count * self._period_s

@@ -7,15 +7,15 @@ that a torque step tau crosses the threshold h after t = -ln(1 - h / |tau|) / a.
 **Sections** are lettered A, B, C, … in order, see `adacd_hil.log.logged_run`. An adaptation's time is that of its
 section: up to MONITOR, the test of the frozen model and contacts on the way included.
 
-**Frozen residual**: largest |tau_ext_hat| of each joint where nobody touches the arm. A cycle counts unless it lies in
+**Frozen residual**: largest |tau_ext_hat| of each joint free of contact. A cycle counts unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
 5 Nm. In a detection section only armed cycles (MONITOR) count; in an adaptation section all do, and only the CAD
 model's residual is given, because theta_hat still moves. Without the truth, [detection - 10/a, detection + 10/a]
 stands for the contact. After the request to finish the arm parks and stands, where friction may hold any torque up
 to F_c: those cycles don't count.
 
-**A detection** is an alarm of `adacd_hil.score.judge`. Which contacts were found or missed, and which
-detections are false alarms: `adacd_hil.score.judge`; detection is armed in MONITOR.
+**A detection** is an alarm of `adacd_hil.score.judge`. That module decides which contacts were found or missed, and
+which detections are false alarms; detection is armed in MONITOR.
 
 **Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
 those of the fastest channel of its bank. Its other results: `adacd_hil.score.margins`; the paper's
@@ -78,7 +78,7 @@ class TimingEvidence:
     counts: Mapping[str, Count | None]
 
     def as_json(self) -> dict[str, Any]:
-        """Give the evidence in plain values."""
+        """Return the evidence in plain values."""
         times = {name: found for name, found in self.times.items() if found is not None}
         absent = dict.fromkeys(self.times)
         reaction = self.reaction
@@ -137,7 +137,7 @@ class CyclicData:
     excesses: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
+        """Return it in plain values."""
         devices = {name: vars(shares) for name, shares in self.devices.items()}
         return {**vars(self), "devices": devices, "excesses": list(self.excesses)}
 
@@ -190,7 +190,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class ChannelMargin:
-    """A channel of the bank over a section: cut-off and smoothing, rad/s; then per joint, where nothing touches.
+    """A channel of the bank over a section: cut-off and smoothing, rad/s; then per joint, in cycles free of contact.
 
     residual_max_Nm: largest. threshold_Nm: median of the threshold. margin: see the module's first lines.
     """
@@ -206,10 +206,10 @@ class ChannelMargin:
 class CertifiedEvidence:
     """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
 
-    margins: by section. promotions: refined models that took over in the run. is_anchored: whether each certificate
-    says what anchors all its offsets; logs from before there were anchors say nothing. revoked: why certificates were
-    taken back, in order. smallest_push: None where nothing was armed. certificates: those that were not taken back, as
-    the log has them at its end; none in a log that lacks its end, or of an earlier version.
+    margins: by section. promotions: refined models that took over in the run. is_anchored: for each certificate,
+    whether it names the anchor of all its offsets; logs of versions without anchors lack it. revoked: why
+    certificates were withdrawn, in order. smallest_push: None where the scheme was never armed. certificates: those
+    that were not withdrawn, as the log has them at its end; () for a log without its end, or of an earlier version.
     """
 
     tests: dict[str, int]
@@ -231,7 +231,7 @@ class CertifiedEvidence:
 
 
 def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
-    """Give the certificates that events, by name and message, have as numbers; unreadable ones are left out."""
+    """Return the certificates that events, by name and message, have as numbers; unreadable ones are left out."""
     from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
 
     for name, message in told:
@@ -246,7 +246,7 @@ def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
 
 @dataclass(frozen=True)
 class Residual:
-    """Largest |tau_ext_hat| of a section, Nm per joint, over `cycles` cycles free of contact; None if none."""
+    """Largest |tau_ext_hat| of a section, Nm per joint, over `cycles` cycles free of contact; None without a cycle."""
 
     identified: tuple[float, float] | None
     cad: tuple[float, float] | None
@@ -255,9 +255,9 @@ class Residual:
 
 @dataclass(frozen=True)
 class Untouched:
-    """Sums over free cycles, by section. promotions: refined models that took over; beside: None where none ran.
+    """Sums over free cycles, by section. promotions: refined models that took over; beside: None if it didn't run.
 
-    smallest_push: None of the paper's scheme, and where nothing was armed.
+    smallest_push: None for the paper's scheme, and for a run that never armed detection.
     """
 
     residuals: dict[str, Residual]
@@ -271,7 +271,7 @@ class PaperRow(NamedTuple):
     """One line of *paper against measured*.
 
     paper: None where the run is not of the paper's experiment; beside: the paper's scheme on the same stream, None
-    where none ran.
+    if it didn't run.
     """
 
     quantity: str
@@ -281,10 +281,10 @@ class PaperRow(NamedTuple):
 
 
 class ReportSource(NamedTuple):
-    """The log that a run was read from; `is_complete`: it is whole and nothing was dropped on the way to it."""
+    """The log that a run was read from; `is_complete`: it is whole and no record was dropped on the way to it."""
 
     log_name: str
-    problem: str = ""  # what is missing, one line
+    problem: str = ""  # the missing parts, one line
     is_complete: bool = True
 
 
@@ -355,7 +355,7 @@ class CycleStatistics:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Everything that the report says, see the module's first lines for the definitions.
+    """The content of the report, see the module's first lines for the definitions.
 
     fault, fault_s: the first one of the run. findings: a clause each, the gravest first.
     """

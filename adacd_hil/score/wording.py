@@ -81,12 +81,12 @@ def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: 
 
 
 def why_not_found(is_armed: bool) -> str:
-    """Say why nothing found a contact."""
+    """Return why a contact was not found."""
     return "missed" if is_armed else "not armed"
 
 
 def found_text(found: int, contacts: int) -> str:
-    """Say how many contacts were found."""
+    """Write how many contacts were found."""
     return f"{found} of {contacts}"
 
 
@@ -117,12 +117,12 @@ def score_sentence(score: Score) -> str:
 
 
 def unjudged_sentence(count: int) -> str:
-    """Say in one line how many alarms the truth does not cover; "" if none."""
+    """Write in one line how many alarms the truth does not cover; "" without one."""
     return f"the truth doesn't cover {number_of(count, 'detection')}, not judged" if count else ""
 
 
 def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
-    """Say how many false alarms there were, and which rate the counting leaves possible, if that says anything."""
+    """Write how many false alarms there were, and an upper bound of their rate, if the time is long enough."""
     count = number_of(false_alarms, "false alarm") if false_alarms else "No false alarms"
     if bound_per_h > _TELLING_PER_H:
         return f"{count} in that time, which is too short to tell a rate by counting"
@@ -130,7 +130,7 @@ def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
 
 
 def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Give median, 90th percentile and largest."""
+    """Return median, 90th percentile and largest."""
     if not delays_ms:
         return None, None, None
     median, p90, largest = np.quantile(delays_ms, (0.5, 0.9, 1.0)).tolist()
@@ -138,20 +138,20 @@ def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | Non
 
 
 def delays_phrase(delays_ms: Sequence[float]) -> str:
-    """Say how delays are distributed; nothing of none."""
+    """Write the distribution of delays; "" without delays."""
     if not delays_ms:
         return ""
     return ", after {:.1f} ms (median), {:.1f} (p90), {:.1f} (largest)".format(*delay_figures(delays_ms))
 
 
 def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float, float]) -> str:
-    """Say how many contacts were found, the bounds of their share, and their delays."""
+    """Write how many contacts were found, the bounds of their share, and their delays."""
     found = found_text(len(delays_ms), contacts)
     return f"{found} contacts found ({100 * bounds[0]:.0f} to {100 * bounds[1]:.0f} %){delays_phrase(delays_ms)}"
 
 
 def rate_phrase(alarms: int, hours: float, bound_per_h: float) -> str:
-    """Say how many false alarms came in how many hours."""
+    """Write how many false alarms came in how many hours."""
     return f"{alarms} false alarms in {hours:.4f} h, 95 % bound {bound_per_h:.3g} per hour"
 
 

@@ -11,7 +11,7 @@ All cyclic frames are taken as queued together with SYNC. That is never better t
 needs no knowledge of the devices' and the host's delays. Response times are computed for three kinds of traffic:
 operation (without requests and EMCY), which decides whether the contract fits; the same with one SDO frame per SYNC;
 and with the EMCY of every device besides. Deadlines missed under the last two are reported but don't fail the contract:
-a late command acts one SYNC later. NMT commands begin and end operation and disturb none of them.
+a late command acts one SYNC later. NMT commands begin and end operation and do not disturb it.
 
 On a bus that several arms share, messages without a node id count once and all others once per arm.
 
@@ -95,7 +95,7 @@ def response_time(
 
 
 def is_overloaded(streams: Sequence[Stream]) -> bool:
-    """Tell whether messages together need more than the whole bus."""
+    """Return whether messages together need more than the whole bus."""
     common = math.lcm(*(stream.interval_ns for stream in streams))
     return sum(stream.duration_ns * (common // stream.interval_ns) for stream in streams) > common
 

@@ -109,7 +109,7 @@ class Bus(Protocol):
         """
 
     def close(self) -> None:
-        """Release the bus; a second call does nothing."""
+        """Release the bus; ignore a second call."""
 
 
 class EmbeddedBus(Bus):

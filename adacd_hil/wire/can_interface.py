@@ -175,7 +175,7 @@ def can_interfaces() -> list[str]:
 
 
 def is_virtual(interface: str, channel: str) -> bool:
-    """Tell whether a channel certainly has no wire: vcan, vxcan, python-can's own virtual bus.
+    """Return whether a channel certainly has no wire: vcan, vxcan, python-can's own virtual bus.
 
     False for a serial adapter (slcan), although it has no device of its own. If the kernel doesn't report the kind of
     an interface, its name decides.

@@ -157,7 +157,7 @@ class MessageCodec(MessageTable):
         return tuple([r * scale + offset for r, (scale, offset) in zip(raw, self._scales, strict=True)])
 
     def takes(self, length: int) -> bool:
-        """Tell whether a frame of so many bytes can be decoded."""
+        """Return whether a frame of so many bytes can be decoded."""
         return length == self.length
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
@@ -317,7 +317,7 @@ class Codec:
         """Whether any message needs CAN FD."""
         self.wire_version = int(attributes[WIRE_VERSION].value)
         self.layout_digest = zlib.crc32(_describe(self.messages).encode())
-        """CRC-32 of every identifier, length, protection, signal place, scale and data id; nothing else counts."""
+        """CRC-32 of every identifier, length, protection, signal place, scale and data id; of no other property."""
 
     def message(self, name: str) -> MessageCodec:
         """Return a message by name. Raises CodecError when the DBC lacks it."""

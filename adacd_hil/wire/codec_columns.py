@@ -49,7 +49,7 @@ class SignalCodec:
 
 @dataclass
 class MessageTable:
-    """What is needed to read a message's frames: signals in the order of their containers."""
+    """Everything needed to read a message's frames: signals in the order of their containers."""
 
     name: str
     can_id: int
@@ -58,7 +58,7 @@ class MessageTable:
 
 
 def plain_tables(messages: Iterable[MessageTable]) -> tuple[MessageTable, ...]:
-    """Take the tables of messages without their codecs, to be told to another process."""
+    """Return the tables of messages without their codecs, so that another process can receive them."""
     return tuple(MessageTable(one.name, one.can_id, one.length, one.signals) for one in messages)
 
 

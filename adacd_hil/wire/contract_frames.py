@@ -33,7 +33,7 @@ NOT_VALID = 1 << 31
 DEFAULT_BITRATE = 1_000_000
 """Bit rate of a DBC without that attribute, bit/s."""
 ASSUMED_INTERVAL_MS = 100
-"""Interval of an event frame that declares none: the usual heartbeat period."""
+"""Interval of an event frame without a declared one: the usual heartbeat period."""
 _LAST_DEVICE = 126
 _STATEMENT = re.compile(
     r"""^(?P<head>\s*(?:BO_|BO_TX_BU_|VAL_|SIG_VALTYPE_|SIG_GROUP_|SG_MUL_VAL_|CM_\s+(?:BO_|SG_)"""

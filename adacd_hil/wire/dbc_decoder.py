@@ -34,7 +34,7 @@ class MessageDecoder:
         self._plain = plain, create_encode_decode_formats(plain, message.length)
 
     def takes(self, length: int) -> bool:
-        """Tell whether a frame of so many bytes is decoded; short frames only if the DBC is no contract."""
+        """Return whether a frame of so many bytes is decoded; short frames only if the DBC isn't a contract."""
         return length == self._message.length or not self._is_exact
 
     def decode(self, data: bytes) -> dict[str, float]:

@@ -170,7 +170,7 @@ class E2eReceiver:
         return None
 
     def is_signed(self, frame: bytes) -> bool:  # noqa: ARG002
-        """Tell whether length and CRC of a frame are right; doesn't count it."""
+        """Return whether length and CRC of a frame are right; doesn't count it."""
         return True
 
     def miss(self) -> E2eStatus:
@@ -267,7 +267,7 @@ class Profile2Receiver(_SequenceReceiver):
         return (frame[1] - self._last) & _COUNTER_MASK_2
 
     def is_signed(self, frame: bytes) -> bool:
-        """Tell whether length and CRC of a frame are right; doesn't count it."""
+        """Return whether length and CRC of a frame are right; doesn't count it."""
         return len(frame) == self._length and frame[0] == crc8(frame, self._data_ids[frame[1] & _COUNTER_MASK_2])
 
     def _note_silence(self) -> None:
@@ -317,7 +317,7 @@ class Profile5Receiver(_SequenceReceiver):
         return (frame[2] - self._last) & _COUNTER_MASK_5
 
     def is_signed(self, frame: bytes) -> bool:
-        """Tell whether length and CRC of a frame are right; doesn't count it."""
+        """Return whether length and CRC of a frame are right; doesn't count it."""
         return len(frame) == self._length and frame[0] | frame[1] << 8 == crc16(frame, self._data_id)
 
     def _judge(self, frame: bytes) -> E2eStatus:

@@ -99,7 +99,7 @@ class BusTrouble(NamedTuple):
 
 
 def is_bus_off(frame: Frame) -> bool:
-    """Tell whether an error frame reports bus-off."""
+    """Return whether an error frame reports bus-off."""
     return bool(frame.can_id & _BUS_OFF)
 
 

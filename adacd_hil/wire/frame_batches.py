@@ -149,7 +149,7 @@ class FrameReceiver:
         return Frame(can_id & CAN_ID_MASK, data[:length], t_ns, bool(can_id & CAN_ERR_FLAG))
 
     def _lost_before(self, index: int) -> int:
-        """Return the drop count before a frame of the batch; the last known one if the frame carries none."""
+        """Return the drop count before a frame of the batch; the last known one if the frame carries no count."""
         *_, kind, lost = _RECEIVED.unpack_from(self._memory, index * _SLOT_BYTES)
         return lost if kind == _SO_RXQ_OVFL else self.frames_lost
 

@@ -10,9 +10,9 @@ its transmit queue:
     fifo        in the order in which they were handed over, as in Linux's default queue. SYNC waits behind a late
                 command, and every frame behind one that loses to the devices'.
 
-What the host sends reaches the devices in the order in which it is through.
+The host's frames reach the devices in the order in which they are through.
 
-How devices let time pass: `adacd_hil.wire.time_marks`. Devices that send no marks are waited for, by the wall
+How devices let time pass: `adacd_hil.wire.time_marks`. The host waits for devices that send no marks by the wall
 clock.
 """
 
@@ -65,8 +65,8 @@ class LockstepBus(Bus):
     ) -> None:
         """Take over a bus.
 
-        answers: identifiers that devices send on every SYNC. patience_s: by the wall clock, how long devices that send
-        no marks are waited for. queue_length: frames that wait at most while nobody acknowledges. is_fifo: the host's
+        answers: identifiers that devices send on every SYNC. patience_s: by the wall clock, longest wait for devices
+        that send no marks. queue_length: frames that wait at most while no node acknowledges. is_fifo: the host's
         frames leave in the order in which they were handed over.
         """
         self.channel = bus.channel
@@ -82,7 +82,7 @@ class LockstepBus(Bus):
         self._queue: list[Offer] = []  # the host's
         self._offered: list[Offer] = []  # the devices'
         self._received: deque[Frame] = deque()
-        """What is through, or surely will be unless the host sends before; see `_withdraw`."""
+        """Frames that the bus has sent, or will send before the host can add another; see `_withdraw`."""
         self._ahead: deque[Frame] = deque()  # of the bus behind, taken with others
         self._free_ns = 0
         """When the last frame was through."""
@@ -98,14 +98,14 @@ class LockstepBus(Bus):
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
-        """Identifiers of the host's frames that SYNC would overtake now, oldest first; in a fifo it overtakes none."""
+        """Identifiers of the host's frames that SYNC would overtake now, oldest first; in a fifo always empty."""
         if self._is_fifo or not self._queue:
             return ()
         self._transmit_before(self._clock.now_ns())
         return tuple([offer[0] for offer in self._queue])
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Queue a frame at the clock's present time. Raises TransmitQueueError while nobody acknowledges."""
+        """Queue a frame at the clock's present time. Raises TransmitQueueError while no node acknowledges."""
         now_ns = self._clock.now_ns()
         if not self._is_attached:
             self._attach()
@@ -135,7 +135,7 @@ class LockstepBus(Bus):
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, with the clock at its end; or None with the clock after `timeout_s`.
 
-        Raises SilenceError when nobody answers a SYNC, BusError.
+        Raises SilenceError when no device answers a SYNC, BusError.
         """
         if not self._is_attached:
             self._attach()
@@ -175,7 +175,7 @@ class LockstepBus(Bus):
         return frames
 
     def recover(self) -> None:
-        """Drop what waits and what was received. Raises BusError when the bus behind it can't yet."""
+        """Drop queued and received frames. Raises BusError when the bus behind it can't recover yet."""
         self._bus.recover()
         self._ahead.clear()
         self._queue.clear()
@@ -183,7 +183,7 @@ class LockstepBus(Bus):
         self._received.clear()
 
     def close(self) -> None:
-        """Let what waits go out, then close the bus behind it."""
+        """Send the queued frames, then close the bus behind it."""
         self._transmit_before(NEVER_NS)
         self._bus.close()
 
@@ -221,7 +221,7 @@ class LockstepBus(Bus):
         return True
 
     def _transmit_own(self, limit_ns: int) -> bool:
-        """Let a frame of the host's win the bus, for which nobody else waits, if it starts before `limit_ns`."""
+        """Let a frame of the host's, without a competing frame, win the bus, if it starts before `limit_ns`."""
         queue = self._queue
         t_ns = queue[0][2]  # the earliest: the queue is in the order in which frames were handed over
         start_ns = t_ns if t_ns > self._free_ns else self._free_ns
@@ -247,7 +247,7 @@ class LockstepBus(Bus):
             self._take_answers()
 
     def _take_answers(self) -> None:
-        """Take what belongs to this SYNC. Raises SilenceError when nobody says anything."""
+        """Take the answers to this SYNC. Raises SilenceError when no frame comes."""
         count = missing = len(self._answers)
         came = self._bus.receive_some(self._patience_s, count) if count and not self._ahead else []
         if len(came) == count and {frame.can_id for frame in came} == self._answers:
@@ -276,7 +276,7 @@ class LockstepBus(Bus):
                 self._offer(frame, self.sync_ns)
 
     def _take_marked(self, mark: Frame) -> None:
-        """Take frames by their release, from a mark up to the one that says that this was all."""
+        """Take frames by their release, from a mark up to END."""
         offset_ns = 0
         frame: Frame | None = mark
         while frame is not None:
@@ -293,13 +293,13 @@ class LockstepBus(Bus):
             frame = self._receive()
 
     def _receive(self, timeout_s: float | None = None) -> Frame | None:
-        """Receive the next frame of the bus behind; None when none came within the time, if not given in patience."""
+        """Return the next frame of the bus behind; None after `timeout_s` without a frame (default: the patience)."""
         if self._ahead:
             return self._ahead.popleft()
         return self._bus.receive(self._patience_s if timeout_s is None else timeout_s)
 
     def _line_up(self, came: list[Frame]) -> None:
-        """Let answers that nothing competes with go one after the other, by identifier."""
+        """Send answers without competing frames one after the other, by identifier."""
         came.sort()
         through_ns = self._free_ns
         for can_id, data, _, is_error in came:
@@ -311,7 +311,7 @@ class LockstepBus(Bus):
         self._free_ns = through_ns
 
     def _withdraw(self, now_ns: int) -> None:
-        """Take back what was lined up and has not begun: the host sends something that may come first."""
+        """Take back the answers that have not begun: the host sends a frame that may come first."""
         while self._received:
             last = self._received[-1]
             start_ns = last.t_ns - (0 if last.is_error else self._frame_time(last.can_id, last.data))
@@ -334,7 +334,7 @@ class LockstepBus(Bus):
         return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
 
     def _let_pass(self, limit_ns: int) -> bool:
-        """Ask the devices to let time pass; tell whether that may have brought something."""
+        """Ask the devices to let time pass; return whether that may have brought a frame."""
         now_ns = self._clock.now_ns()
         if self._is_cyclic(now_ns):
             return False
@@ -343,19 +343,19 @@ class LockstepBus(Bus):
         return self._ask(limit_ns) or self._granted_ns < limit_ns
 
     def _ask(self, until_ns: int) -> bool:
-        """Let the devices live until then, or until they send something; tell whether they did."""
+        """Let the devices run until then, or until they send a frame; return whether they sent one."""
         self._bus.send(HOST_MARK, pack_mark(MarkKind.ADVANCE, until_ns))
         return self._await_grant()
 
     def _attach(self) -> None:
-        """Tell the devices what the clock reads, and find out whether they send marks. What came before is dropped."""
+        """Drop old frames, send the clock's time to the devices, and find out whether they send marks."""
         self._is_attached = True
         while self._bus.receive(0.0) is not None:
             pass
         self._ask(self._clock.now_ns())
 
     def _await_grant(self) -> bool:
-        """Take what comes until time is granted; tell whether a frame came."""
+        """Take frames until the devices grant time; return whether a frame came."""
         came: list[Frame] = []
         while (frame := self._receive()) is not None:
             if frame.can_id != DEVICE_MARK:
@@ -374,7 +374,7 @@ class LockstepBus(Bus):
         return bool(came)
 
     def _take_while(self, timeout_s: float) -> bool:
-        """Take what the bus behind has; tell whether there was something."""
+        """Take frames of the bus behind, waiting `timeout_s` for the first; return whether one came."""
         has_come = False
         while (frame := self._receive(timeout_s)) is not None:
             timeout_s = 0.0

@@ -33,7 +33,7 @@ def interface_names() -> list[str]:
 
 
 def is_usable(interface: str) -> bool:
-    """Tell whether python-can knows an interface and a cycle can run on it."""
+    """Return whether python-can knows an interface and a cycle can run on it."""
     return interface in can.VALID_INTERFACES and interface not in _ECHOING_INTERFACES
 
 

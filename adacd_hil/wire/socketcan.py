@@ -244,7 +244,7 @@ class SocketCanBus(Bus):
         self._open()
 
     def _carries_frames(self) -> bool:
-        """Tell whether any frame is received within 0.25 s, including transmitted frames of other programs."""
+        """Return whether any frame is received within 0.25 s, including transmitted frames of other programs."""
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as listener:
             listener.bind((self.channel,))
             return bool(select.select([listener], [], [], _LIVE_S)[0])
@@ -258,7 +258,7 @@ class SocketCanBus(Bus):
         self._socket.close()
 
     def close(self) -> None:
-        """Close the socket; a second call does nothing."""
+        """Close the socket; ignore a second call."""
         self._is_closed = True
         self._retire_socket()
 

@@ -1,20 +1,21 @@
 """The frames by which a host in lockstep and the emulated devices keep one time.
 
-A bus without time of its own, such as vcan, carries them like any other frame, so order tells what belongs together.
-Both have 29-bit identifiers that no CANopen service has; on an arm they never appear. Data: 1 byte kind, 7 bytes time
-in ns, little-endian.
+A bus without time of its own, such as vcan, carries them like any other frame, so their order shows which frames belong
+together. Both have 29-bit identifiers that no CANopen service has; on an arm they never appear. Data: 1 byte kind,
+7 bytes time in ns, little-endian.
 
 | kind | from | means |
 |---|---|---|
-| ADVANCE | host | "I send nothing before this time": let time pass until then, or until you have sent something |
-| GRANT | devices | "it is this time": the answer to ADVANCE, after what was sent on the way |
-| RELEASE | devices | what follows is handed to the bus so long after SYNC; wait for END |
-| END | devices | that is all that belongs to this SYNC |
-| DARK | devices | nobody is powered, so nobody acknowledges; time: 0 |
-| LIT | devices | somebody is |
+| ADVANCE | host | "I won't send before this time": let time pass until then, or until you have sent a frame |
+| GRANT | devices | "it is this time": the answer to ADVANCE, after the frames sent on the way |
+| RELEASE | devices | the frames after this are handed to the bus so long after SYNC; wait for END |
+| END | devices | all frames that belong to this SYNC have been sent |
+| DARK | devices | no device is powered, so frames are not acknowledged; time: 0 |
+| LIT | devices | a device is powered |
 
-Every SYNC lets one period pass. Only when not all cyclic frames follow a SYNC at once, or others too, it takes RELEASE
-and END; an undisturbed arm sends none. The first ADVANCE of a host says what its clock reads and lets no time pass.
+Every SYNC lets one period pass. RELEASE and END are sent only when not all cyclic frames follow a SYNC at once, or when
+other frames follow it too; an undisturbed arm doesn't send them. The first ADVANCE of a host gives its clock's time and
+lets no time pass.
 """
 
 import struct
@@ -26,12 +27,12 @@ from adacd_hil.wire.codec import Codec
 HOST_MARK: Final = 0x1ADACD00
 DEVICE_MARK: Final = 0x1ADACD01
 NEVER_NS: Final = 1 << 62
-"""Later than any time: nothing is due."""
+"""A time after all others: no frame is due."""
 _PACKING: Final = struct.Struct("<Q")
 
 
 class MarkKind(IntEnum):
-    """What a mark says."""
+    """Meaning of a mark; see the module's table."""
 
     ADVANCE = 1
     GRANT = 2
@@ -47,7 +48,7 @@ def pack_mark(kind: MarkKind, t_ns: int = 0) -> bytes:
 
 
 def unpack_mark(data: bytes) -> tuple[MarkKind, int] | None:
-    """Unpack the data of a mark; None when it is none."""
+    """Unpack the data of a mark; return None for other data."""
     if len(data) != _PACKING.size:
         return None
     (packed,) = _PACKING.unpack(data)

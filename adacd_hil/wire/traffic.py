@@ -65,7 +65,7 @@ class Traffic:
 
 
 def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
-    """Wait for one frame until `end_ns`; None if none came. Raises BusError."""
+    """Wait for one frame until `end_ns`; None if no frame came. Raises BusError."""
     while (now_ns := clock.now_ns()) < end_ns:
         slice_ns = min(end_ns, now_ns + round(_SLICE_S * 1e9))
         frame = bus.receive((slice_ns - now_ns) * 1e-9)
@@ -76,7 +76,7 @@ def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
 
 
 def listen(bus: Bus, clock: Clock, duration_s: float, traffic: Traffic) -> None:
-    """Count the frames on the bus for a duration, sending none. Raises BusError."""
+    """Count the frames on the bus for a duration, without sending. Raises BusError."""
     end_ns = clock.now_ns() + round(duration_s * 1e9)
     while (frame := receive_until(bus, clock, end_ns)) is not None:
         traffic.count_frame(frame)

@@ -53,7 +53,7 @@ class McapReader(BinaryIOMessageReader):
 
     @property
     def problem(self) -> str:
-        """What is missing."""
+        """The missing or unreadable parts, one line; "" for a whole file."""
         return self._frames.problem
 
     def __iter__(self) -> Generator[can.Message, None, None]:
@@ -78,7 +78,7 @@ class McapWriter(BinaryIOMessageWriter):
         self._is_stopped = False
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Write a message. Raises ValueError for what no frame has."""
+        """Write a message. Raises ValueError for a message that no CAN frame can have."""
         self._writer.write(to_frame(msg))
 
     def stop(self) -> None:
@@ -102,7 +102,7 @@ class TimedMessage(can.Message):
 
 
 def time_ns(message: can.Message) -> int:
-    """Return the time of a message: in whole nanoseconds if it knows it and nobody has changed `timestamp` since."""
+    """Return the time of a message: in whole nanoseconds if it has them and `timestamp` is unchanged."""
     seconds = message.timestamp or 0.0
     t_ns = getattr(message, "t_ns", None)
     if t_ns is not None and t_ns / 1_000_000_000 == seconds:
@@ -191,11 +191,11 @@ _BLF_FRAMES = (blf.CAN_MESSAGE, blf.CAN_MESSAGE2, blf.CAN_ERROR_EXT, blf.CAN_FD_
 
 
 class _AscReader(can.ASCReader):
-    """python-can's, but for what it gets wrong without a word.
+    """python-can's, without its silent errors.
 
-    It loses a first frame that follows a head without `internal events logged`, as BUSMASTER writes it, takes stamps
-    that count from the line before for stamps from the beginning, requests to send (TxRq) for frames, and passes over
-    frames with a negative stamp or a decimal comma.
+    python-can's loses a first frame that follows a head without `internal events logged`, as BUSMASTER writes it, takes
+    stamps that count from the line before for stamps from the beginning, requests to send (TxRq) for frames, and passes
+    over frames with a negative stamp or a decimal comma.
     """
 
     def _extract_header(self) -> None:
@@ -211,7 +211,7 @@ _ASC_FRAME = re.compile(r"-?\d+[.,]\d+\s+(CANFD\s+)?\d+\s+\S+\s+(Rx|Tx|TxRq)\s",
 
 
 def _asc_lines(lines: Iterable[str], is_relative: bool) -> Iterator[str]:
-    """Give the lines of an ASC, with stamps from the beginning; say which frames python-can will pass over."""
+    """Yield the lines of an ASC, with stamps from the beginning; say which frames python-can will pass over."""
     time_s = Decimal(0)
     for number, text in enumerate(lines, 1):
         line = text.strip()
@@ -231,7 +231,7 @@ _ERROR_FLAG = 0x20000000
 
 
 class _CandumpReader(can.CanutilsLogReader):
-    """python-can's, but a line that is no frame ends nothing, and error frames keep their class.
+    """python-can's, but it skips lines without a frame, and error frames keep their class.
 
     Of an error frame python-can makes data of a 29-bit identifier, or drops all but the time.
     """
@@ -266,7 +266,7 @@ class _CandumpReader(can.CanutilsLogReader):
 
 
 class _PassedOver(logging.Handler):
-    """Counts the records that are not read, and keeps what is said of the first; also what python-can says of it."""
+    """Counts the records that are not read, and keeps the first one's error; python-can's warnings count, too."""
 
     first = ""
     count = 0
@@ -285,7 +285,7 @@ class _PassedOver(logging.Handler):
 _LOGGER = logging.getLogger("can.io")
 _LOGGER.addHandler(logging.NullHandler())  # python-can's words go through `_PassedOver`, not to the terminal
 _HARMLESS = ("Unknown object header version", "DLC vs Data Length mismatch")
-"""Objects that are no frames, or that `_BlfReader` counts; frames that are read."""
+"""Beginnings of warnings: on objects other than frames, or that `_BlfReader` counts; on frames that are read."""
 _READERS: dict[str, Any] = {".blf": _BlfReader, ".asc": _AscReader, ".log": _CandumpReader}
 _FLAGS = slice(RecordedFrame._fields.index("is_extended"), None)
 """Those that a row of RECORDED_FRAME_DTYPE ends with, too."""
@@ -312,7 +312,7 @@ class PythonCanFrames:
             open_input(path).close()
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Give the frames, (n,) of RECORDED_FRAME_DTYPE; what is no frame is left out, and the problem."""
+        """Yield the frames, (n,) of RECORDED_FRAME_DTYPE; drop other records, and set `problem`."""
         passed_over = _PassedOver()
         rows: list[tuple[Any, ...]] = []
         count = 0
@@ -341,7 +341,7 @@ class PythonCanFrames:
             yield np.array(rows, RECORDED_FRAME_DTYPE)
 
     def _messages(self, passed_over: _PassedOver) -> Iterator[tuple[can.Message, int]]:
-        """Give what python-can reads, each message with the start to add, up to an error."""
+        """Yield the messages that python-can reads up to an error, each with the start to add, ns."""
         suffix = self._path.suffix.lower()
         kind = _READERS.get(suffix) or MESSAGE_READERS[suffix]
         count = 0

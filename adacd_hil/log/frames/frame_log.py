@@ -34,11 +34,11 @@ class FrameSource(Protocol):
     problem: str
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Give the frames, (n,) of RECORDED_FRAME_DTYPE, in the order of the recording."""
+        """Return the frames, (n,) of RECORDED_FRAME_DTYPE, in the order of the recording."""
 
 
 def open_frames(path: Path) -> FrameSource:
-    """Open a recording; its suffix says what it is.
+    """Open a recording; its suffix gives its format.
 
     Raises LogError when it can't be read, also from the iteration.
     """

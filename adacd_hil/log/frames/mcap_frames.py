@@ -74,16 +74,16 @@ _CLASSIC_DTYPE = np.dtype(
         ("data", "u1", (CLASSIC_BYTES,)),
     ]
 )
-"""What follows frame_id in can_msgs/msg/Frame."""
+"""Fields after frame_id in can_msgs/msg/Frame."""
 _FD_DTYPE = np.dtype(
     [("can_id", "<u4"), ("is_extended", "u1"), ("is_error", "u1"), ("length", "u1"), ("", "u1"), ("count", "<u4")]
 )
-"""What follows frame_id in ros2_socketcan_msgs/msg/FdFrame, up to its data."""
+"""Fields after frame_id in ros2_socketcan_msgs/msg/FdFrame, up to its data."""
 _NO_FRAMES = np.zeros(0, RECORDED_FRAME_DTYPE)
 
 
 class _Source(NamedTuple):
-    """What an MCAP channel says of all its frames."""
+    """Properties of an MCAP channel that all its frames share."""
 
     is_fd: bool
     is_tx: bool
@@ -114,7 +114,7 @@ class McapFrames:
                 first.seek(0)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Give the frames of each chunk, (n,) of RECORDED_FRAME_DTYPE."""
+        """Yield the frames of each chunk, (n,) of RECORDED_FRAME_DTYPE."""
         for source in self._files:
             if not isinstance(source, Path):
                 yield from self._read(source, "the file")
@@ -191,7 +191,7 @@ class McapFrames:
         )
 
     def _frames(self, contents: Contents) -> NDArray[Any]:
-        """Read the frames of a chunk in the order of the file. Raises ValueError for a frame that is none."""
+        """Read the frames of a chunk in the order of the file. Raises ValueError for an invalid frame."""
         places, found = [], []
         for number in np.unique(contents.channels).tolist():
             source = self._sources.get(number)
@@ -260,7 +260,7 @@ _STAMP = struct.Struct("<II")
 
 
 class RecordedFrame(NamedTuple):
-    """A frame as recordings have it; the fields mean what those of RECORDED_FRAME_DTYPE do."""
+    """A frame as recordings have it; its fields mean the same as those of RECORDED_FRAME_DTYPE."""
 
     t_ns: int  # since the file's epoch
     can_id: int
@@ -319,7 +319,7 @@ class FrameWriter:
         self._frames += frame.channel == self._first_channel
 
     def _add_channel(self, frame: RecordedFrame) -> int:
-        """Register what such frames need."""
+        """Register schema and channel for frames like this one; return the channel's id."""
         kind = FD_FRAME if frame.is_fd else CAN_FRAME
         if frame.is_fd not in self._schemas:
             self._schemas[frame.is_fd] = self._writer.register_schema(kind.name, "ros2msg", kind.text.encode())

@@ -44,7 +44,7 @@ CHUNK_BYTES = 256 * 1024
 FLUSH_PERIOD_NS = 250_000_000
 """A chunk spans at most so much time, so that little is lost with a killed process."""
 _CHUNK_MARGIN = 16 * 1024
-"""A chunk is closed after the message that overruns it; none of ours is longer than two texts of 4 KiB."""
+"""A chunk is closed after the message that overruns it; our longest message has two texts of 4 KiB."""
 COMPRESSION_LEVEL = 3
 """1 saves 1 µs per cycle of a run and makes its file 1 % larger; lz4 saves 2 µs and makes it 31 % larger."""
 INDEX_HEAD = struct.Struct("<BQHI")

@@ -1,7 +1,8 @@
 """The records of an MCAP file: in order, after damage, at the end of the file, and parsed by mcap's classes.
 
-A record repeats its length: what its strings, maps and arrays say they hold must fill it exactly. In random bytes that
-happens once in 2^72 and more, so that it says where records go on after damage. A message record has no such shape.
+A record repeats its length: its strings, maps and arrays must fill exactly the lengths that they state. In random bytes
+that happens once in 2^72 and more, so that it shows where records resume after damage. A message record has no such
+shape.
 
 Constant memory: one record at a time; one of more than MOST_RECORD_BYTES is none. Chunks stay closed.
 """
@@ -63,12 +64,12 @@ LEAST_MESSAGE = 22
 
 
 def has_shape(opcode: int) -> bool:
-    """Say whether records of this kind repeat their length."""
+    """Return whether records of this kind repeat their length."""
     return opcode in _SHAPES
 
 
 def fits(opcode: int, length: int, read: Callable[[int, int], bytes]) -> bool:
-    """Say whether a record of this kind can be `length` bytes long; `read` gives bytes of it, by place and count."""
+    """Return whether a record of this kind can be `length` bytes long; `read` gives bytes of it, by place and count."""
     if opcode not in _SHAPES:
         return opcode == Opcode.MESSAGE and length >= LEAST_MESSAGE
     position = 0
@@ -118,7 +119,7 @@ _READERS: dict[int, Any] = {
     Opcode.DATA_END: DataEnd.read,
 }
 _BEGINNING = re.compile(rb"(?=[\x01-\x04\x06-\x0f].{5}\0\0\0)", re.DOTALL)
-"""Where a record of less than a TiB may begin."""
+"""Possible beginning of a record of less than a TiB."""
 
 
 class RawRecord(NamedTuple):
@@ -130,7 +131,7 @@ class RawRecord(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Where the next one begins."""
+        """Offset of the next record."""
         return self.offset + HEAD.size + len(self.body)
 
 
@@ -142,7 +143,7 @@ class IndexRun(NamedTuple):
 
 
 class FileGap(NamedTuple):
-    """Bytes that are no record."""
+    """Bytes that belong to no record."""
 
     offset: int
     size: int
@@ -177,7 +178,7 @@ def parse(opcode: int, body: bytes) -> Any:
 
 
 def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[RawRecord | IndexRun | Problem]:
-    """List the records of a file up to its end, or to what can't be one; message indexes, which are many, in runs.
+    """List the records of a file up to its end, or to bytes that can't be one; the many message indexes in runs.
 
     passed: kinds whose bodies aren't read. Raises LogError, which begins with `name`, when it isn't MCAP.
     """
@@ -234,12 +235,12 @@ def _index_run(data: bytes) -> IndexRun:
 
 
 def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap | Trailer]:
-    """List the records of a file, and the gaps between them: what follows damage is found again."""
+    """List the records of a file, and the gaps between them: after damage, search for the next record."""
     return _Scan(file).items()
 
 
 def read_header(path: Path) -> Header | None:
-    """Read the header of a file; None where it has none that can be trusted."""
+    """Read the header of a file; None without one that can be trusted."""
     try:
         with open_input(path) as file:
             first = next(scan(file), None)
@@ -294,7 +295,7 @@ class _Scan:
         return (opcode, length) if is_there else None
 
     def _is_shaped(self, position: int) -> bool:
-        """Say whether a record that repeats its length is at `position`."""
+        """Return whether a record that repeats its length is at `position`."""
         head = self._read(position, HEAD.size)
         if len(head) < HEAD.size or not has_shape(head[0]):
             return False
@@ -316,12 +317,12 @@ class _Scan:
 
 
 def chunk_crc(record: RawRecord) -> int:
-    """Return the CRC that a chunk brings of what it opens to; 0 where it has none."""
+    """Return the CRC that a chunk carries of its uncompressed records; 0 without one."""
     return int.from_bytes(record.body[24:28], "little")
 
 
 def attachment_crc_fits(record: RawRecord, can_lack: bool = True) -> bool:
-    """Say whether an attachment fits its CRC; can_lack: one of 0, for none, does."""
+    """Return whether an attachment fits its CRC; can_lack: a CRC of 0, which means absent, fits."""
     stored = int.from_bytes(record.body[-4:], "little")
     return stored == crc32(record.body[:-4]) or (stored == 0 and can_lack)
 
@@ -331,15 +332,15 @@ _DATA_END = HEAD.size + 4
 
 
 class FileEnd(NamedTuple):
-    """What the end of a file says."""
+    """Position and CRC of the data section, and the summary, by the end of the file."""
 
     data_end: int  # where the DataEnd begins
-    data_crc: int  # stored there; 0: none
-    summary: list[RawRecord]  # empty where its CRC doesn't fit, or where it has none and its records no shape
+    data_crc: int  # stored there; 0: no CRC
+    summary: list[RawRecord]  # empty if its CRC doesn't fit, or if both its CRC and its records' shape are missing
 
 
 def read_end(file: IO[bytes]) -> FileEnd | None:
-    """Read the end of a file; None where there is none."""
+    """Read the end of a file; None without one."""
     found = _find(file)
     if found is None:
         return None
@@ -357,13 +358,13 @@ def read_end(file: IO[bytes]) -> FileEnd | None:
 
 
 def _has_shape(record: RawRecord) -> bool:
-    """Say whether a record is one that repeats its length, and does so."""
+    """Return whether a record is of a kind that repeats its length, and does so."""
     body = record.body
     return has_shape(record.opcode) and fits(record.opcode, len(body), lambda place, count: body[place : place + count])
 
 
 def summary_of(file: IO[bytes]) -> list[RawRecord]:
-    """Read the summary of a file, whether or not it has a CRC that fits; empty where there is none."""
+    """Read the summary of a file, whether or not it has a CRC that fits; empty without a summary."""
     found = _find(file)
     if found is None or found[0] - found[1] > MOST_RECORD_BYTES:
         return []
@@ -372,7 +373,7 @@ def summary_of(file: IO[bytes]) -> list[RawRecord]:
 
 
 def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
-    """Find where the footer is, and where the summary begins; None where there is no end."""
+    """Find where the footer is, and where the summary begins; None for a file without an end."""
     size = file.seek(0, os.SEEK_END)
     place = size - len(MAGIC) - _FOOTER
     tail = _read(file, max(0, place), _FOOTER + len(MAGIC))
@@ -407,7 +408,7 @@ def read_record(file: IO[bytes], offset: int) -> RawRecord:
 
 
 def crc_of(file: IO[bytes], start: int, end: int, crc: int = 0) -> int:
-    """Compute the CRC of bytes of a file; `crc`: of what comes before them."""
+    """Compute the CRC of bytes of a file; `crc`: that of the bytes before them."""
     file.seek(start)
     while start < end and (block := file.read(min(_WINDOW, end - start))):
         crc = crc32(block, crc)

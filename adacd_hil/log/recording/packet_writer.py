@@ -128,7 +128,7 @@ class PacketWriter:
         return len(starts) - len(packets.heads)
 
     def _is_right(self, packets: Columns) -> NDArray[np.bool_]:
-        """Tell for each packet whether the file can hold all of it."""
+        """Return for each packet whether the file can hold all of it."""
         messages, frames = packets.messages, packets.frames
         is_short = (messages["channel"] == ChannelId.SCHEME) & (messages["size"] < self._least_scheme)
         is_wrong_message = is_short | ~self._is_known[messages["channel"]]

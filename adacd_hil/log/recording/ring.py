@@ -81,7 +81,7 @@ class Ring(_SharedRing):
         self._room_until = self.capacity  # limit of HEAD by the last TAIL that was read
 
     def put_packet(self, packet: bytes) -> bool:
-        """Add a packet; False if there is no room for it."""
+        """Add a packet; return False if the room is too small for it."""
         size = len(packet)
         head = self._head
         end = head + room_of(size)

@@ -30,7 +30,7 @@ def make_room(path: Path) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """Tell whether any file, a dangling link included, has the name of a log or one of its parts.
+    """Return whether any file, a dangling link included, has the name of a log or one of its parts.
 
     Raises LogExistsError if a folder of the path is a file, LogError.
     """
@@ -45,7 +45,7 @@ def is_taken(path: Path) -> bool:
 
 
 def is_there(path: Path) -> bool:
-    """Tell whether any file of that name exists, a dangling link included."""
+    """Return whether any file of that name exists, a dangling link included."""
     return path.is_symlink() or path.exists()
 
 
@@ -56,7 +56,7 @@ def _refusal(path: Path) -> LogExistsError:
 
 
 def _is_failed_start(path: Path) -> bool:
-    """Tell whether a log is empty, or has ended properly without a cycle.
+    """Return whether a log is empty, or has ended properly without a cycle.
 
     Raises LogExistsError if it is being written.
     """

@@ -27,7 +27,7 @@ class JointStateMessage(NamedTuple):
 
 
 def decode_joint_state(payload: bytes, is_ros1: bool = False) -> JointStateMessage:
-    """Decode a message of ROS 2 (CDR), or of ROS 1. Raises LogError for one that is none."""
+    """Decode a message of ROS 2 (CDR), or of ROS 1. Raises LogError for an invalid one."""
     from rosbags.serde import SerdeError
 
     store = _store(is_ros1)
@@ -42,7 +42,7 @@ def decode_joint_state(payload: bytes, is_ros1: bool = False) -> JointStateMessa
 
 
 def is_joint_state(payload: bytes) -> bool:
-    """Tell whether `decode_joint_state` decodes a payload of ROS 2."""
+    """Return whether `decode_joint_state` decodes a payload of ROS 2."""
     try:
         decode_joint_state(payload)
     except LogError:
@@ -54,7 +54,7 @@ def joint_state_columns(payloads: Iterable[bytes]) -> Iterator[tuple[tuple[str, 
     """Make tables of messages of ROS 2, one for each choice of joints: (their names, columns).
 
     Columns: `t_ns` of the stamp, and `position_NAME`, `velocity_NAME`, `effort_NAME`; nan if a message has none, or not
-    one of each joint. Payloads that are no messages are left out.
+    one of each joint. Invalid payloads are left out.
     """
     groups: dict[tuple[str, ...], list[JointStateMessage]] = {}
     for payload in payloads:

@@ -291,7 +291,7 @@ def pack_log(stamp: bytes, event: Event) -> bytes:
 
 
 def is_log(payload: bytes) -> bool:
-    """Tell whether `unpack_log` can unpack a payload."""
+    """Return whether `unpack_log` can unpack a payload."""
     try:
         unpack_log(payload)
     except (struct.error, IndexError):

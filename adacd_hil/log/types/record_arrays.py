@@ -119,7 +119,7 @@ def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
 
 
 def is_of_frames(topic: Topic) -> bool:
-    """Say whether a topic is one of ours with bus frames."""
+    """Return whether a topic is one of ours with bus frames."""
     return topic.name in FRAME_TOPICS and FRAME_TOPICS[topic.name].type_name == topic.type_name
 
 
@@ -188,20 +188,20 @@ RECORDED_FRAME_DTYPE = np.dtype(
 class FrameLog(NamedTuple):
     """The frames of a recording, in its order."""
 
-    channels: tuple[str, ...]  # "" where the recording names none
+    channels: tuple[str, ...]  # "" where the recording gives no name
     frames: NDArray[Any]  # (n,) of RECORDED_FRAME_DTYPE
     epoch_ns: int = 0  # offset from t_ns to the times in the file
     problem: str = ""  # defect, one line; "" for a whole recording
 
 
 def is_plain(frames: NDArray[Any]) -> NDArray[np.bool_]:
-    """Say which frames a bus end of ours can receive (n,): none remote, none of 29 bits that reads as 11-bit."""
+    """Mark the frames that a bus end of ours can receive (n,): neither remote nor of 29 bits that read as 11-bit."""
     is_as_wide = (frames["can_id"] > MAX_STANDARD_ID) == frames["is_extended"]
     return np.asarray(~frames["is_remote"] & (is_as_wide | frames["is_error"]))
 
 
 def is_sendable(frames: NDArray[Any]) -> NDArray[np.bool_]:
-    """Say which frames a bus end of ours can send as they are (n,): of FD frames those of more than 8 bytes."""
+    """Mark the frames that a bus end of ours can send as they are (n,): of FD frames those of more than 8 bytes."""
     is_short_fd = frames["is_fd"] & (frames["length"] <= CLASSIC_BYTES)
     return np.asarray(is_plain(frames) & ~frames["is_error"] & ~is_short_fd)
 
@@ -276,7 +276,7 @@ class PieceBuilder:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing has been gathered since the latest piece."""
+        """Whether no message has been gathered since the latest piece."""
         return not (self._frames or any(rows.count for rows in self._rows) or any(self._payloads))
 
     def add_topic(self, topic: Topic) -> int:
@@ -361,7 +361,7 @@ class PieceBuilder:
 def _rows_of(
     contents: "Contents", starts: Numbers, sizes: Numbers, topic: Topic
 ) -> tuple[NDArray[np.bool_] | None, NDArray[np.uint8]]:
-    """Copy the records of a topic, of those messages that are as long as they must be, and say which; None: of all."""
+    """Copy the records of a topic, of messages of the right length, and mark these messages; None: all are right."""
     assert topic.dtype is not None
     most = topic.dtype.itemsize
     is_right = sizes == most

@@ -4,7 +4,7 @@ A topic is added here, by an `OwnTopic` in RUN_TOPICS, and where its messages ar
 export and live view follow from the declaration. A field of /scheme is added to `records.scheme_layout`, or to the head
 of SCHEME and to `records.SchemeOutput`.
 
-The control side packs *bodies*: what follows the stamp. The writer puts encapsulation and stamp in front, the same
+The control side packs *bodies*: a message without its stamp. The writer puts encapsulation and stamp in front, the same
 for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its bytes.
 
 | topic | type | when |
@@ -18,7 +18,7 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 | /contact | adacd_hil_msgs/msg/Contact | when a report begins and when it is final |
 | /control | adacd_hil_msgs/msg/Control | every cycle; records.CONTROL_LAYOUT |
 | /cycle | adacd_hil_msgs/msg/Cycle | every cycle; records.CycleRecord |
-| /frame_checks | adacd_hil_msgs/msg/FrameChecks | once a second: what the checks said of each device's cyclic frames |
+| /frame_checks | adacd_hil_msgs/msg/FrameChecks | once a second: counts of the checks of each device's cyclic frames |
 | /events | foxglove_msgs/msg/Log | when something happens |
 | /truth | adacd_hil_msgs/msg/Truth | every cycle, in the emulator's own log; records.TRUTH_LAYOUT |
 """
@@ -100,7 +100,7 @@ class LogChannel:
 
 
 class BlockSize(NamedTuple):
-    """What the block of /scheme is laid out for; further_count and channel_count: see `records.certified_layout`."""
+    """Counts that size the block of /scheme; further_count and channel_count: see `records.certified_layout`."""
 
     parameter_count: int
     further_count: int = 0
