@@ -1,7 +1,7 @@
 """Two runs beside each other: settings, decisions field by field, states, contacts, parameters, timing.
 
-The comparison pairs cycles that lie equally long after *motion start*, the first cycle in ADAPT; where there is none,
-after the first of the log. It matches contacts by the time of their detection since then. It reads logs in pieces and
+The comparison pairs cycles that lie equally long after *motion start*, the first cycle in ADAPT; in a log without one,
+after its first cycle. It matches contacts by the time of their detection since then. It reads logs in pieces and
 keeps a digest of each run.
 """
 
@@ -55,7 +55,7 @@ class RunDigest:
 
 
 class RunReader:
-    """One of the logs: rows of /scheme with their cycle since motion start, and what is kept of it."""
+    """One of the logs: rows of /scheme with their cycle since motion start, and the digest of the log."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -80,7 +80,7 @@ class RunReader:
         return self._zero[1]
 
     def only(self, first: int, end: int) -> None:
-        """Read nothing but the cycles between two numbers since motion start."""
+        """Limit the reading to the cycles between two numbers since motion start."""
         self._bounds = first + self.zero_cycle, end + self.zero_cycle
 
     def _wanted(self, series: Series) -> Series:
@@ -308,8 +308,8 @@ def compare_logs(
 ) -> LogComparison:
     """Compare two logs. Raises LogError, ConfigError.
 
-    stretch: of the first log; of the second the cycles that lie equally long after its motion start. LogError is also
-    raised when one of them has none.
+    stretch: of the first log; the second is read over the same time after its own motion start. Raises LogError also
+    when one of the logs has no cycle in it.
     """
     readers = RunReader(first), RunReader(second)
     period_s = readers[0].settings.bus.period_s
