@@ -17,7 +17,7 @@ _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 
 
 class Bag(NamedTuple):
-    """What is in a bag: the type of each topic, and how messages of one are read."""
+    """The contents of a bag: the type of each topic, and a function that reads the messages of one."""
 
     topics: Mapping[str, str]
     messages: Callable[[str], Iterator[tuple[int, JointStateMessage]]]  # with when they were recorded, ns
@@ -31,7 +31,7 @@ def is_bag(path: Path) -> bool:
         with open_input(path) as file:
             return file.peek(16).startswith((_MCAP_MAGIC, _BAG_MAGIC, _SQLITE_MAGIC))
     except OSError:
-        return False  # who reads it says why it can't be
+        return False  # its reader raises the reason
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, HEAD, INDEX_ENTRY, 
 
 @dataclass
 class ChunkFacts:
-    """What a chunk index must say of a chunk."""
+    """The values that the index of a chunk must have."""
 
     length: int
     message_start_time: int
@@ -115,7 +115,7 @@ class ChunkCheck:
             self._findings.add("chunk-times", text, offset)
 
     def _expect(self, contents: Contents, facts: ChunkFacts) -> None:
-        """Note what the indexes of the chunk must be."""
+        """Store the message indexes that the chunk must have."""
         order = np.argsort(contents.channels, kind="stable")
         channels, firsts = np.unique(contents.channels[order], return_index=True)
         groups = np.split(contents.entries[order], firsts[1:])
@@ -223,11 +223,11 @@ class SummaryCheck:
         self._findings = findings
         self._definitions = definitions
         self._chunks = chunks
-        self._attachments: dict[int, AttachmentIndex] = {}  # what the indexes must be, by offset
+        self._attachments: dict[int, AttachmentIndex] = {}  # the indexes that the summary must have, by offset
         self._metadata: dict[int, MetadataIndex] = {}
         self._attachment_count = self._metadata_count = 0
         self._indexed: set[int] = set()
-        self._start = 0  # of the summary; 0: none so far
+        self._start = 0  # of the summary; 0: not reached so far
         self._groups: list[list[int]] = []  # opcode, start, end of each
         self._offsets: list[tuple[int, SummaryOffset]] = []
         self._offset_start = 0
@@ -366,7 +366,7 @@ class SummaryCheck:
         for what, (said, real) in pairs.items():
             if said != real:
                 self._findings.add("statistics", f"there are {real} {what}, the Statistics say {said}")
-        # Some writers count what the summary alone defines, some don't.
+        # Some writers count the schemas and channels that only the summary defines, some don't.
         for what, said, data, summary in (
             ("schemas", statistics.schema_count, self._definitions.schemas, self._definitions.summary_schemas),
             ("channels", statistics.channel_count, self._definitions.channels, self._definitions.summary_channels),
