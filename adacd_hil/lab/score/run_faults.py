@@ -125,7 +125,7 @@ class CyclicDataGatherer:
         self._present = 0, 0, last
 
     def data(self, run: Run) -> CyclicData:
-        """Sum up what has been taken in. run: has the cycles in which the state changes."""
+        """Return the shares of incomplete and aged data so far. run: has the cycles in which the state changes."""
         self._end_window()
         limits = run.settings.data
         shares = {name: count / self._logged for name, count in self._counted.items()} if self._logged else {}

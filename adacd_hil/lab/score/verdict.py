@@ -274,7 +274,7 @@ def compare_with_paper(
 
 
 def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, ...]:
-    """Leave out the paper's numbers, and lines that then say nothing, where anything else was played."""
+    """Leave out the paper's numbers, and rows that are then empty, unless the run was the paper's experiment."""
     if is_papers_experiment(run):
         return tuple(rows)
     return tuple(
@@ -354,7 +354,7 @@ def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
 
 
 def data_text(data: CyclicData) -> str:
-    """Say in a clause of the verdict how much of the data came; nothing where the drives never had torque."""
+    """Return the verdict's clause on the share of data that arrived; "" if the drives never had torque."""
     if not data.cycles:
         return ""
     if data.incomplete is None:
