@@ -3,7 +3,7 @@
 A browser sends with every WebSocket the origin of the page that opens it, and lets any page open one to this machine:
 so a page that is not a viewer's must be refused, or a stranger's page could read the run (cross-site WebSocket
 hijacking). A page that reaches this machine by a name of its own (DNS rebinding) also shows itself by the Host that it
-asks for. Programs that are no browsers send no origin; admission does not keep out anybody who can start one on this
+asks for. Other programs send no origin: admission does not keep out a person who can start one on this
 network.
 """
 

@@ -1,7 +1,7 @@
 """The live view's records: from the writer into a ring that a process of its own looks into, and which are shown.
 
-Nothing here waits for that process. Records that find the ring full are not shown; one that is stopped, dead or busy
-with five hundred viewers costs the log nothing. Only the writer's start waits until it listens, or says why it can't.
+The writer never waits for that process. Records that find the ring full are not shown; a process that is stopped, dead
+or busy with five hundred viewers does not delay the log. Only the writer's start waits until it listens or fails.
 
 **Topics**: those of a log, fewer records of them, and three that are drawn from these.
 
@@ -191,7 +191,7 @@ class LiveFeed:
 RATES_HZ = {TRANSFORMS_TOPIC: 50, SCENE_TOPIC: 10, **{topic.name: topic.rate_Hz for topic in RUN_TOPICS}}
 DECODED_RATE_HZ = 10
 EVERY_RECORD = 0
-"""The rate of topics that have none, as /events, /contact and /frame_checks."""
+"""The rate of topics without a limit, as /events, /contact and /frame_checks."""
 
 
 def rate_of(topic: str) -> int:
