@@ -219,12 +219,12 @@ class BodyRegion:
 
     @property
     def transient_force_N(self) -> float | None:
-        """Transient limit; None where the standard gives none."""
+        """Transient limit; None if the standard lacks one."""
         return TRANSIENT_FACTOR * self.force_N if self.has_transient_limit else None
 
     @property
     def transient_pressure_N_cm2(self) -> float | None:
-        """Transient limit of the most sensitive area; None where the standard gives none."""
+        """Transient limit of the most sensitive area; None if the standard lacks one."""
         return TRANSIENT_FACTOR * self.pressure_N_cm2 if self.has_transient_limit else None
 
 

@@ -50,7 +50,7 @@ class Bench:
         on_answer: Callable[[], None] = lambda: None,
         arm: MovableArm | None = None,
     ) -> None:
-        """Build and compile everything; nothing is sent before `boot`.
+        """Build and compile everything; the devices send no frame before `boot`.
 
         send: called with (identifier, data). on_answer: called when all that answers a SYNC has been sent. seed:
         outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
@@ -229,7 +229,7 @@ class Bench:
         return True
 
     def _ignore_sync(self, data: bytes, takers: Sequence[int]) -> None:
-        """Let the devices take note of a SYNC that none of them answers."""
+        """Let the devices take note of a SYNC that no device answers."""
         listeners, is_quiet = self._nodes.listeners, self.injector.is_quiet
         heard = listeners.everybody if is_quiet else self.injector.hear(self._sync_id, data)
         listeners.ignore(heard, takers, self._order.kind, self.time.now_ns)
@@ -296,7 +296,7 @@ class Bench:
             listeners.tell(heard, takers, order.kind, lost, now_ns)
             heard = [times * is_taken for times, is_taken in zip(heard, takers, strict=True)]
             self.injector.sync(heard, measured, now_ns)
-            if not self._is_wall:  # by the clock, a drive that hears no SYNC has nothing to count
+            if not self._is_wall:  # by the clock, a drive that hears no SYNC has no period to count
                 self._nodes.lose_sync(heard, now_ns)
         if now_ns >= self.time.due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
             self.time.poll(now_ns)

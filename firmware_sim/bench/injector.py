@@ -1,12 +1,12 @@
 """The application of a scenario's faults to the bench: frames both ways, measured values, and the nodes themselves.
 
 `firmware_sim.bench.fault_plan` decides which faults act now; the injector applies them. The delay of a host's frame
-counts from the SYNC before it, because by SYNC nobody knows when within the period the frame came.
+counts from the SYNC before it, because by SYNC the time of the frame within the period is unknown.
 
 The devices' frames go to the bus at once, or later where a fault delays them (`Outbox`). By SYNC, time stands still
 while the bench answers one, so the frames released within the next period go out together, in the order of release.
 Marks tell a host in lockstep when each frame is released (`adacd_hil.wire.time_marks`); an undisturbed answer needs
-none.
+no mark.
 """
 
 import heapq

@@ -25,7 +25,7 @@ COUNT = 8
 
 
 class PdoUser:
-    """The device's side of its PDOs. By itself it does nothing."""
+    """The device's side of its PDOs. The methods of this base class are empty."""
 
     def act(self, t_ns: int) -> None:
         """Act on a frame that doesn't wait for SYNC; its values have been written."""
@@ -179,7 +179,7 @@ class ReceivePdo(PdoRecord):
         self.pending = None
 
     def on_frame(self, data: bytes, t_ns: int) -> None:
-        """Take a frame in at the bench's time; one that fails a check changes nothing."""
+        """Take a frame in at the bench's time; a frame that fails a check has no effect."""
         layout = self.layout
         if len(data) != layout.length:
             self._is_length_wrong = True

@@ -7,7 +7,7 @@ brake, and so do shutdown and disable operation by 0x605B and 0x605C; everywhere
 Units on the wire: position in encoder counts, velocity in the LSB of the contract, torque in per mille of rated torque
 0x6076, rated torque in mNm of the joint, or in the count of an arm of one's own, behind the gear.
 
-While the motor is powered, SDO writes nothing but the controlword and clears the error history. While an RPDO brings
+While the motor is powered, SDO writes only the controlword and clears the error history. While an RPDO brings
 the controlword, SDO writes only those that take the power away: Disable voltage and Quick stop.
 
 Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statusword 0x6041.
@@ -96,7 +96,7 @@ class DriveNode(Application):
         self._received_word: int | None = None
         self._controlword = 0
         self.error_code = 0
-        """0x603F: the fault that is latched, 0 for none."""
+        """0x603F: the fault that is latched, 0 without a fault."""
         self._cause: Watchdog | None = None
         self._failure = 0
         self._is_found_by_time = False
@@ -286,7 +286,7 @@ class DriveNode(Application):
             self._latch(self._failure, None, t_ns)
 
     def leave_operational(self, t_ns: int) -> None:
-        """Fault: without PDOs there is no command."""
+        """Fault: without PDOs no command arrives."""
         if self.state in _POWERED:
             self._fault(Watchdog.OPERATIONAL, t_ns)
 
@@ -492,7 +492,7 @@ class DriveNode(Application):
 
     @property
     def _obstacle(self) -> int:
-        """0x2212, why there is no Operation enabled: 0 nothing, 1 no PDO is exchanged, 2 none brings commands."""
+        """0x2212, reason against Operation enabled: 0 no reason, 1 PDOs are not exchanged, 2 no PDO brings commands."""
         if self._pdos.is_commandable:
             return 0
         return 2 if self.device.is_operational else 1

@@ -115,14 +115,14 @@ STATE_BITS = {
 
 
 def find_transition(state: DriveState, event: DriveEvent) -> StateTransition | None:
-    """Return the transition that `event` causes in `state`, None when it causes none."""
+    """Return the transition that `event` causes in `state`, None without one."""
     return _BY_SOURCE.get((state, event))
 
 
 def decode_command(controlword: int, previous: int) -> DriveEvent | None:
-    """Name the command of a controlword, None when it carries none (CiA 402-2, command coding).
+    """Name the command of a controlword, None without one (CiA 402-2, command coding).
 
-    Fault reset is the rising edge of bit 7; while bit 7 stays set there is no command.
+    Fault reset is the rising edge of bit 7; while bit 7 stays set, a controlword carries no command.
     """
     if controlword & _FAULT_RESET:
         return None if previous & _FAULT_RESET else DriveEvent.FAULT_RESET
@@ -238,7 +238,8 @@ class Motor(NamedTuple):
     """The drive's knowledge of its motor without the bus: velocity in rad/s, torque in Nm.
 
     is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
-    fault that the motor's state calls for now, 0 for none. is_ideal: neither ever is, so that nobody has to ask.
+    fault that the motor's state calls for now, 0 without a fault. is_ideal: neither ever occurs, so both need no
+    check.
     """
 
     velocity_rad_s: Callable[[], float]

@@ -176,7 +176,7 @@ class FaultSettings:
 
     @property
     def nodes(self) -> tuple[int, ...]:
-        """Places in `NODES` of those that it befalls; none where it is the host."""
+        """Places in `NODES` of the devices that the fault affects; () for the host."""
         if self.node == HOST:
             return ()
         names = FRAME_NODES[self.frame] if self.frame is not None else NODES
