@@ -1,6 +1,6 @@
 """The effects of a scenario's faults over time: on frames, on measured values, and on nodes.
 
-A bench tells the plan the time at every SYNC and whenever `wait_ns` is over; then it asks for the effects. The plan
+A bench passes the time to the plan at every SYNC and whenever `wait_ns` is over; then it reads the effects. The plan
 recognises frames by the contract's identifiers. Nodes are places in `NODES`; times are ns.
 """
 
@@ -98,7 +98,7 @@ class FaultPlan:
 
     @property
     def wait_ns(self) -> int:
-        """How long after the last `advance` a row begins or ends by time, or a node's storm goes on, at the latest."""
+        """Time from the last `advance` to the next beginning or end of a row, or the next EMCY of a storm, at most."""
         wait_ns = NEVER_NS
         for now_ns, next_ns in (
             (self._scenario_ns, self._next_scenario_ns),

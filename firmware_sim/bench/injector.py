@@ -164,12 +164,12 @@ class Injector:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether frames and values are left alone now."""
+        """Whether no fault changes frames or values now."""
         return self.plan.is_quiet
 
     @property
     def due_ns(self) -> int:
-        """When a fault begins, ends or goes on."""
+        """Time of the next beginning, end or repetition of a fault."""
         return min(self.now_ns + self.plan.wait_ns, self._flooded_ns if self.plan.is_flooding else NEVER_NS)
 
     def sender(self, place: int) -> Send:

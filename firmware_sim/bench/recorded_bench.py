@@ -122,7 +122,7 @@ _TORQUES = ("Sensor1Torque", "Sensor2Torque")
 
 
 class RecordedBody:
-    """The arm as its recorded frames show it, for the nodes' objects and standstill; it knows no truth."""
+    """The arm as its recorded frames show it, for the nodes' objects and standstill; it has no truth."""
 
     has_ideal_motors = True
     is_torque_limited = (False, False)
@@ -182,7 +182,7 @@ class RecordedBody:
 
 
 class RecordedBench(Bench):
-    """A bench whose cyclic frames come from a recording, or from somebody else on the bus."""
+    """A bench whose cyclic frames come from a recording, or from another sender on the bus."""
 
     def __init__(
         self,

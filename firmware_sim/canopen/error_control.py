@@ -288,7 +288,7 @@ class SyncOrder:
         self.counter = 0
         """Of the last SYNC that was taken, 0 before the first; counted if SYNC has no counter."""
         self.periods = 1
-        """By how many the last SYNC went on; 1 where that isn't known."""
+        """Periods from the SYNC before to the last one; 1 if unknown."""
         self._is_timed = is_timed
         self._last_ns = 0
         self._lateness_ns = 0.0
@@ -298,7 +298,7 @@ class SyncOrder:
         self.counter = 0
 
     def periods_to(self, counter: int, overflow: int) -> int:
-        """Return by how many periods a SYNC with this counter goes on, 1 where a counter is missing."""
+        """Return the periods from the last SYNC to one with this counter; 1 if a counter is missing."""
         return (counter - self.counter) % overflow if counter and self.counter else 1
 
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:

@@ -78,7 +78,7 @@ class DriveNode(Application):
         self.torque_Nm = 0.0
         self.state = DriveState.START
         self.has_news = False
-        """Whether something has changed that the bus hasn't been told."""
+        """Whether a change waits to be sent on the bus."""
         self._pdos = device.pdos
         self._clock = device.clock
         self._tripped = device.watchdogs.tripped
@@ -112,7 +112,7 @@ class DriveNode(Application):
         self._shown_mode = self._told_mode = self._meanwhile = self._mode
         self._told_ns = 0
         self._enabling_ns: int | None = None
-        """When Enable operation was first asked for; None: it isn't."""
+        """Time of the first command Enable operation; None without one."""
         device.pause_ns = round(habits.pause_ms * 1e6)
         self._patience = Patience(device)
         self._serve(codec)

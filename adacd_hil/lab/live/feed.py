@@ -225,7 +225,7 @@ _BODY = len(ENCAPSULATION) + 8
 
 
 class Shown(NamedTuple):
-    """A message for those who have subscribed to its topic."""
+    """A message for the viewers that have subscribed to its topic."""
 
     channel: int
     log_ns: int
@@ -258,7 +258,7 @@ class LiveTopics:
         self._description = pack_string(setup.robot_description)
 
     def description(self) -> Shown:
-        """Return the arm's description, for somebody who has just asked for it."""
+        """Return the arm's description, for a viewer that has just subscribed to it."""
         return Shown(self.robot, self.latest_ns, self._description)
 
     def choose(self, batch: Batch, wanted: Collection[int]) -> Iterator[Shown]:

@@ -167,7 +167,7 @@ class LiveServer:
     # -- the writer -----------------------------------------------------------------------------------------------
 
     def _hear(self) -> None:
-        """Take the writer's words; whatever they are, look into the ring."""
+        """Receive all waiting words of the writer; after any of them, look into the ring."""
         word: bytes | None = None
         with contextlib.suppress(BlockingIOError):
             while True:
@@ -203,7 +203,7 @@ class LiveServer:
                 viewer.put(_TIME.pack(_TIME_DATA, log_ns))
 
     def _tell_writer(self) -> None:
-        """Say whether somebody has subscribed to something, where that has changed."""
+        """Notify the writer when the first viewer subscribes, or the last subscription ends."""
         is_watched = any(viewer.subscriptions for viewer in self._viewers)
         if is_watched != self._is_watched:
             self._is_watched = is_watched

@@ -36,7 +36,7 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def opened_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag. Raises LogError for whatever its reader raises."""
+    """Open a bag. Raises LogError for any error of its reader."""
     try:
         if not path.is_dir():
             with open_input(path) as file:
@@ -53,7 +53,7 @@ def opened_bag(path: Path) -> Iterator[Bag]:
         raise
     except OSError as error:
         raise LogError(f"recording {path}: {error.strerror or error}") from None
-    except Exception as error:  # whatever a reader makes of damaged bytes
+    except Exception as error:  # damaged bytes can raise any error
         remedy = "; `adacd-hil log recover` saves what is left of a cut MCAP file" if path.suffix == ".mcap" else ""
         reason = " ".join(str(error).split()) or type(error).__name__
         raise LogError(f"recording {path} can't be read: {reason}{remedy}") from None

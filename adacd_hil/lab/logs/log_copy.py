@@ -156,7 +156,7 @@ def _gather(
 
 
 class _CopyTarget:
-    """A file beside the one that it becomes."""
+    """A temporary file beside its final name, renamed by `commit`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -134,7 +134,7 @@ class Tables:
         self.rows[path] += len(columns["t_ns"])
 
     def _path(self, topic: str) -> Path:
-        """Name the file of a topic: one of its own, whatever others have called their topics."""
+        """Name a file for one topic only, even if the names of other topics give the same file name."""
         stem = re.sub(r"[^\w.-]", "_", topic.strip("/"))[:_LONGEST_STEM] or "_"
         stems = itertools.chain((stem,), (f"{stem}_{number}" for number in itertools.count(2)))
         paths = (self._folder / f"{stem}.{self._kind}" for stem in stems)

@@ -345,7 +345,7 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
 
 
 def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
-    """Return the unit that torques are meant in if they are off by 1000; "" if they aren't.
+    """Return the probable unit of torques if they are off by 1000; "" if they aren't.
 
     Some URDFs have masses of a thousandth for the sake of a simulator: with a plausible inertia, torques are not mNm.
     """

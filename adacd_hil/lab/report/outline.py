@@ -42,7 +42,7 @@ class Facts:
         self.reports: list[ContactReport] = []
         self.events: list[LoggedEvent] = []
         self.finish_cycle: int | None = None
-        """In which the user asked to finish."""
+        """Cycle of the first request to finish."""
         self.motion_start_ns: int | None = None
         """The first cycle in ADAPT."""
         self.first_ns: int | None = None
@@ -60,7 +60,7 @@ class Facts:
         return next((t_ns for t_ns in (self.motion_start_ns, self.first_ns) if t_ns is not None), 0)
 
     def add(self, stream: LogStream, piece: Piece) -> None:
-        """Take in the next piece."""
+        """Add the facts of the next piece."""
         self.reports += [entry.report for entry in contacts_of(piece.series["/contact"])]
         self.events += stream.events(piece)
         self._checks += _checks_of(piece.series["/frame_checks"])
@@ -80,7 +80,7 @@ class Facts:
         self.cycles += len(scheme)
 
     def apply(self, run: Run) -> Run:
-        """Give a run that knows them."""
+        """Return a run with these facts, else as `run`."""
         return dataclasses.replace(
             run,
             reports=tuple(self.reports),
@@ -174,7 +174,7 @@ class Outline:
         self._busy_ns = 0  # time of the last cycle in a state of `BUSY`, or of a later row of the truth
 
     def add(self, stream: LogStream, piece: Piece) -> None:
-        """Take in the next piece."""
+        """Add the next piece: its facts, and the rows of the outline."""
         before = self.facts.cycles
         self.facts.add(stream, piece)
         scheme = piece.series["/scheme"]
@@ -319,7 +319,7 @@ MARGIN_S: Final = 0.2
 
 
 def settling_s(run: Run) -> float:
-    """Give after how long a contact or a reaction is forgotten."""
+    """Return the time after which a contact or a reaction has left the filters, s."""
     return SETTLING_TIME_CONSTANTS / run.a_rad_s
 
 

@@ -191,7 +191,7 @@ def left_out_text(metrics: Metrics, most: int) -> str:
 def contact_rows(
     metrics: Metrics, contacts: Sequence[ReportedContact]
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Give head and rows of a list of contacts, where it is known with the delay of the paper's scheme beside."""
+    """Give head and rows of a list of contacts, with the delay of the paper's scheme if it is known."""
     rows = [_contact_words(contact) for contact in contacts]
     beside = shown_beside(metrics)
     if beside is None or not beside.contacts:

@@ -248,7 +248,7 @@ def _force(contact: ReportedContact) -> tuple[str, str]:
 
 
 def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Give each joint's peak and impulse; a peak without its deviation where that is not told."""
+    """Give each joint's peak and impulse; a peak without its deviation if that is unknown."""
     unknown = (None, None)
     impulses = contact.impulse_Nm_s or unknown
     impulse_sigmas = contact.impulse_sigma_Nm_s or unknown

@@ -59,7 +59,7 @@ TIME_BUCKETS: Final = 4_000
 ADAPTATION_CYCLES: Final = 10_000
 _AROUND_S: Final = (0.15, 0.6)
 _AFTER_ADAPTATION: Final = 0.1
-"""Share of an adaptation's length by which its figure goes on."""
+"""Share of an adaptation's length that its figure shows after its end."""
 _ROOM: Final = 200_000
 """Rows to allocate at first; most runs keep fewer."""
 _NOISE_STRETCHES: Final = 16

@@ -183,7 +183,7 @@ def _parameters(run: Run) -> Iterator[TracePanel]:
 
 
 def _true_parameter(run: Run, name: str) -> Vector | None:
-    """Give a parameter's true value in each cycle (n,); None where it is not known."""
+    """Give a parameter's true value in each cycle (n,); None if it is unknown."""
     truth = run.truth
     if truth is None or name not in PARAMETER_NAMES:
         return None

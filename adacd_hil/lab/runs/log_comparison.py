@@ -200,7 +200,7 @@ class FieldDifference(NamedTuple):
     largest: float
 
     def as_json(self) -> dict[str, Any]:
-        """Give it in plain values; `largest` is None where it is infinite."""
+        """Return plain values for JSON; `largest` is None if it is infinite."""
         return self._asdict() | {"largest": self.largest if math.isfinite(self.largest) else None}
 
 

@@ -387,7 +387,7 @@ def _first_model(summary: RunSummary, table: Mapping[str, Any]) -> _Model:
 
 
 def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> Pair | None:
-    """Give the friction that the paper's scheme has identified; it knows no deviation."""
+    """Return the friction that the paper's scheme has identified, without deviation."""
     if section is None or section not in parameters:
         return None
     values = {name: _number(pair[1]) for name, pair in parameters[section].items()}

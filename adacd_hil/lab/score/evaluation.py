@@ -344,7 +344,7 @@ class TimingGatherer:
         self._reactions: Distribution | None = None
 
     def add(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
-        """Take in the next cycles. reactions: see `collect_evidence`."""
+        """Add the next cycles. reactions: see `collect_evidence`."""
         self._cycles += len(columns)
         for quantity in QUANTITIES:
             self._add_times(quantity, columns)

@@ -104,7 +104,7 @@ def _margin_text(evidence: CertifiedEvidence | None) -> str:
 
 
 def _fault_texts(faults: tuple[Fault, ...]) -> list[str]:
-    """Say which faults there were: the first, and the one that the run ended in."""
+    """Return texts of the faults: the first one, and the one in which the run ended."""
     if not faults:
         return []
     last = faults[-1]

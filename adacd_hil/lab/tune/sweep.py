@@ -383,7 +383,7 @@ class _Flights:
                     yield from self._fail(task, f"{type(error).__name__}: {error}", self._again)
 
     def _launch(self) -> bool:
-        """Begin as many tasks as there is room for; return whether any is in flight."""
+        """Submit tasks until the workers are full; return whether any is in flight."""
         if not self._flying:
             self._is_alone = bool(self._suspects)
         room = 1 if self._is_alone or self._suspects else self._workers.room

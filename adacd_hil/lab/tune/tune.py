@@ -58,7 +58,7 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names, to_toml
 
 FARTHEST: Final = 100.0
-"""Extrapolation beyond which filters and gains are not told apart: thresholds of equal ones differ by a factor of 4."""
+"""Extrapolation beyond which filters and gains are not ranked: thresholds of equal ones differ by a factor of 4."""
 
 
 def tune(

@@ -309,14 +309,14 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeW
 
 
 class _Index:
-    """Gathers the cycles of a log, in arrays that grow where they are: joined in the end, they would be there twice."""
+    """Gathers the cycles of a log in growing arrays: joining pieces at the end would need twice the memory."""
 
     def __init__(self) -> None:
         self.attempts = AttemptBegins()
         self._cycle, self._t_ns, self._before, self._threshold = array("q"), array("q"), array("B"), array("d")
 
     def add(self, scheme: Series) -> None:
-        """Take in the next piece of /scheme."""
+        """Add the next piece of /scheme."""
         self.attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
         self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
         self._t_ns.frombytes(scheme.t_ns.tobytes())
@@ -352,7 +352,7 @@ def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterat
 
 
 def _windows(touches: Sequence[TouchWindow], t_ns: Times, place: int | None) -> tuple[Window, ...]:
-    """Give the rows of contacts. place: of the log; None where there is one log only."""
+    """Give the rows of contacts. place: of the log; None for a single log."""
     onsets_ns = np.array([touch.onset_ns for touch in touches], np.int64)
     until_ns = explained_until(onsets_ns, np.array([touch.forgotten_ns for touch in touches], np.int64))
     firsts = np.searchsorted(t_ns, onsets_ns).tolist()

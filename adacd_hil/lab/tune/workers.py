@@ -133,7 +133,7 @@ class ProcessWorkers:
         self._pool = self._open()
 
     def end(self) -> None:
-        """End all processes, whatever they do."""
+        """End all processes, with or without a task."""
         processes: set[BaseProcess] = set(multiprocessing.active_children()) - self._others
         self._pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:

@@ -43,7 +43,7 @@ class DefinitionCheck:
         self._duplicates: set[str] = set()
 
     def schema(self, schema: Schema, offset: int, is_summary: bool) -> None:
-        """Take in a schema."""
+        """Check a schema and compare it with earlier ones of its number."""
         name = f"schema {schema.id}"
         if schema.id == 0:
             self._findings.add("schema-id", f"schema {schema.name!r} has the number 0", offset)
@@ -62,7 +62,7 @@ class DefinitionCheck:
             self.schemas.setdefault(schema.id, schema)
 
     def channel(self, channel: Channel, offset: int, is_summary: bool) -> None:
-        """Take in a channel."""
+        """Check a channel and compare it with earlier ones of its number."""
         name = f"channel {channel.id}"
         known = self.channels.get(channel.id)
         if known is not None:
@@ -137,7 +137,7 @@ class ContentCheck:
                 self._findings.add("schema-text", f"schema {schema.id} ({schema.name}): {problem}", offset)
 
     def messages(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
-        """Take in the messages of a chunk."""
+        """Check order and payloads of the messages of a chunk."""
         for number in np.unique(contents.channels).tolist():
             if number not in self._described and number in definitions.channels:
                 channel = definitions.channels[number]

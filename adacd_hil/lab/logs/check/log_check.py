@@ -141,7 +141,7 @@ class _FileCheck:
             self._findings.add("record", str(error), record.offset)
 
     def _count(self, record: RawRecord) -> None:
-        """Count records of which there is one."""
+        """Count records that a file may have only once."""
         opcode = Opcode(record.opcode)
         self._counts[opcode] += 1
         if self._counts[opcode] > 1:
