@@ -268,7 +268,7 @@ def collect_forces(
 
 @compiled
 def is_free(joint: int, state: np.void, mechanics: np.void) -> bool:
-    """Say whether a link is free of dry friction and brake, so that it never sticks."""
+    """Tell whether a link is free of dry friction and brake, so that it never sticks."""
     is_braked = mechanics["stiffness_Nm_rad"][joint] == 0.0 and state["brake_Nm"][joint] != 0.0
     return bool(mechanics["is_free"][joint] != 0.0 and not is_braked)
 

@@ -351,7 +351,7 @@ def integrate_mechanics(
 
 @compiled
 def _has_stiff_motor(joint: int, mechanics: np.void, forces: np.void) -> bool:
-    """Whether a stiff joint has a rotor or friction on its motor side, so that the sensor misses part of the torque."""
+    """Tell whether a stiff joint has a rotor or friction on its motor side, so the sensor misses part of the torque."""
     has_friction = mechanics["motor_viscous_Nm_s"][joint] != 0.0 or forces["motor_level_Nm"][joint] != 0.0
     is_stiff = mechanics["stiffness_Nm_rad"][joint] == 0.0
     return bool(is_stiff and (has_friction or mechanics["rotor_inertia_kg_m2"][joint] != 0.0))

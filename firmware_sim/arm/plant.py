@@ -172,7 +172,7 @@ def accelerate(
 def decide_slips(
     state: np.void, arm: np.void, torque1: float, torque2: float, q2: float, dq1: float, dq2: float
 ) -> tuple[int, int]:
-    """Say how each joint goes on: the sign of its velocity, or at standstill whether and which way it breaks away.
+    """Return the slip of each joint: the sign of its velocity, or at standstill of its breakaway, 0 if it sticks.
 
     At standstill exactly one choice fits friction's law, because the inertia is positive definite: joints that stick
     need no more than F_c, joints that slip accelerate the way they slip. Within rounding of the limit no choice may

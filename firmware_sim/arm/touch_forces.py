@@ -162,7 +162,7 @@ def _joint_torque(
 
 @compiled
 def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float, float, float]:
-    """Say where a body's link meets it: penetration and point along the link in m, normal x, y, distance across in m.
+    """Return where a body's link meets it: penetration and point along the link, m; normal x, y; distance across, m.
 
     The normal points from the link to the body; the last is the signed distance of its centre from the link's line.
     """

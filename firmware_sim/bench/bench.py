@@ -133,7 +133,7 @@ class Bench:
         self.time.advance_to(t_ns)
 
     def outlive_host(self) -> None:
-        """By SYNC, let the time pass that no host gives any more, until the arm is at rest, for 5 s at most."""
+        """Let time pass without a host, by SYNC, until the arm is at rest, for 5 s at most."""
         self.time.outlive_host()
 
     def release(self) -> None:
@@ -254,7 +254,7 @@ class Bench:
         self.time.end_sync(self.cycle, t_ns)
 
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
-        """By SYNC, let the period of a SYNC pass that a fault keeps from all devices; their other frames go out."""
+        """Let the period of a SYNC pass, by SYNC, if a fault keeps it from all devices; their other frames go out."""
         is_counted = self._order.counter != 0 and any(self._nodes.listeners.takers(data)) and self._judge(data, t_ns)
         if is_counted and self.time.has_begun:
             self._nodes.listeners.miss(self._lost_syncs + 1)

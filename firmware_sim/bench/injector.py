@@ -232,7 +232,7 @@ class Injector:
                 self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
 
     def hear(self, sync_id: int, data: bytes) -> tuple[int, ...]:
-        """Tell how often each node hears a SYNC that is on the bus once."""
+        """Return how often each node hears a SYNC that is on the bus once."""
         plan = self.plan
         return tuple(
             len(plan.receive(place, sync_id, data)) * device.is_on_bus for place, device in enumerate(self._devices)

@@ -197,7 +197,7 @@ class ReceivePdo(PdoRecord):
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
     def is_late(self, t_ns: int) -> bool:
-        """Whether its deadline is over."""
+        """Tell whether its deadline is over."""
         return self.timer_ns > 0 and self.acted_ns is not None and t_ns - self.acted_ns >= self.timer_ns
 
 
@@ -257,7 +257,7 @@ class Pdos:
         return any(pdo.is_command for pdo in self._receiving)
 
     def brings(self, index: int, subindex: int) -> bool:
-        """Whether a PDO is exchanged that brings values of an object."""
+        """Tell whether an exchanged PDO brings values of an object."""
         return any((index, subindex) in pdo.layout.keys for pdo in self._receiving)
 
     def accept(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
@@ -339,7 +339,7 @@ class Pdos:
         return is_commanded
 
     def find_late(self, t_ns: int) -> bool:
-        """Whether an RPDO's deadline is over."""
+        """Tell whether the deadline of some RPDO is over."""
         return any(pdo.is_late(t_ns) for pdo in self._receiving)
 
     @property

@@ -108,14 +108,14 @@ class Service:
                 return
 
     def _patience_s(self) -> float:
-        """Say how long to wait for a frame."""
+        """Return the time to wait for a frame, s."""
         if not self._is_wall:
             return _IDLE_NS * 1e-9
         due_ns = self._bench.due_ns - self._clock.now_ns()
         return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
 
     def _pass_time(self, now_ns: int, is_idle: bool) -> None:
-        """Tell the bench the time: by wall clock whenever no frame waits, by SYNC when no SYNC has come for a while.
+        """Pass the time to the bench: by wall clock whenever no frame waits, by SYNC when no SYNC has come for a while.
 
         A host in lockstep sends the time itself, until it has gone. A host that has gone is outlived.
         """

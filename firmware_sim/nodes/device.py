@@ -259,7 +259,7 @@ class EmulatedDevice(ObjectDictionary):
         self._errors.report(code, t_ns, time_ms=self._time_ms(t_ns))
 
     def report_no_error(self, t_ns: int) -> None:
-        """Say by an EMCY with code 0 that a fault was reset."""
+        """Report the reset of a fault by an EMCY with code 0."""
         self._errors.report(0, t_ns)
 
     def poll(self, t_ns: int) -> int:

@@ -272,7 +272,7 @@ class DriveNode(Application):
         return self._clock.bench_ns(due_ns)
 
     def fail(self, code: int, t_ns: int) -> None:
-        """Fault by itself, with an error code of 0x603F; its cause stays until `mend`."""
+        """Enter Fault with an error code of 0x603F; its cause stays until `mend`."""
         self._failure = code
         self._feel_failure(self._clock.own_ns(t_ns))
 
@@ -281,12 +281,12 @@ class DriveNode(Application):
         self._failure = 0
 
     def _feel_failure(self, t_ns: int) -> None:
-        """Fault for a failure that lasts, after a reset again."""
+        """Enter Fault for a failure that lasts, again after a reset."""
         if self._failure and self.device.is_powered:
             self._latch(self._failure, None, t_ns)
 
     def leave_operational(self, t_ns: int) -> None:
-        """Fault: without PDOs no command arrives."""
+        """Enter Fault if powered: without PDOs no command arrives."""
         if self.state in _POWERED:
             self._fault(Watchdog.OPERATIONAL, t_ns)
 
@@ -296,7 +296,7 @@ class DriveNode(Application):
         self._find_command_pdo(t_ns)
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """Fault when powered."""
+        """Enter Fault if powered; else only trip the watchdog."""
         if self.state in _POWERED:
             self._fault(Watchdog.HEARTBEAT, t_ns, is_found_by_time=True)
         else:
@@ -307,7 +307,7 @@ class DriveNode(Application):
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def distrust_sync(self, t_ns: int) -> None:
-        """Fault when enabled: torque that acts at SYNC has no time."""
+        """Enter Fault if enabled: torque that acts at SYNC has no time."""
         if self.is_enabled:
             self._fault(Watchdog.SYNC, t_ns)
 

@@ -171,11 +171,11 @@ class Standstill:
         self._since_ns = self._moving_ns = 0
 
     def begin(self, t_ns: int) -> None:
-        """Braking begins."""
+        """Begin braking."""
         self._since_ns = self._moving_ns = t_ns
 
     def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
-        """Whether the motor stands still, or has braked for the longest time."""
+        """Tell whether the motor stands still, or has braked for the longest time."""
         if abs(velocity_rad_s) > _REST_RAD_S:
             self._moving_ns = t_ns
         return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS
@@ -229,7 +229,7 @@ class TorqueLimits:
         self._combine()
 
     def _combine(self) -> None:
-        """Of several limits the smallest counts."""
+        """Apply the smallest of several limits."""
         most, positive, negative = self._limits.values()
         self._low, self._high = -min(most, negative), min(most, positive)
 

@@ -98,7 +98,7 @@ class Admission:
         return origin.lower() in self._origins or _OWN_PAGE.fullmatch(origin.lower()) is not None
 
     def _is_own_host(self, host: str) -> bool:
-        """Whether a Host header, such as `name:port` or `[::1]:port`, is an address, or a name of this machine."""
+        """Return whether a Host header, as `name:port` or `[::1]:port`, is an address, or a name of this machine."""
         found = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::\d{1,5})?", host)
         if not found:
             return False

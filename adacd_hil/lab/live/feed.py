@@ -208,7 +208,7 @@ class Decimator:
         self._first_ns = -1  # the first cycle of the slot
 
     def choose(self, cycles_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Say which of the next records are shown (n,), by the times of their cycles, which never run backwards."""
+        """Choose the next records to show (n,), by the times of their cycles, which never run backwards."""
         if not self._slot_ns or not len(cycles_ns):
             return np.ones(len(cycles_ns), np.bool_)
         slots = cycles_ns // self._slot_ns

@@ -385,7 +385,7 @@ def listen(setup: LiveSetup) -> socket.socket:
 
 
 def url_of(setup: LiveSetup, listening: socket.socket) -> str:
-    """Say where viewers find it."""
+    """Return the URL for viewers."""
     host = f"[{setup.host}]" if ":" in setup.host else setup.host
     return f"ws://{host}:{listening.getsockname()[1]}"
 

@@ -71,7 +71,7 @@ class SalvagedLog:
         self.losses.missing_parts = [*self._missing(), *foreign]
 
     def _is_foreign(self, item: Metadata, is_vouched: bool) -> bool:
-        """Say whether a part is of another run: one damaged entry doesn't make it so."""
+        """Tell whether a part is of another run: one damaged entry doesn't make it so."""
         if item.name != RUN_METADATA:
             return False
         mine, theirs = (

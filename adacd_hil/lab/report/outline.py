@@ -189,7 +189,7 @@ class Outline:
             self._busy_ns = max(self._busy_ns, int(scheme.t_ns[busy[-1]]))
 
     def is_idle_since(self, t_ns: int) -> bool:
-        """Whether the last cycle in a state of `BUSY` and the last row of the truth so far are before a time."""
+        """Tell whether the last cycle in a state of `BUSY` and the last row of the truth so far are before a time."""
         return self._busy_ns < t_ns
 
     def _edges(self, scheme: Series) -> NDArray[np.int64]:

@@ -276,7 +276,7 @@ def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> ArmDrawing |
 
 
 def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Push | None:
-    """Say where the force of a contact is drawn: as reported, else as true, else not at all."""
+    """Return the place of a contact's force in the drawing: the reported one, else the true one, else None."""
     link = contact.link if contact.link_detected is None else contact.link_detected
     if link is None:
         return None

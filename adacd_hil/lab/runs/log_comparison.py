@@ -91,7 +91,7 @@ class RunReader:
         return series.part((cycle >= self._bounds[0]) & (cycle < self._bounds[1]))
 
     def _is_over(self, series: Series) -> bool:
-        """Tell whether all that is to be read has been."""
+        """Tell whether the reading has passed all cycles to compare."""
         return self._bounds is not None and bool(len(series)) and int(series.records["cycle"][0]) >= self._bounds[1]
 
     def __iter__(self) -> Iterator[NDArray[Any]]:

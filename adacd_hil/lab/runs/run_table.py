@@ -114,7 +114,7 @@ def in_order(runs: Iterable[RunSummary]) -> list[RunSummary]:
 
 
 def count_text(runs: Sequence[RunSummary]) -> str:
-    """Say how many runs there are, and how many of them are not good."""
+    """Return a phrase with the number of runs and of those that are not good."""
     text = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     bad = sum(run.status not in (GOOD, NOT_JUDGED, RUNNING) for run in runs)
     parts = [f"{bad} not good"] if bad else []

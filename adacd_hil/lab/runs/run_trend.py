@@ -215,7 +215,7 @@ def _last_changes(quantity: TrendQuantity) -> tuple[RunSummary, str]:
 
 
 def _settings_text(runs: Sequence[RunSummary], run: RunSummary) -> str:
-    """Say which settings a run changed against the one before it."""
+    """Return a phrase with the settings that a run changed against the one before it."""
     place = next(number for number, each in enumerate(runs) if each is run)
     if run.settings is None or runs[place - 1].settings is None:
         return "the settings are not known"

@@ -143,7 +143,7 @@ class CyclicDataGatherer:
 
 
 def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShares]:
-    """Tell the cycles of each device apart, from counts that begin anew in each attempt."""
+    """Return the shares of each device's cycles, from counts that begin anew in each attempt."""
     if checks is None or len(checks.cycle) < 2 or not run.cycle.size:
         return {}
     cycles = np.diff(checks.cycle)

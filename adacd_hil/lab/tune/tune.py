@@ -155,7 +155,7 @@ def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
 
 
 def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_per_h: float) -> tuple[str, ...]:
-    """Say why a candidate is not fit."""
+    """Return the reasons why a candidate is not fit; () if it is."""
     problems = []
     if choice.calibration is None:
         problems.append("too little motion for a tail")
