@@ -136,7 +136,7 @@ def touch_table(scenario: Scenario) -> Structured:
 
 
 def initial_touch_state(things: Structured) -> Vector:
-    """Give the touch state at power-on, all zero: without contact (TOUCH_HEADER + n THING_PLACES,)."""
+    """Return the touch state at power-on: no thing is in place yet (TOUCH_HEADER + n THING_PLACES,)."""
     return np.zeros(TOUCH_HEADER + things.size * THING_PLACES)
 
 

@@ -65,7 +65,7 @@ class DeviceRatings(NamedTuple):
         return degrees if _LEAST_LIMIT_DEG <= degrees <= _MOST_LIMIT_DEG else None
 
     def velocity_limit_deg_s(self, scale: ScaleSettings) -> float | None:
-        """Return 0x6080, rpm of the motor, at the joint; None if no joint reaches it, as with a factory's 50000."""
+        """Return 0x6080, rpm of the motor, at the joint; None if missing or implausible, as a factory's 50000."""
         rpm = self.numbers.get((0x6080, 0))
         gear = self.numbers.get((0x6091, 1), 0) / (self.numbers.get((0x6091, 2)) or 1) or scale.gear_ratio
         degrees_s = (rpm or 0) * _DEG_S_PER_RPM / gear

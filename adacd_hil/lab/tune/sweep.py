@@ -136,7 +136,7 @@ def _tuples(variants: Sequence[Mapping[str, str]]) -> tuple[Changes, ...]:
 SET: Final = "set."
 """Prefix of the columns of varied settings."""
 REFUSALS: Final = (ConfigError, CodecError, LogError)
-"""Errors that repeat at every attempt: they become a row with the reason, without a retry."""
+"""Errors that repeat at every attempt: they make a row with the reason."""
 
 Value = str | int | float | bool | None
 Values = dict[str, Value]
