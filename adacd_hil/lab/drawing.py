@@ -106,7 +106,7 @@ def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings:
 def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.intp]:
     """Choose the rows that keep the smallest and the largest value of each of `bins` equal parts, and both ends.
 
-    Rows ascend. A series of at most two rows per part is kept whole. NaN is chosen only where a part has nothing else.
+    Rows ascend. A series of at most two rows per part is kept whole. NaN is chosen only where a part has no number.
     """
     count = y.shape[0]
     width = -(-count // bins)

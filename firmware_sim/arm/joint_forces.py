@@ -23,7 +23,7 @@ are seen from the joint: a rotor's inertia is already multiplied by the square o
     τ_s   = K dead(q_m − q, b) + D (q̇_m − q̇)                        the torque that the sensor sees
     dead(x, b) = x − b/2 above b/2, x + b/2 below −b/2, 0 within     b: whole width of the backlash
 
-In the dead zone nothing is transmitted, damping included, and a flank only pushes: where K dead + D (q̇_m − q̇) would
+In the dead zone the gear transmits no torque, damping included. A flank only pushes: where K dead + D (q̇_m − q̇) would
 pull, the flanks have parted and τ_s is 0. Ripple is (amplitude + share · |τ_m|) sin(n q_m + phase).
 """
 
@@ -55,7 +55,7 @@ MECHANICS_NUMBERS: Final = float_fields(
         "capacity_J_K": PAIR,  # C, J/K; 0: the temperature stays
         "cooling_s": PAIR,  # t_cool, s
         "ambient_C": PAIR,  # T_ambient, °C
-        "is_free": PAIR,  # nothing dry in this joint, it never sticks
+        "is_free": PAIR,  # no dry friction in this joint, it never sticks
         "stiffness_Nm_rad": PAIR,  # K, Nm/rad; 0: the joint is stiff
         "damping_Nm_s": PAIR,  # D, Nm s/rad
         "rotor_inertia_kg_m2": PAIR,  # J, kg m²
@@ -177,7 +177,7 @@ FORCES: Final = float_fields(
 class Surroundings(NamedTuple):
     """Everything that acts on the arm in a tick: elements of MECHANICAL_STATE, ARM_NUMBERS, MECHANICS_NUMBERS; touches.
 
-    contact: one row of the contact table, or none. things: the touch table.
+    contact: one row of the contact table, or an empty array. things: the touch table.
     """
 
     state: np.void
@@ -268,7 +268,7 @@ def collect_forces(
 
 @compiled
 def is_free(joint: int, state: np.void, mechanics: np.void) -> bool:
-    """Say whether nothing dry acts on a link, so that it never sticks."""
+    """Tell whether a link is free of dry friction and brake, so that it never sticks."""
     is_braked = mechanics["stiffness_Nm_rad"][joint] == 0.0 and state["brake_Nm"][joint] != 0.0
     return bool(mechanics["is_free"][joint] != 0.0 and not is_braked)
 

@@ -318,7 +318,7 @@ def integrate_mechanics(
 ) -> None:
     """Advance the mechanical state and the touch state by `step_s` in `substeps` substeps.
 
-    contact: one row of the contact table, or none; elapsed_s: since its onset. things, touch_state: table and state of
+    contact: one row of the contact table, or empty; elapsed_s: since its onset. things, touch_state: table and state of
     bodies, hands and walls for `firmware_sim.arm.touch_forces.touch`; time_s: scenario time,
     negative before the scenario starts. target: set-points of the drives' torque loops, Nm. space: from
     `work_space`.
@@ -351,7 +351,7 @@ def integrate_mechanics(
 
 @compiled
 def _has_stiff_motor(joint: int, mechanics: np.void, forces: np.void) -> bool:
-    """Whether a stiff joint has a rotor or friction on its motor side, so that the sensor misses part of the torque."""
+    """Tell whether a stiff joint has a rotor or friction on its motor side, so the sensor misses part of the torque."""
     has_friction = mechanics["motor_viscous_Nm_s"][joint] != 0.0 or forces["motor_level_Nm"][joint] != 0.0
     is_stiff = mechanics["stiffness_Nm_rad"][joint] == 0.0
     return bool(is_stiff and (has_friction or mechanics["rotor_inertia_kg_m2"][joint] != 0.0))
@@ -401,7 +401,7 @@ def observe(
 ) -> tuple[float, float, float, float, float, float]:
     """Give the present true values, Nm: external torque, friction along +dq, gravity torque, two joints each.
 
-    Changes nothing that goes on.
+    Leaves the state of the simulation unchanged.
     """
     around = Surroundings(state, arm, mechanics, contact, things)
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]

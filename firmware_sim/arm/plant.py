@@ -172,11 +172,11 @@ def accelerate(
 def decide_slips(
     state: np.void, arm: np.void, torque1: float, torque2: float, q2: float, dq1: float, dq2: float
 ) -> tuple[int, int]:
-    """Say how each joint goes on: the sign of its velocity, or at standstill whether and which way it breaks away.
+    """Return the slip of each joint: the sign of its velocity, or at standstill of its breakaway, 0 if it sticks.
 
     At standstill exactly one choice fits friction's law, because the inertia is positive definite: joints that stick
-    need no more than F_c, joints that slip accelerate the way they slip. Within rounding of the limit none may fit;
-    then the one that fits best is taken.
+    need no more than F_c, joints that slip accelerate the way they slip. Within rounding of the limit no choice may
+    fit; then the function returns the choice that fits best.
     """
     if dq1 != 0.0 and dq2 != 0.0:
         return (1 if dq1 > 0.0 else -1), (1 if dq2 > 0.0 else -1)
@@ -224,7 +224,7 @@ def _stop_torque(arm: np.void, joint: int, q: float, dq: float) -> float:
 def external_torque(
     arm: np.void, contact: Structured, elapsed_s: float, q1: float, q2: float, dq1: float, dq2: float
 ) -> tuple[float, float]:
-    """Give the external torque of a contact, one row of the table or none, and of the joint stops."""
+    """Give the external torque of the joint stops and a contact, one row of the table or empty."""
     stop1, stop2 = _stop_torque(arm, 0, q1, dq1), _stop_torque(arm, 1, q2, dq2)
     if contact.size == 0:
         return stop1, stop2

@@ -32,7 +32,7 @@ TORQUE_COUNTS: Final = (-(1 << 15), (1 << 15) - 1)
 
 _LOWEST_COUNT: Final = TORQUE_COUNTS[0]
 _HIGHEST_COUNT: Final = TORQUE_COUNTS[1]
-# Samples drawn at once: large enough to cost nothing per sample, small enough to draw within 10 µs.
+# Samples drawn at once: large enough for a negligible cost per sample, small enough to draw within 10 µs.
 _SAMPLES_AT_ONCE: Final = 256
 
 

@@ -44,7 +44,7 @@ THING: Final = float_fields(
         "length2_m": (),
         "x_m": (),  # body: centre; hand: where it guides to; wall: a point of it
         "y_m": (),
-        "angle_rad": (),  # body: free direction, nan for the normal; hand: direction, nan for none; wall: normal
+        "angle_rad": (),  # body: free direction, nan for the normal; hand: direction, nan without one; wall: normal
         "stiffness": (),  # N/m
         "damping": (),  # body, hand: N s/m; wall: s/m
         "mass_kg": (),  # body
@@ -80,7 +80,7 @@ HAND_STATE: Final = float_fields(
         "presence": (),  # one of the three below
         "start_x_m": (),  # where it grasped, m
         "start_y_m": (),
-        "path_x": (),  # direction of its way; 0, 0 for none
+        "path_x": (),  # direction of its way; 0, 0 without one
         "path_y": (),
         "path_length_m": (),  # inf for no end
     }
@@ -99,8 +99,8 @@ _HALF_TICK_S: Final = 0.5 * TICK_S
 TOUCH_TRUTH: Final = float_fields(
     {
         "force_N": (),  # the strongest force
-        "link": (),  # 0 for none
-        "index": (),  # −1 for none
+        "link": (),  # 0 without contact
+        "index": (),  # −1 without contact
         "power_W": (),
         "energy_J": (),
     }
@@ -162,7 +162,7 @@ def _joint_torque(
 
 @compiled
 def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float, float, float]:
-    """Say where a body's link meets it: penetration and point along the link in m, normal x, y, distance across in m.
+    """Return where a body's link meets it: penetration and point along the link, m; normal x, y; distance across, m.
 
     The normal points from the link to the body; the last is the signed distance of its centre from the link's line.
     """
@@ -188,7 +188,7 @@ def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float
 
 @compiled
 def _recede_rate(thing: np.void, own: np.void) -> float:
-    """Give the velocity of a body along its free direction, m/s: none into the wall behind it.
+    """Give the velocity of a body along its free direction, m/s: 0 instead of into the wall behind it.
 
     Between ticks, speed ṡ against the wall is reset.
     """
@@ -260,7 +260,7 @@ def touch(
 ) -> tuple[float, float]:
     """Give the external torque of all bodies, hands and walls, Nm, and fill the rates of their state.
 
-    time_s: scenario time. Changes nothing but rates_out, and not even that when the table is empty: an integrator may
+    time_s: scenario time. Writes only rates_out, and leaves even that unchanged for an empty table: an integrator may
     call it at any stage of a step.
     """
     torque1, torque2 = 0.0, 0.0
@@ -399,7 +399,7 @@ def describe_touch(
 ) -> tuple[float, float]:
     """Fill an element of TOUCH_TRUTH; give the external torque of all that touches, Nm.
 
-    contact, contact_index, elapsed_s: the prescribed contact in force, an empty array for none.
+    contact, contact_index, elapsed_s: the prescribed contact in force, an empty array without one.
     """
     out["force_N"], out["link"], out["index"] = 0.0, 0.0, -1.0
     torque1, torque2 = 0.0, 0.0
@@ -450,7 +450,7 @@ def add_prescribed_work(
     """Add the energy that the arm gave to a prescribed contact in a step: the mean torque along the way of the joints.
 
     before1, before2: joint positions at the start of the step, at elapsed_s; q1, q2: at its end. Frame "motion" goes by
-    the mean velocity of the step. No contact adds nothing.
+    the mean velocity of the step. Without a contact, adds no energy.
     """
     if contact.size == 0:
         return

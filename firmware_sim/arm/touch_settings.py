@@ -219,12 +219,12 @@ class BodyRegion:
 
     @property
     def transient_force_N(self) -> float | None:
-        """Transient limit; None where the standard gives none."""
+        """Transient limit; None if the standard lacks one."""
         return TRANSIENT_FACTOR * self.force_N if self.has_transient_limit else None
 
     @property
     def transient_pressure_N_cm2(self) -> float | None:
-        """Transient limit of the most sensitive area; None where the standard gives none."""
+        """Transient limit of the most sensitive area; None if the standard lacks one."""
         return TRANSIENT_FACTOR * self.pressure_N_cm2 if self.has_transient_limit else None
 
 
@@ -329,7 +329,7 @@ class BodySettings:
         return math.inf if self.gap_m is None else self.gap_m
 
     def overlap_m(self, lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> float:
-        """Say how deep its link is in it in this pose; negative: how far away."""
+        """Return the depth of its link in it in this pose, m; negative: the distance."""
         ends = _ends(lengths_m, pose_rad)
         (base_x, base_y), (end_x, end_y) = ends[self.link - 1], ends[self.link]
         along_x, along_y = end_x - base_x, end_y - base_y
@@ -389,7 +389,7 @@ class WallSettings:
         return ticks(self.at_s)
 
     def overlap_m(self, lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> float:
-        """Say how far the worse of the two link ends is behind it in this pose; negative: in front."""
+        """Return how far the worse of the two link ends is behind it in this pose, m; negative: in front."""
         normal_x, normal_y = math.cos(math.radians(self.normal_deg)), math.sin(math.radians(self.normal_deg))
         ends = _ends(lengths_m, pose_rad)[1:]
         return max(-(x - self.x_m) * normal_x - (y - self.y_m) * normal_y for x, y in ends)

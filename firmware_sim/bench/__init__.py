@@ -1,1 +1,1 @@
-"""Arm and nodes in one time, faults that befall them, and the truth about it."""
+"""Arm and nodes in one time, the faults that affect them, and the truth of the run."""

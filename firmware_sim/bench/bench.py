@@ -50,7 +50,7 @@ class Bench:
         on_answer: Callable[[], None] = lambda: None,
         arm: MovableArm | None = None,
     ) -> None:
-        """Build and compile everything; nothing is sent before `boot`.
+        """Build and compile everything; the devices send no frame before `boot`.
 
         send: called with (identifier, data). on_answer: called when all that answers a SYNC has been sent. seed:
         outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
@@ -133,7 +133,7 @@ class Bench:
         self.time.advance_to(t_ns)
 
     def outlive_host(self) -> None:
-        """By SYNC, let the time pass that no host gives any more, until the arm is at rest, for 5 s at most."""
+        """Let time pass without a host, by SYNC, until the arm is at rest, for 5 s at most."""
         self.time.outlive_host()
 
     def release(self) -> None:
@@ -229,7 +229,7 @@ class Bench:
         return True
 
     def _ignore_sync(self, data: bytes, takers: Sequence[int]) -> None:
-        """Let the devices take note of a SYNC that none of them answers."""
+        """Let the devices take note of a SYNC that no device answers."""
         listeners, is_quiet = self._nodes.listeners, self.injector.is_quiet
         heard = listeners.everybody if is_quiet else self.injector.hear(self._sync_id, data)
         listeners.ignore(heard, takers, self._order.kind, self.time.now_ns)
@@ -254,7 +254,7 @@ class Bench:
         self.time.end_sync(self.cycle, t_ns)
 
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
-        """By SYNC, let the period of a SYNC pass that a fault keeps from all devices; their other frames go out."""
+        """Let the period of a SYNC pass, by SYNC, if a fault keeps it from all devices; their other frames go out."""
         is_counted = self._order.counter != 0 and any(self._nodes.listeners.takers(data)) and self._judge(data, t_ns)
         if is_counted and self.time.has_begun:
             self._nodes.listeners.miss(self._lost_syncs + 1)
@@ -296,7 +296,7 @@ class Bench:
             listeners.tell(heard, takers, order.kind, lost, now_ns)
             heard = [times * is_taken for times, is_taken in zip(heard, takers, strict=True)]
             self.injector.sync(heard, measured, now_ns)
-            if not self._is_wall:  # by the clock, a drive that hears no SYNC has nothing to count
+            if not self._is_wall:  # by the clock, a drive that hears no SYNC has no period to count
                 self._nodes.lose_sync(heard, now_ns)
         if now_ns >= self.time.due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
             self.time.poll(now_ns)

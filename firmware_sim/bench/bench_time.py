@@ -1,7 +1,7 @@
 """The time of a bench, and the log of its truth.
 
 `BenchTime.advance` moves the arm and the bench's time; no other function moves the arm. A SYNC samples the arm where it
-is. The clock mode says who calls `advance`:
+is. The clock mode determines the caller of `advance`:
 
     sync   every SYNC is one period (0x1006), however long it took to come: the same frames in give the same frames
            out, bit for bit. A gap in the SYNC counter is as many lost periods. Between SYNCs the arm waits, and
@@ -193,13 +193,13 @@ class BenchTime:
             self._sync_ns += dt_ns
 
     def reach_sync(self, lost: int) -> None:
-        """By SYNC, let the period before this SYNC pass, and those of `lost` SYNCs before it."""
+        """Let the period before this SYNC pass, by SYNC, and those of `lost` SYNCs before it."""
         if not self._is_wall and self.has_begun:
             self.pass_lost_syncs(lost)
             self.advance(self._nodes.period_ns)
 
     def pass_lost_syncs(self, count: int) -> None:
-        """By SYNC, let the periods pass whose SYNC never came."""
+        """Let the periods of lost SYNCs pass, by SYNC."""
         for _ in range(count):
             self.advance(self._nodes.period_ns)
             for drive in self._nodes.drives:
@@ -207,7 +207,7 @@ class BenchTime:
             self._nodes.latch_motors()
 
     def delay_sample(self, late_ns: int) -> None:
-        """By SYNC, let the arm move on until this SYNC reaches the devices."""
+        """Let the arm move until this SYNC reaches the devices, by SYNC."""
         self._move_arm(self.now_ns + late_ns)
 
     def end_sync(self, cycle: int, stamp_ns: int) -> None:
@@ -253,7 +253,7 @@ class BenchTime:
         self._granted = self._outbox.sent
 
     def outlive_host(self) -> None:
-        """By SYNC, let the time pass that no host gives any more, until the arm is at rest, for 5 s at most.
+        """Let time pass without a host, by SYNC, until the arm is at rest, for 5 s at most.
 
         The drives then miss their SYNC as by the clock. Once per host; by the clock time passes anyway.
         """
@@ -299,7 +299,7 @@ class BenchTime:
             self._nodes.move_arm(tick_count)
 
     def _has_rested(self, now_ns: int) -> bool:
-        """Whether the arm has stood still for a while, and no drive could move it; asked while it may move."""
+        """Tell whether the arm has stood still for a while, and no drive could move it; call while it may move."""
         is_powered = any(drive.motor_mode for drive in self._nodes.drives)
         if is_powered or max(map(abs, self._arm.drive_velocity_rad_s)) > _REST_RAD_S:
             self._moving_ns = now_ns

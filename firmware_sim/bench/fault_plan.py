@@ -1,6 +1,6 @@
 """The effects of a scenario's faults over time: on frames, on measured values, and on nodes.
 
-A bench tells the plan the time at every SYNC and whenever `wait_ns` is over; then it asks for the effects. The plan
+A bench passes the time to the plan at every SYNC and whenever `wait_ns` is over; then it reads the effects. The plan
 recognises frames by the contract's identifiers. Nodes are places in `NODES`; times are ns.
 """
 
@@ -53,8 +53,8 @@ class ActionKind(Enum):
     EMERGENCY = "emergency"  # error code
     FAIL = "fail"  # error code
     MEND = "mend"
-    SENSOR_STATUS = "sensor status"  # bits of 0x6150, 0: none
-    DRIFT = "drift"  # ppm, 0: none
+    SENSOR_STATUS = "sensor status"  # bits of 0x6150, 0: no error
+    DRIFT = "drift"  # ppm, 0: no drift
 
 
 class NodeAction(NamedTuple):
@@ -73,7 +73,7 @@ class FaultPlan:
         self.mask = 0
         """Bit i: row i is active."""
         self.is_quiet = True
-        """Whether nothing acts on frames or values and nothing is left to be done; then `advance` is all it needs."""
+        """Whether no fault acts on frames or values and no action is left; then a call of `advance` is enough."""
         self._period_ns = period_ns
         self._rows = tuple(
             FaultRow(index, row, seed_text, period_ns)
@@ -98,7 +98,7 @@ class FaultPlan:
 
     @property
     def wait_ns(self) -> int:
-        """How long after the last `advance` a row begins or ends by time, or a node's storm goes on, at the latest."""
+        """Time from the last `advance` to the next beginning or end of a row, or the next EMCY of a storm, at most."""
         wait_ns = NEVER_NS
         for now_ns, next_ns in (
             (self._scenario_ns, self._next_scenario_ns),
@@ -121,8 +121,8 @@ class FaultPlan:
     def advance(self, scenario_ns: int, since_power_on_ns: int = _BEFORE_NS) -> list[FaultEdge]:
         """Let time pass; return the rows that begin and end, in order.
 
-        scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative where nothing is to
-        count from there. Neither goes back.
+        scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative if no time counts
+        from there. Neither goes back.
         """
         self._scenario_ns, self._power_ns = scenario_ns, since_power_on_ns
         is_due = scenario_ns >= self._next_scenario_ns or since_power_on_ns >= self._next_power_ns
@@ -186,7 +186,7 @@ class FaultPlan:
             while (due_ns := row.flood_ns) < end_ns:
                 row.sent += 1
                 if due_ns < now_ns:
-                    continue  # nobody asked for that time
+                    continue  # that time passed before the call
                 row.hits_left -= 1
                 if not self._off.union(self._off_bus).issuperset(settings.nodes):
                     frames.append((due_ns - now_ns, settings.can_id or 0, data))

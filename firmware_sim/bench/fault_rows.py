@@ -68,7 +68,7 @@ class FaultRow:
 
     @property
     def due_ns(self) -> int:
-        """When it begins, ends or, in a storm of EMCY, goes on."""
+        """Time at which it begins, ends or, in a storm of EMCY, sends the next one."""
         is_storming = self.is_active and self.settings.kind == "emcy_storm"
         return min(self.next_ns, self.flood_ns) if is_storming else self.next_ns
 

@@ -1,12 +1,12 @@
 """The application of a scenario's faults to the bench: frames both ways, measured values, and the nodes themselves.
 
 `firmware_sim.bench.fault_plan` decides which faults act now; the injector applies them. The delay of a host's frame
-counts from the SYNC before it, because by SYNC nobody knows when within the period the frame came.
+counts from the SYNC before it, because by SYNC the time of the frame within the period is unknown.
 
 The devices' frames go to the bus at once, or later where a fault delays them (`Outbox`). By SYNC, time stands still
 while the bench answers one, so the frames released within the next period go out together, in the order of release.
 Marks tell a host in lockstep when each frame is released (`adacd_hil.wire.time_marks`); an undisturbed answer needs
-none.
+no mark.
 """
 
 import heapq
@@ -164,12 +164,12 @@ class Injector:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether frames and values are left alone now."""
+        """Whether no fault changes frames or values now."""
         return self.plan.is_quiet
 
     @property
     def due_ns(self) -> int:
-        """When a fault begins, ends or goes on."""
+        """Time of the next beginning, end or repetition of a fault."""
         return min(self.now_ns + self.plan.wait_ns, self._flooded_ns if self.plan.is_flooding else NEVER_NS)
 
     def sender(self, place: int) -> Send:
@@ -232,7 +232,7 @@ class Injector:
                 self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
 
     def hear(self, sync_id: int, data: bytes) -> tuple[int, ...]:
-        """Tell how often each node hears a SYNC that is on the bus once."""
+        """Return how often each node hears a SYNC that is on the bus once."""
         plan = self.plan
         return tuple(
             len(plan.receive(place, sync_id, data)) * device.is_on_bus for place, device in enumerate(self._devices)

@@ -1,7 +1,7 @@
 """The emulated devices around a recorded arm: the answers to SYNC come from a recording, all else from live nodes.
 
 Object dictionary, NMT and CiA 402 states, heartbeats, status frames, EMCY and watchdogs are those of `Bench`, so any
-host can boot and command the devices. Torque moves nothing: the arm repeats its recorded motion.
+host can boot and command the devices. Torque has no effect: the arm repeats its recorded motion.
 
 The bench reads the recording as the host asks for it. An attempt begins with the first SYNC after an NMT reset, so a
 run that recovered from a fault has several. In each the cycles count from its first SYNC by the SYNC counter, as the
@@ -66,7 +66,7 @@ class RecordedCycles:
         self.attempt += 1
 
     def take(self, cycle: int) -> tuple[Answer, ...]:
-        """Return the answers to a cycle of the attempt, nothing where the recording has none. Raises LogError."""
+        """Return the answers to a cycle of the attempt, () if the recording lacks them. Raises LogError."""
         wanted = (self.attempt, cycle)
         while self._next is not None and (self._next.attempt, self._next.cycle) < wanted:
             self._next = self._fetch()
@@ -122,7 +122,7 @@ _TORQUES = ("Sensor1Torque", "Sensor2Torque")
 
 
 class RecordedBody:
-    """The arm as its recorded frames show it, for the nodes' objects and standstill; it knows no truth."""
+    """The arm as its recorded frames show it, for the nodes' objects and standstill; it has no truth."""
 
     has_ideal_motors = True
     is_torque_limited = (False, False)
@@ -157,7 +157,7 @@ class RecordedBody:
                     self._torque_Nm[place] = values.get("torque", self._torque_Nm[place])
 
     def start_scenario(self) -> None:
-        """Do nothing: whatever happened is in the recording."""
+        """Ignore the start: the recording already has all faults and contacts."""
 
     def advance(
         self,
@@ -178,11 +178,11 @@ class RecordedBody:
         )
 
     def truth(self, out: Vector) -> None:
-        """Leave everything as it is: nothing is known."""
+        """Leave `out` unchanged: a recording has no truth."""
 
 
 class RecordedBench(Bench):
-    """A bench whose cyclic frames come from a recording, or from somebody else on the bus."""
+    """A bench whose cyclic frames come from a recording, or from another sender on the bus."""
 
     def __init__(
         self,
@@ -207,7 +207,7 @@ class RecordedBench(Bench):
         )
 
     def outlive_host(self) -> None:
-        """Do nothing: the recording moves the arm, with or without host."""
+        """Ignore the loss of the host: the recording moves the arm with or without it."""
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
         super()._on_nmt(data, t_ns)

@@ -1,1 +1,1 @@
-"""The arm in motion: motors, encoders, torque transducers, and who touches it."""
+"""The arm in motion: motors, encoders, torque transducers, and the contacts."""

@@ -125,7 +125,7 @@ def _wall_row(arm: ArmProfile, wall: WallSettings) -> np.void:
 
 
 def touch_table(scenario: Scenario) -> Structured:
-    """Pack a scenario's bodies, hands and walls (n,), with the fields of THING; n = 0 when it has none."""
+    """Pack a scenario's bodies, hands and walls (n,), with the fields of THING; n = 0 without any."""
     arm = scenario.arm
     rows = [_body_row(arm, body) for body in scenario.bodies]
     rows += [_hand_row(arm, hand) for hand in scenario.hands]
@@ -136,7 +136,7 @@ def touch_table(scenario: Scenario) -> Structured:
 
 
 def initial_touch_state(things: Structured) -> Vector:
-    """Give the state at power-on: nothing is there (TOUCH_HEADER + n THING_PLACES,)."""
+    """Return the touch state at power-on: no thing is in place yet (TOUCH_HEADER + n THING_PLACES,)."""
     return np.zeros(TOUCH_HEADER + things.size * THING_PLACES)
 
 
@@ -236,12 +236,12 @@ def _pack_numbers(scenario: Scenario) -> Vector:
 
 
 class Body:
-    """One emulated arm, from power-on. Nothing is compiled and nothing large allocated after construction."""
+    """One emulated arm, from power-on. After construction it compiles no code and allocates no large array."""
 
     def __init__(self, scenario: Scenario, period_s: float = 1e-3, seed: int | None = None) -> None:
         """Put the arm at the scenario's start pose, at rest.
 
-        `seed` outweighs the scenario's. Raises ValueError when the period is no multiple of 100 µs.
+        `seed` outweighs the scenario's. Raises ValueError when the period isn't a multiple of 100 µs.
         """
         self._ticks_per_period = ticks(period_s)
         if self._ticks_per_period < 1 or not math.isclose(self._ticks_per_period * TICK_S, period_s, rel_tol=1e-9):
@@ -332,7 +332,7 @@ class Body:
         )  # fmt: skip
 
     def start_scenario(self) -> None:
-        """Let scenario time start now: both drives are enabled and show torque mode. Later calls change nothing."""
+        """Let scenario time start now: both drives are enabled and show torque mode. Later calls have no effect."""
         if not self.is_started:
             self._course["start_tick"] = self._course["tick"]
 
@@ -363,7 +363,7 @@ class Body:
 
     @property
     def motor_error_code(self) -> tuple[int, int]:
-        """Error code that each motor's I²t or temperature calls for now, 0 for none; 0x603F."""
+        """Error code that each motor's I²t or temperature calls for now, 0 without a fault; 0x603F."""
         if self.has_ideal_motors:
             return 0, 0
         heat1, heat2 = self._is_overheated.tolist()

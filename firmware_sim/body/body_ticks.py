@@ -85,7 +85,7 @@ overshoot."""
 
 @compiled
 def find_contact(course: np.void, contacts: Structured) -> Structured:
-    """Give the row of the contact in force at this tick, or none; steps over those that have ended."""
+    """Give the row of the contact in force at this tick, or an empty array; steps over those that have ended."""
     tick = course["tick"] - course["start_tick"]
     index = int(course["contact"])
     while index < contacts.size and contacts[index]["end_tick"] <= tick:

@@ -174,7 +174,7 @@ def heat_motor(numbers: np.void, state: np.void, joint: int, tau_Nm: float) -> N
 
 
 def error_code(is_overheated: float, is_overloaded: float) -> int:
-    """Give the error code that a motor calls for; overloaded: I²t is spent, and that is a fault. 0 for none."""
+    """Give the error code that a motor calls for; overloaded: I²t is spent, and that is a fault. 0: no fault."""
     if is_overheated:
         return EXCESS_TEMPERATURE
     return CONTINUOUS_OVER_CURRENT if is_overloaded else 0

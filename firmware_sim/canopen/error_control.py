@@ -18,11 +18,11 @@ counts all. The drive handles a fault that a watchdog caused, and the fault stay
 A counter that runs forward means SYNCs that were lost. Ahead of time is more than 0.4 periods ahead of its place after
 the SYNC before, less the lateness of earlier SYNCs: a master that stalls may come back to its grid, and frames that
 waited for a busy receiver may come in a row. That lateness is forgotten with a time constant of 100 SYNCs, so that a
-master whose clock is slow gathers none.
+master whose clock is slow gathers no lateness.
 
 CAN itself may deliver a frame twice: if the last bit of its end-of-frame is disturbed, the sender repeats a frame
 that receivers have taken already (ISO 11898-1). So a single odd SYNC is a warning. More than `TOLERATED` before
-`CLEAN_SYNCS` in a row were right mean that SYNC is no time base.
+`CLEAN_SYNCS` in a row were right mean that SYNC can't serve as a time base.
 """
 
 import struct
@@ -198,12 +198,12 @@ class Watchdog(IntEnum):
 
     SYNC = 1  # a SYNC comes
     COMMAND = 2  # a valid command acts
-    HEARTBEAT = 3  # the master's heartbeat comes, or is no longer monitored
+    HEARTBEAT = 3  # the master's heartbeat comes, or monitoring ends
     OPERATIONAL = 4  # NMT start
     LENGTH = 5  # a command frame of the right length comes
     SYNC_ORDER = 6  # 100 SYNCs in a row are right
     SYNC_LENGTH = 7  # a SYNC of the right length comes
-    COMMAND_PDO = 8  # Enable operation is no longer asked for, or can be obeyed
+    COMMAND_PDO = 8  # Enable operation is withdrawn, or can be obeyed
 
 
 ERROR_CODES = {
@@ -286,9 +286,9 @@ class SyncOrder:
         self.is_taken = True
         """Whether devices take the last SYNC."""
         self.counter = 0
-        """Of the last SYNC that was taken, 0 before the first; counted where SYNC has none."""
+        """Of the last SYNC that was taken, 0 before the first; counted if SYNC has no counter."""
         self.periods = 1
-        """By how many the last SYNC went on; 1 where that isn't known."""
+        """Periods from the SYNC before to the last one; 1 if unknown."""
         self._is_timed = is_timed
         self._last_ns = 0
         self._lateness_ns = 0.0
@@ -298,13 +298,13 @@ class SyncOrder:
         self.counter = 0
 
     def periods_to(self, counter: int, overflow: int) -> int:
-        """Return by how many periods a SYNC with this counter goes on, 1 where a counter is missing."""
+        """Return the periods from the last SYNC to one with this counter; 1 if a counter is missing."""
         return (counter - self.counter) % overflow if counter and self.counter else 1
 
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:
         """Judge a SYNC of the right length.
 
-        `counter`: 0 where it has none. `overflow`: 0x1019. `period_ns`: 0x1006; 0: not set, so no SYNC is early.
+        `counter`: 0 without one. `overflow`: 0x1019. `period_ns`: 0x1006; 0: not set, so no SYNC is early.
         """
         last = self.counter
         self.kind, self.is_taken, self.periods = SyncKind.RIGHT, True, 1
@@ -330,7 +330,7 @@ class SyncOrder:
         ahead_ns = self.periods * period_ns - (t_ns - self._last_ns)
         self._last_ns = t_ns
         if is_first or period_ns == 0:
-            self._lateness_ns = period_ns  # nobody knows
+            self._lateness_ns = period_ns  # the lateness is unknown
             return
         if ahead_ns - self._lateness_ns > _AHEAD * period_ns:
             self.kind = SyncKind.EARLY if self.periods == 1 else SyncKind.OUT_OF_SEQUENCE

@@ -122,7 +122,7 @@ class _SilentNetwork(canopen.Network):
 
 
 class _Server(SdoServer):
-    """canopen's SDO server, one transfer at a time: a segment that belongs to none is refused, lengths are held to."""
+    """canopen's SDO server, one transfer at a time; refuses segments outside a transfer, and wrong lengths."""
 
     def __init__(self, node: "_DictionaryNode") -> None:
         node_id = int(node.id or 0)
@@ -300,7 +300,7 @@ class ObjectDictionary:
         return self._node.object_dictionary
 
     def has(self, index: int, subindex: int = 0) -> bool:
-        """Whether the EDS lists this object."""
+        """Tell whether the EDS lists this object."""
         try:
             self._node._find_object(index, subindex)
         except canopen.SdoAbortedError:
@@ -361,7 +361,7 @@ class ObjectDictionary:
         return self.value(index, subindex) if self.has(index, subindex) else default
 
     def default_or(self, default: int, index: int, subindex: int = 0) -> int:
-        """Return the EDS's value of a numeric object, `default` when it has none."""
+        """Return the EDS's value of a numeric object, `default` without one."""
         if not self.has(index, subindex):
             return default
         value = self._node._find_object(index, subindex).default
@@ -420,7 +420,7 @@ def _call_all(functions: list[Callable[[int], None]], value: int) -> None:
 class DeviceDescription:
     """One device: its EDS, and further values of its objects at power-on.
 
-    defaults: values in place of the EDS's. fallbacks: values where the EDS has none. made_up: objects that the EDS
+    defaults: values in place of the EDS's. fallbacks: values that the EDS lacks. made_up: objects that the EDS
     omits, by index. aliases: objects that hold the live value of another.
     """
 
@@ -472,7 +472,7 @@ def contract_of(codec: Codec) -> EmulatedContract:
 
 
 def playable_contract(codec: Codec) -> EmulatedContract:
-    """Find the contract with the layout of a DBC, wherever its nodes are. Raises ConfigError when there is none."""
+    """Find the contract with the layout of a DBC, wherever its nodes are. Raises ConfigError if no contract has it."""
     for contract in CONTRACTS.values():
         if codec.path == contract.path:
             return contract
@@ -489,7 +489,7 @@ def playable_contract(codec: Codec) -> EmulatedContract:
 
 
 def is_fd(codec: Codec) -> bool:
-    """Whether frames are longer than classic CAN has."""
+    """Tell whether frames are longer than classic CAN allows."""
     return any(message.length > CLASSIC_BYTES for message in codec.messages.values())
 
 

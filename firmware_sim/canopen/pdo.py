@@ -25,7 +25,7 @@ COUNT = 8
 
 
 class PdoUser:
-    """The device's side of its PDOs. By itself it does nothing."""
+    """The device's side of its PDOs. The methods of this base class are empty."""
 
     def act(self, t_ns: int) -> None:
         """Act on a frame that doesn't wait for SYNC; its values have been written."""
@@ -179,7 +179,7 @@ class ReceivePdo(PdoRecord):
         self.pending = None
 
     def on_frame(self, data: bytes, t_ns: int) -> None:
-        """Take a frame in at the bench's time; one that fails a check changes nothing."""
+        """Take a frame in at the bench's time; a frame that fails a check has no effect."""
         layout = self.layout
         if len(data) != layout.length:
             self._is_length_wrong = True
@@ -197,7 +197,7 @@ class ReceivePdo(PdoRecord):
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
     def is_late(self, t_ns: int) -> bool:
-        """Whether its deadline is over."""
+        """Tell whether its deadline is over."""
         return self.timer_ns > 0 and self.acted_ns is not None and t_ns - self.acted_ns >= self.timer_ns
 
 
@@ -257,7 +257,7 @@ class Pdos:
         return any(pdo.is_command for pdo in self._receiving)
 
     def brings(self, index: int, subindex: int) -> bool:
-        """Whether a PDO is exchanged that brings values of an object."""
+        """Tell whether an exchanged PDO brings values of an object."""
         return any((index, subindex) in pdo.layout.keys for pdo in self._receiving)
 
     def accept(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
@@ -339,7 +339,7 @@ class Pdos:
         return is_commanded
 
     def find_late(self, t_ns: int) -> bool:
-        """Whether an RPDO's deadline is over."""
+        """Tell whether the deadline of some RPDO is over."""
         return any(pdo.is_late(t_ns) for pdo in self._receiving)
 
     @property

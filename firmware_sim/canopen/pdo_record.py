@@ -24,12 +24,12 @@ _MAPPING = 0x200  # from a communication record to its mapping record
 
 LAST_NODE = 32
 LISTENED_IDS = frozenset(base + node for base in (0x200, 0x300, 0x400, 0x500) for node in range(1, LAST_NODE + 1))
-"""Identifiers that an RPDO may have: those of RPDO1 to 4 of nodes 1 to 32. A real controller's acceptance filter is no
-wider, and the emulator's kernel filter is this one."""
+"""Identifiers that an RPDO may have: those of RPDO1 to 4 of nodes 1 to 32. A real controller's acceptance filter is at
+most as wide, and the emulator's kernel filter is this one."""
 
 
 def _is_restricted(can_id: int) -> bool:
-    """Whether an identifier is none for PDOs: CiA 301, table 34, and SYNC and EMCY."""
+    """Tell whether an identifier is not allowed for PDOs: CiA 301, table 34, and SYNC and EMCY."""
     lowest = (0x000, 0x080, 0x101, 0x581, 0x601, 0x6E0, 0x701)
     highest = (0x07F, 0x100, 0x180, 0x5FF, 0x67F, 0x6FF, 0x7FF)
     return any(low <= can_id <= high for low, high in zip(lowest, highest, strict=True))

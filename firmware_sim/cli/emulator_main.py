@@ -182,7 +182,7 @@ def run(
         if out is not None:
             metadata = {"scenario": resolved.name, "profile": resolved.arm.name, "seed": str(resolved.seed)}
             _make_folder(out)
-            # By SYNC, time waits for the log; by wall clock nothing may.
+            # By SYNC, time waits for the log; by wall clock it never waits.
             log = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
             stack.enter_context(log)
         departure = Departure(bus)

@@ -19,7 +19,7 @@ from firmware_sim.canopen.pdo_record import LISTENED_IDS
 
 _IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
 _LONGEST_WAIT_NS = 50_000_000  # how soon a signal is noticed on a silent bus
-_SILENCE_NS = 2_000_000_000  # a host that says nothing for this long has gone
+_SILENCE_NS = 2_000_000_000  # a host that is silent for this long has gone
 
 
 class StopRequest:
@@ -108,16 +108,16 @@ class Service:
                 return
 
     def _patience_s(self) -> float:
-        """Say how long to wait for a frame."""
+        """Return the time to wait for a frame, s."""
         if not self._is_wall:
             return _IDLE_NS * 1e-9
         due_ns = self._bench.due_ns - self._clock.now_ns()
         return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
 
     def _pass_time(self, now_ns: int, is_idle: bool) -> None:
-        """Tell the bench the time: by wall clock whenever no frame waits, by SYNC when none has come for a while.
+        """Pass the time to the bench: by wall clock whenever no frame waits, by SYNC when no SYNC has come for a while.
 
-        A host in lockstep says the time itself, until it has gone. A host that has gone is outlived.
+        A host in lockstep sends the time itself, until it has gone. A host that has gone is outlived.
         """
         is_silent = now_ns - self._heard_ns > _SILENCE_NS
         if is_silent:

@@ -46,7 +46,7 @@ _OF_SYNC = {Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH}
 
 
 class Application(PdoUser):
-    """The application of a device: everything besides communication. By itself it does nothing."""
+    """The application of a device: everything besides communication. The methods of this base class are empty."""
 
     @property
     def is_at_work(self) -> bool:
@@ -66,7 +66,7 @@ class Application(PdoUser):
         """Act on the return of the master's heartbeat."""
 
     def distrust_sync(self, t_ns: int) -> None:
-        """Act on SYNCs that are no time base."""
+        """Act on SYNCs that can't serve as a time base."""
 
     def note_error(self) -> None:
         """Take note that the error register, 0x1001, may have changed."""
@@ -89,7 +89,7 @@ class EmulatedDevice(ObjectDictionary):
         fallbacks: Values | None = None,
         made_up: Mapping[int, MadeUp] | None = None,
     ) -> None:
-        """Read the EDS; nothing is sent before `boot`. Raises OSError when the EDS can't be read.
+        """Read the EDS; the device sends no frame before `boot`. Raises OSError when the EDS can't be read.
 
         `messages`: the contract's, by identifier. `longest_pdo` in bytes. `defaults`, `fallbacks`, `made_up`: of
         objects.
@@ -259,7 +259,7 @@ class EmulatedDevice(ObjectDictionary):
         self._errors.report(code, t_ns, time_ms=self._time_ms(t_ns))
 
     def report_no_error(self, t_ns: int) -> None:
-        """Say by an EMCY with code 0 that a fault was reset."""
+        """Report the reset of a fault by an EMCY with code 0."""
         self._errors.report(0, t_ns)
 
     def poll(self, t_ns: int) -> int:
@@ -349,7 +349,7 @@ class NodeClock:
 
 
 class SyncListeners:
-    """All devices of a bench. A SYNC in its place costs nothing here."""
+    """All devices of a bench. A SYNC in order takes no work here."""
 
     def __init__(self, devices: Sequence[EmulatedDevice]) -> None:
         self._devices = devices

@@ -7,7 +7,7 @@ brake, and so do shutdown and disable operation by 0x605B and 0x605C; everywhere
 Units on the wire: position in encoder counts, velocity in the LSB of the contract, torque in per mille of rated torque
 0x6076, rated torque in mNm of the joint, or in the count of an arm of one's own, behind the gear.
 
-While the motor is powered, SDO writes nothing but the controlword and clears the error history. While an RPDO brings
+While the motor is powered, SDO writes only the controlword and clears the error history. While an RPDO brings
 the controlword, SDO writes only those that take the power away: Disable voltage and Quick stop.
 
 Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statusword 0x6041.
@@ -78,7 +78,7 @@ class DriveNode(Application):
         self.torque_Nm = 0.0
         self.state = DriveState.START
         self.has_news = False
-        """Whether something has changed that the bus hasn't been told."""
+        """Whether a change waits to be sent on the bus."""
         self._pdos = device.pdos
         self._clock = device.clock
         self._tripped = device.watchdogs.tripped
@@ -96,7 +96,7 @@ class DriveNode(Application):
         self._received_word: int | None = None
         self._controlword = 0
         self.error_code = 0
-        """0x603F: the fault that is latched, 0 for none."""
+        """0x603F: the fault that is latched, 0 without a fault."""
         self._cause: Watchdog | None = None
         self._failure = 0
         self._is_found_by_time = False
@@ -112,7 +112,7 @@ class DriveNode(Application):
         self._shown_mode = self._told_mode = self._meanwhile = self._mode
         self._told_ns = 0
         self._enabling_ns: int | None = None
-        """When Enable operation was first asked for; None: it isn't."""
+        """Time of the first command Enable operation; None without one."""
         device.pause_ns = round(habits.pause_ms * 1e6)
         self._patience = Patience(device)
         self._serve(codec)
@@ -272,7 +272,7 @@ class DriveNode(Application):
         return self._clock.bench_ns(due_ns)
 
     def fail(self, code: int, t_ns: int) -> None:
-        """Fault by itself, with an error code of 0x603F; its cause stays until `mend`."""
+        """Enter Fault with an error code of 0x603F; its cause stays until `mend`."""
         self._failure = code
         self._feel_failure(self._clock.own_ns(t_ns))
 
@@ -281,12 +281,12 @@ class DriveNode(Application):
         self._failure = 0
 
     def _feel_failure(self, t_ns: int) -> None:
-        """Fault for a failure that lasts, after a reset again."""
+        """Enter Fault for a failure that lasts, again after a reset."""
         if self._failure and self.device.is_powered:
             self._latch(self._failure, None, t_ns)
 
     def leave_operational(self, t_ns: int) -> None:
-        """Fault: without PDOs there is no command."""
+        """Enter Fault if powered: without PDOs no command arrives."""
         if self.state in _POWERED:
             self._fault(Watchdog.OPERATIONAL, t_ns)
 
@@ -296,7 +296,7 @@ class DriveNode(Application):
         self._find_command_pdo(t_ns)
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """Fault when powered."""
+        """Enter Fault if powered; else only trip the watchdog."""
         if self.state in _POWERED:
             self._fault(Watchdog.HEARTBEAT, t_ns, is_found_by_time=True)
         else:
@@ -307,7 +307,7 @@ class DriveNode(Application):
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def distrust_sync(self, t_ns: int) -> None:
-        """Fault when enabled: torque that acts at SYNC has no time."""
+        """Enter Fault if enabled: torque that acts at SYNC has no time."""
         if self.is_enabled:
             self._fault(Watchdog.SYNC, t_ns)
 
@@ -492,7 +492,7 @@ class DriveNode(Application):
 
     @property
     def _obstacle(self) -> int:
-        """0x2212, why there is no Operation enabled: 0 nothing, 1 no PDO is exchanged, 2 none brings commands."""
+        """0x2212, reason against Operation enabled: 0 no reason, 1 PDOs are not exchanged, 2 no PDO brings commands."""
         if self._pdos.is_commandable:
             return 0
         return 2 if self.device.is_operational else 1

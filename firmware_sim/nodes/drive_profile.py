@@ -115,14 +115,14 @@ STATE_BITS = {
 
 
 def find_transition(state: DriveState, event: DriveEvent) -> StateTransition | None:
-    """Return the transition that `event` causes in `state`, None when it causes none."""
+    """Return the transition that `event` causes in `state`, None without one."""
     return _BY_SOURCE.get((state, event))
 
 
 def decode_command(controlword: int, previous: int) -> DriveEvent | None:
-    """Name the command of a controlword, None when it carries none (CiA 402-2, command coding).
+    """Name the command of a controlword, None without one (CiA 402-2, command coding).
 
-    Fault reset is the rising edge of bit 7; while bit 7 stays set there is no command.
+    Fault reset is the rising edge of bit 7; while bit 7 stays set, a controlword carries no command.
     """
     if controlword & _FAULT_RESET:
         return None if previous & _FAULT_RESET else DriveEvent.FAULT_RESET
@@ -171,11 +171,11 @@ class Standstill:
         self._since_ns = self._moving_ns = 0
 
     def begin(self, t_ns: int) -> None:
-        """Braking begins."""
+        """Begin braking."""
         self._since_ns = self._moving_ns = t_ns
 
     def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
-        """Whether the motor stands still, or has braked for the longest time."""
+        """Tell whether the motor stands still, or has braked for the longest time."""
         if abs(velocity_rad_s) > _REST_RAD_S:
             self._moving_ns = t_ns
         return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS
@@ -229,7 +229,7 @@ class TorqueLimits:
         self._combine()
 
     def _combine(self) -> None:
-        """Of several limits the smallest counts."""
+        """Apply the smallest of several limits."""
         most, positive, negative = self._limits.values()
         self._low, self._high = -min(most, negative), min(most, positive)
 
@@ -238,7 +238,8 @@ class Motor(NamedTuple):
     """The drive's knowledge of its motor without the bus: velocity in rad/s, torque in Nm.
 
     is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
-    fault that the motor's state calls for now, 0 for none. is_ideal: neither ever is, so that nobody has to ask.
+    fault that the motor's state calls for now, 0 without a fault. is_ideal: neither ever occurs, so both need no
+    check.
     """
 
     velocity_rad_s: Callable[[], float]

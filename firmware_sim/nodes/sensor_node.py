@@ -60,7 +60,7 @@ class SensorNode(Application):
         else:
             self._lsbs_per_count = count_Nm / signal.scale
         self._ends = signal.raw_low, signal.raw_high
-        self._status = STATUS_NOT_VALID  # nothing measured yet
+        self._status = STATUS_NOT_VALID  # not measured yet
         self._torque = self._counts = 0
         self._zero_counts = 0.0
         self._autozero_left = self._autozero_sum = 0
@@ -98,7 +98,7 @@ class SensorNode(Application):
             self.has_news = True
 
     def set_error(self, bits: int) -> None:
-        """Let the sensor find fault with itself, from its next sample on: bits of 0x6150, 0 for none."""
+        """Let the sensor find fault with itself, from its next sample on: bits of 0x6150, 0: no error."""
         self._error_bits = bits
 
     def poll(self, t_ns: int) -> int:

@@ -48,7 +48,7 @@ _COUNTED = ("feedback", "torque", "command")
 
 
 class _Kind(NamedTuple):
-    """The keys of a kind, besides those of its time, and the nodes that it can befall."""
+    """The keys of a kind, besides those of its time, and the nodes that it can affect."""
 
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
@@ -141,7 +141,7 @@ class FaultSettings:
             raise ValueError(f"same_as = {self.same_as!r} is the node itself")
 
     def _check_node(self, kind: _Kind) -> None:
-        """Check who can have such a frame, value or fault."""
+        """Raise ValueError unless the node can have such a frame, value or fault."""
         if self.frame is not None and self.frame not in kind.frames:
             raise ValueError(_refusal("frame", self.frame, kind.frames, f"kind {self.kind!r}"))
         allowed, what = kind.nodes, f"kind {self.kind!r}"
@@ -176,7 +176,7 @@ class FaultSettings:
 
     @property
     def nodes(self) -> tuple[int, ...]:
-        """Places in `NODES` of those that it befalls; none where it is the host."""
+        """Places in `NODES` of the devices that the fault affects; () for the host."""
         if self.node == HOST:
             return ()
         names = FRAME_NODES[self.frame] if self.frame is not None else NODES

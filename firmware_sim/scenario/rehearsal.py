@@ -61,7 +61,7 @@ class DeviceCounts(NamedTuple):
 
     increments_per_joint_rev: of position. torque_range_Nm: the largest torque that the sensors' signals, or the
     profile, allow. rated_count_Nm: one count of 0x6076 behind the gear. rated_torque_Nm: 0x6076 of the EDS, behind the
-    gear; 0: the EDS has none.
+    gear; 0: the EDS lacks it.
     """
 
     increments_per_joint_rev: Pair

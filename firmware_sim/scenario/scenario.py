@@ -2,7 +2,7 @@
 
 Times count from the moment both drives are in Operation enabled. Scenarios are TOML files; those that come with the
 package are in the folder `scenarios`. `about`, `group`, `lasts_s`, `acknowledge_faults`, `expect` and
-`expect_certified` are for the programs that play a scenario; they change nothing on the arm.
+`expect_certified` are for the programs that play a scenario; they have no effect on the arm.
 
 Section `[expect]` of a scenario states the outcome with a healthy host of configuration `paper`, as that host is: where
 the host does badly, so does the expectation. `[expect_certified]` replaces `[expect]`, as a whole, for a host of
@@ -12,9 +12,9 @@ configuration `certified`; without it the same outcome is expected of both. Coun
 Ends of a run:
 
     finished   parked and disabled when the time was over
-    fault      the host went to FAULT and nobody acknowledged it
+    fault      the host went to FAULT, without an acknowledgement
     refused    the host did not put the devices into operation
-    lost       the bus failed in operation, or nobody answered any more
+    lost       the bus failed in operation, or the devices stopped answering
 
 A truth has the properties of the real arm that the host's configuration gets wrong or lacks. The host never reads it.
 `[arm]` has values of their own; `[factor]` multiplies values of the host's configuration; `[wiring]` exchanges and
@@ -113,7 +113,7 @@ _TROUBLES: Final = (("false_alarms", "false"), ("missed", "missed"))
 
 
 class ScenarioOutcome(NamedTuple):
-    """The outcome of a run, named as in `ExpectSettings`. Times since motion start; None: there is none."""
+    """The outcome of a run, named as in `ExpectSettings`. Times since motion start; None: it did not happen."""
 
     end: str
     fault: str | None
@@ -270,7 +270,7 @@ class Scenario:
                 )
 
     def expected_of(self, scheme: str) -> ExpectSettings | None:
-        """Return the outcome with a healthy host of a scheme, `paper` or `certified`; None: the file has none."""
+        """Return the outcome with a healthy host of a scheme, `paper` or `certified`; None: the file lacks it."""
         own = self.expect_certified if scheme == "certified" else None
         return own or self.expect
 
@@ -286,7 +286,7 @@ class Scenario:
 
     @property
     def payload_bodies(self) -> tuple[PayloadBody, ...]:
-        """Every payload of this scenario, and none."""
+        """Every payload of this scenario, and the arm without payload."""
         changes = ((change.mass_kg, change.center_m, change.inertia_kg_m2) for change in self.payloads)
         return (0.0, (0.0, 0.0), 0.0), (self.payload_kg, (0.0, 0.0), 0.0), *changes
 

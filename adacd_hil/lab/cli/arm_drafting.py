@@ -91,7 +91,7 @@ class InitOptions:
 
 @dataclass
 class DraftFiles:
-    """Files to be written: all or none of them, and none over an existing file unless `--force`."""
+    """Files to be written all at once, or not at all. Existing files stay unless `--force` is given."""
 
     out: Path
     is_forced: bool
@@ -408,7 +408,7 @@ class Drafting:
         return names
 
     def _eds_files(self) -> list[tuple[Path, str]]:
-        """Return the EDS files with the kind of each; ask if 0x1000 names none."""
+        """Return the EDS files with the kind of each; ask if 0x1000 names neither."""
         options = self.options
         found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
         for eds in options.eds:

@@ -155,7 +155,7 @@ def _open_log(
 def write_pictures(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
     """Write commtest.html, with the tables and curves of the times as in the report of a run.
 
-    Returns the files that were written; none without a cycle. Raises LogError when they can't be written.
+    Returns the files that were written, [] without a cycle. Raises LogError when they can't be written.
     """
     # Here and not above: they take a second to import, and memory that the test itself has no use for.
     from adacd_hil.lab.report.page import Heading, render_page

@@ -48,7 +48,7 @@ class Interview:
         """Return an answer and its source: "given", the proposal's, or "" for an unchanged guess.
 
         read: makes an answer from an option's value, typed text, or a proposal; raises ConfigError for an invalid one,
-        and the question is asked again. explanation: printed on `?`. Raises CommandError if there is no answer.
+        and the question is repeated. explanation: printed on `?`. Raises CommandError without an answer.
         """
         if given is not None:
             return read(given), "given"
@@ -83,7 +83,7 @@ class Interview:
                 self.say(str(error))
 
     def confirm(self, answer: bool | None, question: str) -> bool:
-        """Return the option's answer if given, else ask; without a terminal the answer is no."""
+        """Return the option's answer if given, else ask; return False without a terminal."""
         if answer is not None:
             return answer
         return self.is_asking and click.confirm(in_line(question), default=False, err=True)

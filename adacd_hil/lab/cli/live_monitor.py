@@ -50,7 +50,7 @@ class LiveMonitor:
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
 
     def accept_message(self, message: LiveMessage) -> None:
-        """Take in a message."""
+        """Update the display with a message; ignore other topics."""
         if message.topic not in TOPICS:
             return
         self.messages += 1

@@ -294,7 +294,7 @@ dbc_option = click.option(
 def export(
     log: Path, kind: str, out: Path | None, topics: tuple[str, ...], dbc: Path | None, as_json: bool
 ) -> ExitCode:
-    """Write what a recording holds as tables, Parquet or CSV.
+    """Write the contents of a recording as tables, Parquet or CSV.
 
     Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. Tables replace tables, and no other file. For BLF, ASC and
     candump logs of the frames: can_logconvert.

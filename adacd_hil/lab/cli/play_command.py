@@ -246,7 +246,7 @@ def may_move_an_arm(interface: str, channel: str) -> bool:
 
 
 def _ahead(pieces: "Iterator[NDArray[Any]]") -> "Iterator[NDArray[Any]]":
-    """Give the pieces; a thread reads the next one meanwhile. Raises what reading raises."""
+    """Yield the pieces; a thread reads the next one meanwhile. Errors of reading propagate."""
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, pieces, None)
         while (piece := following.result()) is not None:

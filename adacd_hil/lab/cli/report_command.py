@@ -73,7 +73,7 @@ def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -
 
 
 def _runs_in(given: Path) -> tuple[Path, ...]:
-    """Return the folders with a run below a folder that has none itself."""
+    """Return the folders with a run below a folder, unless the folder itself has a run."""
     return () if not given.is_dir() or (given / LOG_NAME).exists() else tuple(find_runs(given))
 
 

@@ -413,7 +413,7 @@ class HandMotion:
         return bool(np.abs(self._way).max() >= math.radians(self.WANTED_DEG))
 
     def observe_cycle(self, cycle: ZeroTorqueCycle) -> None:
-        """Take in one cycle."""
+        """Add a cycle to the check; ignore an incomplete one."""
         state = cycle.state
         if not state.is_complete:
             return

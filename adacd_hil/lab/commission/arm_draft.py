@@ -198,7 +198,7 @@ def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str])
 
 
 def _limit_about(arm: SerialArm, sign: int, bent_deg: float) -> float:
-    """Return the largest |q2| to both sides of the stretched arm within joint 2's limits, deg; 0 or less: none."""
+    """Return the largest |q2| to both sides of the stretched arm within joint 2's limits, deg; 0 or less: no room."""
     first, second = (math.degrees(sign * float(end[1])) + bent_deg for end in (arm.position_low, arm.position_high))
     return round(min(-min(first, second), max(first, second)), 2)
 
@@ -259,7 +259,7 @@ def _position_limits(arm: SerialArm) -> Vector:
 
 
 def _plausible(key: str, values: Vector, doubts: list[str]) -> Pair | None:
-    """Return limits; None if the URDF has none, or, with a doubt, if `arm.KEY` doesn't accept them."""
+    """Return limits; None if the URDF lacks them, or, with a doubt, if `arm.KEY` doesn't accept them."""
     if not np.all(np.isfinite(values)):
         return None
     pair = float(values[0]), float(values[1])

@@ -175,7 +175,7 @@ class CommunicationTest:
     _complete: int = 0
 
     def observe_cycle(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
-        """Take in one cycle; return its record for the log."""
+        """Add a cycle to the test; return its record for the log."""
         state = cycle.state
         ages = (*state.age_q, *state.age_tau_J)
         if self._ages:  # periods skipped before the first cycle don't count

@@ -109,7 +109,7 @@ def choose_family(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Choose the profiles of two drives and two sensors: those whose layout digest the devices report (0x2000).
 
-    If none reports one, the first profile that fits each; "" if none fits.
+    If no device reports a digest, the first profile that fits each; "" if no profile fits.
     """
     digests = {device.node.layout_digest for device in (*drives, *sensors)} - {None}
     combinations = itertools.product(drives[0].profiles or ("",), sensors[0].profiles or ("",))

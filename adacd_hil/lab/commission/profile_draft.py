@@ -65,7 +65,7 @@ class DeviceRatings(NamedTuple):
         return degrees if _LEAST_LIMIT_DEG <= degrees <= _MOST_LIMIT_DEG else None
 
     def velocity_limit_deg_s(self, scale: ScaleSettings) -> float | None:
-        """Return 0x6080, rpm of the motor, at the joint; None if it is no joint's limit, such as a factory's 50000."""
+        """Return 0x6080, rpm of the motor, at the joint; None if missing or implausible, as a factory's 50000."""
         rpm = self.numbers.get((0x6080, 0))
         gear = self.numbers.get((0x6091, 1), 0) / (self.numbers.get((0x6091, 2)) or 1) or scale.gear_ratio
         degrees_s = (rpm or 0) * _DEG_S_PER_RPM / gear
@@ -122,7 +122,7 @@ def is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int |
 
 
 def kind_of(eds: Path) -> str:
-    """Return "drive" or "sensor" by 0x1000 of an EDS; "" for another profile, or none.
+    """Return "drive" or "sensor" by 0x1000 of an EDS; "" for another profile, or without one.
 
     Raises ConfigError.
     """
@@ -174,7 +174,7 @@ def draft_profile(
 
 
 def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
-    """Return the shipped profile of the EDS's maker; None if there is none.
+    """Return the shipped profile of the EDS's maker; None if no profile is shipped.
 
     Its values that are not `assumed` hold for all devices of this maker.
     """

@@ -98,7 +98,7 @@ class TareSession:
         return self._describe(poses, solve_tare(poses, self.settings), sensors, temperatures)
 
     def _read_temperature(self, node: Any, sensor: Identity) -> float | None:
-        """Read the sensor's temperature in °C; None if it has none."""
+        """Read the sensor's temperature in °C; None for another maker's sensor, or without an answer."""
         if sensor.vendor != _OWN_VENDOR:
             return None
         try:
@@ -315,7 +315,7 @@ def _describe_pose(pose: Pose) -> str:
 
 
 def _user() -> str:
-    """Return the name of the user who runs this, "" if the system has none."""
+    """Return the name of the user who runs this; "" if the system has no name."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):

@@ -3,7 +3,7 @@
 A browser sends with every WebSocket the origin of the page that opens it, and lets any page open one to this machine:
 so a page that is not a viewer's must be refused, or a stranger's page could read the run (cross-site WebSocket
 hijacking). A page that reaches this machine by a name of its own (DNS rebinding) also shows itself by the Host that it
-asks for. Programs that are no browsers send no origin; admission does not keep out anybody who can start one on this
+asks for. Other programs send no origin: admission does not keep out a person who can start one on this
 network.
 """
 
@@ -98,7 +98,7 @@ class Admission:
         return origin.lower() in self._origins or _OWN_PAGE.fullmatch(origin.lower()) is not None
 
     def _is_own_host(self, host: str) -> bool:
-        """Whether a Host header, such as `name:port` or `[::1]:port`, is an address, or a name of this machine."""
+        """Return whether a Host header, as `name:port` or `[::1]:port`, is an address, or a name of this machine."""
         found = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::\d{1,5})?", host)
         if not found:
             return False

@@ -22,7 +22,7 @@ from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import payload_dtype
 
 MOST_MESSAGE_BYTES = 16 * 1024 * 1024
-"""A longer message is nothing that we serve."""
+"""Longer messages don't come from our server."""
 
 
 class LiveTopic(NamedTuple):
@@ -68,7 +68,7 @@ class LiveClient:
             self._waiting.append(message)
 
     def receive(self, timeout_s: float) -> LiveMessage | None:
-        """Return the next message; None when there is none in time, or the server has ended."""
+        """Return the next message; None after the timeout, or when the server has ended."""
         return self._waiting.popleft() if self._waiting else self._receive(timeout_s)
 
     def _receive(self, timeout_s: float) -> LiveMessage | None:

@@ -1,7 +1,7 @@
 """The live view's records: from the writer into a ring that a process of its own looks into, and which are shown.
 
-Nothing here waits for that process. Records that find the ring full are not shown; one that is stopped, dead or busy
-with five hundred viewers costs the log nothing. Only the writer's start waits until it listens, or says why it can't.
+The writer never waits for that process. Records that find the ring full are not shown; a process that is stopped, dead
+or busy with five hundred viewers does not delay the log. Only the writer's start waits until it listens or fails.
 
 **Topics**: those of a log, fewer records of them, and three that are drawn from these.
 
@@ -191,7 +191,7 @@ class LiveFeed:
 RATES_HZ = {TRANSFORMS_TOPIC: 50, SCENE_TOPIC: 10, **{topic.name: topic.rate_Hz for topic in RUN_TOPICS}}
 DECODED_RATE_HZ = 10
 EVERY_RECORD = 0
-"""The rate of topics that have none, as /events, /contact and /frame_checks."""
+"""The rate of topics without a limit, as /events, /contact and /frame_checks."""
 
 
 def rate_of(topic: str) -> int:
@@ -208,7 +208,7 @@ class Decimator:
         self._first_ns = -1  # the first cycle of the slot
 
     def choose(self, cycles_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Say which of the next records are shown (n,), by the times of their cycles, which never run backwards."""
+        """Choose the next records to show (n,), by the times of their cycles, which never run backwards."""
         if not self._slot_ns or not len(cycles_ns):
             return np.ones(len(cycles_ns), np.bool_)
         slots = cycles_ns // self._slot_ns
@@ -225,7 +225,7 @@ _BODY = len(ENCAPSULATION) + 8
 
 
 class Shown(NamedTuple):
-    """A message for those who have subscribed to its topic."""
+    """A message for the viewers that have subscribed to its topic."""
 
     channel: int
     log_ns: int
@@ -258,7 +258,7 @@ class LiveTopics:
         self._description = pack_string(setup.robot_description)
 
     def description(self) -> Shown:
-        """Return the arm's description, for somebody who has just asked for it."""
+        """Return the arm's description, for a viewer that has just subscribed to it."""
         return Shown(self.robot, self.latest_ns, self._description)
 
     def choose(self, batch: Batch, wanted: Collection[int]) -> Iterator[Shown]:

@@ -39,5 +39,5 @@ class LiveAddress(NamedTuple):
 def live_address(
     host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int
 ) -> LiveAddress:
-    """Return the place of a live view. Raises ValueError where one of the origins is none."""
+    """Return the place of a live view. Raises ValueError for an invalid origin."""
     return LiveAddress(host, port, tuple(map(normal_origin, origins)), names, most_viewers)

@@ -13,7 +13,7 @@ from adacd_hil.log.types.message_types import ENCAPSULATION, MessageType, foreig
 from adacd_hil.records import JOINT_NAMES, ContactLevel, ContactReport, Location, SchemeState, Vector
 
 TRANSFORMS_TOPIC, DESCRIPTION_TOPIC = "/tf", "/robot_description"
-"""Topics that only the live view has; the last is sent to whoever subscribes, once."""
+"""Topics that only the live view has; each viewer gets the last once, when it subscribes."""
 Point = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Color = tuple[float, float, float, float]
@@ -53,7 +53,7 @@ class Sphere(NamedTuple):
 
 
 class Label(NamedTuple):
-    """A text that faces who looks."""
+    """A text that always faces the viewer."""
 
     centre: Point
     text: str

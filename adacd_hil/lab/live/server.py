@@ -2,7 +2,7 @@
 
 Server to viewer, JSON: serverInfo, advertise, status. Binary, little endian: 1, subscription (uint32), log time in ns
 (uint64), payload; and 2, time (uint64), since the capability `time` is offered: log time, which never runs backwards.
-Viewer to server: subscribe, unsubscribe; whatever else is answered with one warning and changes nothing.
+Viewer to server: subscribe, unsubscribe; any other message is answered with one warning and ignored.
 
 A viewer that reads slowly loses its oldest messages; one that answers no ping for some 40 s is closed. The number of
 viewers is limited, and so is the number of connections that are still opening. The server never logs or prints data
@@ -105,7 +105,7 @@ class Viewer:
 
     @property
     def is_served(self) -> bool:
-        """Whether nothing waits."""
+        """Whether no message waits."""
         return not self._waiting
 
     async def send_all(self) -> None:
@@ -167,7 +167,7 @@ class LiveServer:
     # -- the writer -----------------------------------------------------------------------------------------------
 
     def _hear(self) -> None:
-        """Take the writer's words; whatever they are, look into the ring."""
+        """Receive all waiting words of the writer; after any of them, look into the ring."""
         word: bytes | None = None
         with contextlib.suppress(BlockingIOError):
             while True:
@@ -203,7 +203,7 @@ class LiveServer:
                 viewer.put(_TIME.pack(_TIME_DATA, log_ns))
 
     def _tell_writer(self) -> None:
-        """Say whether somebody has subscribed to something, where that has changed."""
+        """Notify the writer when the first viewer subscribes, or the last subscription ends."""
         is_watched = any(viewer.subscriptions for viewer in self._viewers)
         if is_watched != self._is_watched:
             self._is_watched = is_watched
@@ -372,7 +372,7 @@ _PAGE = Path(__file__).with_name("live_page.html")
 
 
 def _no_logger() -> logging.Logger:
-    """Return a logger that formats nothing, since strangers may send much."""
+    """Return a logger that drops every message unformatted, since strangers may send much."""
     logger = logging.getLogger("adacd_hil.live")
     logger.disabled = True
     return logger
@@ -385,7 +385,7 @@ def listen(setup: LiveSetup) -> socket.socket:
 
 
 def url_of(setup: LiveSetup, listening: socket.socket) -> str:
-    """Say where viewers find it."""
+    """Return the URL for viewers."""
     host = f"[{setup.host}]" if ":" in setup.host else setup.host
     return f"ws://{host}:{listening.getsockname()[1]}"
 

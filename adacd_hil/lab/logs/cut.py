@@ -66,7 +66,7 @@ def cut(
 ) -> Cut:
     """Cut a stretch out of the log whose first part is `path`, of all topics or of `topics`.
 
-    Raises LogError when the log is damaged, when nothing is in the stretch, or when `out` is the log itself.
+    Raises LogError when the log is damaged, when the stretch has no message, or when `out` is the log itself.
     """
     log = SalvagedLog(path, progress)
     known = set()

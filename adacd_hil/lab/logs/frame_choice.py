@@ -31,7 +31,7 @@ class FrameChoice:
     end_ns: int | None = None
 
     def pieces(self, source: FrameSource) -> Iterator[NDArray[Any]]:
-        """Give what is chosen of each piece of a recording."""
+        """Yield the chosen frames of each piece of a recording; skips pieces without any."""
         first_ns = None
         for frames in source:
             if first_ns is None and len(frames):

@@ -17,7 +17,7 @@ _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 
 
 class Bag(NamedTuple):
-    """What is in a bag: the type of each topic, and how messages of one are read."""
+    """The contents of a bag: the type of each topic, and a function that reads the messages of one."""
 
     topics: Mapping[str, str]
     messages: Callable[[str], Iterator[tuple[int, JointStateMessage]]]  # with when they were recorded, ns
@@ -31,12 +31,12 @@ def is_bag(path: Path) -> bool:
         with open_input(path) as file:
             return file.peek(16).startswith((_MCAP_MAGIC, _BAG_MAGIC, _SQLITE_MAGIC))
     except OSError:
-        return False  # who reads it says why it can't be
+        return False  # its reader raises the reason
 
 
 @contextmanager
 def opened_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag. Raises LogError for whatever its reader raises."""
+    """Open a bag. Raises LogError for any error of its reader."""
     try:
         if not path.is_dir():
             with open_input(path) as file:
@@ -53,7 +53,7 @@ def opened_bag(path: Path) -> Iterator[Bag]:
         raise
     except OSError as error:
         raise LogError(f"recording {path}: {error.strerror or error}") from None
-    except Exception as error:  # whatever a reader makes of damaged bytes
+    except Exception as error:  # damaged bytes can raise any error
         remedy = "; `adacd-hil log recover` saves what is left of a cut MCAP file" if path.suffix == ".mcap" else ""
         reason = " ".join(str(error).split()) or type(error).__name__
         raise LogError(f"recording {path} can't be read: {reason}{remedy}") from None

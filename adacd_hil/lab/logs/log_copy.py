@@ -32,7 +32,7 @@ from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end, read_head
 from adacd_hil.log.types.record_arrays import count_frames
 
 _CHANNEL = 9
-"""Where the number of the channel is in a message record, bytes."""
+"""Offset of the channel's number in a message record, bytes."""
 
 
 class LogCopy:
@@ -134,7 +134,7 @@ class LogCopy:
 
 
 def _common_profile(sources: Iterable[Path]) -> str:
-    """Return the profile that all logs fit; earlier ones of ours fit the one of ROS 2, but don't say so."""
+    """Return the profile that all logs fit, "" if they differ. Earlier logs of ours fit ROS 2 without naming it."""
     headers = [read_header(path) for path in sources]
     return ROS_PROFILE if headers and all(header is not None and _is_ros(header) for header in headers) else ""
 
@@ -156,7 +156,7 @@ def _gather(
 
 
 class _CopyTarget:
-    """A file beside the one that it becomes."""
+    """A temporary file beside its final name, renamed by `commit`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -189,7 +189,7 @@ class _CopyTarget:
             raise self._error(error) from None
 
     def discard(self) -> None:
-        """Remove what was not committed."""
+        """Close and remove the file, unless it was committed."""
         with contextlib.suppress(OSError):
             self._file.close()
         self._replacement.discard()

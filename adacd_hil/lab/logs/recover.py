@@ -1,8 +1,8 @@
 """A damaged log made whole again from its trusted records: see salvage.py.
 
 The result is one file, whatever the number of parts: definitions, attachments, metadata and messages as they were, and
-an index, statistics and a summary made anew, whose `ending` says "recovered" and what was lost. The source stays as it
-is, and nothing appears under the result's name before it is whole.
+an index, statistics and a summary made anew, whose `ending` is "recovered" and names the lost parts. The source stays
+as it is, and the result appears under its name only when it is whole.
 """
 
 from collections.abc import Callable
@@ -34,9 +34,9 @@ def default_out(path: Path) -> Path:
 
 
 def recover(path: Path, out: Path | None = None, progress: Callable[[str], None] = lambda _: None) -> LogRecovery:
-    """Save what can be trusted of the log whose first part is `path`, with all its parts, to `out`.
+    """Save the trusted records of all parts of a log to `out`. path: the log's first part.
 
-    Raises LogError when there is nothing, when a file can't be read, or when `out` is the log itself.
+    Raises LogError when no record can be trusted, when a file can't be read, or when `out` is the log itself.
     """
     out = out or default_out(path)
     log = SalvagedLog(path, progress)

@@ -24,10 +24,10 @@ from adacd_hil.log.salvage import Losses, Salvage
 
 
 class SalvagedLog:
-    """Iterate once for attachments, of each name the first, and chunks; then `losses` says what is missing.
+    """Iterate once for chunks and, of each name, the first attachment; then `losses` names the missing parts.
 
     `metadata`, by name the first of each, and `definitions`, those of the present part, fill up on the way. Iterating
-    raises LogError when a file can't be read, or when nothing in the log can be trusted.
+    raises LogError when a file can't be read, or when no record of the log can be trusted.
     """
 
     def __init__(self, path: Path, progress: Callable[[str], None] = lambda _: None) -> None:
@@ -71,7 +71,7 @@ class SalvagedLog:
         self.losses.missing_parts = [*self._missing(), *foreign]
 
     def _is_foreign(self, item: Metadata, is_vouched: bool) -> bool:
-        """Say whether a part is of another run: one damaged entry doesn't make it so."""
+        """Tell whether a part is of another run: one damaged entry doesn't make it so."""
         if item.name != RUN_METADATA:
             return False
         mine, theirs = (

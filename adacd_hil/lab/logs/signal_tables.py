@@ -103,7 +103,7 @@ class Tables:
     """Files of tables in one folder, each begun when its first rows come; they appear when all are whole."""
 
     def __init__(self, folder: Path, kind: str, metadata: Mapping[str, str]) -> None:
-        """Make the folder. `metadata` goes into Parquet files. Raises LogError when nothing can be written."""
+        """Make the folder. `metadata` goes into Parquet files. Raises LogError if that fails, or pyarrow is missing."""
         self.rows: dict[Path, int] = {}
         """How many rows each file has."""
         self._folder = folder
@@ -118,7 +118,7 @@ class Tables:
             folder.mkdir(parents=True, exist_ok=True)
 
     def write(self, topic: str, columns: Columns) -> None:
-        """Add rows to the table of a topic; none make an empty table. Raises LogError."""
+        """Add rows to the table of a topic; without rows, make an empty table. Raises LogError."""
         path = self._paths.get(topic) or self._path(topic)
         with failing_as(f"{path} can't be written"):
             if topic not in self._tables:
@@ -134,7 +134,7 @@ class Tables:
         self.rows[path] += len(columns["t_ns"])
 
     def _path(self, topic: str) -> Path:
-        """Name the file of a topic: one of its own, whatever others have called their topics."""
+        """Name a file for one topic only, even if the names of other topics give the same file name."""
         stem = re.sub(r"[^\w.-]", "_", topic.strip("/"))[:_LONGEST_STEM] or "_"
         stems = itertools.chain((stem,), (f"{stem}_{number}" for number in itertools.count(2)))
         paths = (self._folder / f"{stem}.{self._kind}" for stem in stems)
@@ -189,7 +189,7 @@ class _Parquet:
 
 
 def import_pyarrow() -> tuple[Any, Any]:
-    """Return pyarrow and its module for Parquet. Raises LogError with what to install."""
+    """Return pyarrow and its module for Parquet. Raises LogError with the command that installs it."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -222,7 +222,7 @@ def export_tables(
     """Write the tables of a recording into the folder `out`.
 
     wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty: all. decoder:
-    decodes the frames of recordings that have no decoded topics. progress: is told the rows so far.
+    decodes the frames of recordings that have no decoded topics. progress: called with the number of rows so far.
     Raises LogError when the recording can't be read, lacks a topic, or a table can't be written.
     """
     is_mcap = path.suffix.lower() == ".mcap"
@@ -239,9 +239,9 @@ def export_tables(
 def choose_topics(
     topics: Collection[str], wanted: Collection[str], raw: Collection[str] = (), owner: str = "the log"
 ) -> list[str]:
-    """Choose topics by names or patterns. Raises LogError for one that fits none, with the nearest.
+    """Choose topics by names or patterns. Raises LogError for one that fits no topic, with the nearest.
 
-    raw: topics of frames, of which no table is made. owner: who has the topics, for the error.
+    raw: topics of frames, of which no table is made. owner: the source of the topics, for the error.
     """
     if not wanted:
         return list(topics)
@@ -310,14 +310,14 @@ def _export_frames(
 
 
 def _topics(path: Path) -> list[str]:
-    """List the topics that the first chunk of an MCAP file defines. Raises LogError when it is none."""
+    """List the topics that the first chunk of an MCAP file defines. Raises LogError for any other file."""
     topics: list[str] = []
     with failing_as(f"log {path} can't be read"):
         file = open_input(path)
     with file:
         if file.read(len(MAGIC)) != MAGIC:
             raise LogError(f"{path} is not an MCAP file")
-        with contextlib.suppress(OSError, LogError, ChunkError):  # who reads the log says what is wrong with it
+        with contextlib.suppress(OSError, LogError, ChunkError):  # the reader of the log raises the reason
             for record in scan(file):
                 if not isinstance(record, RawRecord):
                     break

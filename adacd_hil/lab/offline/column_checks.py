@@ -54,7 +54,7 @@ CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 
 
 class RecordingFinding(NamedTuple):
-    """A finding on a recording, and the user's next step; "" if none is needed.
+    """A finding on a recording, and the user's next step; "" if the user need not act.
 
     is_against: a reason why the torque isn't explained; else a remark. Of columns: is_dead: no model can be fitted.
     is_wrong: a fitted model is worthless, unless another interpretation of the map is found. With neither, the defect
@@ -337,7 +337,7 @@ def plateau(torque: Vector) -> tuple[float, float] | None:
     """Return the bound at which a torque stays within its noise, and the share of time there; None without one.
 
     The last band below the extreme reading, as wide as the noise, holds far more readings than the band before it. A
-    joint that overcomes nothing but friction looks like this, too.
+    joint that overcomes only friction looks like this, too.
     """
     noise = float(MEDIAN_TO_SIGMA) * float(np.median(np.abs(np.diff(torque, 2))))
     width, span = 2.0 * _PLATEAU_SIGMAS * noise, float(np.ptp(torque))

@@ -1,7 +1,7 @@
 """A recording in a CSV file: head, rows, and hints at the key of the map that would make a cell readable.
 
-A row is skipped if it has fewer cells than the head, or a cell that is no number; an empty cell is a missing value. A
-row of units below the head is compared with the map.
+A row is skipped if it has fewer cells than the head, or a cell that isn't a number; an empty cell is a missing value.
+A row of units below the head is compared with the map.
 """
 
 import csv
@@ -42,7 +42,7 @@ _KINDS_OF_FILE: Final = (
 
 
 class CsvHead(NamedTuple):
-    """The first row: heads, empty if the map announces none, and the number of cells."""
+    """The first row: heads, empty if the map announces no head, and the number of cells."""
 
     heads: list[str]
     cells: int
@@ -208,7 +208,7 @@ class _RowReader:
         return row if self._has_time else [(self._rows - 1) * self._described.sampling.period_s, *row]
 
     def _slowly(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
-        """Read a row with a cell that is no number: empty, a unit, or unreadable."""
+        """Read a row with a cell that isn't a number: empty, a unit, or unreadable."""
         row, wrong = [], []
         for column in self._wanted:
             text = cells[column.place].strip()

@@ -189,7 +189,7 @@ def _reach(tau: Vector, arm: SerialArm) -> str:
 
 
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
-    """Draft the keys of a bag; none are needed if it has the URDF's names on one topic."""
+    """Draft the keys of a bag; it needs no key if it has the URDF's names on one topic."""
     keys = []
     with opened_bag(recording) as bag:
         found = joint_state_topics(bag.topics)

@@ -237,7 +237,7 @@ def _touches(stretch: RecordingStretch) -> NDArray[np.int64]:
 def _owners(
     stretch: RecordingStretch, samples: NDArray[np.int64], recording: ForeignRecording, settings: OfflineSettings
 ) -> NDArray[np.int64]:
-    """Return the touch that each contact belongs to, -1 for none, as far as the touches' times are known."""
+    """Return the touch that each contact belongs to, -1 without one, as far as the touches' times are known."""
     firsts, lasts = _touches(stretch).T
     onsets = firsts - round(recording.blur_s / recording.period_s)
     return owners(samples, onsets, explained_until(onsets, lasts + round(settings.isolation_s / settings.period_s)))

@@ -30,12 +30,12 @@ _SPELLINGS = {
 
 
 def unit_of(text: str) -> str:
-    """Return the unit that a text names, as the map spells it; "" if it is none."""
+    """Return the unit that a text names, as the map spells it; "" for any other text."""
     return _SPELLINGS.get(text.strip(" []()").casefold(), "")
 
 
 def time_unit_of(step: float) -> str:
-    """Return the unit in which a step between two rows is a plausible period of a recording; "" if none is."""
+    """Return the unit in which a step between two rows is a plausible period of a recording; "" without one."""
     low_s, high_s = _USUAL_PERIOD_S
     return next((unit for unit in ("s", "ms", "us", "ns") if low_s <= step * TIME_S[unit] <= high_s), "")
 
@@ -77,7 +77,7 @@ class UnitsSection:
 
 @dataclass(frozen=True)
 class ScaleSection:
-    """A factor per joint, after the unit; none: 1."""
+    """A factor per joint, after the unit; 1 if it is empty."""
 
     q: tuple[float, ...] = setting((), low=-1e9, high=1e9, meaning="of positions and velocities")
     tau_J: tuple[float, ...] = setting((), low=-1e9, high=1e9, meaning="of torques; Nm/A of currents")

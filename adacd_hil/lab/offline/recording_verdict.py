@@ -72,7 +72,7 @@ class Verdict:
     joints: tuple[JointShare, ...]
     reasons: tuple[str, ...]
     remarks: tuple[str, ...]
-    remedy: str  # the user's next step; "" if none is needed
+    remedy: str  # the user's next step; "" if the user need not act
 
     def __repr__(self) -> str:
         return f"<Verdict: {self.headline}>"
@@ -149,7 +149,7 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Recor
 
 
 def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
-    """Tell for each torque whether it is no more than the sensor's noise behind the filter of the fit."""
+    """Tell for each torque whether it is within the sensor's noise behind the filter of the fit."""
     noise = offline.filtered_noise_Nm(fit.settings)
     return [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
 
@@ -345,7 +345,7 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
 
 
 def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
-    """Return the unit that torques are meant in if they are off by 1000; "" if they aren't.
+    """Return the probable unit of torques if they are off by 1000; "" if they aren't.
 
     Some URDFs have masses of a thousandth for the sake of a simulator: with a plausible inertia, torques are not mNm.
     """

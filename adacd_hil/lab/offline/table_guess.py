@@ -70,7 +70,7 @@ class TableGuess:
     """The guess. columns, units: by role, from the heads. reasons: of guesses."""
 
     form: TableForm
-    values: Vector  # (k, columns) of the rows that were read; nan for cells that are no numbers
+    values: Vector  # (k, columns) of the rows that were read; nan for cells without a number
     is_iso: bool = False
     columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)

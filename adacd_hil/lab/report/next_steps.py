@@ -16,7 +16,7 @@ from adacd_hil.terminal import in_line
 
 
 class NextStep(NamedTuple):
-    """A next step, and the command for it; empty where there is none."""
+    """A next step, and the command for it; "" for a step without a command."""
 
     text: str
     command: str = ""
@@ -73,7 +73,7 @@ def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
 
 
 def _checked(run: Run, text: str) -> NextStep:
-    """Send a reader to the check of host, bus and arm; of an arm in the host's own process there is none."""
+    """Return the check of host, bus and arm as the next step; without a command for an arm in the host's process."""
     interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
     if interface in ("", EMBEDDED):
         played = f" --scenario {_quoted(run.metadata['scenario'])}" if run.metadata.get("scenario") else ""

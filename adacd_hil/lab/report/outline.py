@@ -42,7 +42,7 @@ class Facts:
         self.reports: list[ContactReport] = []
         self.events: list[LoggedEvent] = []
         self.finish_cycle: int | None = None
-        """In which the user asked to finish."""
+        """Cycle of the first request to finish."""
         self.motion_start_ns: int | None = None
         """The first cycle in ADAPT."""
         self.first_ns: int | None = None
@@ -60,7 +60,7 @@ class Facts:
         return next((t_ns for t_ns in (self.motion_start_ns, self.first_ns) if t_ns is not None), 0)
 
     def add(self, stream: LogStream, piece: Piece) -> None:
-        """Take in the next piece."""
+        """Add the facts of the next piece."""
         self.reports += [entry.report for entry in contacts_of(piece.series["/contact"])]
         self.events += stream.events(piece)
         self._checks += _checks_of(piece.series["/frame_checks"])
@@ -80,7 +80,7 @@ class Facts:
         self.cycles += len(scheme)
 
     def apply(self, run: Run) -> Run:
-        """Give a run that knows them."""
+        """Return a run with these facts, else as `run`."""
         return dataclasses.replace(
             run,
             reports=tuple(self.reports),
@@ -121,7 +121,7 @@ class TruthClock:
         self._before: tuple[int, int] | None = None  # cycle and time of the last row before the piece
 
     def add(self, scheme: Series, begins: Cycles) -> tuple[Cycles, Cycles]:
-        """Take in a piece; return the rows of the truth whose times it tells, and their cycles.
+        """Place the rows of the truth that fall into a piece of the log; return these rows and their cycles.
 
         begins: first cycle of each attempt so far.
         """
@@ -159,11 +159,11 @@ class Outline:
     def __init__(self, shell: Run, empty: Series, truth: TruthTable | None) -> None:
         """`shell`: a run with empty arrays: settings, metadata, and a truth on the host's cycles if there is one.
 
-        empty: a piece of /scheme without records; truth: whose place on the host's cycles is to be found.
+        empty: a piece of /scheme without records; truth: rows whose cycle of the host is still to be found.
         """
         self.facts = Facts()
         self.indexes: list[NDArray[np.int64]] = []
-        """Which of the cycles that were read the rows are, from 0."""
+        """Index of each row's cycle among the cycles that were read, from 0."""
         self._shell = shell
         self._rows = SchemeRows(empty)
         self._truth = truth
@@ -171,10 +171,10 @@ class Outline:
         index = next((known.contact_index for known in (truth, shell.truth) if known is not None), np.empty(0))
         self._is_onset = (index >= 0.0) & (np.concatenate(([-1.0], index))[:-1] != index)
         self._last: tuple[int, bool] | None = None  # state of the row before, and whether the paper's scheme was armed
-        self._busy_ns = 0  # when something was last going on
+        self._busy_ns = 0  # time of the last cycle in a state of `BUSY`, or of a later row of the truth
 
     def add(self, stream: LogStream, piece: Piece) -> None:
-        """Take in the next piece."""
+        """Add the next piece: its facts, and the rows of the outline."""
         before = self.facts.cycles
         self.facts.add(stream, piece)
         scheme = piece.series["/scheme"]
@@ -189,11 +189,11 @@ class Outline:
             self._busy_ns = max(self._busy_ns, int(scheme.t_ns[busy[-1]]))
 
     def is_idle_since(self, t_ns: int) -> bool:
-        """Whether nothing has been going on since a time."""
+        """Tell whether the last cycle in a state of `BUSY` and the last row of the truth so far are before a time."""
         return self._busy_ns < t_ns
 
     def _edges(self, scheme: Series) -> NDArray[np.int64]:
-        """List the rows at which something changes."""
+        """List the first and last row and the rows beside changes of the state or of arming of the paper's scheme."""
         state = scheme.records["state"].astype(np.int64)
         is_armed = np.zeros(len(state), np.bool_)
         if "paper_is_armed" in scheme.fields:
@@ -244,12 +244,12 @@ _PAPER: Final = ("paper_is_armed", "paper_tau_ext_hat", "paper_threshold")
 class SchemeRows:
     """Rows of /scheme, gathered piece by piece: only the fields that a report reads.
 
-    They lie in one block of memory, which is asked for at once and used as far as it is filled: columns that are
-    gathered apart and joined at the end are there twice, and leave holes behind.
+    One block of memory holds them. It is allocated at once and used as far as it is filled: columns that are gathered
+    apart and joined at the end need the memory twice, and fragment it.
     """
 
     def __init__(self, first: Series, room: int = 1 << 16) -> None:
-        """`first`: a piece of /scheme, with or without records, all of which are taken; room: for so many rows."""
+        """Take all records of `first`, a piece of /scheme with or without records. room: rows to allocate at first."""
         self.count = 0
         self._room = room
         self._begin(first)
@@ -319,14 +319,14 @@ MARGIN_S: Final = 0.2
 
 
 def settling_s(run: Run) -> float:
-    """Give after how long a contact or a reaction is forgotten."""
+    """Return the time after which a contact or a reaction has left the filters, s."""
     return SETTLING_TIME_CONSTANTS / run.a_rad_s
 
 
 def widen(run: Run, start_s: float, end_s: float) -> tuple[float, float]:
-    """Give the smallest stretch of a run, s since motion start, that holds another one and cuts nothing.
+    """Extend a stretch of a run, s since motion start, as little as needed to cut no contact and no adaptation.
 
-    run: has the cycles in which something begins or ends.
+    run: has the cycles in which contacts and adaptations begin or end.
     """
     if run.cycle.size == 0:
         return start_s, end_s
@@ -341,7 +341,7 @@ def widen(run: Run, start_s: float, end_s: float) -> tuple[float, float]:
 
 
 def _busy(run: Run) -> Iterator[tuple[float, float]]:
-    """Give when something is going on, s."""
+    """Yield start and end of each true contact and each stretch in a state of `BUSY`, margins included, s."""
     time_s, later_s = run.time_s(), settling_s(run)
     is_busy = np.concatenate(([False], np.isin(run.state, BUSY), [False]))
     edges = np.flatnonzero(is_busy[1:] != is_busy[:-1])

@@ -1,8 +1,8 @@
 """Pages from the Jinja2 templates in `templates`: words, forms and limits that all share; the only place that renders.
 
-A page needs nothing from outside and allows its own styles and scripts alone, by their digests: no
-inline style, no request (content security policy). Every value is escaped; where a template marks one as safe, it says
-why it is. A template that asks for a value that it isn't given is an error. Pages follow the reader's light or dark
+A page loads no other file and allows its own styles and scripts alone, by their digests: no
+inline style, no request (content security policy). Every value is escaped; a template that marks one as safe gives
+the reason. A value that a template needs and lacks is an error. Pages follow the reader's light or dark
 scheme and print in the light one.
 
 The size of a report is bounded, whatever the length of the run. The tables as CSV and JSON are complete.
@@ -72,7 +72,7 @@ class Cell(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table; columns are aligned right but those of `left`. head: empty where it has none."""
+    """A table; columns are aligned right but those of `left`. head: empty for a table without one."""
 
     head: Sequence[Cell]
     rows: Sequence[Sequence[Cell]]
@@ -180,7 +180,7 @@ def went_wrong(contact: ReportedContact) -> bool:
 
 
 def left_out_text(metrics: Metrics, most: int) -> str:
-    """Say which contacts are not listed; nothing where all are."""
+    """Return a sentence on the contacts that are not listed; empty if all are."""
     count, shown = len(metrics.contacts), len(shown_contacts(metrics, most))
     if shown == count:
         return ""
@@ -191,7 +191,7 @@ def left_out_text(metrics: Metrics, most: int) -> str:
 def contact_rows(
     metrics: Metrics, contacts: Sequence[ReportedContact]
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Give head and rows of a list of contacts, where it is known with the delay of the paper's scheme beside."""
+    """Give head and rows of a list of contacts, with the delay of the paper's scheme if it is known."""
     rows = [_contact_words(contact) for contact in contacts]
     beside = shown_beside(metrics)
     if beside is None or not beside.contacts:
@@ -249,7 +249,7 @@ def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
 
 
 def stretch_text(stretch: StretchOfRun) -> str:
-    """Say which stretch of a log was taken, and why it is not the one that was asked for."""
+    """Describe the stretch of a log that was read, and the reason if it differs from the requested one."""
     start_s, end_s = stretch.found
     text = (
         "the log"

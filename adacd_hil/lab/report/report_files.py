@@ -46,7 +46,7 @@ class Report:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the log is whole and nothing was dropped on the way to it."""
+        """Whether the log is whole and no record was dropped before it was written."""
         return self.source.is_complete
 
     def as_json(self) -> dict[str, Any]:
@@ -54,7 +54,7 @@ class Report:
         return report_json(self.metrics, self.metadata, self.source, self.stretch)
 
     def as_text(self) -> str:
-        """Say for a terminal what happened, what to do, and where the report is."""
+        """Return the result of the run, the next steps and the path of the report, as text for a terminal."""
         first, *further = headlines(self.metrics)
         lines = [in_line(f"{'Good' if self.metrics.is_clean else 'NOT GOOD'}: {first}")]
         lines += [in_line(f"The log is not whole: {self.source.problem}")] if self.source.problem else []

@@ -1,6 +1,6 @@
 """The numbers of a run as plain values for other programs: the content of report.json.
 
-It draws nothing, so that lists of runs read it quickly; the keys are described in `adacd_hil.score.metrics`.
+It draws no figure, so that lists of runs read it quickly; the keys are described in `adacd_hil.score.metrics`.
 """
 
 import dataclasses

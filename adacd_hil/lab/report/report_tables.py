@@ -216,7 +216,7 @@ _QUEUES: Final = {
 
 
 class TimingTables(NamedTuple):
-    """The tables; queues: None where there are none. is_modelled: times are those of a model."""
+    """The tables. queues: None without queues. is_modelled: the times come from a model."""
 
     is_modelled: bool
     times: Table

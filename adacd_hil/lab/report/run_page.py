@@ -248,7 +248,7 @@ def _force(contact: ReportedContact) -> tuple[str, str]:
 
 
 def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Give each joint's peak and impulse; a peak without its deviation where that is not told."""
+    """Give each joint's peak and impulse; a peak without its deviation if that is unknown."""
     unknown = (None, None)
     impulses = contact.impulse_Nm_s or unknown
     impulse_sigmas = contact.impulse_sigma_Nm_s or unknown
@@ -276,7 +276,7 @@ def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> ArmDrawing |
 
 
 def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Push | None:
-    """Say where the force of a contact is drawn: as reported, else as true, else not at all."""
+    """Return the place of a contact's force in the drawing: the reported one, else the true one, else None."""
     link = contact.link if contact.link_detected is None else contact.link_detected
     if link is None:
         return None

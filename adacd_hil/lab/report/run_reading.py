@@ -1,8 +1,8 @@
 """A run read from its logs: the data that report and metrics need, in bounded memory.
 
-A log is read twice, whatever its length: once for when something begins or ends (`outline`), then piece by piece
-through the gatherers, which sum up all cycles and keep those that are drawn (`KeptCycles`). For a stretch of a log, the
-outline of the whole log says how far it has to be widened to cut no contact and no adaptation.
+A log is read twice, whatever its length: once for the beginnings and ends of contacts and adaptations (`outline`), then
+piece by piece through the gatherers, which sum up all cycles and keep those that are drawn (`KeptCycles`). A stretch of
+a log is first widened by the outline of the whole log, so that it cuts no contact and no adaptation.
 
 A run of at most `FULL_CYCLES` cycles keeps all of them. A longer one keeps, besides the cycles of the outline:
 
@@ -10,7 +10,7 @@ A run of at most `FULL_CYCLES` cycles keeps all of them. A longer one keeps, bes
 |---|---|
 | curves | the smallest and the largest value of each in `BUCKETS` buckets |
 | contacts | all from 0.15 s before to 0.6 s after the first `TRACED_CONTACTS` |
-| adaptations | all of the first `ADAPTATIONS` that are no longer than `ADAPTATION_CYCLES` |
+| adaptations | all of the first `ADAPTATIONS` that last at most `ADAPTATION_CYCLES` |
 | times of the cycle | the smallest and the largest value of each in `TIME_BUCKETS` buckets |
 | noise | `_NOISE_STRETCHES` stretches of `_NOISE_CYCLES` cycles, by which the steps of the curves are chosen |
 """
@@ -59,9 +59,9 @@ TIME_BUCKETS: Final = 4_000
 ADAPTATION_CYCLES: Final = 10_000
 _AROUND_S: Final = (0.15, 0.6)
 _AFTER_ADAPTATION: Final = 0.1
-"""Share of an adaptation's length by which its figure goes on."""
+"""Share of an adaptation's length that its figure shows after its end."""
 _ROOM: Final = 200_000
-"""Rows that memory is asked for at once, more than are kept of most runs."""
+"""Rows to allocate at first; most runs keep fewer."""
 _NOISE_STRETCHES: Final = 16
 _NOISE_CYCLES: Final = 500
 
@@ -265,10 +265,10 @@ class _Reading:
     def outline(
         self, bounds_ns: Bounds | None = None, shell: Run | None = None, until_ns: int | None = None
     ) -> Outline:
-        """Find when something begins and ends, in all cycles or between two times.
+        """Find when contacts, adaptations and states begin and end, in all cycles or between two times.
 
-        shell: facts about the run that are known before, its truth included. until_ns: read no further than needed to
-        know what happens until then.
+        shell: facts about the run that are known before, its truth included. until_ns: stop reading when
+        the log is past this time by the settling time, and the outline is idle since (`Outline.is_idle_since`).
         """
         outline = Outline(shell or self._shell, self._scheme, self._truth if shell is None else None)
         settling_ns = round(settling_s(self._shell) * 1e9)
@@ -298,7 +298,10 @@ class _Reading:
         return self._done(run, sums.gathered(run))
 
     def read_stretch(self, stretch: TimeWindow, full_cycles: int) -> ReadRun:
-        """Read a part of the log, widened so that it cuts nothing. Raises LogError for a part without a cycle."""
+        """Read a part of the log, widened to cut no contact and no adaptation.
+
+        Raises LogError for a part without a cycle.
+        """
         start_ns = self._shell.log_start_ns
         if start_ns is None:
             raise LogError(f"log {self._path} has no message")
@@ -353,11 +356,11 @@ def _truth_within(truth: Truth | None, bounds_s: tuple[float, float]) -> Truth |
 
 
 def _unjudged(run: Run) -> str:
-    """Say in one line how many detections the truth can't judge, because it begins later or ends before; "" if none."""
+    """Return a line with the number of detections outside the time of the recorded truth; "" for 0."""
     return unjudged_sentence(sum(not detection.raised.is_known for detection in find_detections(run)))
 
 
 def _count(summary: Mapping[str, str], key: str) -> int | None:
-    """Give a number of the log's summary; a cut file has none, a damaged one something else."""
+    """Return a number of the log's summary; None if it is missing (a cut file) or not a number (a damaged one)."""
     text = summary.get(key, "")
     return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None

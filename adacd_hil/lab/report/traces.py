@@ -162,7 +162,7 @@ def _channels(run: Run) -> Iterator[TracePanel]:
 def _shares(stream: CertifiedStream) -> Vector:
     shares = np.zeros((len(stream.tau_ext), JOINTS))
     for channel in range(stream.tau_ext.shape[1]):
-        with np.errstate(over="ignore"):  # a damaged log's threshold of next to nothing
+        with np.errstate(over="ignore"):  # a damaged log's threshold near 0
             np.maximum(shares, np.abs(stream.tau_ext[:, channel]) / stream.threshold[:, channel], out=shares)
     return shares
 
@@ -183,7 +183,7 @@ def _parameters(run: Run) -> Iterator[TracePanel]:
 
 
 def _true_parameter(run: Run, name: str) -> Vector | None:
-    """Give a parameter's true value in each cycle (n,); None where it is not known."""
+    """Give a parameter's true value in each cycle (n,); None if it is unknown."""
     truth = run.truth
     if truth is None or name not in PARAMETER_NAMES:
         return None
@@ -278,7 +278,7 @@ def pack(values: Vector, step: float) -> Packed:
     numbers = candidates[order]
     count = max(1, -(-int(numbers.max(initial=0)).bit_length() // 8))
     planes = numbers.astype("<u4").view(np.uint8).reshape(-1, 4).T[:count]
-    squeezer = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE)  # noise repeats nothing but zeros
+    squeezer = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE)  # only zeros repeat in noise
     squeezed = squeezer.compress(planes.tobytes()) + squeezer.flush()
     return Packed(low, step, order + 1, count, b64encode(squeezed).decode("ascii"))
 

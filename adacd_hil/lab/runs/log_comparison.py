@@ -1,7 +1,7 @@
 """Two runs beside each other: settings, decisions field by field, states, contacts, parameters, timing.
 
-The comparison pairs cycles that lie equally long after *motion start*, the first cycle in ADAPT; where there is none,
-after the first of the log. It matches contacts by the time of their detection since then. It reads logs in pieces and
+The comparison pairs cycles that lie equally long after *motion start*, the first cycle in ADAPT; in a log without one,
+after its first cycle. It matches contacts by the time of their detection since then. It reads logs in pieces and
 keeps a digest of each run.
 """
 
@@ -55,7 +55,7 @@ class RunDigest:
 
 
 class RunReader:
-    """One of the logs: rows of /scheme with their cycle since motion start, and what is kept of it."""
+    """One of the logs: rows of /scheme with their cycle since motion start, and the digest of the log."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -80,7 +80,7 @@ class RunReader:
         return self._zero[1]
 
     def only(self, first: int, end: int) -> None:
-        """Read nothing but the cycles between two numbers since motion start."""
+        """Limit the reading to the cycles between two numbers since motion start."""
         self._bounds = first + self.zero_cycle, end + self.zero_cycle
 
     def _wanted(self, series: Series) -> Series:
@@ -91,7 +91,7 @@ class RunReader:
         return series.part((cycle >= self._bounds[0]) & (cycle < self._bounds[1]))
 
     def _is_over(self, series: Series) -> bool:
-        """Tell whether all that is to be read has been."""
+        """Tell whether the reading has passed all cycles to compare."""
         return self._bounds is not None and bool(len(series)) and int(series.records["cycle"][0]) >= self._bounds[1]
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
@@ -200,7 +200,7 @@ class FieldDifference(NamedTuple):
     largest: float
 
     def as_json(self) -> dict[str, Any]:
-        """Give it in plain values; `largest` is None where it is infinite."""
+        """Return plain values for JSON; `largest` is None if it is infinite."""
         return self._asdict() | {"largest": self.largest if math.isfinite(self.largest) else None}
 
 
@@ -308,8 +308,8 @@ def compare_logs(
 ) -> LogComparison:
     """Compare two logs. Raises LogError, ConfigError.
 
-    stretch: of the first log; of the second the cycles that lie equally long after its motion start. LogError is also
-    raised when one of them has none.
+    stretch: of the first log; the second is read over the same time after its own motion start. Raises LogError also
+    when one of the logs has no cycle in it.
     """
     readers = RunReader(first), RunReader(second)
     period_s = readers[0].settings.bus.period_s

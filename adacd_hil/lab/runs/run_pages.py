@@ -26,7 +26,7 @@ _SHOWN: Final = 60
 
 
 class ListedRun(NamedTuple):
-    """A run of the list: where its report is, None without one, and why it was left alone, "" where it was not."""
+    """A run of the list. report: None without one; problem: reason why the log can't be reported, else ""."""
 
     run: RunSummary
     report: Path | None

@@ -1,8 +1,8 @@
 """The figures of a run in one line, without reading its log where a report has them.
 
 A run's figures are those of the judge (`adacd_hil.lab.score`), as report.json beside the log has them. A report of
-a stretch, of another log or of another version of the file's layout is left alone. Without a report there is what the
-log's index and its events say; `judged` reads the whole log.
+a stretch, of another log or of another version of the file's layout is ignored. Without a report, the figures come
+from the log's index and its events; `judged` reads the whole log.
 
 Friction and torque offsets are those of the first certificate that no payload was announced for, thresholds those of
 the watching after the first adaptation. Friction is at `FRICTION_AT_RAD_S`; offsets have the configuration's included.
@@ -38,7 +38,7 @@ _AT: Final = slice(1, None, 3)
 """Of a certificate's friction, at 0.2, 0.6 and 1.2 rad/s joint by joint."""
 GOOD, NOT_GOOD, NOT_JUDGED, BROKEN, RUNNING = STATUSES = ("good", "not good", "not judged", "broken", "running")
 CERTIFIED, IDENTIFIED, TAKEN_BACK, NO_CERTIFICATE = CERTIFICATES = ("certified", "identified", "taken back", "none")
-"""`identified`: by the paper's scheme, which certifies nothing."""
+"""`identified`: by the paper's scheme, which issues no certificates."""
 _MOST_REPORT_BYTES: Final = 64 << 20
 _DATED: Final = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:]?(\d\d)[-:]?(\d\d)")
 _MOTION_START: Final = "-> ADAPT"
@@ -104,10 +104,10 @@ class RunSummary:
 
 
 def find_runs(folder: Path) -> Iterator[Path]:
-    """Give the folders of runs in a folder, by name, itself alone if it is one; links are left alone.
+    """Give the folders of runs in a folder, by name; only the folder itself if it is a run. Ignores links.
 
-    One whose log lacks its first part is one, too. A folder that can't be read is given as if it were a run, so that it
-    is told of.
+    A folder whose log lacks its first part is also a run. A folder that can't be read is given as a run, so that the
+    list names it.
     """
     if _has_run(folder, [entry.name for entry in folder.iterdir()] if folder.is_dir() else []):
         yield folder
@@ -130,7 +130,7 @@ def _has_run(folder: Path, names: Sequence[str]) -> bool:
 
 
 def summarise(folder: Path, name: str = "") -> RunSummary:
-    """Sum up the run in a folder, in some milliseconds where it was reported. Raises nothing."""
+    """Sum up the run in a folder, in some milliseconds if it has a report. Never raises."""
     log = folder / LOG_NAME
     started, started_by = _started(log)
     broken = RunSummary(folder.resolve().name if name in ("", ".") else name, log, BROKEN, "", started, started_by)
@@ -387,7 +387,7 @@ def _first_model(summary: RunSummary, table: Mapping[str, Any]) -> _Model:
 
 
 def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> Pair | None:
-    """Give the friction that the paper's scheme has identified; it knows no deviation."""
+    """Return the friction that the paper's scheme has identified, without deviation."""
     if section is None or section not in parameters:
         return None
     values = {name: _number(pair[1]) for name, pair in parameters[section].items()}

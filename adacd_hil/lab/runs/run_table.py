@@ -1,6 +1,6 @@
-"""Lists of runs: those that are asked for, as rows for a terminal, a page, JSON, CSV and Parquet.
+"""Lists of runs that pass a filter, as rows for a terminal, a page, JSON, CSV and Parquet.
 
-CSV and Parquet have the same columns, a value per joint in columns of its own (`threshold_1_Nm`); what is not known is
+CSV and Parquet have the same columns, a value per joint in columns of its own (`threshold_1_Nm`); unknown values are
 empty. Parquet's columns have fixed types, so that tables of several folders can be read as one.
 """
 
@@ -75,10 +75,10 @@ NUMBERS: Final = (5, 6, 7)
 
 @dataclass(frozen=True)
 class RunFilter:
-    """Which runs are asked for; what is None or empty lets all through.
+    """The conditions that a run of the list meets; None or empty: all runs meet it.
 
     arms: names as in the list, configurations, or patterns of them. since, until: bounds of the beginning, both
-    included; a run without a date is in none.
+    included; a run without a date is outside any bounds.
     """
 
     arms: tuple[str, ...] = ()
@@ -88,7 +88,7 @@ class RunFilter:
     until: datetime | None = None
 
     def takes(self, run: RunSummary) -> bool:
-        """Tell whether a run is asked for."""
+        """Tell whether a run meets all conditions."""
         if self.arms and not any(is_arm(run, arm) for arm in self.arms):
             return False
         if self.statuses and run.status not in self.statuses:
@@ -114,7 +114,7 @@ def in_order(runs: Iterable[RunSummary]) -> list[RunSummary]:
 
 
 def count_text(runs: Sequence[RunSummary]) -> str:
-    """Say how many runs there are, and how many of them are not good."""
+    """Return a phrase with the number of runs and of those that are not good."""
     text = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     bad = sum(run.status not in (GOOD, NOT_JUDGED, RUNNING) for run in runs)
     parts = [f"{bad} not good"] if bad else []
@@ -141,7 +141,7 @@ def cells(run: RunSummary) -> tuple[str, ...]:
 
 
 def certificate_text(run: RunSummary) -> str:
-    """Say of a run's last certificate what it is, and when it was given or taken back, since motion start."""
+    """Return the state of a run's last certificate, and when it was given or taken back, s since motion start."""
     if run.certificate is None:
         return NONE
     state, at_s, given = run.certificate

@@ -1,11 +1,11 @@
-"""How an arm's figures went on from run to run, and when they last changed beyond what explains it.
+"""An arm's figures from run to run, and their last change beyond the expected variation.
 
 A run is compared with the first one since the last change, so that slow drift adds up and is found. A **threshold** has
-changed when it differs by more than a share of it, `THRESHOLD_SHARE` unless asked otherwise: from run to run it varies
-with what was learnt. Where settings of the detection differ from those of the run before, a quarter of that is enough.
+changed when it differs by more than a share of it, `THRESHOLD_SHARE` by default: it varies from run to run with the
+identified parameters. If settings of the detection differ from those of the run before, a quarter of that is enough.
 **Friction and torque offsets** have changed when they differ by more than `LAST_SIGMAS` standard
 deviations of both certificates together, the bound by which a run doubts the last certificate. The friction that the
-paper's scheme identifies has no deviation, so nothing is said of it. Margins are drawn only.
+paper's scheme identifies has no deviation, so its changes are not judged. Margins are only drawn.
 
 Runs of an emulated arm in the same process are apart from those of the arm on a bus.
 
@@ -33,7 +33,7 @@ _DETECTION: Final = ("certified.", "detector.", "estimator.", "filter.", "scheme
 """Settings that thresholds follow from."""
 _TOLD_KEYS: Final = 3
 _OF_A_RUN: Final = ("name", "history.", "operator.", "log.", "realtime.")
-"""Settings that differ from run to run and say nothing of the detection."""
+"""Settings that differ from run to run and do not affect the detection."""
 
 
 class TrendChange(NamedTuple):
@@ -181,7 +181,7 @@ def _is_meant(run: RunSummary, before: RunSummary) -> bool:
 
 
 def _changed(run: RunSummary, before: RunSummary) -> dict[str, tuple[str, str]]:
-    """Give the settings that a run changed against the one before it, but for those that say nothing."""
+    """Return the settings that a run changed against the one before it, without those of `_OF_A_RUN`."""
     if run.settings is None or before.settings is None or run.settings == before.settings:
         return {}
     changed = changed_keys(before.settings, run.settings)
@@ -189,7 +189,7 @@ def _changed(run: RunSummary, before: RunSummary) -> dict[str, tuple[str, str]]:
 
 
 def _threshold_sentence(runs: Sequence[RunSummary], thresholds: TrendQuantity) -> str:
-    """Say when thresholds last changed, from what to what, and which settings changed with them."""
+    """Return a sentence on the last change of thresholds: run, values before and after, settings changed with it."""
     known = int(np.isfinite(thresholds.values).all(axis=1).sum())
     if not runs:
         return "No run is judged."
@@ -204,7 +204,7 @@ def _threshold_sentence(runs: Sequence[RunSummary], thresholds: TrendQuantity) -
 
 
 def _last_changes(quantity: TrendQuantity) -> tuple[RunSummary, str]:
-    """Give the run of the last changes, and in words what changed at each joint."""
+    """Return the run of the last changes, and a text with the change at each joint."""
     run = quantity.changes[-1].run
     parts = []
     for each in quantity.changes:
@@ -215,7 +215,7 @@ def _last_changes(quantity: TrendQuantity) -> tuple[RunSummary, str]:
 
 
 def _settings_text(runs: Sequence[RunSummary], run: RunSummary) -> str:
-    """Say which settings a run changed against the one before it."""
+    """Return a phrase with the settings that a run changed against the one before it."""
     place = next(number for number, each in enumerate(runs) if each is run)
     if run.settings is None or runs[place - 1].settings is None:
         return "the settings are not known"

@@ -344,7 +344,7 @@ class TimingGatherer:
         self._reactions: Distribution | None = None
 
     def add(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
-        """Take in the next cycles. reactions: see `collect_evidence`."""
+        """Add the next cycles. reactions: see `collect_evidence`."""
         self._cycles += len(columns)
         for quantity in QUANTITIES:
             self._add_times(quantity, columns)
@@ -373,7 +373,7 @@ class TimingGatherer:
         self._histograms[quantity.name] = found if before is None else before.joined(found)
 
     def evidence(self) -> TimingEvidence:
-        """Sum up what has been taken in."""
+        """Return the statistics of all columns added so far."""
         reactions = self._reactions
         return TimingEvidence(
             period_us=self._period_us,
@@ -403,7 +403,7 @@ class TimingGatherer:
 def collect_evidence(
     columns: CycleColumns, period_us: float, is_modelled: bool, reactions: NDArray[np.bool_] | None = None
 ) -> TimingEvidence:
-    """Sum up the columns. reactions: the cycles in which the state becomes REACT (n,); None where there is no state."""
+    """Sum up the columns. reactions: the cycles in which the state becomes REACT (n,); None without states."""
     gatherer = TimingGatherer(period_us, is_modelled)
     gatherer.add(columns, reactions)
     return gatherer.evidence()

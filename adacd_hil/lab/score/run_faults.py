@@ -79,12 +79,12 @@ class CyclicDataGatherer:
         self._window = max(1, round(DATA_WINDOW_S / settings.bus.period_s))
         self._counted = {"frames_missing": 0, "data_age": 0}
         self._cycles = 0  # with powered drives
-        self._logged = 0  # of which /cycle tells how they went
+        self._logged = 0  # with a record in /cycle
         self._worst = 0.0
         self._present = (0, 0, -1)  # of the window under way: cycles, incomplete ones, the last cycle's number
 
     def add(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
-        """Take in the next cycles. cycle, state: those of /scheme (k,)."""
+        """Add the next cycles. cycle, state: those of /scheme (k,)."""
         is_powered = np.isin(state, _POWERED)
         self._cycles += int(np.count_nonzero(is_powered))
         if "cycle" not in columns:
@@ -125,7 +125,7 @@ class CyclicDataGatherer:
         self._present = 0, 0, last
 
     def data(self, run: Run) -> CyclicData:
-        """Sum up what has been taken in. run: has the cycles in which the state changes."""
+        """Return the shares of incomplete and aged data so far. run: has the cycles in which the state changes."""
         self._end_window()
         limits = run.settings.data
         shares = {name: count / self._logged for name, count in self._counted.items()} if self._logged else {}
@@ -143,7 +143,7 @@ class CyclicDataGatherer:
 
 
 def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShares]:
-    """Tell the cycles of each device apart, from counts that begin anew in each attempt."""
+    """Return the shares of each device's cycles, from counts that begin anew in each attempt."""
     if checks is None or len(checks.cycle) < 2 or not run.cycle.size:
         return {}
     cycles = np.diff(checks.cycle)

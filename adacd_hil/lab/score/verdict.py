@@ -46,7 +46,7 @@ def list_findings(
     causes: tuple[str, ...],
     data: CyclicData,
 ) -> tuple[Finding, ...]:
-    """Say how the run went. causes: of attempts that ended without a fault."""
+    """List the findings of a run. causes: of attempts that ended without a fault."""
     if run.cycle.size == 0:
         cause = "; ".join(causes) or "the log does not say why"
         return (Finding(f"no cycle was run: {cause}", True),)
@@ -104,7 +104,7 @@ def _margin_text(evidence: CertifiedEvidence | None) -> str:
 
 
 def _fault_texts(faults: tuple[Fault, ...]) -> list[str]:
-    """Say which faults there were: the first, and the one that the run ended in."""
+    """Return texts of the faults: the first one, and the one in which the run ended."""
     if not faults:
         return []
     last = faults[-1]
@@ -146,7 +146,7 @@ def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:
 def identified_text(
     adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None], anew: frozenset[str], done: str
 ) -> str:
-    """Say how long the model took to be `done`, identified or certified. anew: see `begun_anew`."""
+    """Return a phrase with the time until the model was `done`, identified or certified. anew: see `begun_anew`."""
     if not adaptation_s:
         return "the arm never moved to adapt"
     labels = list(adaptation_s)
@@ -274,7 +274,7 @@ def compare_with_paper(
 
 
 def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, ...]:
-    """Leave out the paper's numbers, and lines that then say nothing, where anything else was played."""
+    """Leave out the paper's numbers, and rows that are then empty, unless the run was the paper's experiment."""
     if is_papers_experiment(run):
         return tuple(rows)
     return tuple(
@@ -285,7 +285,7 @@ def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, .
 
 
 def _tests_text(times_s: list[float | None]) -> str:
-    """Say how long the tests took; of many the shortest and the longest."""
+    """Return the durations of the tests as text; of many, the shortest and the longest."""
     found = [time_s for time_s in times_s if time_s is not None]
     if len(times_s) > LISTED and found:
         return f"tests of {min(found):.2f} to {max(found):.2f} s"
@@ -354,7 +354,7 @@ def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
 
 
 def data_text(data: CyclicData) -> str:
-    """Say in a clause of the verdict how much of the data came; nothing where the drives never had torque."""
+    """Return the verdict's clause on the share of data that arrived; "" if the drives never had torque."""
     if not data.cycles:
         return ""
     if data.incomplete is None:

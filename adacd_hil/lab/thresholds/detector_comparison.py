@@ -158,7 +158,10 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
 
 
 def calibrate_all(statistics: Statistics, rate_per_h: float) -> tuple[dict[str, DetectorCalibration], tuple[str, ...]]:
-    """Calibrate each detector; also return those whose tail can't be fitted. Raises TooLittleMotionError: none can."""
+    """Calibrate each detector; also return those whose tail can't be fitted.
+
+    Raises TooLittleMotionError if no tail can be fitted.
+    """
     found: dict[str, DetectorCalibration] = {}
     missing: list[str] = []
     for name, places in statistics.settings.detectors.items():

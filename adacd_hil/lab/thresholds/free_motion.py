@@ -102,7 +102,7 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 def read_motion(
     path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, watch: Watch = lambda _: None
 ) -> LoggedMotion:
-    """Find the contact-free motion in a log, or in a stretch of it. Raises LogError if there is none.
+    """Find the contact-free motion in a log, or in a stretch of it. Raises LogError without any.
 
     watch: called with each piece of its /scheme.
     """

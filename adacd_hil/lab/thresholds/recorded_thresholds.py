@@ -258,7 +258,7 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
         x = low_pass(statistics.z[free, i], (_MODEL_RAD_S,), motion.period_s)[moves]
         direction = low_pass(np.sign(motion.dq[free, i]), (_MODEL_RAD_S,), motion.period_s)[moves]
         velocity_LSB = resolution(motion.dq[free, i])
-        # the slope of the velocity's noise dominates single samples: nothing else is as fast
+        # the slope of the velocity's noise dominates single samples: no other part is as fast
         torque_gain, momentum_gain = gains((), motion.period_s, statistics.lag_s)
         noise = white_noise(motion.tau_J[free, i])
         fast = mean_square(statistics.z[free, i][moves]) - (torque_gain * noise) ** 2

@@ -1,17 +1,17 @@
 """The search for an excitation: the motion that shows every combination of parameters soonest, within the arm's limits.
 
-What a motion shows is judged as the certified scheme judges it: by the information D (∫ W_f' W_f) D of the slow filter
-over the shortest fit, D the errors that must not stay hidden (`termination`), and by that of the inertia alone over the
-shortest fit of a payload. The search makes the smallest eigenvalues large and the condition number small:
+The search rates a motion as the certified scheme does: by the information D (∫ W_f' W_f) D of the slow filter over the
+shortest fit, D the errors that must not stay hidden (`termination`), and by that of the inertia alone over the shortest
+fit of a payload. The search makes the smallest eigenvalues large and the condition number small:
 
     cost = -ln e - ½ ln e_inertia + ¼ ln (largest / e)
 
-The motion is the Fourier series of `config.ExcitationSettings`. That it begins at rest fixes its first harmonic by the
-others. The limits are those of the trajectory's amplitude, of the speed and acceleration of a withdrawal, and where a
-CAD model is given, a share of the torque limit.
+The motion is the Fourier series of `config.ExcitationSettings`. It begins at rest, so the other harmonics
+determine the first one. The limits are the trajectory's amplitude, the speed and acceleration of a withdrawal, and,
+with a CAD model, a share of the torque limit.
 
 L-BFGS climbs from the present motion first, then from random ones. While it climbs, Coulomb friction is a tanh, so that
-the cost has a slope; results are judged with the sign, as the scheme sees it.
+the cost has a slope; the results are rated with the sign function, as in the scheme.
 
 Shapes: N samples, K harmonics; q, dq, ddq (N, 2); W (N, 2, p). Units: rad, rad/s, rad/s², Nm.
 """
@@ -34,9 +34,9 @@ from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.schema import ConfigError
 
 PERIOD_S = 2.4
-"""Of an excitation for a configuration that has none: a fit of 1.4 s sees more than half of it."""
+"""Period of an excitation for a configuration without one: a fit of 1.4 s covers more than half of it."""
 HARMONICS = 6
-"""Of the same: with 2.4 s up to 2.5 Hz; faster ones meet the limit of acceleration before they show anything."""
+"""Harmonics of that excitation, up to 2.5 Hz. The acceleration limit keeps faster ones too small to be of use."""
 TOLERANCE = 1e-3
 """Part by which a motion may be over a limit: a search from outside ends a little outside."""
 TORQUE_SHARE = 0.5
@@ -56,7 +56,7 @@ class NoExcitationError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Figures:
-    """What a motion shows and needs. Pairs are joints; e: smallest eigenvalues, Nm² s."""
+    """The information from a motion (smallest eigenvalues, Nm² s; their condition), and its peaks. Pairs are joints."""
 
     excitation_Nm2s: float
     condition: float
@@ -65,16 +65,16 @@ class Figures:
     velocity_deg_s: tuple[float, float]
     acceleration_deg_s2: tuple[float, float]
     torque_Nm: tuple[float, float] | None
-    """None: without a CAD model nobody knows."""
+    """None: unknown without a CAD model."""
 
     @property
     def cost(self) -> float:
-        """What the search makes small."""
+        """The quantity that the search minimises."""
         return _cost_of(self.excitation_Nm2s, self.condition, self.inertia_Nm2s)
 
 
 class ExcitationLimits(NamedTuple):
-    """What a motion has to keep; pairs are joints. travel: largest |q|; torque: infinite without a CAD model."""
+    """Limits of a motion; pairs are joints. travel: largest |q|; torque: infinite without a CAD model."""
 
     travel_rad: Vector
     velocity_rad_s: Vector
@@ -136,7 +136,7 @@ class Search:
         self._theta = settings.cad_theta if arm.cad_theta else None
         self._base = len(settings.estimator.parameter_names)
         scale = constants_of(settings)["scale"][0]
-        # The lag shows in the torque's derivative, so only where a model says what the torque is.
+        # The lag shows in the torque's derivative, so only a model of the torque makes it identifiable.
         self._scale = scale if arm.cad_theta else scale[: self._base + JOINTS]
         self._step_s = settings.bus.period_s * certified.learn_every
         elapsed_s = np.arange(0.0, max(self._period_s, *certified.fit_s), self._step_s)
@@ -149,7 +149,7 @@ class Search:
         self._cosine, self._sine = (wave(np.outer(elapsed_s, self._rad_s)) for wave in (np.cos, np.sin))
 
     def figures(self, excitation: ExcitationSettings) -> Figures:
-        """Say what a motion of this period and number of harmonics shows and needs."""
+        """Return the figures of a motion. excitation: of the period and number of harmonics of this search."""
         motion = self.move(np.array(excitation.cosine), np.array(excitation.sine))
         W = self._regressors(motion)
         smallest, largest, inertia = self._shown(W)

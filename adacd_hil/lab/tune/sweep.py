@@ -1,15 +1,15 @@
-"""A sweep: tasks go to workers, rows come back and are kept at once.
+"""A sweep: sends tasks to workers and stores the rows that they return.
 
-A few tasks per worker are in flight, and what comes back is written every few seconds, so that memory doesn't grow with
-the plan. A task that raises is tried again. A worker that dies costs nobody but its task: the tasks that were in flight
-are tried again one by one, so that the one at fault is found. What fails every time leaves rows that say why. Workers
-need the package and, of replays, the logs at the same paths.
+A few tasks per worker are in flight, and rows are written every few seconds, so that memory doesn't grow with the plan.
+A task that raises is tried again. When a worker dies, the tasks in flight are tried again one by one, so that only the
+task at fault is lost. A task that fails every time leaves rows with the reason. Workers need the package and, for
+replays, the logs at the same paths.
 
 Results are parts as they come, one Parquet table in the end. The sweep writes a part beside and renames it, so that a
 sweep that is killed leaves whole parts only. Columns are those of all rows; a row that lacks one has null there.
 Readers: `duckdb`, `pandas.read_parquet`, `pyarrow.parquet`.
 
-The plan says which logs or scenarios, with which settings and seeds; its rows, and the tasks they go out in. Every row
+The plan has the logs or scenarios, settings and seeds; its rows, and the tasks that compute them. Every row
 has a key made of all that its result depends on. A sweep that is begun again computes the keys that its folder lacks. A
 log that has changed, other settings, and another version of the package or of the code make other keys.
 """
@@ -136,7 +136,7 @@ def _tuples(variants: Sequence[Mapping[str, str]]) -> tuple[Changes, ...]:
 SET: Final = "set."
 """Prefix of the columns of varied settings."""
 REFUSALS: Final = (ConfigError, CodecError, LogError)
-"""What makes a row of its own that says why, however often it is tried."""
+"""Errors that repeat at every attempt: they make a row with the reason."""
 
 Value = str | int | float | bool | None
 Values = dict[str, Value]
@@ -155,7 +155,7 @@ def row_labels(subject: Subject, row: SweepRow) -> Values:
 
 
 def failed(subject: Subject, row: SweepRow, error: str) -> Values:
-    """Make a row that says why there is no result."""
+    """Make the row of a failed task, with its error."""
     return row_labels(subject, row) | {"status": "failed", "error": " ".join(error.split())}
 
 
@@ -383,7 +383,7 @@ class _Flights:
                     yield from self._fail(task, f"{type(error).__name__}: {error}", self._again)
 
     def _launch(self) -> bool:
-        """Begin as many tasks as there is room for; return whether any is in flight."""
+        """Submit tasks until the workers are full; return whether any is in flight."""
         if not self._flying:
             self._is_alone = bool(self._suspects)
         room = 1 if self._is_alone or self._suspects else self._workers.room

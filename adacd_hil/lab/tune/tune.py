@@ -1,14 +1,14 @@
 """Thresholds, filter and gain found from logs: candidates, how each is judged, which one is suggested, as TOML.
 
-Every candidate gets the thresholds that one half of the logs gives it for the wanted rate of false alarms: those at
-which the tail's upper 95 % bound is that rate. Then the logs are replayed with it, thresholds and all. A candidate is
-fit if it adapts as often as the logs' own settings do, misses none of the contacts that those were armed for, and has
-no more false alarms than the wanted rate allows. The suggestion is the fit candidate with the smallest median delay.
-Where a wanted rate is extrapolated too far, the bounds of the tails differ more by chance than the candidates do: then
-filter and gain stay as they are. Without the truth nobody knows a delay: only thresholds are found then, too.
+One half of the logs gives each candidate its thresholds for the wanted rate of false alarms: those at which the tail's
+upper 95 % bound is that rate. Then the logs are replayed with the candidate and its thresholds. A candidate is fit if
+it adapts as often as the logs' own settings do, misses no contact for which those were armed, and has no more false
+alarms than the wanted rate allows. The suggestion is the fit candidate with the smallest median delay.
+If a wanted rate is extrapolated too far, the bounds of the tails differ more by chance than by candidate: then filter
+and gain stay as they are. They also stay without the truth, because delays are unknown: only thresholds are found.
 
-The suggestion names what it extends and the keys that change, with their origin as comments. Figures show what is found
-against false alarms, and how late.
+The suggestion names the configuration that it extends and the keys that change, with their origin as comments. Figures
+show the share of contacts found against false alarms, and the delays.
 """
 
 import json
@@ -58,7 +58,7 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names, to_toml
 
 FARTHEST: Final = 100.0
-"""Extrapolation beyond which filters and gains are not told apart: thresholds of equal ones differ by a factor of 4."""
+"""Extrapolation beyond which filters and gains are not ranked: thresholds of equal ones differ by a factor of 4."""
 
 
 def tune(
@@ -70,7 +70,7 @@ def tune(
 ) -> Tuning:
     """Find thresholds, filter and gain. config: name or file of the settings to start from.
 
-    stretch: of each log; the replays begin with the log, and what comes of them in the stretch counts.
+    stretch: of each log; the replays begin with the log, and only their results in the stretch count.
 
     Raises LogError, ConfigError, CodecError, TooLittleMotionError.
     """
@@ -108,7 +108,7 @@ def _choices(
     progress: Progress,
     notes: list[str],
 ) -> tuple[list[Changes], list[Choice]]:
-    """Choose thresholds for each filter and gain; leave out, with a note, what never monitors untouched motion."""
+    """Choose thresholds for each filter and gain; drop, with a note, those that never monitor contact-free motion."""
     chosen: list[tuple[Changes, Choice]] = []
     for changes, observed in zip(tried, observe_candidates(logs, tried, progress), strict=True):
         try:
@@ -155,7 +155,7 @@ def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
 
 
 def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_per_h: float) -> tuple[str, ...]:
-    """Say why a candidate is not fit."""
+    """Return the reasons why a candidate is not fit; () if it is."""
     problems = []
     if choice.calibration is None:
         problems.append("too little motion for a tail")
@@ -181,7 +181,7 @@ def best_of(judged: Sequence[Candidate]) -> Candidate | None:
 
 
 def _delays(candidate: Candidate) -> tuple[float, ...]:
-    """Give median, 90th percentile and largest, by which equal medians are told apart; infinite of no contact."""
+    """Return the sort key of a candidate: median, 90th percentile and largest delay, ms; inf without a contact."""
     figures = delay_figures(candidate.choice.chosen.delays_ms)
     return tuple(math.inf if each is None else each for each in figures)
 
@@ -248,7 +248,7 @@ def _plain(path: Path) -> str:
 
 
 def in_words(found: Found) -> str:
-    """Say what thresholds come to in one half."""
+    """Return a phrase on the effect of thresholds: false alarms, their rate, and contacts found."""
     text = rate_phrase(found.alarms, found.hours, found.rate_bound_per_h)
     if found.contacts is None:
         return text
@@ -256,7 +256,7 @@ def in_words(found: Found) -> str:
 
 
 def outcome_in_words(candidate: Candidate) -> str:
-    """Say what the replay of all logs with a candidate came to."""
+    """Return a phrase on the replay of all logs with a candidate: adaptations, misses, false alarms, delays."""
     outcome = candidate.outcome
     text = f"{len(outcome.adaptation_s)} adaptations"
     if outcome.adaptation_s:
@@ -269,7 +269,7 @@ def outcome_in_words(candidate: Candidate) -> str:
 _LOOKS: Final = ("identified", "cad", "joint1", "joint2", "bar", "beside", "alarm", "ink", "muted")
 
 _LEAST_RATE: Final = 1e-6
-"""Per hour; what the model predicts below this nobody will ever check."""
+"""Per hour; predictions of the model below this are not drawn, because they can't be checked."""
 
 
 @contextmanager
@@ -285,7 +285,7 @@ def _axes(title: str) -> Iterator[tuple[Figure, Axes]]:
 
 
 def _curves(tuning: Tuning) -> Iterator[tuple[Choice, dict[str, Any]]]:
-    """Give what is drawn, and how: the suggestion or else the logs' own filter, then the detectors."""
+    """Yield each choice and its line style: the suggestion, else the logs' own filter, then the detectors."""
     scheme = tuning.best or tuning.candidates[0]
     named = [(f"scheme: {scheme.name}", scheme.choice), *((choice.name, choice) for choice in tuning.detectors)]
     for (name, choice), colour in zip(named, ("alarm", *_LOOKS), strict=False):

@@ -1,6 +1,6 @@
 """Candidates of tuning on the logs: the scheme with other filters and gains, replayed, and all detectors of the stream.
 
-The paper's scheme is replayed with thresholds that nothing exceeds, so that every candidate keeps monitoring and its
+The paper's scheme is replayed with thresholds that no residual exceeds: every candidate keeps monitoring, and its
 residual is seen; the model is frozen while it does. The certified scheme keeps learning, but not from samples over a
 threshold: it is replayed with its own thresholds, and its statistic is the largest ratio to them, which grow with
 `certified.noise_sigmas` and `certified.model_sigmas` (but for the friction that is allowed at standstill).
@@ -38,7 +38,7 @@ Places = NDArray[np.int64]
 
 
 def candidates(settings: Settings) -> list[Changes]:
-    """List changes of filter and gain to try, none first; what a configuration can't have is left out."""
+    """List the changes of filter and gain to try, the unchanged settings first. Leaves out invalid settings."""
     tried: list[Changes] = []
     for filter_factor in _FILTER_FACTORS:
         for gain_factor in _GAIN_FACTORS:
@@ -64,7 +64,7 @@ def _filter(settings: Settings, factor: float) -> Changes:
 
 
 def _gain(settings: Settings, factor: float) -> Changes:
-    """Change how much a sample corrects: P(0), or what is believed of a sample's residual, whose square divides."""
+    """Change the weight of a sample by a factor: P(0) times it, or the assumed residual over its square root."""
     if settings.scheme == "certified":
         return {"certified.residual_Nm": in_toml(settings.certified.residual_Nm / factor**0.5)}
     return {"estimator.P0": in_toml([factor * each for each in settings.estimator.P0])}
@@ -78,8 +78,8 @@ def in_toml(value: float | Sequence[float]) -> str:
 
 
 def thresholds_as_changes(settings: Settings, thresholds: Vector) -> Changes:
-    """Say thresholds (1, n) of `observe_candidates` as settings, rounded up; within what a configuration may have."""
-    up = 1.0005  # four digits are never less than what was chosen
+    """Write thresholds (1, n) of `observe_candidates` as settings, rounded up, within the configuration's bounds."""
+    up = 1.0005  # so that four digits are never below the chosen value
     if settings.scheme == "certified":
         factor = up * float(thresholds[0, 0])
         own = {"noise_sigmas": settings.certified.noise_sigmas, "model_sigmas": settings.certified.model_sigmas}
@@ -115,7 +115,7 @@ def _show_to(shown: "Sequence[ShownLog]") -> Watch:
 
 
 def name_of(changes: Mapping[str, str]) -> str:
-    """Name a candidate by what it changes."""
+    """Name a candidate by its changed settings."""
     return ", ".join(f"{key}={value}" for key, value in changes.items() if key != "filter.b_rad_s") or "as it is"
 
 
@@ -128,7 +128,7 @@ def _monitoring(settings: Settings) -> Settings:
 
 
 class ShownLog:
-    """What one candidate shows on one log of N cycles, stretch by stretch."""
+    """The statistics of one candidate on one log of N cycles, gathered stretch by stretch."""
 
     def __init__(self, log: TunedLog, settings: Settings) -> None:
         self._log = log
@@ -137,12 +137,12 @@ class ShownLog:
         self._channels = 1 if self._is_certified else JOINTS
         self._peaks = np.full((len(log.is_chosen_on), 1, self._channels), -np.inf)
         self._windows = [window for window in log.windows or () if window.is_armed]
-        self._open = sorted(self._windows, key=lambda window: window.first)  # whose last cycle is yet to come
+        self._open = sorted(self._windows, key=lambda window: window.first)  # those whose last cycle is yet to come
         self._parts: dict[int, list[tuple[Vector, Vector]]] = {}  # by number of a window: since_s and statistic
         self._touches: dict[int, Touched] = {}
 
     def take(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Take in a stretch; of cycles that the log knows nothing of, nothing is taken."""
+        """Add a stretch; skips cycles that the log lacks."""
         rows = np.minimum(np.searchsorted(self._log.t_ns, ticks.t_ns), len(self._log.t_ns) - 1)
         known = np.flatnonzero(self._log.t_ns[rows] == ticks.t_ns)
         if known.size == 0:
@@ -163,7 +163,7 @@ class ShownLog:
             self._close(window)
 
     def _take_window(self, window: Window, rows: Places, statistic: Vector, is_armed: NDArray[np.bool_]) -> None:
-        """Take in what cycles show of a contact; of one for which it is not armed, nothing."""
+        """Add the cycles of a stretch to a contact; skips a contact at whose beginning the candidate is not armed."""
         first, end = np.searchsorted(rows, (window.first, window.last + 1)).tolist()
         if first < len(rows) and rows[first] == window.first and is_armed[first]:
             self._parts[window.number] = []
@@ -172,14 +172,14 @@ class ShownLog:
             self._parts[window.number].append((since_s, statistic[first:end].copy()))
 
     def _close(self, window: Window) -> None:
-        """Keep of a contact what has been shown."""
+        """Store the statistics of a contact that has ended."""
         self._open.remove(window)
         parts = self._parts.pop(window.number, None) or [(np.zeros(0), np.zeros((0, 1, self._channels)))]
         since_s, statistic = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         self._touches[window.number] = rising(Touched(since_s, statistic, window.is_chosen_on))
 
     def _statistic_of(self, block: Vector) -> Vector:
-        """Return what is compared with the thresholds that are to be chosen (k, 1, channels)."""
+        """Return the statistic that the thresholds to be chosen bound (k, 1, channels)."""
         if self._is_certified:
             bank, threshold = (block[:, self._slices[name]] for name in ("tau_ext_bank", "threshold_bank"))
             return np.asarray((np.abs(bank) / threshold).max(axis=1))[:, None, None]
@@ -194,7 +194,7 @@ class ShownLog:
         return peaks
 
     def touches(self) -> list[Touched]:
-        """Return what was shown of the contacts that the log's scheme was armed for."""
+        """Return the statistics during the contacts for which the log's scheme was armed."""
         for window in list(self._open):
             self._close(window)
         return [self._touches[window.number] for window in self._windows]
@@ -232,7 +232,7 @@ def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:
     if not waiting:
         return
     before = round(WARM_UP_S / log.motion.period_s)
-    held = tuple(np.empty((0, statistics.z.shape[1])) for _ in range(2))  # what may still be needed of the stream
+    held = tuple(np.empty((0, statistics.z.shape[1])) for _ in range(2))  # stream that contacts may still need
     end = 0
     streams = torque_streams(log.motion.pieces(), statistics.lag_s, statistics.settings.standstill_rad_s)
     for motion, new in streams:

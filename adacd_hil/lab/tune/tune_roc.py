@@ -3,7 +3,7 @@
 A detector is over when some statistic of it is over its threshold: one per channel and joint. All its thresholds times
 one factor make its ROC. Alarms are counted where thresholds were not chosen; contacts are those of all logs.
 
-Thresholds are chosen on one half of the motion that nobody touched and checked on the other: of several logs, on every
+Thresholds are chosen on one half of the contact-free motion and checked on the other: of several logs, on every
 other log; of one log, on every other tenth of its time, and its contacts alternate.
 """
 
@@ -74,7 +74,7 @@ def rising(touched: Touched) -> Touched:
 class Observed:
     """A detector's statistics: peaks (B, channels, n) per block of 0.1 s, NaN unless free; is_chosen_on (B,).
 
-    touches: the contacts for which the logged scheme was armed; None where no log says what touched the arm.
+    touches: the contacts for which the logged scheme was armed; None if no log records the true contacts.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Observed:
 
 
 class Found(NamedTuple):
-    """The effect of thresholds on some part of the logs. Delays in ms, of the contacts found; None of none."""
+    """The effect of thresholds on part of the logs. Delays of the contacts found, ms. contacts: None without truth."""
 
     hours: float
     alarms: int
@@ -106,7 +106,7 @@ class Found(NamedTuple):
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
     def as_json(self) -> dict[str, Any]:
-        """Give it in plain values; what is not known is null."""
+        """Return plain values for JSON; unknown values are null."""
         bound = self.rate_bound_per_h
         plain: dict[str, Any] = {
             "hours": self.hours,
@@ -136,7 +136,7 @@ class Choice:
     chosen: Found
     checked: Found
     roc: tuple[tuple[float, Found, float | None], ...]
-    """Factor, what it comes to, and the rate that the tail predicts, of those factors that it can speak of."""
+    """Factor on the thresholds, its effect, and the tail's rate per hour; None below its level or without a tail."""
 
     @property
     def extrapolation(self) -> float:
@@ -231,7 +231,7 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class TunedLog:
-    """A log of N cycles, or N of them. windows: of the true contacts that begin in those, None where nobody knows.
+    """A log of N cycles, or N of them. windows: of the true contacts that begin in those, None if unknown.
 
     is_chosen_on (B,): of its blocks of 0.1 s.
     """
@@ -309,14 +309,14 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeW
 
 
 class _Index:
-    """Gathers the cycles of a log, in arrays that grow where they are: joined in the end, they would be there twice."""
+    """Gathers the cycles of a log in growing arrays: joining pieces at the end would need twice the memory."""
 
     def __init__(self) -> None:
         self.attempts = AttemptBegins()
         self._cycle, self._t_ns, self._before, self._threshold = array("q"), array("q"), array("B"), array("d")
 
     def add(self, scheme: Series) -> None:
-        """Take in the next piece of /scheme."""
+        """Add the next piece of /scheme."""
         self.attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
         self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
         self._t_ns.frombytes(scheme.t_ns.tobytes())
@@ -324,7 +324,7 @@ class _Index:
         self._threshold.frombytes(scheme["threshold"].astype(np.float64).tobytes())
 
     def joined(self) -> HostCycles:
-        """Give all of them; nothing can be added after that."""
+        """Return all cycles; no cycle can be added after that."""
         return HostCycles(
             np.frombuffer(self._cycle, np.int64),
             np.frombuffer(self._t_ns, np.int64),
@@ -352,7 +352,7 @@ def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterat
 
 
 def _windows(touches: Sequence[TouchWindow], t_ns: Times, place: int | None) -> tuple[Window, ...]:
-    """Give the rows of contacts. place: of the log; None where there is one log only."""
+    """Give the rows of contacts. place: of the log; None for a single log."""
     onsets_ns = np.array([touch.onset_ns for touch in touches], np.int64)
     until_ns = explained_until(onsets_ns, np.array([touch.forgotten_ns for touch in touches], np.int64))
     firsts = np.searchsorted(t_ns, onsets_ns).tolist()
@@ -467,7 +467,7 @@ class Tuning:
 
 
 def free_hours(log: TunedLog) -> float:
-    """Give how long nobody touched the arm while it monitored, h."""
+    """Return the contact-free time while the arm monitored, h."""
     return float(log.motion.is_free.sum()) * log.motion.period_s / 3600.0
 
 

@@ -1,8 +1,8 @@
 """The computing side of a sweep: processes of this machine, or a Dask cluster, behind one interface.
 
-Whoever reaches the port of a Dask scheduler has it run whatever he sends, as the user that started it. So a cluster is
-addressed by tls:// with certificates, as Dask names them. Dask checks who signed a certificate, not for which host. The
-processes of this machine have no port.
+A Dask scheduler runs any code that a client sends to its port, as the user that started it. So a cluster is addressed
+by tls:// with certificates, as Dask names them. Dask checks the signer of a certificate, not its host. The processes of
+this machine have no port.
 """
 
 import contextlib
@@ -28,9 +28,9 @@ from adacd_hil.settings.schema import ConfigError
 TLS = "tls://"
 TIMEOUT_S = 10
 _IN_FLIGHT = 4
-"""Tasks per worker of a cluster, so that none waits for the client."""
+"""Tasks per worker of a cluster, so that no worker waits for the client."""
 _PATIENCE_S = 2.0
-"""For a process that is asked to end, and may be in compiled code."""
+"""Time for a process to end after SIGTERM; it may be in compiled code."""
 
 
 class TlsFiles(NamedTuple):
@@ -60,11 +60,11 @@ class Workers(Protocol):
 
 @contextlib.contextmanager
 def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple[str, ...] = ()) -> Iterator[Workers]:
-    """Give the workers of a Dask scheduler at an address, or, where that is empty, so many processes of this machine.
+    """Give the workers of a Dask scheduler at an address, or, if that is empty, `count` processes of this machine.
 
-    preload: modules that the processes import before they are asked for work.
+    preload: modules that the processes import before their first task.
 
-    Raises ConfigError when the certificates can't be used, LogError when nobody answers.
+    Raises ConfigError when the certificates can't be used, LogError when the scheduler doesn't answer.
     """
     if not scheduler:
         pool = ProcessWorkers(count, preload)
@@ -77,7 +77,7 @@ def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple
         from distributed import Client
     except ImportError:
         raise LogError(f"--scheduler needs dask: {install_command('sweep')}") from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what happens to workers shows in the rows
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the rows show the failures of workers
     security = _security_of(scheduler, tls)
     try:
         client = Client(scheduler, timeout=TIMEOUT_S, set_as_default=False, security=security)
@@ -105,7 +105,7 @@ class DaskWorkers:
         return future
 
     def restart(self) -> None:
-        """Do nothing: the scheduler does."""
+        """Leave the restart to the scheduler."""
 
 
 class ProcessWorkers:
@@ -133,7 +133,7 @@ class ProcessWorkers:
         self._pool = self._open()
 
     def end(self) -> None:
-        """End all processes, whatever they do."""
+        """End all processes, with or without a task."""
         processes: set[BaseProcess] = set(multiprocessing.active_children()) - self._others
         self._pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
@@ -156,7 +156,7 @@ def _ignoring_interrupts() -> Iterator[None]:
 
 
 def _begin() -> None:
-    """Prepare a process: asked to end, it puts away what it has begun."""
+    """Prepare a process: at SIGTERM, and when its parent ends, it exits and cleans up."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
 
@@ -196,7 +196,7 @@ def _security_of(scheduler: str, tls: TlsFiles) -> Any:
 
 
 def _given(tls: TlsFiles) -> dict[str, str | None]:
-    """Name what doesn't come from Dask's configuration. Raises ConfigError."""
+    """Return the given TLS files by Dask's names, to replace those of Dask's configuration. Raises ConfigError."""
     if tls.key is not None and tls.cert is None:
         raise ConfigError("--tls-key needs --tls-cert, the certificate that it belongs to")
     given: dict[str, str | None] = {}

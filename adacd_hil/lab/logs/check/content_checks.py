@@ -43,7 +43,7 @@ class DefinitionCheck:
         self._duplicates: set[str] = set()
 
     def schema(self, schema: Schema, offset: int, is_summary: bool) -> None:
-        """Take in a schema."""
+        """Check a schema and compare it with earlier ones of its number."""
         name = f"schema {schema.id}"
         if schema.id == 0:
             self._findings.add("schema-id", f"schema {schema.name!r} has the number 0", offset)
@@ -62,7 +62,7 @@ class DefinitionCheck:
             self.schemas.setdefault(schema.id, schema)
 
     def channel(self, channel: Channel, offset: int, is_summary: bool) -> None:
-        """Take in a channel."""
+        """Check a channel and compare it with earlier ones of its number."""
         name = f"channel {channel.id}"
         known = self.channels.get(channel.id)
         if known is not None:
@@ -101,7 +101,7 @@ class DefinitionCheck:
             self._findings.add("duplicate", f"{name} is defined more than once in the data section", offset)
 
     def finish(self, counts: NDArray[Any]) -> None:
-        """Judge what the summary alone defines. counts: messages of each channel."""
+        """Judge the channels and schemas that only the summary defines. counts: messages of each channel."""
         used = {"channel": set(np.flatnonzero(counts).tolist())}
         used["schema"] = {self.all_channels[number].schema_id for number in used["channel"] & set(self.all_channels)}
         unused = []
@@ -137,7 +137,7 @@ class ContentCheck:
                 self._findings.add("schema-text", f"schema {schema.id} ({schema.name}): {problem}", offset)
 
     def messages(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
-        """Take in the messages of a chunk."""
+        """Check order and payloads of the messages of a chunk."""
         for number in np.unique(contents.channels).tolist():
             if number not in self._described and number in definitions.channels:
                 channel = definitions.channels[number]
@@ -146,7 +146,7 @@ class ContentCheck:
         self._check_payloads(contents, definitions, offset)
 
     def _describe(self, channel: Channel, schema: Schema | None) -> None:
-        """Note what the payloads of a channel must be."""
+        """Store the size and the kind that the payloads of a channel must have."""
         self._described.add(channel.id)
         self._is_cdr[channel.id] = channel.message_encoding == "cdr"
         self._sizes[channel.id] = _ANY_SIZE if (size := payload_size(channel, schema)) is None else size
@@ -219,7 +219,7 @@ _CONSTANT = re.compile(r"=\s*\S.*")
 
 
 def text_problem(data: bytes) -> str:
-    """Say what is wrong with the text of a schema; "" when it can be read."""
+    """Name the defect in the text of a schema; "" when it can be read."""
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError:

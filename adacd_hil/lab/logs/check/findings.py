@@ -6,7 +6,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 _TOLD = 10
-"""Findings of one rule in one file that are told one by one; the rest are counted."""
+"""Largest number of findings of one rule in one file that are listed; the rest are only counted."""
 
 
 class Severity(StrEnum):

@@ -116,7 +116,7 @@ class _FileCheck:
         return FileFacts(self._findings, self._metadata, total, count_frames(topics, counts), is_ended)
 
     def _gap(self, gap: FileGap) -> None:
-        """Tell of bytes that are no record; they count for the CRC."""
+        """Report bytes that don't form a record; the CRC includes them."""
         self._findings.add("record", f"{gap.size} bytes are no record", gap.offset)
         position = self._file.tell()
         self._crc = crc_of(self._file, gap.offset, gap.offset + gap.size, self._crc)
@@ -141,7 +141,7 @@ class _FileCheck:
             self._findings.add("record", str(error), record.offset)
 
     def _count(self, record: RawRecord) -> None:
-        """Count records of which there is one."""
+        """Count records that a file may have only once."""
         opcode = Opcode(record.opcode)
         self._counts[opcode] += 1
         if self._counts[opcode] > 1:
@@ -225,7 +225,7 @@ class _FileCheck:
         self._judge_missing_crcs()
 
     def _judge_missing_crcs(self) -> None:
-        """Name what no CRC vouches for; that of the data section does so for all that is in it."""
+        """Report the parts that no CRC covers. The CRC of the data section covers all that is in it."""
         missing, chunks = self._findings.without_crc, len(self._chunks.facts)
         if not missing[_DATA_SECTION]:
             missing = Counter(summary=missing["summary"])
@@ -252,9 +252,9 @@ class LogCheck(NamedTuple):
 
 
 def find_logs(paths: Iterable[Path]) -> list[Path]:
-    """List the logs that are meant: files as they are, of folders all .mcap in them but the later parts of a log.
+    """List logs: files as given, and each .mcap file in a given folder, except the later parts of a log.
 
-    Raises LogError when a folder has none.
+    Raises LogError for a folder without a log.
     """
     logs = []
     for path in paths:
@@ -322,7 +322,7 @@ def _summary(facts: FileFacts) -> dict[str, str]:
 
 
 def _check_words(facts: FileFacts) -> None:
-    """Judge what one of our own files says of itself."""
+    """Compare the metadata of one of our own logs with its contents, and judge how the log ended."""
     findings, summary = facts.findings, _summary(facts)
     if RUN_METADATA not in facts.metadata:
         return

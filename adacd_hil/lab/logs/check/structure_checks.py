@@ -31,7 +31,7 @@ from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, HEAD, INDEX_ENTRY, 
 
 @dataclass
 class ChunkFacts:
-    """What a chunk index must say of a chunk."""
+    """The values that the index of a chunk must have."""
 
     length: int
     message_start_time: int
@@ -71,7 +71,7 @@ class ChunkCheck:
         self._offsets: dict[int, int] = {}
 
     def chunk(self, record: RawRecord) -> None:
-        """Take in a chunk."""
+        """Check a chunk, its messages and definitions; store the facts that its index must have."""
         chunk: Chunk = parse(record.opcode, record.body)
         facts = ChunkFacts(
             HEAD.size + len(record.body),
@@ -115,7 +115,7 @@ class ChunkCheck:
             self._findings.add("chunk-times", text, offset)
 
     def _expect(self, contents: Contents, facts: ChunkFacts) -> None:
-        """Note what the indexes of the chunk must be."""
+        """Store the message indexes that the chunk must have."""
         order = np.argsort(contents.channels, kind="stable")
         channels, firsts = np.unique(contents.channels[order], return_index=True)
         groups = np.split(contents.entries[order], firsts[1:])
@@ -123,7 +123,7 @@ class ChunkCheck:
         facts.channels = channels.tobytes()
 
     def message_index(self, record: RawRecord) -> None:
-        """Take in a message index: of the chunk before it, one for each channel."""
+        """Compare a message index with the chunk before it, which has one for each channel."""
         channel = int.from_bytes(record.body[:2], "little")
         latest = self._latest
         if latest is None:
@@ -155,12 +155,12 @@ class ChunkCheck:
         self._latest = None
 
     def message(self, record: RawRecord) -> None:
-        """Take in a message outside of chunks."""
+        """Check a message outside of chunks."""
         self.has_outside = True
         self._messages(message_contents(record), record.offset)
 
     def _messages(self, contents: Contents, offset: int) -> None:
-        """Take in messages, after the definitions that stand between them."""
+        """Check messages, after the definitions that stand between them."""
         channels, firsts = np.unique(contents.channels, return_index=True)
         first_at = dict(zip(channels.tolist(), contents.starts[firsts].tolist(), strict=True))
         known = set(self._definitions.channels)
@@ -223,17 +223,17 @@ class SummaryCheck:
         self._findings = findings
         self._definitions = definitions
         self._chunks = chunks
-        self._attachments: dict[int, AttachmentIndex] = {}  # what the indexes must be, by offset
+        self._attachments: dict[int, AttachmentIndex] = {}  # the indexes that the summary must have, by offset
         self._metadata: dict[int, MetadataIndex] = {}
         self._attachment_count = self._metadata_count = 0
         self._indexed: set[int] = set()
-        self._start = 0  # of the summary; 0: none so far
+        self._start = 0  # of the summary; 0: not reached so far
         self._groups: list[list[int]] = []  # opcode, start, end of each
         self._offsets: list[tuple[int, SummaryOffset]] = []
         self._offset_start = 0
 
     def attachment(self, record: RawRecord, attachment: Attachment) -> None:
-        """Take in an attachment."""
+        """Count an attachment; store the index that it must have."""
         self._attachment_count += 1
         self._attachments[record.offset] = AttachmentIndex(
             offset=record.offset,
@@ -246,12 +246,12 @@ class SummaryCheck:
         )
 
     def metadata(self, record: RawRecord, name: str) -> None:
-        """Take in a metadata record."""
+        """Count a metadata record; store the index that it must have."""
         self._metadata_count += 1
         self._metadata[record.offset] = MetadataIndex(record.offset, HEAD.size + len(record.body), name)
 
     def record(self, record: RawRecord) -> None:
-        """Take in a record of the summary, but for its definitions."""
+        """Store the place of a record of the summary (not a definition); check an index or the statistics."""
         self._start = self._start or record.offset
         if record.opcode == Opcode.SUMMARY_OFFSET:
             self._offset_start = self._offset_start or record.offset
@@ -293,7 +293,7 @@ class SummaryCheck:
             self._findings.add("summary-channels", text, offset)
 
     def footer(self, record: RawRecord, crc: int) -> None:
-        """Take in the footer; `crc`: of the summary up to its own."""
+        """Check the footer. crc: of the summary up to the footer's own CRC."""
         footer: Footer = parse(record.opcode, record.body)
         if footer.summary_start != self._start:
             text = f"the Footer says that the summary begins at byte {footer.summary_start}, it is {self._start}"
@@ -366,7 +366,7 @@ class SummaryCheck:
         for what, (said, real) in pairs.items():
             if said != real:
                 self._findings.add("statistics", f"there are {real} {what}, the Statistics say {said}")
-        # Some writers count what the summary alone defines, some don't.
+        # Some writers count the schemas and channels that only the summary defines, some don't.
         for what, said, data, summary in (
             ("schemas", statistics.schema_count, self._definitions.schemas, self._definitions.summary_schemas),
             ("channels", statistics.channel_count, self._definitions.channels, self._definitions.summary_channels),
