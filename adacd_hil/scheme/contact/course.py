@@ -7,7 +7,7 @@ another. A withdrawal changes to the `two_sided` reaction when a push comes from
 wall behind: the external torque along the direction of the withdrawal has turned against it by more than the upper
 thresholds. Floating needs a valid model: without one the arm stops.
 
-The paper's scheme withdraws from each contact, stops if it cannot, and never gives a withdrawal up.
+The paper's scheme withdraws from each contact, stops if it reacts without one, and never gives a withdrawal up.
 
 Shapes: tau_ext_hat (2,), Nm.
 """

@@ -67,7 +67,7 @@ def on_link2(
 ) -> Place:
     """Return force and lever arm of one contact without friction on link 2; the force is that of its peak.
 
-    tip_margin_m: how far past the tip a touch, of the load for instance, still counts as one of the link's end.
+    tip_margin_m: distance past the tip up to which a touch, of the load for instance, counts as one of the link's end.
     """
     location, *values = _fit(tau_ext_wide_hat, q2, sigma, length_m[0], length_m[1], tip_margin_m)
     return Place(Location(location), *values)
@@ -132,7 +132,7 @@ def _fit(
     if not squares > 0.0:
         return _UNCERTAIN, force, force_sigma, 0.0, np.inf
     lever = products / squares
-    # Of tau_2 - r F = tau_2 (1 + r / arm) - tau_1 r / arm. Neighbours share their noise: as good as one sample.
+    # Deviation of tau_2 - r F = tau_2 (1 + r / arm) - tau_1 r / arm. Neighbours share their noise: they count as one.
     share = lever / arm
     lever_sigma = np.hypot(sigma_2 * (1.0 + share), sigma_1 * share) / abs(force)
     margin = 3.0 * lever_sigma

@@ -114,7 +114,7 @@ class Withdrawal:
 
     @property
     def beyond(self) -> list[int]:
-        """Joints that the acceleration limit lets stop only beyond their position limit, from 0."""
+        """Joints, from 0, that stop only beyond their position limit, at the acceleration limit."""
         limit = self._settings.arm.position_limit_rad
         return [i for i in range(JOINTS) if abs(self._soonest_stop(i)) > limit[i]]
 

@@ -55,9 +55,9 @@ from adacd_hil.settings.configuration import Settings
 class MarginWatch:
     """Monitors the distance of contact-free peaks from the thresholds during a run.
 
-    Fed once per block, of a second say, with the largest ratio of statistic to threshold of each joint. The margin is
-    one over the largest ratio to be expected within the horizon, by a Gumbel law for block maxima whose mean and
-    deviation follow the last blocks; bounded tails stay below it.
+    Each block, of a second for instance, gives the largest ratio of statistic to threshold per joint. The margin is one
+    over the largest ratio to be expected within the horizon, by a Gumbel law for block maxima whose mean and deviation
+    follow the last blocks; bounded tails stay below it.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class MarginWatch:
         if self._blocks == 0:
             return np.full(self._mean.shape, np.inf)
         scale = np.sqrt(np.maximum(self._square - self._mean**2, 0.0)) * math.sqrt(6.0) / math.pi
-        # mode of the largest of so many: mean - Euler's constant * scale + ln(horizon) * scale
+        # mode of the largest in the horizon: mean - Euler's constant * scale + ln(horizon) * scale
         expected = self._mean + (self._horizon - 0.5772156649015329) * scale
         return np.asarray(1.0 / np.maximum(expected, 1e-9))
 
@@ -120,7 +120,7 @@ HOUR_S = 3600.0
 RATE_HZ = 1.0 / HOUR_S
 """Expected rate of excursions over the floor: one an hour."""
 LARGEST = 1.6
-"""A larger one lets the first seconds' threshold of an arm with 1 kg hide a push of 0.1 Nm."""
+"""With a larger one, the threshold of the first seconds of an arm with 1 kg hides a push of 0.1 Nm."""
 FORGOTTEN_S = 600.0
 BLOCK_S = 0.064
 """Longer than the hold-back of a touch before its detection."""

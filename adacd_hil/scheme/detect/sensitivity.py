@@ -13,10 +13,10 @@
   of a good model, less or more by the measured residual without contact. While the arm is monitored the mean square of
   the positive residuals and that of the negative ones are followed apart, and the smaller one counts: a push has one
   sign, an error of the model has both. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
-- R: by how much the velocity's noise exceeds that of the settings, seen in its second difference.
+- R: the velocity's noise over that of the settings, squared, measured in its second difference.
 - e: 1, or more of a joint that has shown contacts while the arm learnt, or right after going on (`strain`).
 - G: uncertainty after lost samples, see below. tail: floor by the largest residual seen (`margin`).
-- s, s': how much of the filter's memory is of standstill, and of low speed. At standstill friction may hold any torque
+- s, s': shares of standstill, and of low speed, in the filter's memory. At standstill friction may hold any torque
   up to F_s: F_c, static friction and friction by load where they are in the model, and as much more as the first two
   are uncertain.
 

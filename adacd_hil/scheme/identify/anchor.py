@@ -4,8 +4,8 @@ A lean and an offset have the same column of the regressor, on every motion, so 
 knowledge can. An anchor judges the fitted offset and never pulls it: that would push a lean into friction.
 
     REST      the reading at rest before the drives are enabled. A motor without power, friction and brake transmits no
-              torque, so the reading is the offset, whoever leans. `holding_Nm`, the torque that the motor side can
-              hold, is the most by which a lean shifts it; if that is unknown the reading bounds no offset.
+              torque, so the reading is the offset, even if a person leans. `holding_Nm`, the torque that the motor side
+              can hold, is the most by which a lean shifts it; if that is unknown the reading bounds no offset.
     TARE      the zero of the configuration, if a tare gives its uncertainty.
     ACCEPTED  the zero that the user has accepted in place of all others.
     LAST      the zero found by the arm's last certificate, used for a joint that no other anchor bounds.

@@ -104,7 +104,7 @@ def withhold(m: Memory, cause: int) -> None:
 def contradicted_by(k: Constants, m: Memory) -> int:
     """Return the source that contradicts the fit: an anchor, the fit itself, kept beliefs, the last certificate.
 
-    Or 0.
+    NOTHING if all agree with it.
     """
     if not anchor.is_within(k, m, m.models.belief, m.models.P_belief):
         return ANCHOR

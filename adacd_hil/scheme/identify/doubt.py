@@ -50,7 +50,7 @@ SHARE, SHARE_OF_ALL = 0.75, 0.9
 LEAST_SHARE = 0.5
 """Part of a contact's Σ r² that always stays, however large the residual of a good model."""
 SPREAD_LOADED, SPREAD = 0.15, 0.3
-"""By how much of its size the contacts may differ, beside 2 sigma."""
+"""Largest difference of the contacts' sizes, as a part of the size, beside 2 sigma."""
 SURE = 8.0
 """Smallest size of an error, in sigmas."""
 BOTH_WAYS = 0.1

@@ -48,7 +48,7 @@ BELIEF_SIGMAS = 3.5
 """With the floors of `earlier`: fits of 400 untouched arms had a median of 0.23 of the allowed excess, and a maximum of
 0.73."""
 PEAK_ACCELERATION = 10.0 / math.sqrt(3.0)
-"""Of a rest-to-rest quintic, over travel / duration²."""
+"""Peak acceleration of a rest-to-rest quintic, over travel / duration²."""
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:

@@ -5,7 +5,7 @@ Each sample that the belief learns, a row w of the regressor with its torque and
     L = Σ v v'/R,   b = Σ v r/R,   r = tau_f - w prior,   v = (w, x)
 
 with x the columns of `regressor` behind the filter that is learnt from. From a prior N(0, S²) of the parameters less
-their mean, with x or without, each sum says how likely the samples are:
+their mean, with x or without, each sum gives the likelihood of the samples:
 
     log evidence = ½ b' S M^-1 S b - ½ log det M,   M = I + S L S
 

@@ -2,14 +2,14 @@
 
 The steps, each a function over a `Record`:
 
-- `identify`: recursive least squares of all parameters that the torque can tell: base parameters of the links, F_v and
+- `identify`: recursive least squares of all parameters that the torque shows: base parameters of the links, F_v and
   F_c of each joint, an offset of each torque sensor, and, where torques are those of motors, the inertia of each rotor
   as the joint feels it through the gear. It starts from prior knowledge, with true uncertainty (`prior`), and ends with
   the uncertainty P that is left.
 - `certify`: the same parameters, frozen, on motion that was not used. It returns the size of the residual, and its
   excess over noise and P: the model's lack.
-- `filtered`: measured torque and the frozen model's residual as the fit sees them: how much of the torque is explained.
-- `parameter_deviation`: how far the parameters may be off, by how much parts of the fit disagree.
+- `filtered`: measured torque and the frozen model's residual as the fit sees them: they show the explained part.
+- `parameter_deviation`: standard deviation of the parameters, by the disagreement of parts of the fit.
 - `detect`: the external torque of each joint, its threshold, and the contacts.
 
     tau_ext_hat = -(tau_f - W_f theta_hat),    threshold = k sqrt(noise² + lack² + w P w') + F_c at standstill

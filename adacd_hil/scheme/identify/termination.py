@@ -234,9 +234,9 @@ def test_limit_Nm(k: Constants, square: float) -> float:
 
 
 def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dict[str, str]) -> list[str]:
-    """Return the conditions that a fit waits for, and the motion that fulfils each, a line each; `k`, `m`.
+    """Return the conditions that a fit waits for, and the motion that fulfils each, a line each.
 
-    Of the kernel.
+    `k`, `m`: as for `is_complete`.
     """
     lines = []
     joints = m.motion.q_low.shape[0]

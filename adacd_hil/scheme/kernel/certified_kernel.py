@@ -1,4 +1,4 @@
-"""The numbers of one cycle of the certified scheme: bank of filters, belief about the model, evidence, detection.
+"""The computation of one cycle of the certified scheme: bank of filters, belief about the model, evidence, detection.
 
 theta is a belief here (`belief`): mean and covariance P in true units. It starts at the prior of any arm of this kind
 and is corrected by recursive least squares. P and a filter's regressor row give the uncertainty of a prediction, so
@@ -61,7 +61,7 @@ MEASURE = 1  # the arm is at rest: measure the torque sensors' noise and zero
 WATCH = 2  # compare the residuals with their thresholds
 LEARN = 4  # correct the belief and use it at once
 TEST = 8  # test the frozen model
-REFINE = 16  # correct the belief, and let its mean replace the model after a test
+REFINE = 16  # correct the belief; its mean replaces the model after a test
 WEIGH = 32  # weigh the evidence for each cause of a contact of the certified model
 
 

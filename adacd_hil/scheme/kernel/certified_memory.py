@@ -35,7 +35,7 @@ restarts with a measured velocity, which lags, and takes this long to forget tha
 def parameter_names(settings: Settings) -> tuple[str, ...]:
     """Return the names of all parameters of the certified scheme, in order.
 
-    Dynamic, offsets, lags, further friction.
+    The dynamic ones, then offsets, lags, further friction.
     """
     return settings.estimator.parameter_names + settings.further_names
 
@@ -69,7 +69,7 @@ def prior_std_of(settings: Settings) -> Vector:
 
 
 def _drift_std_of(settings: Settings) -> Vector:
-    """Return how far each parameter may drift in a second of monitoring (p,); 0 for a sensor's cross-talk."""
+    """Return the standard deviation of each parameter's drift in a second of monitoring (p,); 0 for cross-talk."""
     names = parameter_names(settings)
     std = _by_kind(settings.certified.drift_std, names)
     std[[name.startswith(CROSS_TALK) for name in names]] = 0.0

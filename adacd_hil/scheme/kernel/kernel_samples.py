@@ -20,7 +20,7 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured, described, float_fields
 
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.5, 1.5
-"""Of the nominal period: the shortest and the longest interval of two samples that follow each other."""
+"""Shortest and longest interval of two samples that follow each other, over the nominal period."""
 
 
 class Numbers(NamedTuple):

@@ -1,4 +1,4 @@
-"""The numbers of one cycle of the paper's scheme in one call: filters, predictions, estimator, evidence, contact.
+"""The computation of one cycle of the paper's scheme: filters, predictions, estimator, evidence, contact.
 
 Constants, memory and block: as in `kernel_samples`; the block is `records.scheme_layout`.
 

@@ -20,7 +20,7 @@ so every entry is one bilinear form u' I_k x, which is linear in the ten paramet
 algebra: Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 2 and 5. The planar arm of
 `adacd_hil.scheme.model.regressor` is the case n = 2.
 
-**Parameters.** Of each link, about the origin of its joint and in the axes of its frame, in the order of
+**Parameters.** For each link, about the origin of its joint and in the axes of its frame, in the order of
 `LINK_PARAMETERS`: mass, first moment, inertia; together theta_full (10 n,). The torque doesn't show all of them:
 `find_base` picks a smallest set of columns that spans the others and gives the map theta_base = B theta_full. A
 regressor for the filter has the chosen columns first, then F_v and F_c of each joint, then those that the caller adds.
@@ -46,7 +46,8 @@ from adacd_hil.records import Vector
 Indices = NDArray[np.int64]
 
 LINK_PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-"""Of one link, in Pinocchio's order: kg, kg m, kg m²; the inertia is about the origin of the link's frame."""
+"""Parameters of one link, in Pinocchio's order: kg, kg m, kg m²; the inertia is about the origin of the link's
+frame."""
 
 PER_LINK = len(LINK_PARAMETERS)
 

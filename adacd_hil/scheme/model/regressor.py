@@ -24,7 +24,7 @@ Shapes: q, dq, ddq, tau (2,); theta (p,); W, Y_p, Y_h (2, p); M (2, 2). Units: r
 
 sgn stands for tanh(dq / w), or with w = 0 for the sign itself, 0 of a joint that may stand still (no `width` then).
 One parameter per joint and term, in the order of the settings. While a joint moves its asymmetry looks like an offset
-of its torque sensor; only rest tells the two apart.
+of its torque sensor; only rest separates the two.
 
 Bristles don't bend while a joint may stand still. Two lengths together stand for those between them.
 

@@ -209,8 +209,8 @@ class CertifiedPolicy(SchemePolicy):
         """Begin to learn, and forget the model learnt before.
 
         Runs, too, once a contact that interrupted an adaptation has been reported: the adaptation may have learnt the
-        contact's beginning. Or this is no contact, but the adaptation had learnt an earlier one. Then only a model
-        without any claim lets the arm go on.
+        contact's beginning. Or the arm is free of contact now, and the adaptation had learnt an earlier one. Then the
+        arm goes on only with a model that claims no knowledge.
         """
         certified_kernel.begin_adaptation(self.numbers.constants, self.numbers.memory, self._is_payload, is_first)
 

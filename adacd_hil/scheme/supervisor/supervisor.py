@@ -501,6 +501,6 @@ class KeptRequest:
             self.request = request
 
     def serve(self, states: Iterable[int]) -> None:
-        """Record the states that cycles have reached, and drop the request once they have served it."""
+        """Drop a request to change the payload once cycles have reached PAYLOAD. states: those reached."""
         if self.request is Request.PAYLOAD and SchemeState.PAYLOAD in states:
             self.request = Request.NONE

@@ -162,7 +162,7 @@ def leads_on(state: int, event: int) -> bool:
 
 
 CONTACT_SHIFT = 16
-"""Number of the first of the observation's bits for joints over their lower threshold."""
+"""Index of an observation's first bit for a joint over its lower threshold; one bit per joint."""
 
 
 class Observation(IntFlag):
