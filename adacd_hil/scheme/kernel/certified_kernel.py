@@ -73,6 +73,8 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     evidence.
 
     The belief learnt before is forgotten, so a contact on the way leaves no trace, whenever it is detected.
+
+    Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
     """
     k, m = constants[0], memory[0]
     if is_first:
