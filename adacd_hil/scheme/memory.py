@@ -1,7 +1,7 @@
 """Constants and memory of the certified scheme's compiled code, each declared once with its type and shape.
 
-Each record of memory belongs to one module, which alone writes it; any module may read. In compiled code, and where
-its results become words, k is `Constants` and m is `Memory`.
+Each record of memory belongs to one module, which alone writes it; any module may read. In compiled code, and in
+functions that describe its results, k is `Constants` and m is `Memory`.
 
 Sizes: n joints; p parameters (dynamic ones, torque offsets, lags, further friction); t terms by place, f = p + n t;
 filters of the bank, channels of its detection. The others are constants of the module that owns the record.
@@ -20,7 +20,7 @@ EachTerm = Annotated[Vector, "f"]
 
 
 class Sample:
-    """What a cycle takes in: an ArmState, `age` that of its oldest value, and what is asked in this cycle."""
+    """Inputs of a cycle: an ArmState, `age` that of its oldest value, and the request in this cycle."""
 
     cycle: int
     periods: int
@@ -57,7 +57,7 @@ class Regressor:
 
 
 class Filters:
-    """The filter bank, and the external torque that each filter sees, bare and smoothed: written by `filter_bank`."""
+    """The filter bank, and each filter's external torque, bare and smoothed: written by `filter_bank`."""
 
     input_old: Annotated[Vector, "filters n p"]
     S: Annotated[Vector, "filters n p"]
@@ -72,7 +72,7 @@ class Filters:
 
 
 class Wide:
-    """External torques of the widest filter, of which the filter is undone: written by `external_torque`."""
+    """External torques of the widest filter, from which the filter is undone: written by `external_torque`."""
 
     history: Annotated[Vector, "wide n"]
 
@@ -113,7 +113,10 @@ class Ring:
 
 
 class Motion:
-    """Where and how fast the joints have been in a fit, and what that has shown: written by `termination`."""
+    """Ranges of position and velocity of the joints in a fit, and the information from them.
+
+    Written by `termination`.
+    """
 
     q_low: PerJoint
     q_high: PerJoint
@@ -125,7 +128,7 @@ class Motion:
 
 
 class Fit:
-    """How far a fit and its test have come: written by `termination`."""
+    """Progress of a fit and its test: written by `termination`."""
 
     tested: float
     test_limit_Nm: float
@@ -168,7 +171,7 @@ class Sensitivity:
 
 
 class Margin:
-    """Largest residuals of free motion, and which push would be found: written by `margin`."""
+    """Largest residuals of free motion, and smallest detectable push: written by `margin`."""
 
     peak: Annotated[Vector, "2 channels n"]
     peak_now: Annotated[Vector, "2 channels n"]
@@ -186,7 +189,7 @@ class Margin:
 
 
 class Evidence:
-    """What each source says of each quantity, and what of it a fit contradicts: written by `evidence`."""
+    """Each source's value of each quantity, and the fit's difference from it: written by `evidence`."""
 
     said: Annotated[Vector, "sources quantities"]
     said_variance: Annotated[Vector, "sources quantities"]
@@ -200,7 +203,7 @@ class Evidence:
 
 
 class Anchor:
-    """What holds a torque offset in its place: written by `anchor`."""
+    """Anchors of the torque offsets: written by `anchor`."""
 
     rest_count: float
     anchor_Nm: Annotated[Vector, "kinds n"]
@@ -230,7 +233,7 @@ class FitCheck:
 
 
 class Earlier:
-    """How many beliefs of before a disturbance are kept: written by `earlier`."""
+    """Number of beliefs kept from before a disturbance: written by `earlier`."""
 
     kept_count: float
     refused_fits: float
@@ -238,13 +241,13 @@ class Earlier:
 
 
 class Certificate:
-    """Why a certificate is withheld: written by `certificate`."""
+    """Reason why a certificate is withheld: written by `certificate`."""
 
     withheld_by: float
 
 
 class Doubt:
-    """What the contacts of a certified model look like: written by `doubt`."""
+    """Evidence on the cause of a certified model's contacts: written by `doubt`."""
 
     cause_rw: Annotated[Vector, "causes"]
     cause_ww: Annotated[Vector, "causes"]
@@ -281,7 +284,7 @@ class MissingTorque:
 
 
 class Watch:
-    """What of the cycles is left to Python once in a while: written by `cycle` and `certified_policy`."""
+    """Tasks left to Python at intervals: written by `cycle` and `certified_policy`."""
 
     has_forgotten: float
     monitored_cycles: float
@@ -313,7 +316,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class NoiseConstants:
-    """Of `sensitivity`: by channel (2 C - 1,) (k_tau sigma_tau)² in Nm², and nu² in rad²/s⁴."""
+    """Constants of `sensitivity`: by channel (2 C - 1,) (k_tau sigma_tau)² in Nm², and nu² in rad²/s⁴."""
 
     torque_variance: Vector
     torque_gain: Vector
@@ -329,7 +332,7 @@ class NoiseConstants:
 
 @dataclass(frozen=True)
 class AnchorConstants:
-    """Of `anchor`: torque offsets and how well each is known (n,), inf where it is not."""
+    """Constants of `anchor`: torque offsets and their uncertainties (n,), inf where unknown."""
 
     zero_Nm: Vector
     last_zero_Nm: Vector
@@ -342,14 +345,17 @@ class AnchorConstants:
 
 @dataclass(frozen=True)
 class DoubtConstants:
-    """Of `doubt`: causes (h, p), a payload of 1 kg, then by joint Coulomb and viscous friction."""
+    """Constants of `doubt`: causes (h, p), a payload of 1 kg, then by joint Coulomb and viscous friction."""
 
     causes: Vector
 
 
 @dataclass(frozen=True)
 class EvidenceConstants:
-    """Of `evidence`: columns (Q, p), prior variances and largest torques (Q,), sigmas (S,), less_counts (S, Q)."""
+    """Constants of `evidence`.
+
+    Columns (Q, p), prior variances, largest torques (Q,), sigmas (S,), less_counts (S, Q).
+    """
 
     columns: Vector
     columns_prior: Vector
@@ -360,14 +366,14 @@ class EvidenceConstants:
 
 @dataclass(frozen=True)
 class FitCheckConstants:
-    """Of `fit_check`: learnt samples from one step to the next."""
+    """Constants of `fit_check`: learnt samples from one step to the next."""
 
     step_samples: float
 
 
 @dataclass(frozen=True)
 class EarlierConstants:
-    """Of `earlier`: by quantity, a difference and a share of the value that count as none."""
+    """Constants of `earlier`: by quantity, a difference and a share of the value that are ignored."""
 
     kept_floor: Vector
     kept_share: Vector
@@ -375,7 +381,7 @@ class EarlierConstants:
 
 @dataclass(frozen=True)
 class LastConstants:
-    """Of `certificate`: values of the last certificate (Q,), variances, inf where it says nothing, and slack."""
+    """Constants of `certificate`: values of the last certificate (Q,), variances, inf where unknown, and slack."""
 
     value: Vector
     variance: Vector
@@ -384,7 +390,7 @@ class LastConstants:
 
 @dataclass(frozen=True)
 class MarginConstants:
-    """Of `margin`: excursions of white noise (2 C - 1,) and what a step of torque shows in each channel."""
+    """Constants of `margin`: excursions of white noise (2 C - 1,), and each channel's response to a step of torque."""
 
     excursions_Hz: Vector
     block_cycles: float
@@ -394,7 +400,7 @@ class MarginConstants:
 
 @dataclass(frozen=True)
 class TermConstants:
-    """Of `missing_torque`: prior deviations (f,), and counts of learnt samples."""
+    """Constants of `missing_torque`: prior deviations (f,), and counts of learnt samples."""
 
     prior_std: Vector
     first: float
@@ -403,7 +409,7 @@ class TermConstants:
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds by which measurements alone are judged."""
+    """Bounds for the checks of a measurement alone."""
 
     position_limit_rad: Vector
     velocity_limit_rad_s: Vector

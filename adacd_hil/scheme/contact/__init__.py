@@ -1,1 +1,1 @@
-"""What is known of a contact: link, direction, size, place, and the reaction to it."""
+"""Contacts: link, direction, size and place of a contact, and the reaction to it."""

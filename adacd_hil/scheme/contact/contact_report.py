@@ -1,22 +1,22 @@
-"""The contact report: what is told of a contact, from a short memory of the external torques around it.
+"""The contact report: describes a contact from a short memory of the external torques around it.
 
-A contact begins with the last sample before its detection that is below half of its joints' thresholds. It is
-reported three times, `contact.course` says when: at its detection, when the link is decided, and when the window has
-ended, which is also when push and hit can be told apart.
+A contact begins with the last sample before its detection that is below half of its joints' thresholds. It is reported
+at three times, which `contact.course` sets: at its detection, when the link is decided, and when the window has ended.
+Push and hit differ clearly only then.
 
-**Link.** A force on link 1 loads joint 1 only. So it is link 2 if the mean torque of joint 2 since the beginning stands
-out of the noise further than chance does, and of what a blow on link 1 leaves there for a few samples.
+**Link.** A force on link 1 loads joint 1 only. So the link is 2 if the mean torque of joint 2 since the beginning
+exceeds two bounds: chance noise, and the trace that a blow on link 1 leaves in joint 2 for a few samples.
 
-Per cycle only one row is written; everything else happens three times in a contact.
+Each cycle writes only one row; the rest runs three times in a contact.
 
-**Kind.** Push or hit: by what is left of a contact when 100 ms have passed since it was detected.
+**Kind.** Push or hit: by the share of the torque that remains 100 ms after the detection.
 
-A hit is over by then: a blow of 100 ms has at most a seventh of its largest torque left, a body that has been pushed
-away nothing. A push still grows or lasts. What is left is measured in standard deviations of the joints, so that the
-joint that knows more says more.
+A hit is over by then: after a blow of 100 ms at most a seventh of its largest torque remains, and after a body is
+pushed away no torque remains. A push still grows or lasts. The remaining torque is measured in standard deviations of
+the joints, so that the more certain joint weighs more.
 
-A hand that grasps a moving arm stops it and then guides it; it is called by what is left when the arm has stopped. A
-body that is clamped is a hit where it springs back, a push where it stays under load: transient and quasi-static
+A hand that grasps a moving arm stops it and then guides it; the kind follows from the torque that remains when the arm
+has stopped. A clamped body is a hit if it springs back, a push if it stays under load: transient and quasi-static
 contact of ISO/TS 15066.
 
 **The paper's scheme** (`IntegratedContact`). Link 2 if joint 2 is over its threshold at any time until the isolation
@@ -36,21 +36,21 @@ from adacd_hil.scheme.detect.external_torque import ONSET_FRACTION
 from adacd_hil.settings.configuration import Settings
 
 LINK_S = 0.01
-"""From detection until the link is decided."""
+"""Time from detection until the link is decided."""
 BEFORE_S = 0.08
-"""How far back from its detection the beginning of a contact is sought; a push of 0.2 Nm/s crosses 0.02 Nm in it."""
+"""How far before its detection the beginning of a contact is sought; a push of 0.2 Nm/s crosses 0.02 Nm in it."""
 CERTAIN = 4.0
 """Standard deviations by which the mean torque of joint 2 stands out of the noise: by chance once in 16000 contacts."""
 CROSS_SHARE = 0.04
-"""What a blow on link 1 may leave in joint 2 by the model's error, as a part of joint 1's torque. A force on link 2
-that has less there is nearly along the link, or within 2 cm of joint 2."""
+"""Torque in joint 2 that a blow on link 1 may cause through the model's error, as a part of joint 1's torque. A force
+on link 2 with a smaller part is nearly along the link, or within 2 cm of joint 2."""
 PEAK_SHARE = 0.03
 """Standard deviation of a peak as a part of it: the mean of five samples takes up to 4 % off a blow's of 20 ms."""
 IMPULSE_SHARE = 0.01
-"""Standard deviation of an impulse as a part of it: what the model lacks while the arm reacts."""
+"""Standard deviation of an impulse as a part of it: the model's error while the arm reacts."""
 TOP_PARTS = 8
-"""Part of a contact, of its samples above half of its largest one, over which a peak is a mean: of a half-sine's top it
-takes 1 %."""
+"""A peak is a mean over this part (one in so many) of the contact's samples above half of the largest: on a half-sine's
+top it takes off 1 %."""
 BIAS = 1.5
 """Standard deviations that the largest of the few independent samples of a contact lies above the truth."""
 CORRELATED_SAMPLES = 5.0
@@ -62,7 +62,10 @@ _COLUMNS = 7
 
 @compiled
 def put_row(rows: Vector, kept: int, q: Vector, tau: Vector, sigma: Vector, threshold: Vector) -> None:
-    """Write one cycle behind so many others. rows (2 m, 7): the last m cycles, each twice: any window is one piece."""
+    """Write the row of one cycle. kept: number of rows before it.
+
+    rows (2 m, 7): the last m cycles, each twice, so that any window is contiguous.
+    """
     half = rows.shape[0] // 2
     place = kept % half
     for row in (place, place + half):
@@ -74,7 +77,7 @@ def put_row(rows: Vector, kept: int, q: Vector, tau: Vector, sigma: Vector, thre
 
 
 def last_rows(rows: Vector, kept: int, count: int) -> Vector:
-    """Return up to `count` rows, the newest last; a view, good until the next cycle. kept: so many were written."""
+    """Return up to `count` rows, newest last; a view, valid until the next cycle. kept: rows written so far."""
     half = rows.shape[0] // 2
     count = min(count, kept, half)
     end = half + (kept - 1) % half + 1
@@ -83,10 +86,10 @@ def last_rows(rows: Vector, kept: int, count: int) -> Vector:
 
 @compiled
 def _peak(tau: Vector, sigma: float) -> float:
-    """Return the largest torque (n,) as a mean over a part of the contact, less what noise adds to the largest of many.
+    """Return the largest torque of (n,) samples: a mean over a part of the contact, less the bias of a noisy maximum.
 
-    The longer a contact lasts the longer the mean: a blow's top is short, but when the arm begins to react the torque
-    of its drive jumps, and what the lag makes of that rings for some ten samples around the truth.
+    The mean is longer in a longer contact. A blow's top is short. When the arm begins to react, the torque of its drive
+    jumps, and through the lag the estimate rings for some ten samples around the truth.
     """
     largest = np.max(np.abs(tau))
     width = max(int(np.sum(np.abs(tau) > 0.5 * largest)) // TOP_PARTS, 1)
@@ -100,21 +103,21 @@ def _peak(tau: Vector, sigma: float) -> float:
 
 
 class ContactEvidence(ABC):
-    """What a scheme knows of a contact that it reports; of what a scheme doesn't do, nothing."""
+    """A scheme's data on a contact that it reports; values that the scheme doesn't estimate stay empty."""
 
     due_cycles: tuple[int, ...]
-    """When it is reported, in cycles after its detection: at once first, finally last."""
+    """Cycles from detection to each report: the first report at once, the final one last."""
 
     def compile(self) -> None:
-        """Run every compiled function once."""
+        """Run each compiled function once, so that it is compiled."""
 
     @abstractmethod
     def report(self, detected: int, elapsed: int, direction: tuple[int, int], is_final: bool) -> ContactReport:
-        """Report the contact that was detected in a cycle, so many cycles ago."""
+        """Report a contact. detected: cycle of its detection; elapsed: cycles since then."""
 
 
 def report_of(evidence: ContactEvidence, m: CourseMemory, cycle: int) -> ContactReport:
-    """Make the report that is due in this cycle, and let the contact's course go by its link."""
+    """Return the report that is due in this cycle, and record its link in the contact's course."""
     direction = int(m.direction[0]), int(m.direction[1])
     detected = int(m.detected_cycle)
     report = evidence.report(detected, cycle - detected, direction, not m.is_open)
@@ -125,7 +128,7 @@ def report_of(evidence: ContactEvidence, m: CourseMemory, cycle: int) -> Contact
 
 
 class IntegratedContact(ContactEvidence):
-    """The paper's: what its kernel has integrated since the contact began, at detection and when the window ends.
+    """The paper's evidence: its kernel's integrals since the contact began, at detection and when the window ends.
 
     tau_ext_hat, integral, peak: of the kernel (2,), views.
     """
@@ -155,7 +158,7 @@ class IntegratedContact(ContactEvidence):
 
 
 class RecalledContact(ContactEvidence):
-    """The certified scheme's: the last samples, at detection, when the link is decided and when the kind is."""
+    """The certified scheme's evidence: the last samples, at detection, and when the link and the kind are decided."""
 
     def __init__(self, settings: Settings, m: CourseMemory) -> None:
         period_s = settings.bus.period_s
@@ -169,7 +172,7 @@ class RecalledContact(ContactEvidence):
         self._since = 0
 
     def compile(self) -> None:
-        """Run every compiled function, for one row and for several: numpy calls the columns of one row contiguous."""
+        """Run each compiled function, for one row and for several: numpy takes one row's columns as contiguous."""
         every = np.ones((8, _COLUMNS))
         for count in (1, 2):
             rows = last_rows(every, count, count)
@@ -179,7 +182,7 @@ class RecalledContact(ContactEvidence):
             _peak(tau[:, 0], sigma[0])
 
     def _begin(self) -> None:
-        """Find how many cycles ago the contact began that is detected in this one."""
+        """Find how many cycles ago the contact detected in this cycle began."""
         rows = last_rows(self.rows, int(self._m.kept_rows), self._before_cycles)
         below = np.all(np.abs(rows[:, TAU]) <= np.maximum(ONSET_FRACTION * rows[:, THRESHOLD], rows[:, SIGMA]), axis=1)
         self._since = rows.shape[0] - int(np.flatnonzero(below)[-1]) - 1 if np.any(below) else rows.shape[0]
@@ -223,7 +226,7 @@ class RecalledContact(ContactEvidence):
         )
 
     def _link(self, rows: Vector) -> int:
-        """Return the link that is touched, by joint 2."""
+        """Return the touched link, 1 or 2, from the torque of joint 2."""
         mean = np.abs(np.mean(rows[:, TAU], axis=0))
         sigma = float(rows[-1, SIGMA][1]) * np.sqrt(CORRELATED_SAMPLES / rows.shape[0])
         return 2 if mean[1] > CERTAIN * sigma + CROSS_SHARE * mean[0] else 1
@@ -234,12 +237,12 @@ def _pair(values: Vector) -> tuple[float, float]:
 
 
 KIND_S = 0.1
-"""From detection to the decision."""
+"""Time from detection to the decision of the kind."""
 END_S = 0.01
-"""What is left is the mean of this at the end of the window."""
+"""The remaining torque is the mean over this time at the end of the window."""
 LEFT = 0.18
-"""At least this part of the largest torque is left of a push. Of 600 random contacts of 5 to 60 N the 299 half-sines of
-20 to 100 ms left at most 0.142, the 301 pushes that rise in 0.2 to 1 s at least 0.239."""
+"""A push retains at least this part of its largest torque. Of 600 random contacts of 5 to 60 N the 299 half-sines of 20
+to 100 ms left at most 0.142, the 301 pushes that rise in 0.2 to 1 s at least 0.239."""
 
 
 def classify(tau_ext_wide_hat: Vector, sigma: Vector, period_s: float) -> ContactKind:
@@ -253,7 +256,7 @@ def classify(tau_ext_wide_hat: Vector, sigma: Vector, period_s: float) -> Contac
 
 @compiled
 def share_left(tau: Vector, sigma: Vector, end_samples: int) -> float:
-    """Return what is left at the end over the largest, 0 to 1."""
+    """Return the ratio of the torque at the end to the largest, 0 to 1."""
     count = tau.shape[0]
     largest = 0.0
     for k in range(count):

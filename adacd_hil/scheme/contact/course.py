@@ -1,13 +1,13 @@
-"""A contact's course from detection to its end: when it is reported, and what the arm does about it.
+"""A contact's course from detection to its end: the times of its reports, and the arm's reaction to it.
 
-Per cycle, after the kernel and the supervisor: `follow`. It looks at the state reached, so it must see every cycle.
+`follow` runs in each cycle, after the kernel and the supervisor. It reads the new state, so it must run in each one.
 
-**Reaction.** By level and link. A contact that grows into a collision, or whose link turns out to be another, has its
-reaction chosen anew. A withdrawal is given up for the `two_sided` reaction when something pushes from the other side:
-the external torque along the way of the withdrawal has turned against it by more than the upper thresholds, as in a
-clamp or with a wall behind. Without a valid model there is nothing to float with: the arm stops.
+**Reaction.** By level and link. It is chosen anew if a contact grows into a collision or its link turns out to be
+another. A withdrawal changes to the `two_sided` reaction when a push comes from the other side, as in a clamp or with a
+wall behind: the external torque along the direction of the withdrawal has turned against it by more than the upper
+thresholds. Floating needs a valid model: without one the arm stops.
 
-The paper's scheme withdraws from every contact, stops without one, and gives no withdrawal up.
+The paper's scheme withdraws from each contact, stops if it reacts without one, and never gives a withdrawal up.
 
 Shapes: tau_ext_hat (2,), Nm.
 """
@@ -25,19 +25,19 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import PerJoint
 
 TURNED_CYCLES = 5
-"""How many samples in a row the torque must be turned: what a blow leaves in the estimate is shorter."""
+"""How many samples in a row the torque must be turned: the trace of a blow in the estimate is shorter."""
 BLIND_S = 0.02
-"""After a withdrawal has begun it is not judged yet: the estimate still rings from the blow."""
+"""Time after the start of a withdrawal during which it is not judged: the estimate still rings from the blow."""
 _NEVER = 1 << 60
 _CONTACT, _COLLISION = (int(level) for level in ContactLevel)
 """As plain numbers, which compiled code can compare with others."""
 
 
 class CourseConstants:
-    """The choice of reactions.
+    """Constants of the choice of reactions.
 
     reactions: by level, the lower first, and link. is_kept: a reaction stays in force until the next contact.
-    due_cycles: a report is due so long after the detection, the final one last.
+    due_cycles: cycles from the detection to each report, the final one last.
     """
 
     reactions: Annotated[NDArray[np.int64], "levels n"]
@@ -49,11 +49,11 @@ class CourseConstants:
 
 
 class CourseMemory:
-    """How far a contact has come.
+    """State of the present contact.
 
-    link: that is touched, 0 for none. is_open: a report is out that is not final yet. level: the highest of this
-    contact. cause_link: for which the reaction was chosen. kept_rows: of the history that reports are made from, so
-    far. way: of a withdrawal, a unit vector; zeros without one.
+    link: touched link, 0 for none. is_open: a report has been made that is not final yet. level: the highest of this
+    contact. cause_link: link for which the reaction was chosen. kept_rows: rows written so far in the history for
+    reports. way: direction of a withdrawal, a unit vector; zeros without one.
     """
 
     is_reacting: int
@@ -86,13 +86,13 @@ def fill_constants(settings: Settings, due_cycles: tuple[int, ...], k: CourseCon
 
 
 def begin(m: CourseMemory) -> None:
-    """Fill the memory before the first cycle."""
+    """Fill the course's memory before the first cycle."""
     m.level = ContactLevel.CONTACT
 
 
 @compiled
 def goes_on(m: CourseMemory) -> bool:
-    """Tell whether the arm moves on along its path."""
+    """Return whether the reaction in force lets the arm move on along its path."""
     return bool(m.reaction in (Reaction.NONE, Reaction.SLOW_DOWN))
 
 
@@ -107,7 +107,7 @@ def follow(
     tau_ext_hat: Vector,
     tau_ext: Vector,
 ) -> bool:
-    """Take in one cycle and tell whether a report is due in it.
+    """Process one cycle and return whether a report is due in it.
 
     supervisor: its memory, after its step. is_valid: there is a model to float with. tau_ext_hat: filtered, for the
     reaction; tau_ext: gives the direction of a joint when it crosses its threshold.
@@ -119,7 +119,7 @@ def follow(
     level = _COLLISION if observation & COLLISION else _CONTACT
     if m.is_reacting == 0:
         m.is_reacting = 1
-        if joints == 0:  # as for a host that is late
+        if joints == 0:  # a late host, for example
             _react(m, Reaction.STOP, tau_ext_hat, False)
             m.level, m.cause_link = _COLLISION, 0
             return False
@@ -136,7 +136,7 @@ def follow(
 
 @compiled
 def _leave(k: CourseConstants, m: CourseMemory, state: int) -> None:
-    """Forget the contact that is over: the arm goes on."""
+    """Forget the contact, which is over: the arm goes on."""
     if m.is_reacting != 0:
         m.is_reacting, m.link = 0, 0
         if k.is_kept == 0:
@@ -147,7 +147,7 @@ def _leave(k: CourseConstants, m: CourseMemory, state: int) -> None:
 
 @compiled
 def _is_due(k: CourseConstants, m: CourseMemory, cycle: int, joints: int, tau_ext: Vector) -> bool:
-    """Take in which joints are over their threshold; tell whether a report is due. The final one closes the course."""
+    """Record the joints over their threshold; return whether a report is due. The final one closes the course."""
     elapsed = cycle - m.detected_cycle
     for i in range(m.direction.shape[0]):
         if joints >> i & 1 and m.direction[i] == 0:
@@ -165,7 +165,7 @@ def _is_due(k: CourseConstants, m: CourseMemory, cycle: int, joints: int, tau_ex
 def _reconsider(
     k: CourseConstants, m: CourseMemory, level: int, is_latched: bool, tau_ext_hat: Vector, is_valid: bool
 ) -> None:
-    """Change the reaction if something calls for it."""
+    """Choose the reaction anew if the level, the latch or the link has changed."""
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link
     if is_other and m.cause_link != 0 and m.is_given_up == 0:
@@ -191,7 +191,7 @@ def _possible(reaction: int, is_valid: bool) -> int:
 
 @compiled
 def _react(m: CourseMemory, reaction: int, tau_ext_hat: Vector, is_pushed: bool) -> None:
-    """Begin a reaction; is_pushed: away along tau_ext_hat, if it is a withdrawal."""
+    """Begin a reaction; is_pushed: a withdrawal moves along tau_ext_hat."""
     m.reaction = reaction
     size = np.sqrt(tau_ext_hat[0] * tau_ext_hat[0] + tau_ext_hat[1] * tau_ext_hat[1]) if is_pushed else 0.0
     for i in range(m.way.shape[0]):
@@ -201,7 +201,7 @@ def _react(m: CourseMemory, reaction: int, tau_ext_hat: Vector, is_pushed: bool)
 
 @compiled
 def _judge(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: bool) -> None:
-    """Give a withdrawal up if it pushes something on the other side."""
+    """Give up a withdrawal if it pushes against an obstacle on the other side."""
     m.cycles += 1
     if m.cycles <= k.blind_cycles:
         return

@@ -1,18 +1,17 @@
-"""Where a contact is, and how strong: force and lever arm from the external torques of a 2R arm.
+"""Place and strength of a contact: force and lever arm from the external torques of a 2R arm.
 
 One contact without friction pushes at right angles to its link. On link 2, with the lever arm r from joint 2:
 
     tau_2 = F r,   tau_1 = F (r + l1 cos q2)    =>    F = (tau_1 - tau_2) / (l1 cos q2),   r = tau_2 / F
 
-When the arm begins to react the torque of its drive jumps, and what the lag makes of that stands on some ten samples
-of both joints: a third too much of F in the strongest one. So F is the largest median over a part of the strong
-samples.
+When the arm begins to react, the torque of its drive jumps. Through the lag, this distorts some ten samples of both
+joints: F is a third too large in the strongest one. So F is the largest median over a part of the strong samples.
 
-At q2 = ±90° both joints say the same and F is not known. Over a contact's strong samples r is the slope of tau_2 over F
-by least squares; what F's noise makes of it, 2 % at 1 N, is far below its standard deviation. On link 1 only the
+At q2 = ±90° both joints carry the same information and F is unknown. Over a contact's strong samples r is the slope of
+tau_2 over F by least squares; F's noise biases it by 2 % at 1 N, far below its standard deviation. On link 1 only the
 moment is known: |F| >= |tau_1| / l1. A force along link 2 has no lever arm: one within asin(h_2 / (F l2)) of the link's
-axis leaves joint 2 below its threshold h_2 wherever it is, and reads as one on link 1 that has F l1 |sin q2| = |tau_1|.
-With friction, or two contacts, r may fall off the link.
+axis leaves joint 2 below its threshold h_2 wherever it is. It looks like a force on link 1 with F l1 |sin q2| =
+|tau_1|. With friction, or two contacts, r may fall off the link.
 
 Shapes: tau_ext_wide_hat (n, 2), Nm, filter undone; q2 (n,), rad; sigma (2,), its standard deviation, Nm.
 """
@@ -26,19 +25,20 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import Location, Vector
 
 LARGEST_LEVER_SIGMA_M = 0.03
-"""A lever arm that is less certain counts as not known."""
+"""A lever arm with a larger standard deviation counts as unknown."""
 SQUARE_COSINE = 0.17
 """|cos q2| within 10° of a right angle: there a percent of error in tau_1 - tau_2 is six of the force."""
 WORTH = 0.5
-"""Samples below this part of the strongest one say little of the place, and more of what the model lacks."""
+"""Smaller samples, as a part of the strongest one, carry little information on the place: model error dominates."""
 
 TOP_PARTS = 3
-"""Part of a contact's strong samples over which the force is a median: of a half-sine's top that takes 1.5 %."""
+"""One in so many of a contact's strong samples: the force is a median over these. On a half-sine's top it takes off 1.5
+%."""
 TOP_PLACES = 16
-"""Places of that part that are tried at most: the work is bounded, however many samples there are."""
+"""Largest number of windows of that part that are tried: it bounds the work, whatever the number of samples."""
 
 MODEL_SHARE = 0.015
-"""Standard deviation of a large torque as a part of it: what mean and velocity loop make of a blow."""
+"""Standard deviation of a large torque as a part of it: distortion of a blow by the mean and the velocity loop."""
 
 _KNOWN = int(Location.KNOWN)
 _SINGULAR = int(Location.SINGULAR)
@@ -67,7 +67,7 @@ def on_link2(
 ) -> Place:
     """Return force and lever arm of one contact without friction on link 2; the force is that of its peak.
 
-    tip_margin_m: how far past the tip what the arm carries may be touched and still count as the link's end.
+    tip_margin_m: distance past the tip up to which a touch, of the load for instance, counts as one of the link's end.
     """
     location, *values = _fit(tau_ext_wide_hat, q2, sigma, length_m[0], length_m[1], tip_margin_m)
     return Place(Location(location), *values)
@@ -132,7 +132,7 @@ def _fit(
     if not squares > 0.0:
         return _UNCERTAIN, force, force_sigma, 0.0, np.inf
     lever = products / squares
-    # Of tau_2 - r F = tau_2 (1 + r / arm) - tau_1 r / arm. Neighbours share their noise: as good as one sample.
+    # Deviation of tau_2 - r F = tau_2 (1 + r / arm) - tau_1 r / arm. Neighbours share their noise: they count as one.
     share = lever / arm
     lever_sigma = np.hypot(sigma_2 * (1.0 + share), sigma_1 * share) / abs(force)
     margin = 3.0 * lever_sigma

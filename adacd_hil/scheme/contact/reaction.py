@@ -21,7 +21,7 @@ from adacd_hil.settings.configuration import Settings
 
 
 class JointWay(NamedTuple):
-    """One joint's way: three parts of constant acceleration, each with its length in s, then rest at the target."""
+    """One joint's motion: three parts of constant acceleration, each with its length in s, then rest at the target."""
 
     position: float
     velocity: float
@@ -69,14 +69,14 @@ def time_optimal(
 
 
 class Withdrawal:
-    """The way of all joints from one collision to rest. Made when REACT is entered, then sampled per period."""
+    """The motion of all joints from one collision to rest. Made when REACT is entered, then sampled per period."""
 
     def __init__(
         self, settings: Settings, q_d: Vector, dq_d: Vector, tau_ext_hat: Vector, start: Vector | None = None
     ) -> None:
         """Plan from the present motion. Without an external torque the arm just stops.
 
-        start: where the way began, if not here; what has been covered since is not covered again.
+        start: where the withdrawal began, if not here; the distance since then is not covered again.
         """
         distance = np.radians(settings.reaction.distance_deg)
         velocity_limit = np.minimum(
@@ -114,7 +114,7 @@ class Withdrawal:
 
     @property
     def beyond(self) -> list[int]:
-        """Joints that the acceleration limit lets stop only beyond their position limit, from 0."""
+        """Joints, from 0, that stop only beyond their position limit, at the acceleration limit."""
         limit = self._settings.arm.position_limit_rad
         return [i for i in range(JOINTS) if abs(self._soonest_stop(i)) > limit[i]]
 
@@ -125,7 +125,7 @@ class Withdrawal:
         return profile.position + profile.velocity * abs(profile.velocity) / (2.0 * limit)
 
     def describe_beyond(self, joint: int) -> str:
-        """Say where such a joint stops."""
+        """Return a message that gives where such a joint stops."""
         arm, wish = self._settings.arm, self._settings.reaction
         profile = self._profiles[joint]
         return (
@@ -144,7 +144,7 @@ def _withdraw(
     velocity_limit: float,
     acceleration_limit: float,
 ) -> JointWay:
-    """Plan one joint's way over `displacement`, cut off at the position limit, never back against it."""
+    """Plan one joint's motion over `displacement`, cut off at the position limit, never back against it."""
     sign = math.copysign(1.0, displacement or velocity)  # a joint that is not pushed just stops
     room = position_limit - sign * position
     forward = sign * velocity

@@ -1,1 +1,1 @@
-"""Residuals, their thresholds, and what they let be seen."""
+"""Residuals, their thresholds, and the smallest contact that they detect."""

@@ -1,8 +1,8 @@
-"""Registered detectors: where they come from, and the contract that each of them keeps.
+"""Registered detectors: their sources, and their common contract.
 
 A detector is registered by `register`, or by an entry point of the group `adacd_hil.detectors` in a lab's own package:
-the entry point's name is the detector's, its object what begins one, as for `register`. Entry points are loaded when a
-detector is first looked up; a run loads none.
+the entry point's name is the detector's, its object a function that begins one, as for `register`. Entry points are
+loaded when a detector is first looked up; a run never loads one.
 
 **Contract** (`StreamDetector`): `take` returns one finite statistic per sample and joint, which depends on this sample
 and on those before it. `check_contract` plays noise before a detector is taken: whole, and cut in two.
@@ -27,9 +27,9 @@ class StreamDetector(Protocol):
     """One detector on one stream, from its beginning."""
 
     def take(self, z: Vector, held_Nm: Vector) -> Vector:
-        """Take in N more samples of z and of the friction that may hold (N, n); return the statistic of each (N, n).
+        """Process N more samples of z and of the friction that may hold (N, n); return the statistic of each (N, n).
 
-        An alarm is a statistic above its threshold. A sample's depends on it and on those before it, not on how the
+        An alarm is a statistic above its threshold. It may depend on its sample and those before, but not on how the
         stream is cut into pieces.
         """
 
@@ -39,7 +39,7 @@ Maker = Callable[[float], StreamDetector]
 
 
 class Registered(NamedTuple):
-    """A detector that was registered. origin: where it is from, in words."""
+    """A registered detector. origin: its source, as text."""
 
     make: Maker
     origin: str
@@ -50,7 +50,7 @@ _LOADED: list[str] = []
 
 
 def registered(reserved: Collection[str]) -> Mapping[str, Registered]:
-    """Return all registered detectors by name, those of entry points included. reserved: names of the built-in ones.
+    """Return all registered detectors by name, including entry points'. reserved: names of the built-in ones.
 
     Raises DetectorError for an entry point that can't be loaded, breaks the contract, or has a name that is taken.
     """
@@ -75,7 +75,7 @@ def _load(entry: importlib.metadata.EntryPoint, reserved: Collection[str]) -> No
 
 
 def _remove_loaded() -> None:
-    """Take out what an entry point has registered, so that the next look-up says again what is wrong."""
+    """Remove the detectors of an entry point, so that the next look-up reports the error again."""
     for name in [name for name, found in _REGISTERED.items() if found.origin]:
         del _REGISTERED[name]
 
@@ -94,12 +94,12 @@ def add(name: str, make: Maker, reserved: Collection[str], origin: str = "") -> 
 
 
 def remove(name: str) -> None:
-    """Take out a detector. Raises KeyError for one that was not registered."""
+    """Remove a detector. Raises KeyError if it was not registered."""
     del _REGISTERED[name]
 
 
 def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:
-    """Play noise to a detector. Raises ValueError if it breaks the contract, saying in what."""
+    """Play noise to a detector. Raises ValueError, with the reason, if it breaks the contract."""
     z = np.random.default_rng(0).standard_normal((_CHECK_SAMPLES, JOINTS))
     held_Nm = np.where(z > 1.0, 0.1, 0.0)
     first, parts = make(period_s), make(period_s)
@@ -119,6 +119,6 @@ def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:
 
 
 def describe_error(error: BaseException) -> str:
-    """Say in one line what was raised."""
+    """Return an exception as text in one line."""
     text = " ".join(str(error).split())[:_LONGEST_TEXT]
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -8,8 +8,8 @@ With M dq = Y_p theta and -C' dq + g + friction = Y_h theta, and a velocity that
 
 the mean over the interval. Every detector here is a filter of z; the paper's residual is z through 1 / (s + a) times a.
 
-**A joint that stands still** can hold any torque up to F_c, which no model predicts. What that may do to a channel at
-most is F_c times the channel's own filter of the indicator "stands still", so it is taken off: a statistic is
+**A joint that stands still** can hold any torque up to F_c, which no model predicts. Its largest effect on a channel is
+F_c times the channel's own filter of the indicator "stands still". This is subtracted: a statistic is
 
     |x| - allowance,                                           in Nm but for `likelihood ratio` and `cusum`
 
@@ -22,7 +22,7 @@ smoothed a         the same with a second low-pass: a velocity from a tracking l
 band-pass          first-order at its upper less first-order at its lower cut-off
 observer K         generalised-momentum observer of gain K by the implicit trapezoid
 likelihood N       log-likelihood of a step that began N samples ago: the stream's own covariance whitens it; in sigmas
-cusum              sum of what the smoothed channel of highest cut-off has above a drift; in Nm s
+cusum              sum of the excess of the smoothed channel of highest cut-off over a drift; in Nm s
 
 **Further detectors** are registered (`detector_registry`), one channel each. They run wherever those above do: in
 thresholds, in the comparison of `thresholds --report`, in `tune`, and live if they keep the contract for that.
@@ -54,7 +54,7 @@ VELOCITY_LAG_S: Final = 1.25e-3
 """The emulated drives: 1.59 ms of their tracking loop less 0.34 ms, since a commanded torque is a step at the start of
 the interval and not a straight line over it."""
 LIKELIHOOD: Final = "likelihood"
-"""Its channels' names begin with this."""
+"""First part of the names of its channels."""
 
 
 def register(name: str, make: Maker) -> None:
@@ -66,13 +66,13 @@ def register(name: str, make: Maker) -> None:
 
 
 def unregister(name: str) -> None:
-    """Take a detector out that was registered. Raises KeyError for one that was not."""
+    """Remove a registered detector. Raises KeyError if it was not registered."""
     detector_registry.remove(name)
 
 
 @dataclass(frozen=True)
 class DetectorBankSettings:
-    """What the detectors of one stream are."""
+    """Parameters of the detectors of one stream."""
 
     cutoff_rad_s: tuple[float, ...] = setting(
         (10.0, 50.0, 200.0), unit="rad/s", low=0.1, high=2000.0, meaning="first-order and smoothed channels"
@@ -128,13 +128,13 @@ class DetectorBankSettings:
 
     @property
     def detectors(self) -> dict[str, tuple[int, ...]]:
-        """Name the detectors and the channels of each; a joint is over when one of them is."""
+        """Return the detectors and the channels of each; a joint is over if one of its channels is."""
         first = len(self.own_channels)
         return self.own_detectors | {name: (first + place,) for place, name in enumerate(self.registered)}
 
     @property
     def own_detectors(self) -> dict[str, tuple[int, ...]]:
-        """Name the built-in detectors and the channels of each."""
+        """Return the built-in detectors and the channels of each."""
         count, gains, ages = len(self.cutoff_rad_s), len(self.observer_rad_s), len(self.onset_samples)
         detectors = {
             "paper": (0,),
@@ -154,9 +154,9 @@ def likelihood_windows(
     """Design one joint's likelihood weights (N, L), the newest sample's first, from the covariance (L,) of its z.
 
     With the covariance R of the last L samples and the step's shape s, w = R^-1 s / sqrt(s' R^-1 s): noise of this
-    covariance comes out with a standard deviation of 1, and no other window gives the step more. The shape is what a
-    critically damped loop of that lag makes of a step. floor_Nm: slow errors of the model, added as a constant of
-    unknown size; without them a window would trust averages longer than any model deserves.
+    covariance comes out with a standard deviation of 1, and no other window gives the step more. The shape is the
+    response of a critically damped loop of that lag to a step. floor_Nm: slow errors of the model, added as a constant
+    of unknown size; without them a window would trust averages longer than any model deserves.
 
     Raises ValueError unless L is at least the largest age and the covariance is positive.
     """
@@ -214,7 +214,7 @@ class DetectorConstants:
 
 
 def constants_of(settings: DetectorBankSettings, weights: Vector, period_s: float) -> Structured:
-    """Put settings and the joints' likelihood weights (n, N, L) into the form that the compiled step reads."""
+    """Return the settings and the joints' likelihood weights (n, N, L) as the record that the compiled step reads."""
     return packed(
         DetectorConstants(
             period_s=period_s,
@@ -229,7 +229,7 @@ def constants_of(settings: DetectorBankSettings, weights: Vector, period_s: floa
 
 
 def new_memory(constants: Structured) -> Structured:
-    """Return the memory before the first sample: nothing was seen, nothing stood still."""
+    """Return the memory before the first sample: all zeros."""
     c: DetectorConstants = constants[0]
     joints = c.weights.shape[0]
     return zeros_of(
@@ -239,7 +239,7 @@ def new_memory(constants: Structured) -> Structured:
 
 @compiled
 def step(constants: Structured, memory: Structured, z: Vector, held_Nm: Vector, statistics: Vector) -> None:
-    """Take in z (n,) and fill the statistics (channels, n).
+    """Process z (n,) and fill the statistics (channels, n).
 
     held_Nm (n,): the friction that may hold each joint, F_c if it stands still, else 0.
     """
@@ -310,14 +310,14 @@ class DetectorBank:
     """All detectors on one stream, from its beginning."""
 
     def __init__(self, settings: DetectorBankSettings, weights: Vector, period_s: float) -> None:
-        """Begin. weights (n, N, L): the joints' likelihood weights."""
+        """Begin a stream. weights (n, N, L): the joints' likelihood weights."""
         self._constants = constants_of(settings, weights, period_s)
         self._memory = new_memory(self._constants)
         self._channels = len(settings.channels)
         self._registered = [found.make(period_s) for found in settings.registered.values()]
 
     def take(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
-        """Take in N samples (N, n); return the largest statistic of each block, (ceil(N / block_samples), channels, n).
+        """Process N samples (N, n); return the largest statistic of each block, (ceil(N / block_samples), channels, n).
 
         One sample per block keeps everything; a stream goes on at a block's end.
         """
@@ -346,9 +346,9 @@ def stream(
 ) -> None:
     """Fill the stream and the friction that may hold (N, 2) of a recording; theta (N, p), interval_s (N,).
 
-    The first sample, and one whose interval is not positive (nobody knows what happened before it), has z = 0. Both
-    ends of an interval are judged by the theta of its end, so that a change of theta is no torque. q1 counts from the
-    level, which says where gravity points; nothing else depends on its zero.
+    The first sample has z = 0, and so has one whose interval is not positive, because the motion before it is unknown.
+    Both ends of an interval are judged by the theta of its end, so that a change of theta is not a torque. q1 counts
+    from the level, for the direction of gravity; the rest is independent of its zero.
     """
     count, joints = q.shape
     Y_p = np.zeros((2, joints, theta.shape[1]))
@@ -381,7 +381,7 @@ def make_stream(
     lag_s: float = VELOCITY_LAG_S,
     standstill_rad_s: float = 2e-3,
 ) -> tuple[Vector, Vector]:
-    """Give the stream z and the friction that may hold, both (N, 2), Nm.
+    """Return the stream z and the friction that may hold, both (N, 2), Nm.
 
     q, dq, tau_J (N, 2), q1 from the level; theta (p,) or (N, p), p = 7 or 9; interval_s (N,), 0 or less where
     samples are missing before.

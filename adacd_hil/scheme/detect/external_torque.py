@@ -2,7 +2,7 @@
 
 **Detector.** The collision detector of eq. (13) and (14), one threshold per joint.
 
-The paper's tau_ef = tau_f - W_f theta_hat is the negative of what the environment does, filtered with DC gain b / a.
+The paper's tau_ef = tau_f - W_f theta_hat is the negative of the environment's torque, filtered with DC gain b / a.
 Estimates and thresholds here are in Nm and positive when the environment pushes toward +q:
 
     tau_ext_hat = -(a / b) (tau_f - W_f theta_hat)
@@ -29,7 +29,7 @@ from adacd_hil.scheme.memory import Wide
 
 SMALLEST_UNIT = 0.05
 LARGEST_UNIT = 9.0
-"""Bounds of the unit: a model is never believed to be more than 4.5 times better, or 3 times worse, than it says."""
+"""Bounds of the unit: a model counts as at most 4.5 times better, or 3 times worse, than its covariance."""
 
 
 @compiled
@@ -48,7 +48,7 @@ def estimate_external(tau_f: Vector, tau_f_hat: Vector, dc_gain: float, tau_ext_
 
 @compiled
 def follow_standstill(dq: Vector, standstill_rad_s: float, decay: float, standstill: Vector) -> None:
-    """Filter with DC gain 1, into `standstill` (2,) from 0 to 1, whether each joint stands still."""
+    """Filter with DC gain 1, into `standstill` (2,) from 0 to 1, each joint's indicator of standing still."""
     for i in range(dq.shape[0]):
         target = 1.0 if abs(dq[i]) < standstill_rad_s else 0.0
         standstill[i] = target + decay * (standstill[i] - target)
@@ -56,7 +56,7 @@ def follow_standstill(dq: Vector, standstill_rad_s: float, decay: float, standst
 
 @compiled
 def fill_threshold(threshold_Nm: Vector, standstill: Vector, F_c: Vector, threshold: Vector) -> None:
-    """Fill the thresholds in force (2,), Nm: those of the settings, and what friction may hold at standstill."""
+    """Fill the thresholds in force (2,), Nm: those of the settings, and the friction that may hold at standstill."""
     for i in range(threshold.shape[0]):
         threshold[i] = threshold_Nm[i] + standstill[i] * max(F_c[i], 0.0)
 
@@ -76,7 +76,7 @@ WIDE_SAMPLES = 5
 4 % from 20 ms on."""
 
 ONSET_FRACTION = 0.5
-"""Part of the threshold below which a joint counts as untouched; above what a frozen model leaves (0.07 of 0.15 Nm)."""
+"""Part of the threshold below which a joint counts as untouched; above a frozen model's residual (0.07 of 0.15 Nm)."""
 
 
 @compiled
@@ -108,7 +108,7 @@ def follow_contact(
     integral: Vector,
     peak: Vector,
 ) -> None:
-    """Carry on the integral (2,) Nm s and the peak (2,) Nm of each joint's contact in place.
+    """Update the integral (2,) Nm s and the peak (2,) Nm of each joint's contact in place.
 
     A joint that counts as untouched begins anew, but not while a report is open: its contact may be over by the end.
     """

@@ -1,18 +1,18 @@
-"""What thresholds leave: floor by the largest residual seen, smallest push that is found, and how both change.
+"""Margins of detection: floor by the largest residual seen, smallest detectable push, and the change of both.
 
-**Tail.** No threshold is below what the largest residuals seen let expect for an hour.
+**Tail.** Each threshold is at least the largest residual that is to be expected in an hour, by the largest ones seen.
 
-A threshold follows from noise and from what the belief leaves open. What is neither, a friction that sticks at one
-place or a sensor that errs, shows as a residual that comes near. With excursions above a level that die out like a
+A threshold follows from noise and from the belief's uncertainty. Other errors, a friction that sticks at one place or a
+sensor that errs, show as a residual that comes near the threshold. With excursions above a level that die out like a
 Gaussian's, nu of them a second that are independent, and the largest of T seconds known, the largest of 1 / RATE is
 
     m(T) = sqrt(ln(nu / RATE) / ln(nu T)) times that,    nu = cut-off / pi,    T >= 1 s, m <= LARGEST
 
 An error of the model has both signs in turn, a push has one. So the largest positive and the largest negative residual
 are kept apart, each with half of the time seen, and the floor follows from the smaller one: a push that grows slowly
-raises no threshold above m times what the arm has shown the other way. A residual counts when its block is over and the
-one after it: what is held back from a contact is none. It counts as no more than the threshold without the floor. It is
-forgotten over FORGOTTEN_S without contact.
+can't raise a threshold above m times the largest residual of the other sign. A residual counts once its block and the
+next one are over; a sample held back from a contact doesn't count. It counts as no more than the threshold without the
+floor. It is forgotten over FORGOTTEN_S without contact.
 
 Shapes: peak, peak_now, peak_last (2, 2 C - 1, n), negative residuals first; tail_Nm (2 C - 1, n). Units: Nm.
 
@@ -22,8 +22,8 @@ A channel whose response to a step of 1 is g after WITHIN_S is then over its thr
 
     |tau_ext| > (h + |y|) / g
 
-with y what it shows without the push. A bare channel counts only if the smoothed one of its filter is over AGREES h as
-well (`sensitivity`). Of all channels the least counts. The threshold *in force* is the least h.
+with y the channel's output without the push. A bare channel counts only if the smoothed one of its filter is over
+AGREES h as well (`sensitivity`). Of all channels the least counts. The threshold *in force* is the least h.
 
 Both are an estimate: they assume that thresholds and residuals stay as they are meanwhile. A certificate states them
 over its test. While the arm monitors, the mean of the smallest push over each second of motion is compared with the
@@ -53,17 +53,21 @@ from adacd_hil.settings.configuration import Settings
 
 
 class MarginWatch:
-    """Watches how far the contact-free peaks stay below the thresholds while a run goes on.
+    """Monitors the distance of contact-free peaks from the thresholds during a run.
 
-    Fed once per block, of a second say, with the largest ratio of statistic to threshold of each joint. The margin is
-    one over the largest ratio to be expected within the horizon, by a Gumbel law for block maxima whose mean and
-    deviation follow the last blocks; bounded tails stay below it.
+    Each block, of a second for instance, gives the largest ratio of statistic to threshold per joint. The margin is one
+    over the largest ratio to be expected within the horizon, by a Gumbel law for block maxima whose mean and deviation
+    follow the last blocks; bounded tails stay below it.
     """
 
     def __init__(
         self, joints: int, horizon_blocks: float = 3600.0, memory_blocks: float = 300.0, warn_share: float = 0.75
     ) -> None:
-        """Begin without a reference. horizon: 3600 blocks of 1 s are an hour. warn_share: of the first margin."""
+        """Begin without a reference.
+
+        horizon_blocks: 3600 blocks of 1 s are an hour. warn_share: part of the first margin below which `warning`
+        reports.
+        """
         self._forget = 1.0 / memory_blocks
         self._horizon = math.log(horizon_blocks)
         self._warn_share = warn_share
@@ -75,7 +79,7 @@ class MarginWatch:
         """Margin per joint (n,) when the watch had settled; None until then."""
 
     def add(self, ratio: Vector) -> None:
-        """Take in one contact-free block's largest ratio of each joint (n,); one that isn't finite is left out."""
+        """Add the largest ratio of each joint (n,) in one contact-free block; a value that isn't finite is ignored."""
         if not np.isfinite(ratio).all():
             return
         self._blocks += 1
@@ -96,13 +100,13 @@ class MarginWatch:
         if self._blocks == 0:
             return np.full(self._mean.shape, np.inf)
         scale = np.sqrt(np.maximum(self._square - self._mean**2, 0.0)) * math.sqrt(6.0) / math.pi
-        # mode of the largest of so many: mean - Euler's constant * scale + ln(horizon) * scale
+        # mode of the largest in the horizon: mean - Euler's constant * scale + ln(horizon) * scale
         expected = self._mean + (self._horizon - 0.5772156649015329) * scale
         return np.asarray(1.0 / np.maximum(expected, 1e-9))
 
     @property
     def warning(self) -> str:
-        """Say which joint's margin has shrunk: `joint 1: margin 1.4 x, was 2.1 x`; "" while none has."""
+        """Return which joint's margin has shrunk: `joint 1: margin 1.4 x, was 2.1 x`; "" if all are unchanged."""
         if self.reference is None:
             return ""
         margin = self.margin
@@ -114,12 +118,12 @@ class MarginWatch:
 
 HOUR_S = 3600.0
 RATE_HZ = 1.0 / HOUR_S
-"""Excursions over the floor that are expected: one an hour."""
+"""Expected rate of excursions over the floor: one an hour."""
 LARGEST = 1.6
-"""A larger one lets the first seconds' threshold of an arm with 1 kg hide a push of 0.1 Nm."""
+"""With a larger one, the threshold of the first seconds of an arm with 1 kg hides a push of 0.1 Nm."""
 FORGOTTEN_S = 600.0
 BLOCK_S = 0.064
-"""Longer than a touch is held back before it is seen."""
+"""Longer than the hold-back of a touch before its detection."""
 
 
 def constants_of(settings: Settings) -> MarginConstants:
@@ -137,7 +141,7 @@ def constants_of(settings: Settings) -> MarginConstants:
 
 @compiled
 def begin_tail(m: Memory) -> None:
-    """Begin with a model that no residual has been seen of."""
+    """Begin with a model without residuals so far."""
     m.margin.peak[:] = 0.0
     m.margin.tail_Nm[:] = 0.0
     m.margin.tail_s = 0.0
@@ -146,7 +150,7 @@ def begin_tail(m: Memory) -> None:
 
 @compiled
 def discard_tail(m: Memory) -> None:
-    """Throw away the residuals of the last block and the one under way: a contact is near."""
+    """Discard the residuals of the last block and the present one: a contact is near."""
     m.margin.peak_now[:] = 0.0
     m.margin.peak_last[:] = 0.0
     m.margin.block_used = 0.0
@@ -154,7 +158,7 @@ def discard_tail(m: Memory) -> None:
 
 @compiled
 def follow_tail(k: Constants, m: Memory) -> None:
-    """Take in one sample without contact."""
+    """Process one sample without contact."""
     filters = m.filters.r.shape[0]
     for c in range(m.filters.y.shape[0]):
         still = m.sensitivity.still_smooth[c] if c < filters else m.sensitivity.still[filter_bank.filter_of(c, filters)]
@@ -182,9 +186,9 @@ def follow_tail(k: Constants, m: Memory) -> None:
 
 
 def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> float:
-    """Return how many excursions over a threshold an hour has if the tail is a Gaussian's: 3600 nu (nu T)^(-1 / s²).
+    """Return the excursions over a threshold per hour for a Gaussian tail: 3600 nu (nu T)^(-1 / s²).
 
-    largest_share: s, of its threshold that the residual has come to in seen_s, T; 1 / s = m(T) comes to RATE.
+    largest_share: s, largest residual in seen_s, T, over its threshold; 1 / s = m(T) gives RATE.
     """
     if not largest_share > 0.0:
         return 0.0
@@ -209,18 +213,18 @@ def _factor(excursions_Hz: float, seen_s: float) -> float:
 WITHIN_S = 0.1
 """The slowest filter is at 0.63 of a step by then, without its smoothing."""
 LESS = 2.0
-"""How many times the smallest push of the certificate it may be without a word."""
+"""How many times the certificate's smallest push is allowed without a warning."""
 STRAIN_SAID, ROUGH_SAID = 1.5, 4.0
-"""From which on strain, and the square of the velocity's noise, are named as what raises a threshold."""
+"""From these values on, strain, and the square of the velocity's noise, are named as causes of a raised threshold."""
 LOWEST_NM, WIDTH, BINS = 1e-3, 0.02, 512
 """Thresholds are counted in bins that are 2 % wide, from 1 mNm to 28 Nm."""
 MEAN_S, BLIND_S = 1.0, 3.0
-"""Motion over which the smallest push is averaged, and for how long the mean may be more than LESS times."""
+"""Motion over which the smallest push is averaged, and longest time for which the mean may be over LESS times."""
 
 
 @compiled
 def smallest_push(y: Vector, h: Vector, shown: Vector, joint: int) -> float:
-    """Return the smallest push on a joint that is found within WITHIN_S if all stays as it is now."""
+    """Return the smallest push on a joint, Nm, detected within WITHIN_S if the present y and h stay as they are."""
     filters = (y.shape[0] + 1) // 2
     least = np.inf
     for c in range(y.shape[0]):
@@ -234,7 +238,7 @@ def smallest_push(y: Vector, h: Vector, shown: Vector, joint: int) -> float:
 
 @compiled
 def begin_sight(m: Memory) -> None:
-    """Begin a test."""
+    """Begin a test: empty the counts of thresholds and the worst values."""
     m.margin.seen[:] = 0.0
     m.margin.seen_worst_Nm[:] = 0.0
     m.margin.seen_push_Nm[:] = 0.0
@@ -245,7 +249,7 @@ def begin_sight(m: Memory) -> None:
 
 @compiled
 def follow_test(k: Constants, m: Memory) -> None:
-    """Take in one sample of a test, without contact."""
+    """Process one sample of a test, without contact."""
     for i in range(m.margin.dim_s.shape[0]):
         h = m.sensitivity.wide_threshold[i]
         place = int(math.log(max(h / LOWEST_NM, 1.0)) / WIDTH)
@@ -258,7 +262,7 @@ def follow_test(k: Constants, m: Memory) -> None:
 
 @compiled
 def follow_sight(k: Constants, m: Memory) -> bool:
-    """Take in one sample of monitoring, without contact; tell whether a joint has been blind for too long."""
+    """Process one sample of monitoring, without contact; return whether a joint has been blind for too long."""
     is_blind = False
     for i in range(m.margin.dim_s.shape[0]):
         if m.sensitivity.still[filter_bank.LEARNT, i] >= MOVING:
@@ -277,7 +281,7 @@ def follow_sight(k: Constants, m: Memory) -> bool:
 
 
 def describe_sight(m: Memory) -> str:
-    """Say what the last test has seen, joints separated by strokes."""
+    """Return smallest push, thresholds and residuals of the last test as text, joints separated by strokes."""
     seen = np.cumsum(m.margin.seen, axis=0)
     worst_Nm = m.margin.seen_worst_Nm
     median, most = ([_quantile(seen[:, i], worst_Nm[i], share) for i in range(JOINTS)] for share in (0.5, 0.99))
@@ -289,13 +293,13 @@ def describe_sight(m: Memory) -> str:
 
 
 def describe_push(m: Memory) -> str:
-    """Say in brief what the last test has seen."""
+    """Return the smallest pushes of the last test as a short text."""
     pushes = " / ".join(f"{value:.2f}" for value in m.margin.seen_push_Nm)
     return f"pushes of {pushes} Nm at the joints: found within {1e3 * WITHIN_S:g} ms (estimate)"
 
 
 def describe_dim(m: Memory) -> list[str]:
-    """Say which joints see less than in the test, and since when, a line each; empty if none."""
+    """Return the joints with less sight than in the test, and since when, a line each."""
     return [
         f"joint {i + 1} sees less than was certified: for {m.margin.dim_s[i]:g} s of motion it has found pushes from "
         f"{m.margin.mean_push_Nm[i]:.2f} Nm on within {1e3 * WITHIN_S:g} ms, in the test from "
@@ -306,7 +310,7 @@ def describe_dim(m: Memory) -> list[str]:
 
 
 def _why_dim(m: Memory, joint: int) -> str:
-    """Say what raises a joint's thresholds most."""
+    """Return the main cause of a joint's raised thresholds as text."""
     if np.any(m.margin.tail_Nm[:, joint] > m.sensitivity.h_model[:, joint]):
         return "residuals of both signs have come near the thresholds: the arm moves otherwise than its model"
     if m.sensitivity.strain[joint] > STRAIN_SAID:
@@ -322,7 +326,7 @@ def _why_dim(m: Memory, joint: int) -> str:
 
 
 def _quantile(seen: Vector, worst_Nm: float, share: float) -> float:
-    """Return the upper end of the bin up to which this share of the cycles is; the worst where that is less."""
+    """Return the upper end of the bin below which this share of the cycles lies; the worst value if that is less."""
     place = int(np.searchsorted(seen, share * seen[-1]))
     if place == BINS - 1:
         return float(worst_Nm)

@@ -1,37 +1,37 @@
-"""The thresholds of the certified scheme: what each channel of the bank may show without a contact.
+"""The thresholds of the certified scheme: largest output of each channel of the bank without a contact.
 
     h = max(e sqrt((k_tau sigma_tau)² + nu² (M R M')_ii + (k_m g)² + G) + pull, tail) + F_s max(s, LOW_SPEED_SHARE s')
 
 - sigma_tau: white noise of the torque sensor through the channel. A filter of cut-off a leaves sigma sqrt(a T / 2), one
-  that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor at rest that is found noisier raises it.
+  that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor that is noisier at rest raises it.
   Its steps add their own noise and pull (`follow_torque_step`).
 - nu, rad/s²: noise of the velocity through the momentum M(q) dq, as its largest value: it stems from the encoder's
   counts and is bounded, not Gaussian. The bare filter multiplies it by a, and BARE; smoothing leaves 0.335 (s / 200) /
   (1 + a / 600) of a (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
-- g² = w (u P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
-  parameter explains however long one learns. u is the unit of P's variances: 1 for what the settings say of a good
-  model's residual, less or more as the residual without contact turns out to be. While the arm is monitored the mean
-  square of the positive residuals and that of the negative ones are followed apart, and the smaller one counts: a push
-  has one sign, an error of the model has both. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
-- R: by how much the velocity's noise exceeds that of the settings, seen in its second difference.
+- g² = w (u P + D) w': the belief's uncertainty for this very motion, w the filtered regressor's row, and D the errors
+  that no parameter explains however long the arm learns. u is the unit of P's variances: 1 for the settings' residual
+  of a good model, less or more by the measured residual without contact. While the arm is monitored the mean square of
+  the positive residuals and that of the negative ones are followed apart, and the smaller one counts: a push has one
+  sign, an error of the model has both. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
+- R: the velocity's noise over that of the settings, squared, measured in its second difference.
 - e: 1, or more of a joint that has shown contacts while the arm learnt, or right after going on (`strain`).
-- G: what lost samples leave open, see below. tail: floor by the largest residual seen (`margin`).
-- s, s': how much of the filter's memory is of standstill, and of low speed. At standstill friction may hold any torque
+- G: uncertainty after lost samples, see below. tail: floor by the largest residual seen (`margin`).
+- s, s': shares of standstill, and of low speed, in the filter's memory. At standstill friction may hold any torque
   up to F_s: F_c, static friction and friction by load where they are in the model, and as much more as the first two
   are uncertain.
 
 Shapes: C filters, 2 C - 1 channels, n joints, p parameters; r, still, doubt (C, n); y, h (2 C - 1, n); W_f (C, n, p);
 M (n, n). Units: Nm.
 
-**Lost samples.** What lost samples leave open: where they are put on a straight line, or cut out of time, the
-thresholds widen.
+**Lost samples.** Lost samples are interpolated on a straight line, or cut out of time. The thresholds widen by the
+resulting uncertainty.
 
 Of n periods, n - 1 of them on the line between their neighbours, dt in all, a filter of cut-off a sees up to
 
     G += (k_tau sigma a dt)² (1 - 1 / n) / 2 + (a dt (CURVATURE dt² / 12 + F_c [sgn dq has changed]))²
 
-more: the noise of two samples in the place of n, and what the line leaves out of torque and friction. After a gap that
-is cut out the velocity's noise stands in S for good, G += (2 a nu)² (M R M')_ii. The filters forget it: G e^(-2 a t).
+more: the noise of two samples in the place of n, and the line's error in torque and friction. After a gap that is cut
+out, the velocity's noise stays in S, G += (2 a nu)² (M R M')_ii. The filters forget it: G e^(-2 a t).
 
 Shapes: C filters, n joints; lost (C, n), Nm².
 """
@@ -51,30 +51,31 @@ from adacd_hil.settings.scheme_settings import CertifiedSettings
 SECOND_DIFFERENCE = 0.36
 """Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, and a fifth."""
 JUMP = 5.0
-"""Deviations of the noise as which a jump counts at most."""
+"""Largest size of a single jump, in deviations of the noise."""
 PULL = 1.3
-"""How many times the pull of the sensor's steps a residual may show: the model has learnt some of it, too."""
+"""Largest residual by the sensor's steps, over their pull: the model has learnt some of it, too."""
 CHANGES, LARGEST_STEP_NM = 50.0, 0.2
-"""Changes of a torque sensor's value from which on the smallest is its step, and the largest step that is believed."""
+"""Changes of a torque sensor's value after which the smallest is taken as its step, and the largest plausible step."""
 ROUGHNESS_S, ROUGHNESS_LOST_S = 0.3, 20.0
-"""Memory of the velocity's roughness, and with which it goes back while the joint moves."""
+"""Memory of the velocity's roughness, and time constant of its decay while the joint moves."""
 STRAIN = 2.0
 LARGEST_STRAIN = 8.0
 """A contact while learning doubles the thresholds, three times at most."""
 STRAIN_S = 10.0
-"""Time constant with which the strain goes back, and with which the residual's largest share is forgotten."""
+"""Time constant of the strain's decay, and of the forgetting of the residual's largest share."""
 RELAXED = 0.6
-"""Share of its threshold that the residual must stay below for that."""
+"""Share of its threshold below which the residual must stay for the strain to decay."""
 LOW_SPEED_RAD_S, LOW_SPEED_SHARE = 0.1, 0.1
 """Below this speed friction is known less well, by this share of the static friction: bristles bend, lubricant thins.
 LuGre friction of 4 mrad on profile M errs by 0.02 Nm there, in each of 14 false alarms of 50 min without this."""
 RESTING, MOVING = 0.2, 0.05
-"""Share of standstill in a filter's memory from which on a joint counts as resting, and below which friction is what
-the model says it is."""
+"""Share of standstill in a filter's memory above which a joint counts as resting, and below which friction counts as
+the model's."""
 AGREES = 0.4
 """Share of its threshold that the smoothed channel has at least when the bare one finds a push: 0.5 to 0.75."""
 BARE = 1.15
-"""A bare filter leaves nothing else to average it: in 24 h of clean motion it came to 1.02 of a threshold without."""
+"""Factor for a bare filter, which averages no further: in 24 h of clean motion it came to 1.02 of a threshold
+without."""
 UNIT_PEAK = 2.5
 """Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
 UNIT_S = 20.0
@@ -119,12 +120,12 @@ def follow_standstill(
     still_smooth: Vector,
     low_speed: Vector,
 ) -> None:
-    """Filter with DC gain 1, into `still` (C, n) from 0 to 1, whether each joint may stand still, and smooth it.
+    """Filter with DC gain 1, into `still` (C, n) from 0 to 1, each joint's indicator of possible standstill; smooth it.
 
-    `low_speed` (C, n): the same of a joint that moves slowly or not at all, not smoothed.
+    `low_speed` (C, n): the same for a joint that moves slowly or not at all, not smoothed.
 
-    before (n,): dq one sample ago. One that turns round between two samples has stood still, and its lag lets friction
-    turn a sample or two before the measured velocity does.
+    before (n,): dq one sample ago. A joint that turns round between two samples has stood still, and by its lag
+    friction may turn a sample or two before the measured velocity does.
     """
     for c in range(still.shape[0]):
         for i in range(dq.shape[0]):
@@ -138,7 +139,7 @@ def follow_standstill(
 
 @compiled
 def measure_noise(k: Constants, m: Memory, tau_J: Vector) -> None:
-    """Take one sample at rest into `roughness` (n,): variance of the torque over that of the settings, at least 1."""
+    """Add one sample at rest to `roughness` (n,): variance of the torque over that of the settings, at least 1."""
     m.sensitivity.rest_samples += 1.0
     for i in range(tau_J.shape[0]):
         if m.sensitivity.rest_samples > 1.0:
@@ -150,13 +151,13 @@ def measure_noise(k: Constants, m: Memory, tau_J: Vector) -> None:
 
 @compiled
 def follow_torque_step(k: Constants, m: Memory, tau_J: Vector) -> None:
-    """Take one sample into the sensors' step L (n,), the smallest change ever seen, and how far it pulls their mean.
+    """Update the sensors' step L (n,), the smallest change ever seen, and its pull on their mean, by one sample.
 
     A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most. Until
     enough changes were seen L is 0: the first ones may be a push.
     """
     for i in range(tau_J.shape[0]):
-        change = abs(tau_J[i] - m.gaps.last[2, i])  # nan of the first sample
+        change = abs(tau_J[i] - m.gaps.last[2, i])  # nan for the first sample
         if not change > 0.0:
             continue
         m.sensitivity.torque_changes[i] += 1.0
@@ -172,13 +173,13 @@ def follow_torque_step(k: Constants, m: Memory, tau_J: Vector) -> None:
 
 @compiled
 def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) -> None:
-    """Take one sample into the roughness (n,) of the velocity: its noise over the settings', squared.
+    """Add one sample to the roughness (n,) of the velocity: its noise over the settings', squared.
 
     Noise shows in the second difference of dq, motion does not: at 1 kHz 50 rad/s³ make 5e-5 rad/s of it, a coarse
     encoder's counts 1e-3 and more. A single jump, as of a blow, counts as JUMP deviations at most. After a gap, or on
     the line over one (is_steady: neither), a sample only becomes the last.
 
-    It is forgotten soon, but for what is kept (`keep_velocity_noise`).
+    The roughness decays soon, except for the part that `keep_velocity_noise` keeps.
     """
     floor = (SECOND_DIFFERENCE * k.noise.velocity_noise_rad_s) ** 2
     for i in range(dq.shape[0]):
@@ -198,9 +199,9 @@ def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) 
 
 @compiled
 def keep_velocity_noise(k: Constants, m: Memory) -> None:
-    """Keep the largest roughness (n,) of a sample that nothing touched, until motion shows less.
+    """Keep the largest roughness (n,) of a sample without contact, until motion shows less.
 
-    At rest an encoder that doesn't count shows no noise, and has it again with the first count.
+    At rest an encoder without counts shows no noise, but shows it again with the first count.
     """
     for i in range(m.sensitivity.roughness_kept.shape[0]):
         now, kept = m.sensitivity.roughness_now[i], m.sensitivity.roughness_kept[i]
@@ -211,10 +212,10 @@ def keep_velocity_noise(k: Constants, m: Memory) -> None:
 
 @compiled
 def strain(m: Memory, largest: float) -> None:
-    """Doubt the thresholds of the joints that are over theirs now: a contact while learning may be the model's failure.
+    """Raise the strain of the joints that are over their threshold.
 
-    Once it may be a hand; again and again it is what no parameter explains, such as backlash. Then the arm is armed
-    with higher thresholds rather than never.
+    A contact while learning may be the model's failure. One contact may be a hand; repeated ones come from an error
+    that no parameter explains, such as backlash. Then the arm is armed with higher thresholds rather than never.
     """
     for i in range(m.sensitivity.strain.shape[0]):
         for c in range(m.filters.y.shape[0]):
@@ -225,7 +226,10 @@ def strain(m: Memory, largest: float) -> None:
 
 @compiled
 def relax(k: Constants, m: Memory) -> None:
-    """Take one sample without contact into the strain (n,): it goes back while the residual leaves room for it."""
+    """Update the strain (n,) by one sample without contact.
+
+    It decays while the residual is well below its threshold.
+    """
     for i in range(m.sensitivity.strain.shape[0]):
         share = 0.0
         for c in range(m.filters.y.shape[0]):
@@ -238,10 +242,11 @@ def relax(k: Constants, m: Memory) -> None:
 
 @compiled
 def follow_unit(k: Constants, m: Memory, fit: int, share: float, is_monitored: bool) -> None:
-    """Take one sample without contact into the unit (n,) of the belief's variances; share: what it counts.
+    """Update the unit (n,) of the belief's variances by one sample without contact; share: weight of the sample.
 
-    fit: filter by whose residual. In a faster one the velocity's noise would count as the model's error. is_monitored:
-    the unit is the smaller one of both signs; else it is that of all residuals, and both signs begin with it.
+    fit: index of the filter whose residual counts. In a faster one the velocity's noise would count as the model's
+    error. is_monitored: the unit is the smaller one of both signs; else it is that of all residuals, and both signs
+    begin with it.
     """
     for i in range(m.sensitivity.unit.shape[0]):
         w = m.filters.W_f[fit, i]
@@ -299,9 +304,9 @@ def momentum_noise(m: Memory, joint: int) -> float:
 
 @compiled
 def follow_friction(k: Constants, m: Memory, tau_J: Vector) -> None:
-    """Fill the torque (n,) that friction may hold at standstill, and how much of it is in each filter (C, n) now, Nm.
+    """Fill the torque (n,) that friction may hold at standstill, and its part in each filter (C, n) now, Nm.
 
-    Friction at rest is no noise that averages out: of a joint that mostly rested it is inf, so nothing is learnt.
+    Friction at rest is not noise that averages out: for a joint that mostly rested it is inf, so that it is not learnt.
     """
     for i in range(m.sensitivity.hold.shape[0]):
         m.sensitivity.hold[i] = k.standstill_share * _static_friction(k, m, i, tau_J[i])
@@ -311,13 +316,13 @@ def follow_friction(k: Constants, m: Memory, tau_J: Vector) -> None:
 
 @compiled
 def held_Nm(m: Memory, joint: int, still: float) -> float:
-    """Return how much torque friction may hold in a filter whose memory is by `still` of standstill."""
+    """Return the torque that friction may hold in a filter with a share `still` of standstill in its memory."""
     return float(m.sensitivity.hold[joint] * still) if still < RESTING else np.inf
 
 
 @compiled
 def _static_friction(k: Constants, m: Memory, joint: int, load_Nm: float) -> float:
-    """Return the most that friction is believed to hold of a joint that stands still under a torque, Nm."""
+    """Return the largest friction of a joint that stands still under a torque, by the belief, Nm."""
     coulomb = int(k.first_coulomb) + joint
     total = max(m.models.theta[coulomb], 0.0) + np.sqrt(max(m.models.P[coulomb, coulomb], 0.0))
     further = 0.0
@@ -333,7 +338,7 @@ def _static_friction(k: Constants, m: Memory, joint: int, load_Nm: float) -> flo
 
 @compiled
 def _threshold(k: Constants, m: Memory, channel: int, joint: int, momentum: float, g: float) -> float:
-    """Return a channel's threshold but for standstill, and keep what it is without the floor."""
+    """Return a channel's threshold without the part for standstill, and store its value without the floor."""
     lost = m.sensitivity.lost[filter_bank.filter_of(channel, m.sensitivity.lost.shape[0]), joint]
     noise = (
         k.noise.torque_variance[channel] * m.sensitivity.roughness[joint]
@@ -350,9 +355,9 @@ def _threshold(k: Constants, m: Memory, channel: int, joint: int, momentum: floa
 def fill_wide(k: Constants, m: Memory, c: int) -> None:
     """Fill standard deviation and lower threshold (n,) of the external torque with filter c undone.
 
-    The undone filter is a mean over five samples of what went into it: its noise is white torque noise over five, and
-    of the velocity its change over five samples. A slow push is seen in the slow filters first: the threshold is the
-    least of all channels'.
+    The undone filter is a mean over five samples of its input: its noise is white torque noise over five, and the
+    velocity's change over five samples. The slow filters detect a slow push first: the threshold is the least of all
+    channels'.
     """
     samples = float(external_torque.WIDE_SAMPLES)
     span_s = samples * k.period_s
@@ -376,10 +381,10 @@ def _doubt(k: Constants, m: Memory, w: Vector, unit: float) -> float:
 
 @compiled
 def joints_over(y: Vector, h: Vector) -> int:
-    """Return the joints that are over their threshold in any channel, as bits; what is not a number counts as over.
+    """Return the joints that are over their threshold in any channel, as bits; NaN counts as over.
 
-    A bare channel needs the smoothed one of its filter to agree, see AGREES. A push makes them rise together; what a
-    step of the encoder or a gear's play leaves for a sample or two is in the bare one alone.
+    A bare channel needs the smoothed one of its filter to agree, see AGREES. A push makes them rise together; the trace
+    of an encoder's step or a gear's play, a sample or two long, is in the bare one alone.
     """
     filters = (y.shape[0] + 1) // 2
     joints = 0
@@ -395,16 +400,16 @@ def joints_over(y: Vector, h: Vector) -> int:
 
 
 STATIC_SHARE = 1.0
-"""Static friction beyond Coulomb's that is left open at most, as a share of it: bearings and gears have up to twice."""
+"""Largest uncertain static friction beyond Coulomb's, as a share of it: bearings and gears have up to twice."""
 CURVATURE_NM_S2 = 500.0
 """Second derivative of the torque: 2.5 Nm at 2.2 Hz, or 0.5 Nm at 5 Hz."""
 
 MOST_FILLED = 8
-"""Missing samples that are put on the line between their neighbours."""
+"""Largest number of missing samples that are interpolated."""
 
 
 def begin(m: Memory) -> None:
-    """Begin with an arm that is as the settings say."""
+    """Begin with the settings' noise: roughness and strain of 1."""
     own = m.sensitivity
     for ones in (own.roughness, own.roughness_now, own.roughness_kept, own.velocity_roughness, own.unit, own.strain):
         ones[:] = 1.0
@@ -412,18 +417,18 @@ def begin(m: Memory) -> None:
 
 @compiled
 def begin_fit(m: Memory) -> None:
-    """Begin with a belief whose residuals are what the settings call a good model's."""
+    """Begin with the settings' residuals of a good model."""
     m.sensitivity.unit[:] = 1.0
 
 
 @compiled
 def lift(m: Memory) -> None:
-    """Watch nothing: no torque is over its threshold."""
+    """Lift all thresholds to infinity, so that no torque is over one."""
     m.sensitivity.wide_threshold[:] = np.inf
 
 
 def take_peak_shares(m: Memory) -> Vector:
-    """Return the largest share of its threshold that each joint (n,) has come to since the last call."""
+    """Return each joint's largest residual over its threshold (n,) since the last call, and reset it."""
     shares = np.array(m.sensitivity.peak_share)
     m.sensitivity.peak_share[:] = 0.0
     return shares
@@ -431,7 +436,7 @@ def take_peak_shares(m: Memory) -> Vector:
 
 @compiled
 def follow_lost(k: Constants, m: Memory, dq: Vector, steps: int, period_s: float, is_seen: bool) -> None:
-    """Take in a sample that came `steps` periods, `period_s`, after the one before; is_seen: the line was filled in."""
+    """Process a sample that came `steps` periods, `period_s`, after the last; is_seen: samples were interpolated."""
     lost, before = m.sensitivity.lost, m.gaps.last[1]
     for c in range(lost.shape[0]):
         turn = k.cutoff[c] * period_s

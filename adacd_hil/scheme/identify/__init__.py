@@ -1,1 +1,1 @@
-"""What is learnt of an arm, and what judges it."""
+"""Learning of an arm's model, and the checks of the learnt model."""

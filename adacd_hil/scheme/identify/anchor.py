@@ -1,14 +1,14 @@
-"""Anchors: what says where the zero of a torque sensor is, apart from the fit.
+"""Anchors: evidence of a torque sensor's zero that is independent of the fit.
 
-A lean and an offset have the same column of the regressor, on every motion, so no fit tells them apart. What does is
-knowledge from elsewhere. An anchor judges the fitted offset and never pulls it: that would push a lean into friction.
+A lean and an offset have the same column of the regressor, on every motion, so a fit cannot separate them. Independent
+knowledge can. An anchor judges the fitted offset and never pulls it: that would push a lean into friction.
 
     REST      the reading at rest before the drives are enabled. A motor without power, friction and brake transmits no
-              torque, so the reading is the offset, whoever leans. What the motor side can hold, `holding_Nm`, is the
-              most by which a lean shifts it; where that is not known the reading says nothing.
-    TARE      the zero of the configuration, where a tare says how well it is known.
-    ACCEPTED  what the user has accepted in place of all.
-    LAST      what the arm's last certificate found, asked of a joint that no other anchor bounds.
+              torque, so the reading is the offset, even if a person leans. `holding_Nm`, the torque that the motor side
+              can hold, is the most by which a lean shifts it; if that is unknown the reading bounds no offset.
+    TARE      the zero of the configuration, if a tare gives its uncertainty.
+    ACCEPTED  the zero that the user has accepted in place of all others.
+    LAST      the zero found by the arm's last certificate, used for a joint that no other anchor bounds.
 
 The fitted offset o must keep to each anchor a that there is, a row of `evidence`:
 
@@ -17,14 +17,14 @@ The fitted offset o must keep to each anchor a that there is, a row of `evidence
 u P_oo: the belief's variance in the unit of its residuals; b² t: drift since; 0.1 F_c: friction that differs by
 direction looks like an offset. Before the drives are enabled the reading at rest must keep to the tare likewise.
 
-Shapes: anchor_Nm, anchor_std (4, n), inf where there is none; holding_Nm (n,), inf where not known.
+Shapes: anchor_Nm, anchor_std (4, n), inf for a missing anchor; holding_Nm (n,), inf where not known.
 
-**Torque by place.** Its columns (`regressor`) are in the model only where `arm.position_torque_Nm` says that the arm
-has one, and how much at most. A hand's spring that is held from before the start looks the same, and so does a lean to
-some extent: over a short way a cosine is a constant. So a fit gets no certificate while the torque that it gives to its
-place is more than that anywhere on its own samples. The torque is what stays of it when the joint's offset is put where
-its anchor says, with what goes with it by the belief's covariance. Where the model has no such columns `missing_torque`
-tells whether it should.
+**Torque by place.** Its columns (`regressor`) are in the model only if `arm.position_torque_Nm` gives the arm such a
+torque, and its bound. A hand's spring held from before the start looks the same, and so does a lean to some extent:
+over a short way a cosine is a constant. So a fit gets no certificate while its torque by place exceeds the bound
+anywhere on its own samples. That torque is judged with the joint's offset moved to its anchor, and with the changes
+that follow from the belief's covariance. If the model has no such columns, `missing_torque` detects whether it needs
+them.
 
 Shapes: by_place_Nm (n,): the largest torque by place of the fit.
 """
@@ -44,15 +44,16 @@ NAMES = ("the reading at rest", "the tare", "the user's word", "the last certifi
 _HELD = "the sensor has moved, a cable pulls on it, or the motor holds more at rest than `arm.holding_torque_Nm` says"
 _MOVED = "the sensor has moved, or a cable pulls on it"
 REST_STD_NM = 0.004
-"""Of the reading at rest beside its noise: the sensor's hysteresis, and its warming until the certificate."""
+"""Uncertainty of the reading at rest beside its noise: the sensor's hysteresis, and its warming until the
+certificate."""
 MODEL_STD_NM = 0.005
-"""What else the model leaves in the offset of a clean arm."""
+"""Other errors of the model in the offset of a clean arm."""
 ASYMMETRY = 0.1
 """Part of the Coulomb friction by which its two directions may differ."""
 
 
 def constants_of(settings: Settings) -> AnchorConstants:
-    """Return what the kernel needs to know: `zero_drift_Nm2_s`, `rest_cycles`, and the following (n,).
+    """Return the anchors' constants: `zero_drift_Nm2_s`, `rest_cycles`, and the following (n,).
 
     `holding_Nm`; `zero_Nm`, `zero_std_Nm`: of the configuration; `last_zero_Nm`, `_std_Nm`: of the last certificate.
     """
@@ -69,9 +70,9 @@ def constants_of(settings: Settings) -> AnchorConstants:
 
 
 def unanchored_joints(settings: Settings) -> list[int]:
-    """Return the joints whose torque offset nothing outside a run bounds to `beta_Nm`.
+    """Return the joints whose torque offset has no bound within `beta_Nm` from outside a run.
 
-    Neither a tare, nor a last certificate, nor a motor that holds little without power does.
+    Such bounds are a tare, a last certificate, and a motor that holds little without power.
     """
     arm, history = settings.arm, settings.history
     bounds_Nm = (
@@ -97,9 +98,9 @@ def begin(k: Constants, m: Memory) -> None:
 
 @compiled
 def measure(k: Constants, m: Memory, tau_J: Vector, is_resting: bool) -> None:
-    """Take one sample before the drives are enabled into the reading at rest, which begins anew when the arm moves.
+    """Add one sample before the drives are enabled to the reading at rest, which begins anew when the arm moves.
 
-    A mean over the last `rest_cycles` samples or so: who leaned before and has gone is forgotten.
+    It is a mean over about the last `rest_cycles` samples, so a person who leaned before and has gone is forgotten.
     """
     m.anchor.rest_count = min(m.anchor.rest_count + 1.0, k.anchor.rest_cycles) if is_resting else 0.0
     evidence.date(m, 0, KINDS, 0.0)
@@ -120,9 +121,9 @@ def _rest_variance(k: Constants, m: Memory, joint: int) -> float:
 
 @compiled
 def is_rest_refused(k: Constants, m: Memory) -> bool:
-    """Tell whether some joint reads at rest what its tare excludes, beyond what the motor side may hold.
+    """Return whether a joint's reading at rest is excluded by its tare, beyond the torque that the motor side may hold.
 
-    Asked of a whole reading: the supervisor counts as many cycles, so no arm gets on without.
+    Judges a complete reading only: the supervisor counts as many cycles, so no arm goes on without one.
     """
     if m.anchor.rest_count < k.anchor.rest_cycles:
         return False
@@ -141,7 +142,7 @@ def is_rest_refused(k: Constants, m: Memory) -> bool:
 
 @compiled
 def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
-    """Tell whether a model's offsets are within the bounds of all anchors. theta (p,), P (p, p)."""
+    """Return whether a model's offsets are within the bounds of all anchors. theta (p,), P (p, p)."""
     first_coulomb, is_within = int(k.first_coulomb), True
     evidence.fit(k, m, theta, P, min(np.max(m.sensitivity.unit), 1.0))
     for i in range(m.anchor.anchor_Nm.shape[1]):
@@ -165,14 +166,14 @@ def _variance(k: Constants, m: Memory, kind: int, joint: int) -> float:
 
 @compiled
 def is_excluded(m: Memory, joint: int, offset_Nm: float) -> bool:
-    """Tell whether an anchor excludes another offset of a joint, by the bounds of the fit that was judged last."""
+    """Return whether an anchor excludes another offset of a joint, by the bounds of the last judged fit."""
     bounds_Nm = m.evidence.limit[:KINDS, OFFSETS + joint]
     return not bool(np.all(np.abs(offset_Nm - m.anchor.anchor_Nm[:, joint]) <= bounds_Nm))
 
 
 @compiled
 def innovation(k: Constants, m: Memory, joint: int, offset_Nm: float, variance_Nm2: float) -> float:
-    """Return (o - a) / (P_oo + sigma_a² + b² t) of the joint's best known anchor, 1/Nm; 0 where there is none.
+    """Return (o - a) / (P_oo + sigma_a² + b² t) for the joint's best known anchor, 1/Nm; 0 without an anchor.
 
     theta less P_o times this is the model corrected by the anchor as by a measurement of its offset.
     """
@@ -186,7 +187,7 @@ def innovation(k: Constants, m: Memory, joint: int, offset_Nm: float, variance_N
 
 
 def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
-    """Let offsets (n,) that the user takes for the sensors' zero, with their deviations, replace all anchors."""
+    """Replace all anchors by offsets (n,), and their deviations, that the user accepts as the sensors' zero."""
     m.anchor.anchor_std[:] = np.inf
     m.anchor.anchor_Nm[ACCEPTED] = offset_Nm
     m.anchor.anchor_std[ACCEPTED] = std_Nm
@@ -194,28 +195,28 @@ def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
 
 
 def accept_reading(m: Memory) -> None:
-    """Let the reading at rest, which the tare excludes, stand without the tare."""
+    """Accept the reading at rest, which the tare excludes, and drop the tare."""
     m.anchor.anchor_std[TARE] = np.inf
 
 
 @compiled
 def is_open(k: Constants, m: Memory, joint: int) -> bool:
-    """Tell whether no anchor bounds the offset that was judged last as closely as a test does, to `beta_Nm`."""
+    """Return whether the last judged offset lacks an anchor as close as the test's bound, `beta_Nm`."""
     return bool(not (np.min(m.evidence.limit[:KINDS, OFFSETS + joint]) <= k.beta_Nm))
 
 
 def tightest(k: Constants, m: Memory, joint: int) -> int | None:
-    """Return the anchor that bounds the offset that was judged last most closely; None where none does."""
+    """Return the anchor that bounds the last judged offset most closely; None without an anchor."""
     return None if is_open(k, m, joint) else int(np.argmin(m.evidence.limit[:KINDS, OFFSETS + joint]))
 
 
 def open_joints(k: Constants, m: Memory) -> list[int]:
-    """List the joints whose offset that was judged last has no anchor, from 0."""
+    """Return the joints whose last judged offset has no anchor, from 0."""
     return [i for i in range(JOINTS) if tightest(k, m, i) is None]
 
 
 def is_anchored(k: Constants, m: Memory) -> bool:
-    """Tell whether every offset that was judged last has an anchor."""
+    """Return whether each offset that was judged last has an anchor."""
     return not open_joints(k, m)
 
 
@@ -225,7 +226,7 @@ def judged_Nm(m: Memory) -> Vector:
 
 
 def describe(k: Constants, m: Memory) -> str:
-    """Say of each joint what anchors the offset that was judged last, and how closely, Nm."""
+    """Return, per joint, the anchor of the last judged offset, and its bound, Nm, as text."""
     texts = []
     for i in range(JOINTS):
         kind = tightest(k, m, i)
@@ -238,7 +239,7 @@ def describe(k: Constants, m: Memory) -> str:
 
 
 def describe_refused(m: Memory, is_reading: bool) -> list[str]:
-    """Say which of the torques that have been judged last an anchor excludes, and by how much, a line each.
+    """Return which of the last judged torques an anchor excludes, and by how much, a line each.
 
     is_reading: it was the reading at rest; else the offsets of a fit.
     """
@@ -258,12 +259,12 @@ def describe_refused(m: Memory, is_reading: bool) -> list[str]:
 
 
 LARGEST_OF_STD = 2.5
-"""The largest torque, over the standard deviation that each coefficient is expected to have."""
+"""The largest torque by place, as a multiple of each coefficient's expected standard deviation."""
 
 
 @compiled
 def is_place_bounded(k: Constants, m: Memory) -> bool:
-    """Tell whether the fit's torque by place keeps to `arm.position_torque_Nm`; fill `by_place_Nm`."""
+    """Return whether the fit's torque by place keeps to `arm.position_torque_Nm`; fill `by_place_Nm`."""
     if k.position_torque_Nm == 0.0:
         return True
     is_place_bounded = True
@@ -275,7 +276,7 @@ def is_place_bounded(k: Constants, m: Memory) -> bool:
 
 @compiled
 def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
-    """Return the largest torque by place of a joint over the fit's samples, its offset where the anchor says."""
+    """Return the largest torque by place of a joint over the fit's samples, with its offset moved to the anchor."""
     joints, first = m.anchor.by_place_Nm.shape[0], int(k.first_position)
     offset, largest = int(k.first_offset) + joint, 0.0
     P, theta = m.models.P_belief, m.models.belief
@@ -290,7 +291,7 @@ def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
 
 
 def describe_place(k: Constants, m: Memory) -> str:
-    """Say how much of a torque by place the certified model has, Nm; empty where it has none."""
+    """Return the size of the certified model's torque by place, Nm, as text; empty without such a torque."""
     if k.position_torque_Nm == 0.0:
         return ""
     return (
@@ -299,7 +300,7 @@ def describe_place(k: Constants, m: Memory) -> str:
 
 
 def describe_place_refused(k: Constants, m: Memory) -> list[str]:
-    """Say of each joint whose torque by place is too large how large it is, a line each."""
+    """Return the size of each joint's torque by place that is too large, a line each."""
     limit = float(k.position_torque_Nm)
     return [
         f"joint {i + 1} has a torque of up to {torque:.3f} Nm that depends on where the arm is, bound {limit:g} Nm"

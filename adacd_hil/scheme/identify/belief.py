@@ -1,32 +1,33 @@
-"""What is believed of the parameters: mean theta and covariance P, corrected by samples that have waited.
+"""The belief about the parameters: mean theta and covariance P, corrected by samples that have waited.
 
-The prior says in honest units what an arm may be; recursive least squares (`estimator`) corrects it. A filtered sample
-is no independent measurement: the noise of a filter of cut-off a is correlated over about 2 / a. A sample every
-T_learn therefore counts with the variance
+The prior gives the range of possible arms in true units; recursive least squares (`estimator`) corrects it. Filtered
+samples are not independent measurements: the noise of a filter of cut-off a is correlated over about 2 / a. A sample
+every T_learn therefore counts with the variance
 
-    R = sigma² 2 / (a T_learn),    sigma: what a good model leaves in the filtered residual, Nm rms,
+       R = sigma² 2 / (a T_learn),    sigma: residual of a good model behind the filter, Nm rms,
 
-so that P means what it says. Friction of a joint that stands still is any torque up to the static one: what of it is in
-the filter counts as further deviation, and a joint that mostly rests teaches nothing.
+so that P is the true uncertainty. Friction of a joint that stands still is any torque up to the static one: its share
+in the filter counts as further deviation, and the belief learns little from a joint that mostly rests.
 
-**Payload.** One of mass m at the tip adds m (l1² + l2², l1 l2, l2²) to (a1, a2, a3): the belief widens along this
-direction g by sigma_m² g g', and a little in each inertia for what is no point mass. All else stays known.
+**Payload.** A mass m at the tip adds m (l1² + l2², l1 l2, l2²) to (a1, a2, a3): the belief widens along this direction
+g by sigma_m² g g', and a little in each inertia, as a payload is not a point mass. All else stays known.
 
-**Lags.** Their column is the derivative of a torque that is measured with noise. Where the motion changes the torque
-little the column is mostly noise, and an estimate from it shrinks towards zero, the more the longer it goes on. So lags
-are learnt on the excitation, and *held* after it (`hold_lags`).
+**Lags.** Their column is the derivative of a torque that is measured with noise. If the motion changes the torque
+little, the column is mostly noise, and an estimate from it shrinks towards zero, the more the longer it goes on. So
+lags are learnt on the excitation, and *held* after it (`hold_lags`).
 
-**Hold-back.** A sample waits in a ring until the ring has come round. `discard` empties it.
+**Hold-back.** A sample waits in a ring for one round of the ring. `discard` empties it.
 
 Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R, ring_still (h, n).
 
 **Refinement.** Refinement of a certified model while it detects: a candidate, its own test, and its promotion.
 
-The belief goes on learning where nothing touches the arm. Every so often its mean is frozen as a candidate and runs
-beside the model in use on motion that neither was fitted to. It takes over if it explains that motion better and would
-have raised no alarm. So friction that warms up, and a model that was armed early, are followed, but a touch is not:
-a contact pauses the test, and what is left below the thresholds can't move a candidate by more than that. An offset
-that has left its anchor (`anchor`), by somebody who leans lightly or a sensor that moves, takes the certificate back.
+The belief goes on learning while the arm is free of contact. At intervals its mean is frozen as a candidate and runs
+beside the model in use on motion that neither was fitted to. It replaces that model if it explains the motion better
+and would have raised no alarm. So the model follows friction that warms up, and improves if it was armed early, but
+does not follow a touch: a contact pauses the test, and a torque below the thresholds can't move a candidate by more
+than itself. An offset that has left its anchor (`anchor`) takes the certificate back: a person leans lightly, or a
+sensor moves.
 """
 
 import numpy as np
@@ -41,14 +42,14 @@ from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.model.regressor import is_positive_definite
 
 _SWEEPS = 200
-"""Most sweeps over the parameters that must not be negative; a handful will do unless P ties them together closely."""
+"""Most sweeps over the parameters that must not be negative; a handful is enough unless P couples them closely."""
 _SETTLED = 1e-9
-"""Nm or Nm s/rad that the last sweep may still have moved one of them by."""
+"""Largest step of a parameter in the last sweep, Nm or Nm s/rad."""
 
 
 @compiled
 def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
-    """Begin to learn and use what is believed: the prior, or the certified arm with a payload."""
+    """Begin to learn, and use the belief as the model: the prior, or the certified arm with a payload."""
     m.models.is_payload = 1.0 if is_payload else 0.0
     if is_payload:
         m.models.belief[:] = m.models.certified
@@ -64,7 +65,7 @@ def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
 
 @compiled
 def freeze(k: Constants, m: Memory) -> None:
-    """Take the belief, as far as it is physically possible, for the model in use."""
+    """Use the belief, made physically possible, as the model."""
     first_coulomb = int(k.first_coulomb)
     keep_non_negative(first_coulomb - JOINTS, first_coulomb + JOINTS, m.models.belief, m.models.P_belief)
     _use(m)
@@ -73,7 +74,7 @@ def freeze(k: Constants, m: Memory) -> None:
 
 @compiled
 def certify(k: Constants, m: Memory) -> None:
-    """Take the model in use for the certified one, and begin to refine it."""
+    """Declare the model in use certified, and begin to refine it."""
     m.models.promotions = 0.0
     _certify(m)
     hold_lags(k, m)
@@ -94,13 +95,13 @@ def _use(m: Memory) -> None:
 
 @compiled
 def pause(m: Memory, cycles: float) -> None:
-    """Learn nothing for so many cycles, at least: something touches the arm, or a filter has to settle."""
+    """Stop learning for at least so many cycles: the arm is touched, or a filter has to settle."""
     m.models.recovering_cycles = max(m.models.recovering_cycles, cycles)
 
 
 @compiled
 def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
-    """Count a cycle; tell whether the arm has been left alone for long enough to learn."""
+    """Count a cycle; return whether the arm has been free of contact for long enough to learn."""
     if is_touched:
         pause(m, k.recover_cycles)
     elif m.models.recovering_cycles > 0.0:
@@ -110,7 +111,7 @@ def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
 
 @compiled
 def learn_and_use(k: Constants, m: Memory) -> bool:
-    """Take this sample in as `learn` does, and use what is believed at once; return whether the belief has changed."""
+    """Learn this sample as `learn` does, and use the belief at once; return whether the belief has changed."""
     has_learnt = learn(k, m)
     if has_learnt:
         _use(m)
@@ -139,9 +140,9 @@ def add_payload(direction: Vector, payload_std_kg: float, rest_std: Vector, P: V
 def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
     """Widen P (p, p) in place by a random walk of the parameters, `drift_std` (p,) per √s, as far as it shows.
 
-    By |w| of the row W_f (n, p) that shows a parameter most, 1 at most. One that hardly shows would else be learnt from
-    the error of the others, such as friction that grows with the load from a load that hardly varies, and be far off
-    where it counts.
+    The walk is scaled by |w| of the row of W_f (n, p) that shows a parameter most, at most 1. A parameter that hardly
+    shows would otherwise be learnt from the error of the others, such as friction that grows with the load from a load
+    that hardly varies, and be far off where it counts.
     """
     for j in range(drift_std.shape[0]):
         shown = 0.0
@@ -154,7 +155,7 @@ def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
 def learn(k: Constants, m: Memory) -> bool:
     """Put this sample, W_learnt (n, p) and tau_learnt (n,), into the ring; return whether the belief has changed.
 
-    It is corrected by the sample that has waited long enough, if one has.
+    The sample that has waited long enough, if there is one, corrects the belief.
     """
     W, tau_J, still = m.filters.W_learnt, m.filters.tau_learnt, m.sensitivity.still_smooth[filter_bank.LEARNT]
     m.models.since_learnt += 1.0
@@ -189,7 +190,7 @@ def learn(k: Constants, m: Memory) -> bool:
 
 @compiled
 def hold_lags(k: Constants, m: Memory) -> None:
-    """Learn the lags no further; what is left open of them stays open, and moves nothing else."""
+    """Stop learning the lags; their remaining uncertainty stays, and moves no other parameter."""
     m.models.are_lags_held = 1.0
     P = m.models.P_belief
     first = int(k.first_offset) + m.ring.tau.shape[1]
@@ -212,18 +213,18 @@ def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
 
 @compiled
 def discard(m: Memory) -> None:
-    """Throw away the samples that wait."""
+    """Discard the waiting samples."""
     m.ring.used = 0.0
     m.models.since_learnt = 0.0
 
 
 @compiled
 def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
-    """Move theta (p,) in place so that none of its parameters first .. last - 1 is negative.
+    """Move theta (p,) in place so that its parameters first .. last - 1 are all at least 0.
 
-    To the nearest such theta in the metric of P, theta + P lambda with lambda >= 0: each one that is negative is pushed
-    to zero and takes the others along as P says they belong together; one that was taken further is let go again
-    (Hildreth's method). P stays; it is no less uncertain for that.
+    To the nearest such theta in the metric of P, theta + P lambda with lambda >= 0: each negative parameter is pushed
+    to zero and moves the others by their correlation in P; one that was moved too far is released again (Hildreth's
+    method). P stays: the constraint doesn't reduce the uncertainty.
     """
     pushed = np.zeros(last - first)
     for _ in range(_SWEEPS):
@@ -244,7 +245,7 @@ def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
 
 @compiled
 def restart_candidate(m: Memory) -> None:
-    """Begin the next test with the belief as it is now."""
+    """Begin the next test with the present belief."""
     m.models.candidate_cycles = 0.0
     m.models.candidate_square = 0.0
     m.models.frozen_square = 0.0
@@ -255,7 +256,7 @@ def restart_candidate(m: Memory) -> None:
 
 @compiled
 def test_candidate(k: Constants, m: Memory) -> bool:
-    """Take one sample into the test; tell whether a candidate that passes it is excluded by an anchor alone."""
+    """Add one sample to the test; return whether an anchor alone excludes a candidate that passes it."""
     m.models.candidate_cycles += 1.0
     for c in range(m.filters.W_f.shape[0]):
         for i in range(m.filters.W_f.shape[1]):

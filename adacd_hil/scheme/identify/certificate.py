@@ -1,15 +1,15 @@
-"""A certificate: what contradicts it, what it says of the arm, and what the last one, of another run, says of the next.
+"""A certificate: its contradictions, its description of the arm, and the last run's certificate as evidence.
 
 **The last certificate.** A hand that drags from before the first motion to the end of learning, or moves like a mass,
-is the arm as far as one run can tell. The last certificate knows the arm without it, or with another. It is a source of
-`evidence`, and as within a run **less is the arm's**: a fit gets no certificate while a joint's friction at some speed,
-an inertia, or a joint's viscous friction, which is the friction at the highest of these speeds less that at the lowest,
-over their difference, is
+looks like a part of the arm in that run. The last certificate knows the arm without it, or with another. It is a source
+of `evidence`, and as within a run **less is the arm's**: a fit gets no certificate while one of these quantities is too
+large: a joint's friction at some speed, an inertia, or a joint's viscous friction. The last is the friction at the
+highest of these speeds less that at the lowest, over their difference. The limit is passed if
 
     c theta > last + floor + LAST_SIGMAS sqrt(share² last² + std² + c P c')
 
-until the user says that nobody touches the arm. share: `history.friction_share`, `inertia_share`, how far one run
-differs from another. Not asked with a payload that was announced. It judges the fit, and never pulls it.
+until the user confirms that the arm is free of contact. share: `history.friction_share`, `inertia_share`, the variation
+from run to run. Not applied with a payload that was announced. It judges the fit, and never pulls it.
 """
 
 from typing import NamedTuple
@@ -24,13 +24,13 @@ from adacd_hil.scheme.memory import Constants, LastConstants, Memory
 from adacd_hil.settings.configuration import Settings
 
 NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, BLIND = range(8)
-"""What contradicts a certificate that is withheld, or taken back: of the kernel's `withheld_by`."""
+"""Contradictions for which a certificate is withheld or taken back: values of the kernel's `withheld_by`."""
 FLOOR_NM, FLOOR_KGM2, FLOOR_NM_S = 0.02, 0.006, 0.02
-"""Of friction, inertia, viscous friction: less is nothing."""
+"""Differences of friction, inertia, viscous friction below these are ignored."""
 
 
 class Certificate(NamedTuple):
-    """What a certificate says of the arm, as it was when it was certified.
+    """A certificate's description of the arm at the time of certification.
 
     parameters: a1 … F_c2, and those of gravity where there are any (p,); friction_Nm, their deviations (6,): joint 1 at
     `evidence.SPEEDS_RAD_S`, then joint 2; inertia_kgm2 (3,); offset_Nm (n,): of the torque sensors, the configuration's
@@ -53,10 +53,10 @@ class Certificate(NamedTuple):
 
 
 def constants_of(settings: Settings) -> LastConstants:
-    """Return `last`, `last_variance`, `last_slack` (Q,): what the last certificate says of each quantity; inf: nothing.
+    """Return `last`, `last_variance`, `last_slack` (Q,): the last certificate's value per quantity; inf: unknown.
 
-    The deviations of the two frictions that a viscous friction is between count as if they were independent, which is
-    more than they make.
+    A viscous friction is computed from two frictions. Their deviations count as independent, which overestimates its
+    own.
     """
     history = settings.history
     counts = (FRICTIONS, INERTIAS, JOINTS, JOINTS)
@@ -80,29 +80,32 @@ def constants_of(settings: Settings) -> LastConstants:
 
 
 def begin(k: Constants, m: Memory) -> None:
-    """Believe the last certificate, if there is one."""
+    """Load the last certificate as a source of evidence, if there is one."""
     evidence.say_all(m, LAST, k.last.value, k.last.variance, k.last.slack)
 
 
 def forget(m: Memory) -> None:
-    """Compare no more with the last certificate: the user says that nobody touches the arm."""
+    """Stop the comparison with the last certificate: the user confirms that the arm is free of contact."""
     evidence.retract(m, LAST)
 
 
 def is_compared(m: Memory) -> bool:
-    """Tell whether the last certificate is compared with the fit: not with a payload that was announced."""
+    """Return whether the last certificate is compared with the fit: not with a payload that was announced."""
     return bool(m.evidence.said_variance[LAST, 0] != np.inf and not m.models.is_payload)
 
 
 @compiled
 def withhold(m: Memory, cause: int) -> None:
-    """Note what a certificate is withheld by, or taken back; NOTHING: it isn't."""
+    """Record the contradiction that withholds a certificate or takes it back; NOTHING clears the record."""
     m.certificate.withheld_by = cause
 
 
 @compiled
 def contradicted_by(k: Constants, m: Memory) -> int:
-    """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
+    """Return the source that contradicts the fit: an anchor, the fit itself, kept beliefs, the last certificate.
+
+    NOTHING if all agree with it.
+    """
     if not anchor.is_within(k, m, m.models.belief, m.models.P_belief):
         return ANCHOR
     last_step = fit_check.last_step_before_change(k, m)
@@ -121,7 +124,7 @@ def contradicted_by(k: Constants, m: Memory) -> int:
 
 @compiled
 def is_no_more(k: Constants, m: Memory) -> bool:
-    """Tell whether the fit has no more friction and inertia than the last certificate."""
+    """Return whether friction and inertia of the fit are within those of the last certificate."""
     is_agreed = True
     for q in range(m.evidence.fitted.shape[0]):
         excess = evidence.weigh(k, m, LAST, q)
@@ -130,7 +133,7 @@ def is_no_more(k: Constants, m: Memory) -> bool:
 
 
 def describe_more(m: Memory, date_utc: str) -> list[str]:
-    """Say of which quantities the fit has more than the last certificate, and by how much, a line each."""
+    """Return the quantities of which the fit has more than the last certificate, and by how much, a line each."""
     difference, limit = m.evidence.difference[LAST], m.evidence.limit[LAST]
     return [
         f"{what} is {float(difference[q]):.3f} {unit} more than in the certificate of {date_utc}, "
@@ -140,7 +143,7 @@ def describe_more(m: Memory, date_utc: str) -> list[str]:
 
 
 def certificate_of(k: Constants, theta: Vector, P: Vector, is_payload: bool, text: str) -> Certificate:
-    """Return what a model that was certified says. theta (p,), P (p, p): with the offsets; text: its event."""
+    """Return the certificate of a certified model. theta (p,), P (p, p): with the offsets; text: its event."""
     base, first = int(k.first_offset), FRICTIONS
     rows = k.evidence.columns[:OFFSETS]
     values = rows @ theta

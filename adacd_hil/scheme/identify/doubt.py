@@ -1,25 +1,25 @@
-"""What contacts have in common: a certificate that is wrong meets the same cause again and again.
+"""The common cause of contacts: an arm with a wrong certificate meets the same cause again and again.
 
-While a contact lasts and the arm still moves, the residual r of a filter is compared with what each single error c of
-the model would leave, w = -W_f c: a payload at the tip, a joint's Coulomb or viscous friction. Not a torque offset: who
-leans on the arm again and again leaves the same. From sums over the samples, held-back ones from before the contact
-included,
+While a contact lasts and the arm still moves, the residual r of a filter is compared with the residual w = -W_f c of
+each single error c of the model: a payload at the tip, a joint's Coulomb or viscous friction. A torque offset is not
+among them: a person who leans on the arm again and again leaves the same residual. From sums over the samples,
+including those held back from before the contact,
 
     size = Σ r w / Σ w²,    share = (Σ r w)² / (Σ w² Σ r²),    sigma = RESIDUAL_NM sqrt(correlated / Σ w²)
 
-A joint that rested before held some torque, which the filter forgets as fast as its share s of standstill. What such
-a torque explains goes from r and w: r - s Σ r s / Σ s², w likewise. What a good model leaves in n samples, n
-RESIDUAL_NM², goes from Σ r²; of a contact that was found soon that is much.
+A joint that rested before held some torque, which the filter forgets as fast as its share s of standstill. The part
+that such a torque explains is removed from r and w: r - s Σ r s / Σ s², w likewise. The residual of a good model in n
+samples, n RESIDUAL_NM², is subtracted from Σ r²; for a contact that was detected early that is much.
 
-A payload is named by contacts that tell enough of it, both of how it pulls one way and the other, or by ALIKE contacts
-in a row, each right after going on, that come to the same mass; another error likewise.
+A payload is named if contacts give enough evidence of it, in both directions of its pull, or if ALIKE contacts in a
+row, each right after going on, agree in the mass; another error likewise.
 
-Contacts that no cause explains take the certificate back, too, where a person is not likely: MANY in a row, each but
-the first within HELD_S of going on; or weak ones, less than WEAK times their threshold, that are likelier at
-OFTEN_PER_H than at RARELY_PER_H by ODDS. Three in 6.8 min are.
+Contacts without a common cause take the certificate back, too, where a person is unlikely: MANY in a row, each but the
+first within HELD_S of going on; or weak ones, less than WEAK times their threshold, that are likelier at OFTEN_PER_H
+than at RARELY_PER_H by ODDS. Three in 6.8 min are.
 
-An arm that meets the next contact AT_REST_S after going on would never move far enough to tell what it is: the
-thresholds of the joints that showed it double, to MOST_STRAIN times at most, and fall back as in `sensitivity`.
+An arm that meets the next contact AT_REST_S after going on would never move far enough to show its cause: the
+thresholds of the joints in contact double, to MOST_STRAIN times at most, and fall back as in `sensitivity`.
 
 Shapes: c (h, p), sums (h,), of the share of standstill (h, n) and (n,).
 """
@@ -42,40 +42,41 @@ from adacd_hil.structured import Structured
 WITHIN_S = 60.0
 """How far back the end of a contact may lie."""
 RESIDUAL_NM = 0.012
-"""Rms that a good model leaves behind it."""
+"""Residual of a good model, Nm rms."""
 FEWEST_LOADED, FEWEST = 3, 3
-"""Contacts that agree in a payload, or in another error."""
+"""Smallest number of contacts that agree in a payload, or in another error."""
 SHARE, SHARE_OF_ALL = 0.75, 0.9
-"""Of a contact's squared residual that one error explains; of all their residuals, that a payload does."""
+"""Part of one contact's squared residual that an error must explain; part of all of theirs, for a payload."""
 LEAST_SHARE = 0.5
-"""Of a contact's Σ r² that stays, however much of it a good model may have left."""
+"""Part of a contact's Σ r² that always stays, however large the residual of a good model."""
 SPREAD_LOADED, SPREAD = 0.15, 0.3
-"""By how much of its size the contacts may differ, beside 2 sigma."""
+"""Largest difference of the contacts' sizes, as a part of the size, beside 2 sigma."""
 SURE = 8.0
-"""Sigmas that a size is at least."""
+"""Smallest size of an error, in sigmas."""
 BOTH_WAYS = 0.1
-"""Of the evidence for a payload, the part in which it pulls the other way: who pushes twice pushes one way."""
+"""Part of the evidence for a payload in which it pulls the other way: a person who pushes twice pushes one way."""
 ALIKE = 4
-"""So many contacts, each so soon after going on that it tells little, agree in an error within SPREAD_LOADED."""
+"""So many contacts, each so soon after going on that it is weak evidence, agree in an error within SPREAD_LOADED."""
 PLAUSIBLE = 4.0
-"""Deviations of the prior that a friction is at most."""
+"""Largest plausible friction, in deviations of the prior."""
 AT_ONCE_S = 3.0
-"""Another error than a payload strikes again so soon after the arm goes on; a person may wait."""
+"""An error other than a payload causes the next contact within this time after going on; a person may wait."""
 AT_REST_S, MOST_STRAIN = 0.2, 4.0
-"""A contact so soon after going on is met at rest, and raises the thresholds of its joints, to this many times."""
+"""If a contact follows within this time of going on, the arm reacts at rest, and the thresholds of the contact's joints
+double, up to this many times the normal ones."""
 MANY, HELD_S = 10, 0.3
-"""So many contacts in a row, each so soon after going on, are no person's; of one the run says that it may be a load.
-No more are remembered."""
+"""So many contacts in a row, each this soon after going on, are not a person's. After the first, the run reports that
+it may be a load. MANY is also the largest number remembered."""
 WEAK = 1.5
-"""The residual of a weak contact comes to less than so many times its threshold."""
+"""The residual of a weak contact peaks below so many times its threshold."""
 RARELY_PER_H, OFTEN_PER_H, ODDS = 1.0, 30.0, 1000.0
-"""Weak contacts an hour of a person, and of a model that is wrong; how many times likelier the latter must be."""
+"""Rates of weak contacts per hour, by a person and by a wrong model; how many times likelier the latter must be."""
 LOAD = 0
-"""Place of a payload among the causes."""
+"""Index of a payload among the causes."""
 _FRICTIONS = (("Coulomb friction", "Nm"), ("viscous friction", "Nm s/rad"))
 CAUSES = 1 + len(_FRICTIONS) * JOINTS
 TOLD_NOTHING = 0.6
-"""Share of standstill in a filter's memory from which on a sample of its joint tells nothing of a cause."""
+"""Smallest share of standstill in a filter's memory for which a sample of the joint is not used as evidence."""
 
 
 def constants_of(settings: Settings, count: int) -> DoubtConstants:
@@ -89,9 +90,9 @@ def constants_of(settings: Settings, count: int) -> DoubtConstants:
 
 @compiled
 def react(memory: Structured, is_touched: bool, is_soon: bool) -> None:
-    """Take in that the arm reacts.
+    """Record that the arm reacts.
 
-    is_touched: to a touch; else there is nothing to weigh. is_soon: right after going on, so the thresholds double.
+    is_touched: to a touch; otherwise no samples are weighed. is_soon: right after going on, so the thresholds double.
     """
     m = memory[0]
     if not is_touched:
@@ -115,7 +116,7 @@ def _clear(m: Memory) -> None:
 
 @compiled
 def begin(k: Constants, m: Memory, least_peak: float) -> None:
-    """Begin a contact, with the samples that were held back. least_peak: what its peak counts as at least."""
+    """Begin a contact, with the samples that were held back. least_peak: lower bound of its peak."""
     _clear(m)
     m.doubt.contact_peak = least_peak
     _follow_peak(m)
@@ -127,7 +128,7 @@ def begin(k: Constants, m: Memory, least_peak: float) -> None:
 
 @compiled
 def weigh(k: Constants, m: Memory) -> None:
-    """Take in one sample of a contact; of a joint that rests, friction may hold anything."""
+    """Add one sample of a contact to the sums; at rest, friction explains any torque of the joint."""
     _follow_peak(m)
     for i in range(m.filters.tau_f.shape[1]):
         if (
@@ -154,7 +155,7 @@ def _follow_peak(m: Memory) -> None:
 
 @compiled
 def _add(k: Constants, m: Memory, i: int, w: Vector, tau: float, still: float, weight: float) -> None:
-    """Take in one row w (p,) of joint i."""
+    """Add one row w (p,) of joint i to the sums."""
     r = linalg.misfit(w, m.models.theta, tau)
     m.doubt.contact_rr += weight * r * r
     m.doubt.contact_rows += weight
@@ -170,16 +171,17 @@ def _add(k: Constants, m: Memory, i: int, w: Vector, tau: float, still: float, w
 
 
 class CommonCause(NamedTuple):
-    """What contacts look like. text: in words; is_payload: something was picked up, or put down."""
+    """The common cause of contacts. text: its description; is_payload: an object was picked up, or put down."""
 
     text: str
     is_payload: bool
 
 
 class _Weighed(NamedTuple):
-    """One contact's sums (h,). waited_s: from when the arm went on to its begin; ended_s: when it was over.
+    """One contact's sums (h,). waited_s: from going on to its beginning; ended_s: time of its end.
 
-    peak: largest residual over its threshold; 0 of none. load_ww (2,): evidence for a payload that pulls either way.
+    peak: largest residual over its threshold; 0 without a residual. load_ww (2,): evidence for a payload, by direction
+    of pull.
     """
 
     rw: Vector
@@ -192,7 +194,7 @@ class _Weighed(NamedTuple):
 
 
 class Doubt:
-    """Remembers the contacts of a certificate, and tells whether one cause explains the last ones."""
+    """Remembers the contacts of a certificate, and finds the cause that explains the last ones, if there is one."""
 
     def __init__(self, settings: Settings, constants: Structured, memory: Structured) -> None:
         self._constants, self._memory = constants[0], memory
@@ -205,22 +207,22 @@ class Doubt:
         self._contradiction: CommonCause | None = None
 
     def compile(self) -> None:
-        """Call what is compiled once, on a copy, so that nothing compiles later."""
+        """Call each compiled function once, on a copy, so that no later call compiles."""
         react(self._memory.copy(), True, True)
 
     def forget(self) -> None:
-        """Begin with a new certificate."""
+        """Forget all contacts: a new certificate begins."""
         self._contacts.clear()
         self._log_odds, self._weak = 0.0, 0
 
     def go_on(self, cycle: int) -> None:
-        """Take in that the arm monitors from this cycle on."""
+        """Record that the arm monitors from this cycle on."""
         self._monitored_s = cycle * self._period_s
 
     def begin(self, cycle: int, is_touched: bool, contradiction: CommonCause | None = None) -> None:
-        """Take in that the arm reacts: to a touch or, as where the host is late, to none.
+        """Record that the arm reacts: to a touch, or to another cause such as a late host.
 
-        contradiction: what contradicts the certificate, if it reacts to that.
+        contradiction: the contradiction of the certificate, if the arm reacts to that.
         """
         self._contradiction = contradiction
         self._waited_s = cycle * self._period_s - self._monitored_s
@@ -230,7 +232,7 @@ class Doubt:
         react(self._memory, is_touched, self._waited_s < AT_REST_S)
 
     def end(self, cycle: int) -> CommonCause | None:
-        """Take in that it has ended; return what the last ones look like, if they have one cause."""
+        """Record that the contact has ended; return the common cause of the last ones, or None."""
         if self._contradiction is not None:
             return self._contradiction
         now_s = cycle * self._period_s
@@ -244,7 +246,7 @@ class Doubt:
         return self._payload() or self._other() or self._alike() or self._unexplained()
 
     def describe_again(self) -> str | None:
-        """Say what the last contact may be, if it came at once after the arm had gone on from another."""
+        """Return the possible cause of the last contact as text, if it came at once after going on from another."""
         if len(self._contacts) < 2 or self._contacts[-1].waited_s > HELD_S:
             return None
         waited_s = self._contacts[-1].waited_s
@@ -254,7 +256,7 @@ class Doubt:
         )
 
     def _payload(self) -> CommonCause | None:
-        """Return the payload that the last contacts look like: few that tell much, or many that tell the same."""
+        """Return the payload that explains the last contacts, or None: a few of strong evidence, or many that agree."""
         for count in range(FEWEST_LOADED, len(self._contacts) + 1):
             last = list(self._contacts)[-count:]
             if self._common(last, LOAD, SPREAD_LOADED) is None:
@@ -269,7 +271,7 @@ class Doubt:
         return None
 
     def _alike(self) -> CommonCause | None:
-        """Return the error to which contacts come alike, each so soon after going on that it tells little."""
+        """Return the error in which contacts agree, each so soon after going on that it is weak evidence, or None."""
         last = list(self._contacts)[-ALIKE:]
         if len(last) < ALIKE or max(contact.waited_s for contact in last) > HELD_S:
             return None
@@ -297,7 +299,7 @@ class Doubt:
         return None
 
     def _unexplained(self) -> CommonCause | None:
-        """Return what is to be said if no person is likely to touch so."""
+        """Return the doubt to report if a person is unlikely to touch in this pattern, or None."""
         last = list(self._contacts)[-MANY:]
         text = ""
         if len(last) == MANY and max(contact.waited_s for contact in last[1:]) < HELD_S:
@@ -312,7 +314,7 @@ class Doubt:
         )
 
     def _can_be(self, h: int, size: float) -> bool:
-        """Tell whether an arm may have so much more of a friction than the model: none has less than none."""
+        """Return whether an arm may have so much more of a friction than the model: friction is never negative."""
         cause = self._constants.doubt.causes[h]
         total = float(cause @ self._memory[0].models.theta) + size
         return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._constants.prior_std)
@@ -341,7 +343,7 @@ class Doubt:
 
 
 def _weighed(m: Memory, waited_s: float, now_s: float) -> _Weighed:
-    """Return a contact's sums, less what each joint's torque at rest explains, and what a good model leaves."""
+    """Return a contact's sums, less the torque of each joint at rest, and less the residual of a good model."""
     ss = np.maximum(m.doubt.contact_ss, 1e-12)
     rs, ws = m.doubt.contact_rs, m.doubt.cause_ws
     rw = m.doubt.cause_rw - ws @ (rs / ss)
@@ -352,12 +354,12 @@ def _weighed(m: Memory, waited_s: float, now_s: float) -> _Weighed:
 
 
 def _explained(contacts: list[_Weighed], h: int) -> float:
-    """Return how much of the contacts' squared residuals cause h explains."""
+    """Return the part of the contacts' squared residuals that cause h explains."""
     return float(sum(contact.rw[h] ** 2 / contact.ww[h] for contact in contacts if contact.ww[h] > 0.0))
 
 
 def _named(count: int, h: int, size: float, deviation: float) -> CommonCause:
-    """Return cause h of this size as what the contacts look like."""
+    """Return cause h of this size as the contacts' common cause."""
     if h == LOAD:
         text = f"{abs(size):.2f} ± {deviation:.2f} kg {'picked up' if size > 0.0 else 'put down'}"
     else:

@@ -1,24 +1,25 @@
-"""What was known earlier in the run judges what is learnt later: a touch that has begun must be seen to end.
+"""Earlier beliefs of the run as judges of later fits: a touch that has begun must be seen to end.
 
-A hand that drags, or moves like a mass, has a column of the regressor, so a fit made while it is there explains it.
-What tells it apart is that the arm was known without it before.
+A hand that drags, or moves like a mass, has a column of the regressor, so a fit made during the touch explains it. Only
+the arm as it was known before, without the hand, reveals the touch.
 
-Over a touch the fit's earlier beliefs are *kept*, as rows of `evidence`: where a contact interrupted it all of them and
-the one at the contact, where no one model explains the fit (`fit_check`) those of before the change, after a refuted
-test all. When the touch began is not known, so a later fit must agree with each, in each quantity c that a hand can
-look like, a joint's friction at some speed, an inertia, an offset that nothing anchors:
+Over a touch the fit's earlier beliefs are *kept*, as rows of `evidence`. After an interrupting contact these are all of
+them, and the one at the contact. After a fit that no one model explains (`fit_check`) they are those from before the
+change; after a refuted test, all. The beginning of the touch is not known. So a later fit must agree with each kept
+belief, in each quantity c that a hand can imitate: a joint's friction at some speed, an inertia, an offset without an
+anchor:
 
     c (theta - theta_0) <= max(floor, SIGMAS sqrt(c (P_0 + P) c'))
 
-Friction and an offset that nothing anchors must agree both ways: who pushes the arm on takes friction away. Of an
-inertia **less is the arm's**, and more is a touch that has not been seen to end. Where an anchor gives the offset, a
-belief that differs has been leant on, and is forgotten; one with clearly less friction than none says nothing. The
-first beliefs know little and bound little.
+Friction and an offset without an anchor must agree both ways: a person who pushes the arm on takes friction away. For
+an inertia **less is the arm's**, and more is a touch that has not been seen to end. If an anchor gives the offset, a
+belief with another offset comes from a lean and is forgotten; a belief with clearly negative friction is not used. The
+first beliefs are uncertain and bound little.
 
-**Kept beliefs lapse** where fits in a row, without a contact between, agree with each other against them: LITTLE_FITS,
-if they have more by LITTLE times a bound and by LITTLE_NM on the trajectory at most, for a touch that nobody noticed
-bends the beliefs it comes into; LESS_FITS, if they have less friction, and no more of anything and the same offsets,
-for the hand that was there before may have dragged. A hand as small as that, or that helps as long, is learnt then.
+**Kept beliefs lapse** if fits in a row, without a contact between, agree with each other against them. LITTLE_FITS fits
+suffice if they have more by LITTLE times a bound and by LITTLE_NM on the trajectory at most: an undetected touch bends
+the beliefs that it enters. LESS_FITS suffice if they have less friction, no more of any quantity and the same offsets:
+a hand that was there before may have dragged. A hand as small as that, or that helps as long, is learnt then.
 """
 
 import numpy as np
@@ -30,21 +31,21 @@ from adacd_hil.scheme.identify.evidence import FRICTIONS, INERTIAS, KEPT, OFFSET
 from adacd_hil.scheme.memory import Constants, EarlierConstants, Memory
 
 YOUNG_STEPS = 1
-"""The first ones are not kept: for so long a hand may have been there all the time, and nothing could tell."""
+"""Number of first beliefs that are not kept: a hand may have been there all that time, without a trace."""
 LITTLE, LITTLE_NM, LITTLE_FITS = 2.0, 0.06, 2.0
-"""How many times a bound fits that agree may have more, what may come of that on the trajectory, and how many they must
-be, so that the kept beliefs lapse."""
+"""Kept beliefs lapse for fits that agree: largest excess over a bound, its largest torque on the trajectory, and number
+of such fits."""
 LESS_FITS = 5.0
-"""So many in a row, some 7 s, if they have less friction: a hand that dragged has let go then."""
+"""So many fits in a row, some 7 s, with less friction: a hand that dragged has let go then."""
 FRICTION_NM = 0.03
 OFFSET_NM = 0.03
 INERTIA_KGM2 = 0.006
 INERTIA_SHARE = 0.03
-"""Less than these, and less than this share of an inertia, is nothing."""
+"""Differences below these, and below this share of an inertia, are ignored."""
 
 
 def constants_of() -> EarlierConstants:
-    """Return `kept_floor`, `kept_share` (VISCOUS,): what is nothing; inf of a2, which any touch of the arm bends.
+    """Return `kept_floor`, `kept_share` (VISCOUS,): ignored differences; inf for a2, which any touch of the arm bends.
 
     A mass shows in a1 and a3.
     """
@@ -55,7 +56,7 @@ def constants_of() -> EarlierConstants:
 
 @compiled
 def forget(m: Memory) -> None:
-    """Keep nothing: a certificate stands, or the user says that nobody touches the arm."""
+    """Drop the kept beliefs: a certificate stands, or the user confirms that the arm is free of contact."""
     _drop(m)
     m.earlier.refused_fits = 0.0
     m.earlier.has_lapsed = 0.0
@@ -70,15 +71,15 @@ def _drop(m: Memory) -> None:
 
 @compiled
 def is_keeping(m: Memory) -> bool:
-    """Tell whether something is kept that has not been forgotten since."""
+    """Return whether beliefs are kept."""
     return bool(np.any(m.evidence.said_variance[KEPT:, 0] != np.inf))
 
 
 @compiled
 def keep(k: Constants, m: Memory) -> None:
-    """Keep what the fit has come to, and how it came about, if nothing is kept yet: a touch may have begun.
+    """Keep the fit's belief and its earlier steps, unless beliefs are kept already: a touch may have begun.
 
-    Of a fit that has changed on the way only what it had come to before.
+    If the fit has changed on the way, keep only the steps from before the change.
     """
     m.earlier.refused_fits = 0.0
     if m.earlier.kept_count > 0.0 or m.fit_check.steps_used <= YOUNG_STEPS:
@@ -98,7 +99,7 @@ def keep(k: Constants, m: Memory) -> None:
 
 @compiled
 def keep_steps(k: Constants, m: Memory, last: int) -> None:
-    """Keep the fit's steps up to this number, if nothing is kept yet."""
+    """Keep the fit's steps up to this number, unless beliefs are kept already."""
     if m.earlier.kept_count > 0.0:
         return
     _drop(m)
@@ -122,9 +123,9 @@ def _keep(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, age_s:
 
 @compiled
 def _say(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit: float) -> bool:
-    """Fill a source's rows with what a belief says; tell whether no friction is clearly less than none.
+    """Fill a source's rows from a belief; return whether all its frictions are at least about 0.
 
-    Who pushes the arm on looks like less than none: what is less counts as none.
+    A person who pushes the arm on makes friction look negative: a negative one counts as 0.
     """
     has_friction = True
     for q in range(VISCOUS):
@@ -138,9 +139,9 @@ def _say(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit: float)
 
 @compiled
 def is_no_more(k: Constants, m: Memory) -> bool:
-    """Tell whether the fit has the friction of what was kept, no more inertia, and no other unanchored offset.
+    """Return whether the fit has the kept beliefs' friction, no more inertia, and the same unanchored offsets.
 
-    The fit's offsets keep to their anchors. A kept belief whose offsets don't has been leant on, and is forgotten.
+    The fit's offsets keep to their anchors. A kept belief with other offsets comes from a lean, and is forgotten.
     """
     is_no_more = True
     for s in range(KEPT, KEPT + int(m.earlier.kept_count)):
@@ -165,7 +166,7 @@ def is_no_more(k: Constants, m: Memory) -> bool:
 
 @compiled
 def _is_leant_on(k: Constants, m: Memory, s: int) -> bool:
-    """Tell whether a kept belief has another offset than the fit where an anchor gives it, or excludes the other."""
+    """Return whether a kept belief's offset differs from the fit's where an anchor gives it, or excludes the other."""
     for i in range(m.anchor.anchor_Nm.shape[1]):
         q = OFFSETS + i
         is_another = abs(evidence.excess(m, s, q)) > 1.0
@@ -176,7 +177,7 @@ def _is_leant_on(k: Constants, m: Memory, s: int) -> bool:
 
 @compiled
 def _lapses(k: Constants, m: Memory) -> bool:
-    """Tell whether enough fits in a row have been refused for the same, as large as it is; remember this one."""
+    """Return whether enough fits in a row have been refused for the same excess of the same size; record this one."""
     is_little, is_less, is_same, friction_Nm, else_Nm = True, True, True, 0.0, 0.0
     for q in range(VISCOUS):
         s = evidence.foremost(m, KEPT, KEPT + int(m.earlier.kept_count), q)
@@ -204,9 +205,9 @@ def _lapses(k: Constants, m: Memory) -> bool:
 
 
 def describe_more(m: Memory) -> list[str]:
-    """Say in which quantities the fit contradicts what was kept, by how much and since when, a line each.
+    """Return the quantities in which the fit contradicts kept beliefs, by how much and since when, a line each.
 
-    Of a joint's friction only the speed at which it stands out most.
+    For a joint's friction only the speed with the largest excess.
     """
     excesses = np.abs(m.evidence.difference[KEPT:] / m.evidence.limit[KEPT:])
     worst = KEPT + np.argmax(excesses, axis=0)

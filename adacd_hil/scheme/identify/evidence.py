@@ -1,19 +1,19 @@
-"""What contradicts a certificate, as a table: what each source says of each quantity, against what a fit says.
+"""The table of evidence against a certificate: each source's value of each quantity, compared with the fit's.
 
 A *quantity* is a column c of parameters that a touch can look like: a joint's friction at some speed, an inertia, a
-torque offset, a viscous friction. A *source* knows of quantities apart from the fit: an anchor of the offsets
+torque offset, a viscous friction. A *source* knows quantities independently of the fit: an anchor of the offsets
 (`anchor`), a belief from before a touch (`earlier`), the last certificate (`certificate`). One function weighs each
-row, what a source says of a quantity:
+row, a source's value of a quantity:
 
     difference = c theta - value,    limit = slack + max(floor, sigmas sqrt(variance + c P c'))
 
-and the source contradicts the fit where |difference| is over the limit; of a quantity of which less is the arm's, where
-the difference is. A variance of inf: the source says nothing. Of c P c' the unit of the fit's residuals scales what the
-samples say, and not what the prior does (`split`).
+and the source contradicts the fit if |difference| is over the limit; for a quantity of which less is the arm's, if the
+difference itself is. A variance of inf: the source has no value. In c P c' the unit of the fit's residuals scales the
+part that comes from the samples, and not the prior's part (`split`).
 
-Two questions are no rows, since no column is known beforehand: whether one model explains the whole of a fit
-(`fit_check`), and whether the model lacks columns (`missing_torque`). `docs/scheme.md` lists which touch each row sees,
-and which touches none.
+Two questions are not rows, since their column is not known beforehand: whether one model explains the whole of a fit
+(`fit_check`), and whether the model lacks columns (`missing_torque`). `docs/scheme.md` lists which touch each row
+detects, and which touches all rows miss.
 
 Shapes: Q quantities, S sources, p parameters; columns (Q, p), columns_prior, torque_Nm (Q,); sigmas (S,), less_counts
 (S, Q); said, said_variance, said_floor, said_slack, difference, limit (S, Q); said_age_s (S,); fitted, fitted_variance
@@ -31,31 +31,31 @@ from adacd_hil.scheme.memory import Constants, EvidenceConstants, Memory
 from adacd_hil.settings.configuration import Settings
 
 SPEEDS_RAD_S = (0.2, 0.6, 1.2)
-"""At which friction is compared: what viscous and Coulomb friction hide from each other shows in their sum."""
+"""Speeds at which friction is compared: in the sum, errors of viscous and Coulomb friction can't hide each other."""
 _INERTIAS = ("a1", "a2", "a3")
 FRICTIONS, INERTIAS = JOINTS * len(SPEEDS_RAD_S), len(_INERTIAS)
 OFFSETS = FRICTIONS + INERTIAS
 VISCOUS = OFFSETS + JOINTS
 QUANTITIES = VISCOUS + JOINTS
-"""First offset, first viscous friction, and how many quantities there are; frictions and inertias come before."""
+"""First offset, first viscous friction, and number of quantities; frictions and inertias come before."""
 ANCHORS, BELIEFS = 4, 9
 LAST, REFUSED, KEPT = ANCHORS, ANCHORS + 1, ANCHORS + 2
 SOURCES = KEPT + BELIEFS
 """Sources, in order: anchors, the last certificate, the fit that was refused before, beliefs from before a touch."""
 ANCHOR_SIGMAS, LAST_SIGMAS = 4.0, 4.0
-"""Two joints, two-sided: 1.3e-4 of clean arms, each time that it is asked."""
+"""Two joints, two-sided: exceeded by 1.3e-4 of clean arms, at each comparison."""
 BELIEF_SIGMAS = 3.5
-"""With the floors of `earlier`: fits of 400 untouched arms had 0.23 of what is allowed more in the middle, 0.73 at
-most."""
+"""With the floors of `earlier`: fits of 400 untouched arms had a median of 0.23 of the allowed excess, and a maximum of
+0.73."""
 PEAK_ACCELERATION = 10.0 / math.sqrt(3.0)
-"""Of a rest-to-rest quintic, over travel / duration²."""
+"""Peak acceleration of a rest-to-rest quintic, over travel / duration²."""
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:
     """Return `columns`, `columns_prior`, `torque_Nm`, `sigmas` and `less_counts`. prior_std (p,).
 
-    torque_Nm: torque that one unit of the quantity makes at most on the trajectory; of viscous friction nothing, which
-    the friction at its speeds has already.
+    torque_Nm: largest torque of one unit of the quantity on the trajectory; 0 for viscous friction, which is contained
+    in the friction at its speeds.
     """
     unit = np.eye(prior_std.size)
     base = len(settings.estimator.parameter_names)
@@ -84,32 +84,32 @@ def _accelerations(settings: Settings) -> tuple[float, ...]:
 
 
 def begin(m: Memory) -> None:
-    """Begin with sources that say nothing."""
+    """Empty all sources."""
     m.evidence.said_variance[:] = np.inf
     m.evidence.limit[:] = np.inf
 
 
 def say_all(m: Memory, s: int, said: Vector, variance: Vector, slack: Vector) -> None:
-    """Fill all rows of a source (Q,), without a floor."""
+    """Fill all rows of a source, values `said` (Q,), without a floor."""
     m.evidence.said[s], m.evidence.said_variance[s], m.evidence.said_slack[s] = said, variance, slack
 
 
 @compiled
 def follow(m: Memory, period_s: float) -> None:
-    """Let a period pass."""
+    """Add one period to the age of each source."""
     for s in range(m.evidence.said_age_s.shape[0]):
         m.evidence.said_age_s[s] += period_s
 
 
 @compiled
 def date(m: Memory, first: int, last: int, age_s: float) -> None:
-    """Say how old the knowledge of the sources first .. last - 1 is."""
+    """Set the age of the knowledge of the sources first .. last - 1."""
     m.evidence.said_age_s[first:last] = age_s
 
 
 @compiled
 def say(m: Memory, s: int, q: int, value: float, variance: float, floor: float, slack: float) -> None:
-    """Fill a row: what source s says of quantity q."""
+    """Fill a row: the value of quantity q by source s, its variance, floor and slack."""
     m.evidence.said[s, q] = value
     m.evidence.said_variance[s, q] = variance
     m.evidence.said_floor[s, q] = floor
@@ -118,7 +118,7 @@ def say(m: Memory, s: int, q: int, value: float, variance: float, floor: float, 
 
 @compiled
 def retract(m: Memory, s: int) -> None:
-    """Let a source say nothing."""
+    """Empty the rows of a source."""
     m.evidence.said_variance[s] = np.inf
     m.evidence.difference[s] = 0.0
     m.evidence.limit[s] = np.inf
@@ -126,14 +126,14 @@ def retract(m: Memory, s: int) -> None:
 
 @compiled
 def pass_over(m: Memory, s: int, q: int) -> None:
-    """Leave a row unasked this time."""
+    """Skip a row in this comparison."""
     m.evidence.difference[s, q] = 0.0
     m.evidence.limit[s, q] = np.inf
 
 
 @compiled
 def fit(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float) -> None:
-    """Fill what a model theta (p,), P (p, p) says of each quantity; unit: of its residuals."""
+    """Fill the value and variance of each quantity for a model theta (p,), P (p, p); unit: of its residuals."""
     for q in range(m.evidence.fitted.shape[0]):
         value, variance = of_belief(k, q, theta, P, unit)
         put_fitted(m, q, value, variance)
@@ -141,29 +141,29 @@ def fit(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float) -> None:
 
 @compiled
 def put_fitted(m: Memory, q: int, value: float, variance: float) -> None:
-    """Fill what is weighed of one quantity."""
+    """Set the fitted value and variance of one quantity."""
     m.evidence.fitted[q] = value
     m.evidence.fitted_variance[q] = variance
 
 
 @compiled
 def of_belief(k: Constants, q: int, theta: Vector, P: Vector, unit: float) -> tuple[float, float]:
-    """Return what a belief says of a quantity, c theta, and its variance."""
+    """Return a belief's value of a quantity, c theta, and its variance."""
     column = k.evidence.columns[q]
     return linalg.dot(column, theta), split(linalg.quadratic(P, column), k.evidence.columns_prior[q], unit)
 
 
 @compiled
 def split(variance: float, prior: float, unit: float) -> float:
-    """Return a variance of which `unit` scales what the samples say, and not what the prior does."""
+    """Return a variance with only the samples' part of it, not the prior's, scaled by `unit`."""
     return 1.0 / (1.0 / prior + max(1.0 / variance - 1.0 / prior, 0.0) / unit)
 
 
 @compiled
 def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
-    """Return how many times its limit the fit has more of a quantity than a source says; fill `difference`, `limit`.
+    """Return the fit's excess of a quantity over a source's value, in limits; fill `difference`, `limit`.
 
-    Negative: less. 0 where less doesn't count, or nothing is said.
+    Negative: less. 0 if less doesn't count, or the source has no value.
     """
     difference = m.evidence.fitted[q] - m.evidence.said[s, q]
     if m.evidence.said_variance[s, q] == np.inf or (difference < 0.0 and k.evidence.less_counts[s, q] == 0.0):
@@ -176,13 +176,13 @@ def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
 
 @compiled
 def excess(m: Memory, s: int, q: int) -> float:
-    """Return the same of a row as it was weighed last."""
+    """Return the excess of a row as it was weighed last."""
     return float(m.evidence.difference[s, q] / m.evidence.limit[s, q])
 
 
 @compiled
 def foremost(m: Memory, first: int, last: int, q: int) -> int:
-    """Return which of the sources first .. last - 1 contradicts a quantity most, as weighed last."""
+    """Return the source among first .. last - 1 that contradicts a quantity most, as weighed last."""
     worst = first
     for s in range(first, last):
         if not abs(excess(m, s, q)) <= abs(excess(m, worst, q)):
@@ -191,7 +191,7 @@ def foremost(m: Memory, first: int, last: int, q: int) -> int:
 
 
 def named(excesses: Vector) -> list[tuple[int, str, str]]:
-    """Return place, name and unit of each quantity whose excess (Q,) is over 1; of a joint's friction only the largest.
+    """Return place, name and unit of each quantity with an excess (Q,) over 1; for a joint's friction only the largest.
 
     A viscous friction is named after the others.
     """

@@ -1,28 +1,29 @@
 """Whether one model explains the whole of a fit: its kept samples, and the beliefs that it passed on the way.
 
-A touch that begins or ends while the arm learns changes what the samples say; which column it looks like is not known.
-So a fit counts only if one model explains all of it. With theta_0, P_0 what the fit had come to some time ago, a step,
+A touch that begins or ends while the arm learns changes the samples; its column is not known beforehand. So a fit
+counts only if one model explains all of it. With theta_0, P_0 the belief some time ago, a step,
 
     steady       (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' <= STEADY u
     explained    |tau_f - W_f theta| <= LIMIT_NM + LIMIT_SHARE rms
     borne out    |W_f (theta_late - theta)| <= LATER_NM + RMS_SHARE rms + LEARNT_SHARE sqrt(u) residual_Nm + sigma
 
-for each step, the last two on all samples. theta_late is what came after the step, from the two beliefs alone:
+for each step, the last two on all samples. theta_late is the model of the samples after the step, from the two beliefs
+alone:
 
     theta_late - theta = P (P_0 - P)^-1 (theta - theta_0),   of covariance P (P_0 - P)^-1 P
 
 (P_0 a little larger than it was, see `REGULAR`.) u: mean square of the fit's residuals over that of the settings, up to
 the step or after it, the smaller; rms: of the residuals of the better half of its samples. sigma: where gravity acts,
-the standard deviation of that difference, by the beliefs; else 0. A part of the motion of an arm in gravity hardly
-tells gravity from an offset, so later samples may not know the torque of earlier poses: by sigma = 0.03 to 0.05 Nm of a
+the standard deviation of that difference, by the beliefs; else 0. In gravity a part of the motion hardly separates
+gravity from an offset, so later samples may not determine the torque of earlier poses: sigma was 0.03 to 0.05 Nm on a
 level arm, which differed by 0.033 to 0.045 Nm and got no certificate.
 
-The last sees a weak touch of the beginning, when theta_0 is not known well enough to differ. The last two are not asked
-of a payload's fit.
+The last condition detects a weak touch of the beginning, when theta_0 is too uncertain to differ. A payload's fit is
+exempt from the last two.
 
 Shapes: p parameters, n joints, s samples of room, t steps; samples_W (s, n, p), samples_tau (s, n); steps_theta (t, p),
-steps_P (t, p, p), steps_square, steps_rows (t,); factor (p, p), apart, later (p,). When there is no room left every
-second sample goes, and half as many come.
+steps_P (t, p, p), steps_square, steps_rows (t,); factor (p, p), apart, later (p,). When the room is full each second
+sample is dropped, and the rate of new ones is halved.
 """
 
 import numpy as np
@@ -37,32 +38,32 @@ from adacd_hil.settings.configuration import Settings
 
 ROOM = 128
 FIRST_EVERY = 3.0
-"""Of the samples that are learnt, every 4 ms: 1.5 s fill the room."""
+"""One in so many learnt samples, every 4 ms, is kept: 1.5 s fill the room."""
 STEADY = 400.0
-"""Squared distance over u at which a fit has changed. Fits of 400 untouched arms, wide ones included, came to 0.06 of
-it in the middle and to 0.18 at most. What the model doesn't know is in it too: cross-talk of 2 % comes to 680."""
+"""Squared distance over u at which a fit has changed. Fits of 400 untouched arms, wide ones included: median 0.06 of
+it, maximum 0.18. It includes effects outside the model: cross-talk of 2 % comes to 680."""
 LIMIT_NM = 0.045
 LIMIT_SHARE = 9.0
-"""Of 400 untouched arms, wide ones included, the worst came to 0.63 of the limit, half of them to 0.16."""
+"""Of 400 untouched arms, wide ones included: maximum 0.63 of the limit, median 0.16."""
 SMALLEST_SQUARE = 0.015
-"""Least u of a fit that is asked whether it has changed."""
+"""Least u of a fit that is checked for a change."""
 LATER_NM = 0.02
-"""With the rest of the limit: the same fits came to 0.31 of it in the middle, to 0.94 at most, in MuJoCo to 0.98."""
+"""With the rest of the limit, the same fits: median 0.31 of it, maximum 0.94, in MuJoCo 0.98."""
 RMS_SHARE = 2.0
 """How many times rms a torque may differ beside that."""
 LEARNT_SHARE = 2.5
 """How many times the rms of the learnt residuals, of their better part, it may differ beside that."""
 REGULAR = 0.01
-"""Share of P_0 that is added to P_0 - P, so that what no sample has shown since is no difference."""
+"""Share of P_0 that is added to P_0 - P, so that a direction without new samples gives no difference."""
 NONE = -2
-"""Number of no step."""
+"""Number for a missing step."""
 STEP_S = 0.2
 STEPS = 8
-"""The fit's own earlier beliefs: how far apart, and how many."""
+"""Interval and number of the fit's own earlier beliefs that are kept."""
 HARD = 2.0
-"""Mean square of the learnt residuals in their hard moments over that of all: much of them is noise of the velocity."""
+"""Mean square of the learnt residuals in their hard moments over that of all: the velocity's noise dominates there."""
 SMALLEST_UNIT = 0.1
-"""Least unit of the variances; the rest of it as `sensitivity` has it."""
+"""Least unit of the variances; the other bound is that of `sensitivity`."""
 
 
 def constants_of(settings: Settings) -> FitCheckConstants:
@@ -73,7 +74,7 @@ def constants_of(settings: Settings) -> FitCheckConstants:
 
 @compiled
 def begin(m: Memory) -> None:
-    """Begin a fit."""
+    """Begin a fit: forget steps, samples and residuals."""
     m.fit_check.steps_used = 0.0
     m.fit_check.fit_square = 0.0
     m.fit_check.fit_rows = 0.0
@@ -85,14 +86,14 @@ def begin(m: Memory) -> None:
 
 @compiled
 def add_residual(m: Memory, square: float) -> None:
-    """Take in the residual of a row that is learnt, squared, over its variance."""
+    """Add the residual of a learnt row, squared, over its variance."""
     m.fit_check.fit_square += square
     m.fit_check.fit_rows += 1.0
 
 
 @compiled
 def follow(k: Constants, m: Memory, W_f: Vector, tau_f: Vector) -> None:
-    """Take in that the fit has learnt a sample, W_f (n, p), tau_f (n,) of the filter by which it is tested."""
+    """Record that the fit has learnt a sample, W_f (n, p), tau_f (n,) of the filter by which it is tested."""
     _keep_sample(m, W_f, tau_f)
     m.fit_check.fit_samples += 1.0
     if m.fit_check.fit_samples % k.fit_check.step_samples != 0.0:
@@ -131,7 +132,7 @@ def unit_of(square: float, rows: float) -> float:
 
 @compiled
 def late_square(m: Memory) -> float:
-    """Return u of the later half of the fit, so that what touched its beginning doesn't count; 1 of a short one."""
+    """Return u of the fit's later half, so that a touch of its beginning doesn't count; 1 for a short fit."""
     used = int(m.fit_check.steps_used)
     if used < 2:
         return 1.0
@@ -155,9 +156,9 @@ def _better_square(m: Memory, s: int) -> float:
 
 @compiled
 def last_step_before_change(k: Constants, m: Memory) -> int:
-    """Return the number of the last step, from 0, of which the whole fit is no continuation; NONE if it is of all.
+    """Return the number of the last step, from 0, that the whole fit doesn't continue; NONE if it continues all.
 
-    Where only its later samples don't bear it out, that is the last step of all. -1: no step is old enough.
+    If only the fit's later samples contradict it, that is the last step of all. -1: all steps are too young.
     """
     used, oldest = int(m.fit_check.steps_used), max(int(m.fit_check.steps_used) - m.fit_check.steps_rows.shape[0], 0)
     changed = last_step_before_contradiction(k, m)
@@ -171,7 +172,7 @@ def last_step_before_change(k: Constants, m: Memory) -> int:
 
 @compiled
 def last_step_before_contradiction(k: Constants, m: Memory) -> int:
-    """Return the number of the last step before the fit changed, or a sample stands out; NONE where neither does."""
+    """Return the number of the last step before the fit changed, or a sample stands out; NONE without either."""
     changed = last_unsteady_step(m)
     first = first_unexplained(m)
     return changed if changed != NONE or first < 0 else int(first // k.fit_check.step_samples) - 1
@@ -179,7 +180,7 @@ def last_step_before_contradiction(k: Constants, m: Memory) -> int:
 
 @compiled
 def first_unexplained(m: Memory) -> int:
-    """Return which of the fit's learnt samples, from 0, is the first that its belief doesn't explain; -1: none is."""
+    """Return the index, from 0, of the first learnt sample that the fit's belief doesn't explain; -1 without one."""
     kept, first = int(m.fit_check.samples_kept), -1
     if m.models.is_payload != 0.0 or kept < 2:
         return first
@@ -193,13 +194,13 @@ def first_unexplained(m: Memory) -> int:
 
 @compiled
 def limit_Nm(m: Memory) -> float:
-    """Return the largest residual that the fit explains."""
+    """Return the largest residual that the fit explains, Nm."""
     return float(LIMIT_NM + LIMIT_SHARE * better_rms(m))
 
 
 @compiled
 def residual(m: Memory, s: int, joint: int) -> float:
-    """Return what the belief leaves of sample s, Nm."""
+    """Return the belief's residual of sample s, Nm."""
     return float(-linalg.misfit(m.fit_check.samples_W[s, joint], m.models.belief, m.fit_check.samples_tau[s, joint]))
 
 
@@ -215,13 +216,13 @@ def last_unsteady_step(m: Memory) -> int:
 
 @compiled
 def changed_share(m: Memory, s: int) -> float:
-    """Return how much of its limit the distance of step s from the whole fit is."""
+    """Return the distance of step s from the whole fit as a share of its limit."""
     return float(distance(m, s) / (STEADY * max(_better_square(m, s), SMALLEST_SQUARE)))
 
 
 @compiled
 def later_share(k: Constants, m: Memory, s: int) -> float:
-    """Return how much of its limit the torque is by which what came after step s differs from the fit."""
+    """Return the torque between the fit and the model of the samples after step s, as a share of its limit."""
     if not find_later(m, s):
         return np.inf
     limit_Nm = LATER_NM + RMS_SHARE * better_rms(m)
@@ -249,7 +250,7 @@ def better_rms(m: Memory) -> float:
 
 @compiled
 def distance(m: Memory, s: int) -> float:
-    """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of step s and the fit; inf if there is none.
+    """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of step s and the fit; inf if it has no factor.
 
     In units of the square roots of P_0's diagonal. Leaves the Cholesky factor in `factor`, and in `apart` the vector
     whose square the distance is.
@@ -268,7 +269,7 @@ def distance(m: Memory, s: int) -> float:
 
 @compiled
 def find_later(m: Memory, s: int) -> bool:
-    """Fill `later` (p,): the model of what came after step s less that of the fit; False if there is none."""
+    """Fill `later` (p,): the model of the samples after step s less that of the fit; False if it is undefined."""
     if not distance(m, s) < np.inf:
         return False
     x, P_0 = m.fit_check.apart, m.fit_check.steps_P[s]
@@ -282,7 +283,7 @@ def find_later(m: Memory, s: int) -> bool:
 
 @compiled
 def _later_variance(m: Memory, s: int, w: Vector) -> float:
-    """Return w P (P_0 - P)^-1 P w', with what `distance` has left in `factor`."""
+    """Return w P (P_0 - P)^-1 P w', by the factor that `distance` has left in `factor`."""
     x = m.fit_check.apart
     for j in range(x.shape[0]):
         x[j] = linalg.dot(m.models.P_belief[j], w) / np.sqrt(m.fit_check.steps_P[s, j, j])

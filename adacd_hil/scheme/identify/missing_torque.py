@@ -1,11 +1,11 @@
-"""Evidence that the model lacks a torque that depends on where the arm is.
+"""Evidence that the model lacks a torque that depends on the arm's position.
 
 Each sample that the belief learns, a row w of the regressor with its torque and variance R, also goes into the sums
 
     L = Σ v v'/R,   b = Σ v r/R,   r = tau_f - w prior,   v = (w, x)
 
 with x the columns of `regressor` behind the filter that is learnt from. From a prior N(0, S²) of the parameters less
-their mean, with x or without, each sum says how likely the samples are:
+their mean, with x or without, each sum gives the likelihood of the samples:
 
     log evidence = ½ b' S M^-1 S b - ½ log det M,   M = I + S L S
 
@@ -14,14 +14,14 @@ squares that the basic model leaves, and comes to LEAST_NM rms. Of clean arms, w
 the error campaign but a tilt and a cable, the gain was -25 to -3, or the share below 0.4; tilts of 0.5 and 1
 deg and a cable of 0.1 Nm came to a gain of 20 and more on a motion that shows them.
 
-Asked of an adaptation as a whole, when it refuses a fit. A torque by place is asked for while the arm monitors, too: of
-the first 2 s, the next 4, 8, 16 s and then of each 16 s of learnt samples. Not of longer ones: the drift of a sensor
-over a minute looks like this. There one stretch is not enough, since on one way much depends on the place: what it says
-must explain SAID_SHARE of the squares that the basic model leaves in a later one.
+An adaptation is checked as a whole, when it refuses a fit. While the arm monitors, the check for a torque by place runs
+over the first 2 s of learnt samples, the next 4, 8, 16 s and then each 16 s. Longer stretches are not used: the drift
+of a sensor over a minute looks like such a torque. One stretch is not enough there, since on one way many effects
+depend on the place: its result must explain SAID_SHARE of the squares that the basic model leaves in a later one.
 
 Shapes: p parameters, n joints, t = PLACE_TERMS, f = p + n t; evidence_L (n, f, f): by the joint of the row, lower half;
 evidence_b, _basic, _full, _row, _scale (f,); evidence_M (f, f); evidence_said (n t,): coefficients of the last stretch
-that came to a torque by place, all 0 if none did; missing_rms_Nm (n,): what was found last, 0 where nothing was.
+that came to a torque by place, else all 0; missing_rms_Nm (n,): the last torque found, 0 without one.
 """
 
 import math
@@ -39,15 +39,15 @@ from adacd_hil.settings.configuration import Settings
 EXPECTED_NM = 0.06
 """Standard deviation of a coefficient, of an arm that has a cable."""
 GAIN, SHARE, LEAST_NM = 8.0, 0.6, 0.01
-"""Of one stretch."""
+"""Thresholds for one stretch."""
 SAID_SHARE = 0.4
 LEAST_BACK = 0.2
-"""Share of a joint's samples that are of its less frequent direction: on a way in one direction what depends on speed,
-or on time, depends on the place."""
+"""Share of a joint's samples in its less frequent direction: on a way in one direction a torque by speed or by time
+also depends on the place."""
 STILL = 0.05
-"""Share of standstill in the filter's memory from which on friction may be any."""
+"""Share of standstill in the filter's memory above which friction may take any value."""
 FIRST_S, LONGEST_S = 2.0, 16.0
-"""Learnt samples of which the first question is asked while the arm monitors, and each later one."""
+"""Learnt time before the first check while the arm monitors, and before each later one at most."""
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> TermConstants:
@@ -62,22 +62,23 @@ def constants_of(settings: Settings, prior_std: Vector) -> TermConstants:
 
 @compiled
 def forget(m: Memory) -> None:
-    """Forget the columns that were filtered."""
+    """Forget the filtered columns."""
     m.missing_torque.X_f[:] = 0.0
     m.missing_torque.X_learnt[:] = 0.0
 
 
 @compiled
 def rest(m: Memory) -> None:
-    """Begin with a filter that has seen this pose for ever."""
+    """Begin with a filter that has always been in this pose."""
     m.missing_torque.X_f[:] = m.regressor.X
 
 
 @compiled
 def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
-    """Take the columns X (n, PLACE_TERMS) over one period to what is learnt from; after a gap the filter resumes.
+    """Advance the columns X (n, PLACE_TERMS) over one period behind the learnt filter; after a gap the filter resumes.
 
-    rates (3,): what one period does to the filter, see `filter_bank.FirstOrderHold`; smoothing: to the pole behind it.
+    rates (3,): the filter's coefficients for one period, see `filter_bank.FirstOrderHold`; smoothing: of the pole
+    behind it.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
     X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt
@@ -97,7 +98,7 @@ def keep(m: Memory, slot: int) -> None:
 
 @compiled
 def clear(k: Constants, m: Memory) -> None:
-    """Begin anew: with another arm, as one with another payload, or with a certificate."""
+    """Begin anew: with another arm, such as one with another payload, or with a certificate."""
     _clear_sums(m)
     m.missing_torque.said[:] = 0.0
     m.missing_torque.rms_Nm[:] = 0.0
@@ -116,7 +117,7 @@ def _clear_sums(m: Memory) -> None:
 
 @compiled
 def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
-    """Take in the row of a joint from a slot of the ring, which is learnt; one that moves slowly tells nothing."""
+    """Add the row of a joint, learnt now from a slot of the ring, to the sums; skip a joint that moves slowly."""
     if m.ring.still[slot, joint] > STILL:
         return
     v, count = m.missing_torque.row, m.models.belief.shape[0]
@@ -138,7 +139,7 @@ def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
 
 @compiled
 def _rough_variance(k: Constants, m: Memory, joint: int) -> float:
-    """Return what a velocity that is noisier than the settings say leaves in what is learnt, Nm²: an encoder's steps.
+    """Return the residual's variance from a velocity noisier than in the settings, Nm²: an encoder's steps.
 
     At low speed they come slowly, so they count as the model's error does.
     """
@@ -150,7 +151,10 @@ def _rough_variance(k: Constants, m: Memory, joint: int) -> float:
 
 @compiled
 def is_found_in_time(k: Constants, m: Memory) -> bool:
-    """Take in that a sample was learnt while the arm monitors; once in a while tell whether two stretches agree."""
+    """Record that a sample was learnt while the arm monitors.
+
+    Return whether two stretches agree, when a check is due.
+    """
     m.missing_torque.samples += 1.0
     if m.missing_torque.samples < m.missing_torque.wanted:
         return False
@@ -166,7 +170,7 @@ def is_found_in_time(k: Constants, m: Memory) -> bool:
 
 @compiled
 def is_found(k: Constants, m: Memory) -> bool:
-    """Tell whether the place explains what the model leaves of all samples; fill `missing_rms_Nm` (n,)."""
+    """Return whether the place explains the model's residual over all samples; fill `missing_rms_Nm` (n,)."""
     m.missing_torque.rms_Nm[:] = 0.0
     if k.position_torque_Nm != 0.0:
         return False
@@ -197,7 +201,7 @@ def _scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
 
 @compiled
 def _is_said_again(k: Constants, m: Memory) -> bool:
-    """Tell whether what an earlier stretch has said explains this one, of which `evidence_basic` is the model."""
+    """Return whether an earlier stretch's torque explains this one, of which `evidence_basic` is the model."""
     m.missing_torque.rms_Nm[:] = 0.0
     said, count, basic, full = (
         m.missing_torque.said,
@@ -231,7 +235,7 @@ def _fill_missing(m: Memory) -> None:
 
 @compiled
 def _rms_Nm(m: Memory, joint: int) -> float:
-    """Return by how much the two models differ on a joint's samples."""
+    """Return the rms difference of the two models on a joint's samples, Nm."""
     apart = m.missing_torque.row
     for j in range(apart.shape[0]):
         apart[j] = m.missing_torque.full[j] - m.missing_torque.basic[j]
@@ -241,7 +245,7 @@ def _rms_Nm(m: Memory, joint: int) -> float:
 
 @compiled
 def _log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
-    """Return the log evidence of the columns with a deviation s (f,) above 0, up to what all have; fill x (f,)."""
+    """Return the log evidence of the columns with a deviation s (f,) above 0, less a common constant; fill x (f,)."""
     M, count, log_det = m.missing_torque.M, s.shape[0], 0.0
     for j in range(count):
         x[j] = s[j] * b[j]
@@ -271,7 +275,7 @@ def _squares_left(m: Memory, x: Vector) -> float:
 
 
 def describe(m: Memory) -> list[str]:
-    """Say how large the torque is that the model lacks, in one line; none where none was found."""
+    """Return the size of the torque that the model lacks, in one line; empty without such a torque."""
     missing_Nm = m.missing_torque.rms_Nm.tolist()
     if not any(missing_Nm):
         return []

@@ -2,20 +2,21 @@
 
 The steps, each a function over a `Record`:
 
-- `identify`: recursive least squares of all parameters that the torque can tell: base parameters of the links, F_v and
+- `identify`: recursive least squares of all parameters that the torque shows: base parameters of the links, F_v and
   F_c of each joint, an offset of each torque sensor, and, where torques are those of motors, the inertia of each rotor
-  as the joint feels it through the gear. It starts from what is known before, with honest uncertainty (`prior`), and
-  ends with the uncertainty P that is left.
-- `certify`: the same parameters, frozen, on motion that was not used. It says how large the residual is, and how much
-  larger than noise and P explain: what the model lacks.
-- `filtered`: measured torque and the frozen model's residual as the fit sees them: how much of the torque is explained.
-- `parameter_deviation`: how far the parameters may be off, by how much parts of the fit disagree.
+  as the joint feels it through the gear. It starts from prior knowledge, with true uncertainty (`prior`), and ends with
+  the uncertainty P that is left.
+- `certify`: the same parameters, frozen, on motion that was not used. It returns the size of the residual, and its
+  excess over noise and P: the model's lack.
+- `filtered`: measured torque and the frozen model's residual as the fit sees them: they show the explained part.
+- `parameter_deviation`: standard deviation of the parameters, by the disagreement of parts of the fit.
 - `detect`: the external torque of each joint, its threshold, and the contacts.
 
     tau_ext_hat = -(tau_f - W_f theta_hat),    threshold = k sqrt(noise² + lack² + w P w') + F_c at standstill
 
-with w the joint's row of W_f. noise is what the filter leaves of the sensor's white noise (`_noise_gains`). Filtered
-noise is not white: samples taken every D periods are correlated, so the fit counts one as a measurement of variance
+with w the joint's row of W_f. noise is the part of the sensor's white noise behind the filter (`_noise_gains`).
+Filtered noise is not white: samples taken every D periods are correlated, so the fit counts one as a measurement of
+variance
 noise² (1 + 2 sum rho_jD), which gives a long record the information that it has.
 
 White noise of the velocity goes through the filter's direct path a Y_p: it shows as a M delta_dq in the residual, which
@@ -24,10 +25,10 @@ a fit it is noise of the regressor, which makes an arm look light: inertias came
 velocities of a cheap drive, 0.1 rad/s of noise. So the fit learns behind a second pole of the same cut-off, regressor
 and torque alike, and weighs a sample by the M of a first fit, which leaves this noise out.
 
-A force on a link loads the joints before it and none behind: the link of a contact is that of the outermost joint over
-its threshold until the isolation window ends. A force through a joint's axis is blind to that joint.
+A force on a link loads the joints before it and not those behind: the link of a contact is that of the outermost joint
+over its threshold until the isolation window ends. A force through a joint's axis is blind to that joint.
 
-`_run` is the only place that knows filters and estimator.
+Only `_run` uses filters and estimator.
 
 Shapes: k samples, n joints, p parameters. Filters with DC gain 1 (b = a). Units: Nm, or N for a prismatic joint.
 """
@@ -50,7 +51,7 @@ from adacd_hil.scheme.model.chain import BaseParameters, Chain, Indices, Scratch
 from adacd_hil.settings.schema import setting
 
 _PARTS = 12
-"""Of a fit, which are compared with each other: 8 to 24 came to the same on public recordings."""
+"""Number of parts of a fit that are compared with each other: 8 to 24 gave the same on public recordings."""
 _UNKNOWN_LINK = (
     10.0,
     *(2.0,) * 3,
@@ -60,7 +61,7 @@ _UNKNOWN_LINK = (
 
 @dataclass(frozen=True)
 class OfflineSettings:
-    """What is asked of a record's sensors, filters and thresholds."""
+    """Properties of a record's sensors, filters and thresholds."""
 
     noise_Nm: tuple[float, ...] = setting(unit="Nm", low=1e-6, meaning="rms of each torque sensor's white noise")
     period_s: float = setting(1e-3, unit="s", low=1e-5, high=0.1, meaning="time between two samples")
@@ -79,7 +80,10 @@ class OfflineSettings:
 
 @dataclass(frozen=True)
 class Record:
-    """What was measured, time-first (k, n), at a fixed period. Raises ValueError if it is not whole."""
+    """A measurement, time-first (k, n), at a fixed period.
+
+    Raises ValueError if shapes differ or a value isn't finite.
+    """
 
     q: Vector
     dq: Vector
@@ -111,13 +115,13 @@ class ArmModel:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Name the p parameters."""
+        """Return the names of the p parameters."""
         kinds = ("F_v", "F_c", "offset", *(("rotor",) if self.has_rotors else ()))
         per_joint = (f"{kind}{i + 1}" for kind in kinds for i in range(self.joints))
         return (*self.base.names, *per_joint)
 
     def place_of(self, kind: str) -> slice:
-        """Return the parameters of one kind: "base", "F_v", "F_c", "offset" or, where there are some, "rotor"."""
+        """Return the parameters of one kind: "base", "F_v", "F_c", "offset" or, if the model has them, "rotor"."""
         first, n = self.base.columns.size, self.joints
         starts = {"F_v": first, "F_c": first + n, "offset": first + 2 * n, "rotor": first + 3 * n}
         return slice(0, first) if kind == "base" else slice(starts[kind], starts[kind] + n)
@@ -148,7 +152,7 @@ def prior(
     offset_Nm: float = 1.0,
     rotor_kg_m2: float = 2.0,
 ) -> ModelEstimate:
-    """Return what is known before any motion.
+    """Return the estimate before any motion.
 
     theta_full (10 n,): the designer's parameters, zero if unknown. deviation_full (10 n,): their standard deviations;
     without, any link that a human could stand beside. F_v, F_c, offset_Nm, rotor_kg_m2: standard deviations from zero.
@@ -183,19 +187,19 @@ class OfflineCertificate:
 
     residual_rms_Nm: Vector  # (n,)
     residual_max_Nm: Vector  # (n,)
-    lack_Nm: Vector  # (n,), standard deviation of what neither noise nor P explains
+    lack_Nm: Vector  # (n,), standard deviation of the residual beyond noise and P
     threshold_Nm: Vector  # (n,), median over all samples, of noise and P
     margins: Vector  # (n,), smallest ratio of threshold to residual over all samples; below 1 is a false alarm
 
     @property
     def margin(self) -> float:
-        """The smallest of all joints."""
+        """The smallest margin of all joints."""
         return float(np.min(self.margins))
 
 
 @dataclass(frozen=True)
 class FilteredTorque:
-    """Torque and residual (k, n) behind the filter of the fit, Nm. unit (k,): what it leaves of a constant 1 Nm."""
+    """Torque and residual (k, n) behind the filter of the fit, Nm. unit (k,): its output for a constant 1 Nm."""
 
     torque: Vector
     residual: Vector  # measured minus predicted
@@ -241,14 +245,14 @@ def parameter_deviation(
 ) -> Vector:
     """Return the standard deviation (p,) of an estimate that `identify` made of records, from `before`.
 
-    The largest of three: what noise leaves, P; how much parts of the records disagree,
+    The largest of three: P, by noise; the disagreement between parts of the records,
 
         P (sum g_b g_b') P B / (B - 1),    g_b = sum of w' r / variance over part b of B, less the parts' mean
 
     with r the residual of the fit (White's heteroscedastic covariance, by blocks as the residual of a wrong model is
-    correlated); and, as such a residual may repeat with the motion, P of a fit in which what r has beyond noise counts
-    as if it came in p / 2 independent samples. On nine wrong models of the planar arm the true parameters were off by
-    0.9 to 5 of it (rms) where P said 26 to 390; only a torque that looks like another parameter was further off.
+    correlated); and, as such a residual may repeat with the motion, P of a fit in which the part of r beyond noise
+    counts as if it came in p / 2 independent samples. On nine wrong models of the planar arm the true parameters were
+    off by 0.9 to 5 of it (rms), and by 26 to 390 of P; only a torque that looks like another parameter was further off.
     """
     count, kinds = sum(len(record.q) for record in records), [estimate.P]
     scores = np.zeros((_PARTS, estimate.theta.size))
@@ -274,7 +278,7 @@ def parameter_deviation(
 
 
 def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredTorque:
-    """Give torque and residual of a record as the fit sees them. Raises as `identify`."""
+    """Return torque and residual of a record as the fit sees them. Raises as `identify`."""
     trace = _fit_trace(model, record, estimate, settings, estimate.theta)
     return FilteredTorque(trace.tau_f, -trace.tau_ext_hat, trace.unit)
 
@@ -299,7 +303,7 @@ def mass_terms(model: ArmModel, q: Vector, dq: Vector) -> Vector:
 
 
 def filtered_noise_Nm(settings: OfflineSettings) -> Vector:
-    """Return what the filter of the fit leaves of each torque sensor's noise (n,)."""
+    """Return each torque sensor's noise behind the filter of the fit (n,), Nm."""
     gains = _noise_gains(settings.fit_cutoff_rad_s, settings, is_smoothed=True)
     return gains.torque * np.array(settings.noise_Nm)
 
@@ -357,7 +361,7 @@ def _contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[Offl
 
 
 class _Trace(NamedTuple):
-    """What `_run` leaves of each sample, (k, n)."""
+    """Results of `_run` for each sample, (k, n)."""
 
     tau_ext_hat: Vector
     deviation: Vector  # of tau_ext_hat, by noise and P
@@ -372,7 +376,7 @@ def _threshold(trace: _Trace, settings: OfflineSettings, lack_Nm: Vector) -> Vec
 
 
 class _Memory(NamedTuple):
-    """What lasts from one sample to the next, and scratch."""
+    """Memory from one sample to the next, and scratch."""
 
     Y_p: Vector
     Y_h: Vector
@@ -404,14 +408,14 @@ def _new_memory(joints: int, count: int) -> _Memory:
 
 
 class _Rows(NamedTuple):
-    """The samples of a fit, if they are asked for: (m, n, p) and (m, n), m = 0 if not."""
+    """The samples of a fit, if the caller wants them: (m, n, p) and (m, n), m = 0 if not."""
 
     W: Vector
     tau: Vector
 
 
 class _NoiseGains(NamedTuple):
-    """What the filters make of white noise of 1: its standard deviation, and what correlation costs a fit."""
+    """The filters' gains for white noise of 1: its standard deviation, and the cost of its correlation in a fit."""
 
     torque: float
     velocity: float  # of M delta_dq, 1/s
@@ -419,7 +423,7 @@ class _NoiseGains(NamedTuple):
 
 
 def _noise_gains(cutoff_rad_s: float, settings: OfflineSettings, is_smoothed: bool) -> _NoiseGains:
-    """Work out the gains from the filters' two states x: x_new = A x + B u, y = C x + D u.
+    """Return the gains from the filters' two states x: x_new = A x + B u, y = C x + D u.
 
     Torque: y_1 = F u. Velocity: y_1 = a (u - F u). Behind both, where smoothed, a low-pass of the same cut-off. With
     V = A V A' + B B' the variance of y is C V C' + D², its covariance over j samples C A^(j - 1) (A V C' + B D).
@@ -553,7 +557,7 @@ def _run(
 ) -> None:
     """Filter a record, estimate the external torque of each sample, and correct theta and P if it learns.
 
-    smoothing: what the second pole keeps over a period; 0: there is none. noise_Nm (n,): of the filtered torque. R:
+    smoothing: part that the second pole keeps over a period; 0 without one. noise_Nm (n,): of the filtered torque. R:
     variance of a sample of the fit in units of noise_Nm². passed_rad_s2: the velocity's noise behind the filter, still
     to be multiplied by the mass matrix, of theta_M.
     """
@@ -597,7 +601,7 @@ def _run(
 
 @compiled
 def _smooth(smoothing: float, m: _Memory) -> None:
-    """Take torque and regressor over one period behind the second pole."""
+    """Advance torque and regressor over one period behind the second pole."""
     for i in range(m.W.shape[0]):
         m.tau[i] = m.tau_f[i] + smoothing * (m.tau[i] - m.tau_f[i])
         for j in range(m.W.shape[1]):
@@ -616,7 +620,7 @@ def _weigh(noise_Nm: Vector, R: float, passed_rad_s2: float, m: _Memory) -> None
 
 @compiled
 def _add_score(theta: Vector, m: _Memory, score: Vector) -> None:
-    """Add the scaled regressor, times what theta leaves of the scaled torque, to score (p,)."""
+    """Add the scaled regressor, times theta's residual of the scaled torque, to score (p,)."""
     external_torque.predict(m.W_scaled, theta, m.tau_f_hat)
     for i in range(m.W.shape[0]):
         for j in range(m.W.shape[1]):

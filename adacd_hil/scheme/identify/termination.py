@@ -1,4 +1,4 @@
-"""The end of an adaptation: eq. (15), and the evidence without which eq. (15) proves nothing.
+"""The end of an adaptation: eq. (15), and the evidence without which eq. (15) proves little.
 
 Eq. (15): |tau_ext_hat| <= beta on every joint for T without a break. The paper's t0 is the time of the last violation;
 counted from the start of the adaptation, a start from theta_hat = 0 could never end. An arm that stands still fulfils
@@ -15,14 +15,14 @@ it with any parameters, so three things must have been seen since the adaptation
 
 Shapes: tau_ext_hat, q, dq (2,); W_f (2, p); information (p, p).
 
-**Of the certified scheme.** The evidence that a fit is complete, what is missing of it, and the test that makes it a
+**The certified scheme.** The evidence that completes a fit, its missing parts, and the test that makes it a
 certificate.
 
 A fit is complete after its shortest time when
 
 - each joint has travelled and moved in both directions far and fast enough (a payload leaves friction as it was);
 - no combination of parameters stayed hidden: smallest eigenvalue and condition number of D (∫ W_f' W_f) D, see
-  above; with a payload, what was known before counts too, so only the next point is asked for;
+  above; with a payload, earlier knowledge counts too, so only the next point is required;
 - each parameter is known: the standard deviation that the belief gives it is small enough;
 - the inertia is positive definite at every q.
 
@@ -44,7 +44,7 @@ _SWEEPS = 12
 
 @compiled
 def begin(motion: Motion) -> None:
-    """Forget the evidence: where and how fast the joints have been, and what motion has shown."""
+    """Forget the evidence: ranges of position and velocity of the joints, and information."""
     motion.samples = 0.0
     motion.q_low[:] = np.inf
     motion.q_high[:] = -np.inf
@@ -55,7 +55,7 @@ def begin(motion: Motion) -> None:
 
 @compiled
 def is_quiet(tau_ext_hat: Vector, beta_Nm: float) -> bool:
-    """Tell whether eq. (15) holds in this sample; a value that is not a number violates it."""
+    """Return whether eq. (15) holds in this sample; a value that is not a number violates it."""
     is_within = True
     for i in range(tau_ext_hat.shape[0]):
         is_within = is_within and abs(tau_ext_hat[i]) <= beta_Nm
@@ -74,7 +74,7 @@ def widen(value: Vector, low: Vector, high: Vector) -> None:
 def has_moved(
     q_low: Vector, q_high: Vector, dq_low: Vector, dq_high: Vector, travel_rad: float, velocity_rad_s: float
 ) -> bool:
-    """Tell whether each joint has travelled, and moved in both directions, as far and as fast as asked."""
+    """Return whether each joint has travelled, and moved in both directions, as far and as fast as required."""
     for i in range(q_low.shape[0]):
         if not (q_high[i] - q_low[i] >= travel_rad):
             return False
@@ -94,7 +94,7 @@ def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
 
 @compiled
 def gather(motion: Motion, q: Vector, dq: Vector, W_f: Vector, period_s: float) -> bool:
-    """Take a sample into the ranges of motion and the information; tell whether a look at its eigenvalues is due."""
+    """Add a sample to the ranges of motion and the information; return whether a look at its eigenvalues is due."""
     widen(q, motion.q_low, motion.q_high)
     widen(dq, motion.dq_low, motion.dq_high)
     add_information(W_f, period_s, motion.information)
@@ -165,7 +165,7 @@ def begin_fit(m: Memory) -> None:
 
 @compiled
 def follow(k: Constants, m: Memory, q: Vector, dq: Vector, W_f: Vector) -> bool:
-    """Take a sample, W_f (n, p), into the evidence of a fit; tell whether that is complete."""
+    """Add a sample, W_f (n, p), to the evidence of a fit; return whether that is complete."""
     if gather(m.motion, q, dq, W_f, k.period_s):
         smallest, largest = eigenvalue_range(m.motion.information, k.scale, m.motion.scratch)
         m.fit.excitation = smallest
@@ -184,9 +184,9 @@ def begin_test(k: Constants, m: Memory, square: float) -> None:
 
 @compiled
 def test(k: Constants, m: Memory, dq: Vector, tau_ext_hat: Vector) -> int:
-    """Take a sample into the test; return whether it is refuted, -1, passed, 1, or goes on, 0.
+    """Add a sample to the test; return -1 if the model is refuted, 1 if it has passed, 0 if the test goes on.
 
-    Where a joint rests nothing is proven.
+    Samples of a joint at rest prove no model and are skipped.
     """
     m.fit.tested += 1.0
     widen(dq, m.motion.dq_low, m.motion.dq_high)
@@ -207,7 +207,7 @@ TEST_SHARE = 6.0
 
 @compiled
 def is_complete(k: Constants, m: Memory) -> bool:
-    """Tell whether the evidence for a fit is complete, from the constants `k` and the state `m` of the kernel."""
+    """Return whether the evidence for a fit is complete, from the constants `k` and the state `m` of the kernel."""
     is_payload = m.models.is_payload != 0.0
     if m.motion.samples < k.fit_cycles[1 if is_payload else 0]:
         return False
@@ -225,16 +225,19 @@ def is_complete(k: Constants, m: Memory) -> bool:
 
 @compiled
 def test_limit_Nm(k: Constants, square: float) -> float:
-    """Return how large |tau_ext_hat| of the slowest filter may become in a test.
+    """Return the largest |tau_ext_hat| of the slowest filter that a test allows.
 
-    square: mean square of the fit's residuals over that of the settings. An arm that its fit explains well is asked for
-    as much in the test: what stays below `beta_Nm` only may be a touch that was half learnt.
+    square: mean square of the fit's residuals over that of the settings. If the fit explains the arm well, the test
+    requires the same: a torque just below `beta_Nm` may be a touch that was half learnt.
     """
     return float(min(k.beta_Nm, TEST_NM + TEST_SHARE * k.residual_Nm * np.sqrt(square)))
 
 
 def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dict[str, str]) -> list[str]:
-    """Say, a line each, what a fit waits for and which motion would show it; `k`, `m` as for `is_complete`."""
+    """Return the conditions that a fit waits for, and the motion that fulfils each, a line each.
+
+    `k`, `m`: as for `is_complete`.
+    """
     lines = []
     joints = m.motion.q_low.shape[0]
     travel, speed = float(np.degrees(k.travel_rad)), float(np.degrees(k.velocity_rad_s))
@@ -285,6 +288,6 @@ _MOTIONS = {
 
 
 def _motion_for(name: str) -> str:
-    """Propose the motion that shows a parameter."""
+    """Return the motion that shows a parameter, as text."""
     found = (text for key, text in _MOTIONS.items() if name.startswith(key))
     return next(found, "move joint {} slowly, and with dwells").format(name[-1])

@@ -1,1 +1,1 @@
-"""The compiled numbers of one cycle, of both schemes, and of many cycles at once."""
+"""The compiled computation of one cycle, for both schemes, and of many cycles at once."""

@@ -1,16 +1,16 @@
-"""The numbers of one cycle of the certified scheme: bank of filters, belief about the model, evidence, detection.
+"""The computation of one cycle of the certified scheme: bank of filters, belief about the model, evidence, detection.
 
-theta is not only a number here but a belief (`belief`): mean and covariance P in honest units, begun with what any such
-arm may be and corrected by recursive least squares. What a filter's regressor row makes of the belief is the
-uncertainty of its prediction, so every threshold follows from what is known at the time (`sensitivity`). At the start
-of an adaptation P is large and nothing can be told; a fraction of a second later it can.
+theta is a belief here (`belief`): mean and covariance P in true units. It starts at the prior of any arm of this kind
+and is corrected by recursive least squares. P and a filter's regressor row give the uncertainty of a prediction, so
+each threshold follows from the present knowledge (`sensitivity`). At the start of an adaptation P is large and no
+contact can be detected; a fraction of a second later it can.
 
 **A touch is not learnt.** Samples wait in a ring before they correct the belief. When a residual exceeds its threshold
-the ring is thrown away, so nothing of the touch, from its beginning on, is learnt. What was known before judges what is
-learnt after (`earlier`), and what is known from elsewhere judges the offsets (`anchor`).
+the ring is emptied, so no sample of the touch, from its beginning on, is learnt. Earlier knowledge judges later
+estimates (`earlier`), and independent knowledge judges the offsets (`anchor`).
 
 **A certificate** is a test of the frozen model on motion that was not used for the fit (`termination`). While detection
-is armed the belief goes on learning; its mean takes the place of the frozen one after a test (`belief`).
+is armed the belief goes on learning; its mean replaces the frozen model after a test (`belief`).
 
 Constants, memory and block: `certified_memory`.
 """
@@ -56,22 +56,23 @@ from adacd_hil.scheme.supervisor.transitions import (
 )
 from adacd_hil.structured import Structured
 
-# What a cycle does, as bits.
+# Tasks of a cycle, as bits.
 MEASURE = 1  # the arm is at rest: measure the torque sensors' noise and zero
 WATCH = 2  # compare the residuals with their thresholds
 LEARN = 4  # correct the belief and use it at once
 TEST = 8  # test the frozen model
-REFINE = 16  # correct the belief, and let its mean take over after a test
-WEIGH = 32  # weigh what a contact of the certified model looks like
+REFINE = 16  # correct the belief; its mean replaces the model after a test
+WEIGH = 32  # weigh the evidence for each cause of a contact of the certified model
 
 
 @compiled
 def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool, is_first: bool) -> None:
-    """Begin to learn: from the prior, or with a payload on top of the arm as it was certified.
+    """Begin to learn: from the prior, or a payload on top of the certified arm.
 
-    is_first: of the arm as it is now; else an earlier attempt came to nothing, and its samples are evidence still.
+    is_first: the first attempt on the present arm; otherwise an earlier attempt failed, and its samples stay as
+    evidence.
 
-    What was learnt before is forgotten, so a contact on the way, whenever it is noticed, leaves no trace.
+    The belief learnt before is forgotten, so a contact on the way leaves no trace, whenever it is detected.
 
     Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
     """
@@ -94,7 +95,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
 
 @compiled
 def begin_test(constants: Structured, memory: Structured) -> None:
-    """Freeze the belief, as far as it is physically possible, as the model in use, and begin its test."""
+    """Freeze the belief, made physically possible, as the model in use, and begin its test."""
     k, m = constants[0], memory[0]
     belief.freeze(k, m)
     margin.begin_sight(m)
@@ -112,9 +113,9 @@ def begin_refinement(constants: Structured, memory: Structured) -> None:
 
 @compiled
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
-    """Take in the block's q, dq, tau_J and fill the rest of it; return bits of `Observation`.
+    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of `Observation`.
 
-    is_complete: 1 if it is a fresh sample. steps: periods since the fresh sample before it. mode: MEASURE to REFINE.
+    is_complete: 1 for a fresh sample. steps: periods since the fresh sample before it. mode: bits MEASURE to WEIGH.
     """
     k, m, out = constants[0], memory[0], block[0]
     observation = observe(k, out, steps, OVER_SPEED)
@@ -149,9 +150,9 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 
 @compiled
 def _filter(k: Constants, m: Memory, out: Any, steps: int) -> bool:
-    """Take the bank to this sample and estimate the external torque that each filter sees.
+    """Advance the bank to this sample and estimate the external torque from each filter.
 
-    Return whether the filters took it in; after a gap they only resume.
+    Return whether the filters took the sample in; after a gap they only resume.
     """
     nominal_s: float = k.period_s
     period_s: float = out["period_s"][0]
@@ -169,7 +170,7 @@ def _filter(k: Constants, m: Memory, out: Any, steps: int) -> bool:
     if not is_seen and np.max(np.abs(out["dq"])) > regressor.SLOW_RAD_S:
         belief.pause(m, k.settle_cycles)
     m.gaps.is_steady = 1.0 if is_seen and steps == 1 else 0.0
-    q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays as those above: it is compiled once
+    q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays like those above, so that this is compiled once
     _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
     m.gaps.has_gap = 0.0
     keep_sample(out["q"], out["dq"], out["tau_J"], m.gaps.last)
@@ -193,7 +194,7 @@ def _take_sample(
     is_seen: bool,
     tau_ext_wide_hat: Vector,
 ) -> None:
-    """Take the bank over one period to a sample, or let it resume from there, and compare with the model in use."""
+    """Advance the bank by one period to a sample, or resume there, and compare with the model in use."""
     cutoff = k.cutoff
     regressor.fill(k, m, q, dq, tau_J, period_s)
     filter_bank.take_sample(k, m, tau_J, is_seen)
@@ -224,7 +225,7 @@ def _take_sample(
 
 @compiled
 def _watch(k: Constants, m: Memory, out: Any, is_fresh: bool) -> int:
-    """Compare with the thresholds; return CONTACT, COLLISION and the joints that are over, if any."""
+    """Compare with the thresholds; return CONTACT, COLLISION and the joints over their threshold, or 0."""
     if is_fresh:
         sensitivity.fill_thresholds(k, m, m.sensitivity.h)
         out["threshold"][:] = m.sensitivity.h[filter_bank.SLOW]
@@ -242,7 +243,7 @@ def _watch(k: Constants, m: Memory, out: Any, is_fresh: bool) -> int:
 
 @compiled
 def improve(k: Constants, m: Memory, out: Any, is_touched: bool, mode: int) -> int:
-    """Learn, test or refine by this sample; return what that has come to."""
+    """Learn, test or refine with this sample; return the result as bits of `Observation`."""
     was_free = m.models.recovering_cycles == 0.0
     is_free = belief.is_free(k, m, is_touched)
     if is_touched and was_free and mode & (LEARN | TEST):
@@ -267,7 +268,7 @@ def improve(k: Constants, m: Memory, out: Any, is_touched: bool, mode: int) -> i
 
 @compiled
 def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
-    """Take in the noise of a sample that nothing touches, or throw away what waits to be told from a contact."""
+    """Learn the noise of a sample without contact, or discard the samples that wait to be cleared of contact."""
     if not is_free:
         belief.discard(m)
         margin.discard_tail(m)
@@ -279,13 +280,13 @@ def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
 
 @compiled
 def _test(k: Constants, m: Memory, dq: Vector) -> int:
-    """Take this sample into the test of the frozen model; return what that has come to."""
+    """Add this sample to the test of the frozen model; return the test's result as bits of `Observation`."""
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_test_share, False)
     margin.follow_test(k, m)
     result = termination.test(k, m, dq, m.filters.r[filter_bank.SLOW])
     if result >= 0:
         return CERTIFIED if result > 0 else 0
-    if m.models.is_payload == 0.0:  # of a new one hands have been on the arm, and friction may depend on it
+    if m.models.is_payload == 0.0:  # a new payload: hands have been on the arm, and friction may depend on it
         earlier.keep(k, m)
     is_by_place = missing_torque.is_found(k, m)
     certificate.withhold(m, certificate.BY_PLACE if is_by_place else certificate.NOTHING)
@@ -294,7 +295,7 @@ def _test(k: Constants, m: Memory, dq: Vector) -> int:
 
 @compiled
 def _refine(k: Constants, m: Memory) -> int:
-    """Learn on beside the model in use, and let what was learnt take over after its test; return what is against it."""
+    """Learn on beside the model in use, and replace it after a test; return the bits of evidence against the model."""
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_share, True)
     sensitivity.relax(k, m)
     cause = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
@@ -310,7 +311,7 @@ def _refine(k: Constants, m: Memory) -> int:
 
 @compiled
 def _fill_model(k: Constants, m: Memory, out: Any) -> None:
-    """Fill what the block says of the model and the bank."""
+    """Fill the block's fields of the model and the bank."""
     base, joints = int(k.first_offset), m.filters.y.shape[1]
     for j in range(m.models.theta.shape[0]):
         if j < base:

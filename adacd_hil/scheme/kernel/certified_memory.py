@@ -1,4 +1,4 @@
-"""What the certified scheme's compiled step works on: constants from the settings, memory, and block.
+"""Data of the certified scheme's compiled step: constants from the settings, memory, and block.
 
 Three structured arrays of one element, as in `kernel_samples`; the block is
 `records.certified_layout`. The parameters, in order: the dynamic ones, torque offsets, lags, further friction.
@@ -28,17 +28,20 @@ from adacd_hil.settings.scheme_settings import CROSS_TALK, FRICTION_TERMS
 from adacd_hil.structured import Structured, packed, zeros_of
 
 SETTLED = 3.0
-"""Time constants of the learnt filter for which a moving arm teaches nothing after a gap: the filter begins anew with a
-measured velocity, which lags, and forgets that error only then."""
+"""After a gap a moving arm waits so many time constants of the learnt filter before it learns again: the filter
+restarts with a measured velocity, which lags, and takes this long to forget that error."""
 
 
 def parameter_names(settings: Settings) -> tuple[str, ...]:
-    """Name all parameters of the certified scheme, in order: dynamic ones, offsets, lags, further friction."""
+    """Return the names of all parameters of the certified scheme, in order.
+
+    The dynamic ones, then offsets, lags, further friction.
+    """
     return settings.estimator.parameter_names + settings.further_names
 
 
 def _by_kind(values: tuple[float, ...], names: tuple[str, ...]) -> Vector:
-    """Give each parameter the value of its kind, in the order of `CertifiedSettings`."""
+    """Return, per parameter, the value of its kind; values in the order of `CertifiedSettings`."""
     inertia, viscous, coulomb, gravity, offset, lag, further = values
     prefixes = (("F_v", viscous), ("F_c", coulomb), ("offset", offset), ("lag", lag))
     exact = {"a1": inertia, "a2": inertia, "a3": inertia, "a4": gravity, "a5": gravity}
@@ -47,12 +50,12 @@ def _by_kind(values: tuple[float, ...], names: tuple[str, ...]) -> Vector:
 
 
 def prior_of(settings: Settings) -> Vector:
-    """Return what is expected of an arm of which nothing is known (p,): nothing, but the velocity's usual lag."""
+    """Return the prior mean of an unknown arm (p,): zeros, but for the velocity's usual lag."""
     return _by_kind((0.0, 0.0, 0.0, 0.0, 0.0, settings.certified.lag_s, 0.0), parameter_names(settings))
 
 
 def prior_std_of(settings: Settings) -> Vector:
-    """Return how far an arm of which nothing is known may be from that (p,)."""
+    """Return the prior standard deviation of an unknown arm (p,)."""
     names = parameter_names(settings)
     std = _by_kind(settings.certified.prior_std, names)
     for j, name in enumerate(names):
@@ -66,7 +69,7 @@ def prior_std_of(settings: Settings) -> Vector:
 
 
 def _drift_std_of(settings: Settings) -> Vector:
-    """Return how far each parameter may wander in a second of monitoring (p,); a sensor's cross-talk doesn't."""
+    """Return the standard deviation of each parameter's drift in a second of monitoring (p,); 0 for cross-talk."""
     names = parameter_names(settings)
     std = _by_kind(settings.certified.drift_std, names)
     std[[name.startswith(CROSS_TALK) for name in names]] = 0.0
@@ -74,12 +77,15 @@ def _drift_std_of(settings: Settings) -> Vector:
 
 
 def _first_of(term: str, names: tuple[str, ...]) -> int:
-    """Return the place of the first joint's parameter of a term; behind all where there is none."""
+    """Return the index of the first joint's parameter of a term; the number of names if it is missing."""
     return names.index(f"{term}1") if f"{term}1" in names else len(names)
 
 
 def _enough_std_of(settings: Settings) -> Vector:
-    """Return how well each parameter must be known (p,); an offset no better than the torque by place."""
+    """Return the standard deviation required of each parameter (p,).
+
+    For an offset it is combined with the bound on the torque by place.
+    """
     std = _by_kind(settings.certified.enough_std, parameter_names(settings))
     base = len(settings.estimator.parameter_names)
     offsets = slice(base, base + JOINTS)
@@ -88,7 +94,10 @@ def _enough_std_of(settings: Settings) -> Vector:
 
 
 def _payload_rest_std_of(settings: Settings, count: int) -> Vector:
-    """Return what of a payload's parameters (p,) its mass at the tip doesn't say; of gravity, by the same shift."""
+    """Return the deviation of a payload's parameters (p,) from a mass at the tip.
+
+    Those of gravity follow from the same shift.
+    """
     inertia_std, arm = settings.certified.payload_inertia_std, settings.arm
     std = np.zeros(count)
     std[:3] = inertia_std
@@ -98,7 +107,7 @@ def _payload_rest_std_of(settings: Settings, count: int) -> Vector:
 
 
 def constants_of(settings: Settings) -> Structured:
-    """Put the settings into the form that the compiled step reads."""
+    """Return the settings as the record that the compiled step reads."""
     certified, names = settings.certified, parameter_names(settings)
     period_s = settings.bus.period_s
     cutoff = np.array(certified.cutoffs_rad_s)
@@ -177,7 +186,7 @@ def constants_of(settings: Settings) -> Structured:
 
 
 def sizes_of(settings: Settings) -> dict[str, int]:
-    """Return the sizes that the records of `Memory` name."""
+    """Return the sizes named in the records of `Memory`."""
     learn_s = settings.bus.period_s * settings.certified.learn_every
     count = len(parameter_names(settings))
     return {
@@ -201,7 +210,7 @@ def sizes_of(settings: Settings) -> dict[str, int]:
 
 
 def new_memory(settings: Settings) -> Structured:
-    """Return the memory before the first sample: a gap, and a belief that is the prior."""
+    """Return the memory before the first sample: a gap, and the prior as the belief."""
     memory = zeros_of(Memory, sizes_of(settings))
     k: Constants = constants_of(settings)[0]
     m: Memory = memory[0]
@@ -219,7 +228,7 @@ def new_memory(settings: Settings) -> Structured:
 
 
 def new_block(settings: Settings) -> Structured:
-    """Return a block before the first sample: zeros, and thresholds that nothing exceeds."""
+    """Return a block before the first sample: zeros, and infinite thresholds."""
     base = len(settings.estimator.parameter_names)
     further = len(parameter_names(settings)) - base
     layout = certified_layout(base, further, settings.channel_count)
@@ -230,6 +239,6 @@ def new_block(settings: Settings) -> Structured:
 
 
 def numbers_of(settings: Settings) -> Numbers:
-    """Return what the kernel works on in a run, before the first sample."""
+    """Return the kernel's arrays for one run, before the first sample."""
     block = new_block(settings)
     return Numbers(constants_of(settings), new_memory(settings), block, block.view(np.float64))

@@ -1,13 +1,13 @@
-"""One cycle of the scheme, compiled: the numbers, the paper's beside, the supervisor, and a contact's course.
+"""One cycle of the scheme, compiled: the kernel, the paper's kernel beside it, the supervisor, and a contact's course.
 
-Live calls `certified_cycle` or `paper_cycle` for one sample; a replay calls `run_certified` or `run_paper`, which go
-from one cycle to the next. A cycle returns bits of `Ask`: what Python has to do in it, before its decision is given
-out. That is rare. A state was left, a fit is refused, a model has taken over, the user accepts: these come before the
-contact's course (`BEFORE_CONTACT`), because Python may hold the arm; the cycle is then ended by `end_certified` or
-`end_paper`. A report that is due, a second of monitoring, a push at rest: these come behind.
+Live calls `certified_cycle` or `paper_cycle` for one sample; a replay calls `run_certified` or `run_paper`, which run
+many. A cycle returns bits, `LEFT` to `PUSHED`: tasks for Python before the decision is issued. They are rare. Some come
+before the contact's course (`BEFORE_CONTACT`), because Python may hold the arm: a state was left, a fit is refused, a
+model has been replaced, the user accepts. Then `end_certified` or `end_paper` ends the cycle. The others come after the
+course: a report is due, a second of monitoring is over, the arm is pushed at rest.
 
 Samples and decisions are structured arrays with an element per cycle, `kernel_samples.SAMPLE` and `DECISION`; blocks
-(n, size). Course: constants and memory of what is common to both schemes, one element each.
+are (n, size). Course: constants and memory common to both schemes, one element each.
 """
 
 from typing import Annotated, Any
@@ -28,20 +28,20 @@ from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, WITHHELD
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured, described, zeros_of
 
-# What Python has to do in a cycle, as bits.
+# Tasks for Python in a cycle, as bits.
 LEFT = 1  # a state was left
 REFUSED = 2  # a fit, or the reading at rest, is refused
-TOOK_OVER = 4  # a refined model has taken over
-ACCEPTED = 8  # the user accepts what was refused
+TOOK_OVER = 4  # a refined model has replaced the one in use
+ACCEPTED = 8  # the user accepts the refused fit or reading
 REPORT = 16  # a contact's report is due
-FORGET = 32  # the contact that disturbed an adaptation is reported: what was learnt is to be forgotten
+FORGET = 32  # the contact that disturbed an adaptation is reported: its learnt model is to be forgotten
 SECOND = 64  # a second of monitoring is over
-PUSHED = 128  # something pushes the arm at rest
+PUSHED = 128  # the arm is pushed at rest
 BEFORE_CONTACT = LEFT | REFUSED | TOOK_OVER | ACCEPTED
 
 
 class Decision:
-    """What a cycle comes to. observation: bits of `Observation`."""
+    """The result of a cycle. observation: bits of `Observation`."""
 
     state: Annotated[int, np.uint8]
     previous_state: Annotated[int, np.uint8]
@@ -56,16 +56,16 @@ DECISION = described(Decision, {})
 
 
 class RunConstants:
-    """Constants of all that is common to both schemes."""
+    """Constants common to both schemes."""
 
     supervisor: SupervisorConstants
     contact: CourseConstants
 
 
 class RunMemory:
-    """Memory of all that is common to both schemes.
+    """Memory common to both schemes.
 
-    is_model_valid: the model may be fed forward. is_refusing: there is something that the user may accept.
+    is_model_valid: the model may be fed forward. is_refusing: a refusal is pending that the user may accept.
     """
 
     supervisor: SupervisorMemory
@@ -95,7 +95,7 @@ _PAPER_MODE[[SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED]] = pap
 
 
 def new_course(settings: Settings) -> tuple[Structured, Structured]:
-    """Return constants and memory (1,) before the first cycle; when reports are due, the policy fills in."""
+    """Return constants and memory (1,) before the first cycle; the policy fills in the times of the reports."""
     constants, memory = zeros_of(RunConstants, _SIZES), zeros_of(RunMemory, _SIZES)
     supervisor.fill_constants(settings, constants["supervisor"][0])
     supervisor.begin(memory["supervisor"][0])
@@ -121,9 +121,9 @@ def certified_cycle(
     course_memory: Structured,
     rows: Vector,
 ) -> int:
-    """Take in one cycle of the certified scheme; return bits that ask Python for something, 0 if nothing does.
+    """Run one cycle of the certified scheme; return bits of tasks for Python, or 0.
 
-    place: of the cycle in samples, decisions and blocks. values: the memory of the block (size,). rows: of
+    place: index of the cycle in samples, decisions and blocks. values: memory of the block (size,). rows: those of
     `contact_report.put_row`.
     """
     sample, decision, run = samples[place], decisions[place], course_memory[0]
@@ -157,7 +157,7 @@ def end_certified(
     course_memory: Structured,
     rows: Vector,
 ) -> int:
-    """End a cycle of the certified scheme in the state reached; return what it still asks."""
+    """End a cycle of the certified scheme in the state reached; return bits of further tasks for Python."""
     k, m, out, run = constants[0], memory[0], block[0], course_memory[0]
     decision, contact, state = decisions[place], run.contact, run.supervisor.state
     contact_report.put_row(
@@ -202,7 +202,7 @@ def paper_cycle(
     course_constants: Structured,
     course_memory: Structured,
 ) -> int:
-    """Take in one cycle of the paper's scheme; arguments and result as for `certified_cycle`."""
+    """Run one cycle of the paper's scheme; arguments and result as for `certified_cycle`."""
     sample, decision, run = samples[place], decisions[place], course_memory[0]
     period_s = interval_s(run.interval, sample)
     mode = _PAPER_MODE[run.supervisor.state]
@@ -227,7 +227,7 @@ def end_paper(
     course_constants: Structured,
     course_memory: Structured,
 ) -> int:
-    """End a cycle of the paper's scheme in the state reached; return what it still asks."""
+    """End a cycle of the paper's scheme in the state reached; return bits of further tasks for Python."""
     tau_ext_hat = block[0]["tau_ext_hat"]
     return follow_contact(
         course_constants[0], course_memory[0], samples[place], decisions[place], tau_ext_hat, tau_ext_hat
@@ -236,11 +236,11 @@ def end_paper(
 
 @compiled
 def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, decision: Decision) -> int:
-    """Let the supervisor take in what the numbers say; return what asks Python for something before the contact."""
+    """Run the supervisor on the kernel's findings; return bits of tasks for Python before the contact's course."""
     asked, previous = 0, m.supervisor.state
     if sample.request == Request.ACCEPT:
         asked |= ACCEPTED
-        if m.is_refusing != 0:  # nothing is withheld in this cycle
+        if m.is_refusing != 0:  # this cycle doesn't withhold a certificate
             observation &= ~WITHHELD
     is_reporting = m.contact.is_open != 0
     supervisor.supervise(k.supervisor, m.supervisor, sample, observation, is_reporting, course.goes_on(m.contact))
@@ -258,7 +258,7 @@ def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, deci
 def follow_contact(
     k: RunConstants, m: RunMemory, sample: Sample, decision: Decision, tau_ext_hat: Vector, tau_ext: Vector
 ) -> int:
-    """Take the contact's course on, and fill the decision; return REPORT if one is due."""
+    """Advance the contact's course by one cycle, and fill the decision; return REPORT if a report is due."""
     is_due = course.follow(
         k.contact,
         m.contact,
@@ -280,9 +280,9 @@ def follow_contact(
 def run_certified(
     samples: Structured, decisions: Structured, blocks: Vector, first: int, arrays: tuple[Any, ...]
 ) -> tuple[int, int]:
-    """Run cycles from `first` on up to one that asks Python for something; return its place and what it asks.
+    """Run cycles from `first` until one has a task for Python; return its place and the bits of its tasks.
 
-    arrays: what `certified_cycle` works on, in its order.
+    arrays: arguments of `certified_cycle` from `constants` on, in its order.
     """
     for place in range(first, samples.size):
         asked = certified_cycle(samples, decisions, blocks, place, *arrays)
@@ -295,7 +295,7 @@ def run_certified(
 def run_paper(
     samples: Structured, decisions: Structured, blocks: Vector, first: int, arrays: tuple[Any, ...]
 ) -> tuple[int, int]:
-    """Run cycles of `paper_cycle` as `run_certified` does."""
+    """Run cycles of `paper_cycle` in the way of `run_certified`."""
     for place in range(first, samples.size):
         asked = paper_cycle(samples, decisions, blocks, place, *arrays)
         if asked:

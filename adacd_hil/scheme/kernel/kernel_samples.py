@@ -1,4 +1,4 @@
-"""A sample on its way into either kernel: what is worked on, what the measurement alone says, lost ones before it.
+"""Input of both kernels: their arrays, the checks of a measurement alone, and the samples lost before it.
 
 A kernel works on three structured arrays of one element each, so that fields have names in compiled code and out of it:
 constants from the settings, memory that lasts from one cycle to the next, and the block that is logged. The caller puts
@@ -20,11 +20,11 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured, described, float_fields
 
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.5, 1.5
-"""Of the nominal period: the shortest and the longest interval of two samples that follow each other."""
+"""Shortest and longest interval of two samples that follow each other, over the nominal period."""
 
 
 class Numbers(NamedTuple):
-    """What a kernel works on. values: the same memory as block, as (size,) float64."""
+    """A kernel's arrays. values: the same memory as block, as (size,) float64."""
 
     constants: Structured
     memory: Structured
@@ -36,7 +36,7 @@ SAMPLE = described(Sample, {"n": JOINTS})
 
 
 class Interval:
-    """Whether intervals are measured, and when the last fresh sample was taken, if there was one."""
+    """State of the interval's measurement: whether intervals are measured, and the time of the last fresh sample."""
 
     is_measured: int
     is_known: int
@@ -44,7 +44,7 @@ class Interval:
 
 
 def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
-    """Put a cycle into one element of SAMPLE (1,)."""
+    """Write one cycle into an element of SAMPLE (1,)."""
     age = max(*arm.age_q, *arm.age_tau_J)
     sampled_ns = arm.t_ns if arm.sampled_ns is None else arm.sampled_ns
     counts = arm.cycle, arm.periods, arm.steps, sampled_ns, age, arm.fault, request
@@ -52,7 +52,7 @@ def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
 
 
 def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
-    """Lay out n cycles as SAMPLE (n,)."""
+    """Return n cycles as SAMPLE (n,)."""
     samples = np.zeros(arms.cycle.size, SAMPLE)
     for name in ("cycle", "periods", "steps", "sampled_ns", "fault", "is_complete", "is_enabled", "is_late"):
         samples[name] = getattr(arms, name)
@@ -65,7 +65,7 @@ def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
 
 @compiled
 def interval_s(m: Interval, sample: Sample) -> float:
-    """Return the time since the last fresh sample, s; 0 of the first, of none, and where it isn't measured."""
+    """Return the time since the last fresh sample, s; 0 for the first sample, a missing one, and if not measured."""
     if m.is_measured == 0 or sample.is_complete == 0:
         return 0.0
     period_s = (sample.sampled_ns - m.sampled_ns) * 1e-9 if m.is_known != 0 else 0.0
@@ -75,7 +75,7 @@ def interval_s(m: Interval, sample: Sample) -> float:
 
 @compiled
 def put_sample(block: Structured, sample: Sample, period_s: float) -> None:
-    """Put a sample where the next step of a kernel finds it."""
+    """Write a sample into the block, the input of a kernel's next step."""
     out = block[0]
     for i in range(out["q"].shape[0]):
         out["q"][i] = sample.q[i]
@@ -85,12 +85,12 @@ def put_sample(block: Structured, sample: Sample, period_s: float) -> None:
 
 
 def block_dtype(layout: Layout) -> np.dtype[np.void]:
-    """Describe a block as a structure; its bytes are those of the float64 block."""
+    """Return a block's structured type; its bytes are those of the float64 block."""
     return float_fields({field.name: (field.size,) for field in layout.fields})
 
 
 def limits_of(settings: Settings) -> Limits:
-    """Return the constants with which measurements alone are judged."""
+    """Return the limits for checks of a measurement alone."""
     return Limits(
         position_limit_rad=settings.arm.position_limit_rad,
         velocity_limit_rad_s=settings.arm.velocity_limit_rad_s,
@@ -100,7 +100,7 @@ def limits_of(settings: Settings) -> Limits:
 
 
 class Judging(Protocol):
-    """Constants of either scheme."""
+    """Constants of either scheme that the checks of measurements need."""
 
     @property
     def period_s(self) -> float:
@@ -108,12 +108,12 @@ class Judging(Protocol):
 
     @property
     def limits(self) -> Limits:
-        """By which measurements are judged."""
+        """Limits for checks of measurements."""
 
 
 @compiled
 def observe(k: Judging, out: Any, steps: int, too_fast: int) -> int:
-    """Return what the measurements alone say, and UNSEEN; fill period_s with the nominal one where not measured.
+    """Return the findings of the measurements alone, and UNSEEN; fill period_s with the nominal one if not measured.
 
     steps: periods since the fresh sample before it. too_fast: the bit of a joint beyond its velocity limit.
     """
@@ -137,9 +137,9 @@ def observe(k: Judging, out: Any, steps: int, too_fast: int) -> int:
 
 @compiled
 def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
-    """Tell whether a sample follows the one before it near enough. steps: periods between them, taking period_s.
+    """Return whether a sample is close enough after the one before it. steps: periods between them, over period_s.
 
-    most: missing samples that may be put on the line between them.
+    most: largest number of missing samples that may be interpolated between them.
     """
     if not 1 <= steps <= most + 1:
         return False

@@ -1,18 +1,18 @@
-"""The numbers of one cycle of the paper's scheme in one call: filters, predictions, estimator, evidence, contact.
+"""The computation of one cycle of the paper's scheme: filters, predictions, estimator, evidence, contact.
 
 Constants, memory and block: as in `kernel_samples`; the block is `records.scheme_layout`.
 
-A cycle without a fresh sample leaves filters and estimate as they were. Up to `MOST_FILLED` samples that are missing
-before one are taken to lie on the straight line between their neighbours, so that a lost frame leaves nothing unseen. A
-longer gap, a value that is not a number, or an interval that is not near the nominal one makes a gap from which the
-filters resume as `filter_bank` says. The step says whether they took a sample in.
+A cycle without a fresh sample leaves filters and estimate as they were. Up to `MOST_FILLED` missing samples are
+interpolated on a straight line between their neighbours, so that a lost frame causes no blind time. A longer gap, a
+value that is not a number, or an interval far from the nominal one makes a gap; the filters resume from it as described
+in `filter_bank`. The step returns whether they took a sample in.
 
-The measured interval goes into what integrates: filters, estimator, information, impulse. It does not go into what only
-counts: T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is right to a period. Nor does it into
-`external_torque.undo_filter`: of the mean of five derivatives only the ends count, and the five periods between them.
+The measured interval enters the quantities that integrate: filters, estimator, information, impulse. It does not enter
+the quantities that count. T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is right to a period.
+`external_torque.undo_filter` needs only the ends of the mean of five derivatives, and the five periods between them.
 
-**Beside.** Beside the certified scheme it takes the same samples by the same step (`step_beside`): it adapts until
-eq. (15) holds, then compares with its thresholds. What it comes to is in the block of the scheme in charge.
+**Beside.** Beside the certified scheme it takes the same samples by the same step (`step_beside`): it adapts until eq.
+(15) holds, then compares with its thresholds. Its results are in the block of the scheme in charge.
 """
 
 from dataclasses import dataclass
@@ -47,19 +47,19 @@ from adacd_hil.scheme.supervisor.transitions import (
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Columns, PerJoint, PerParameter, Square, Structured, packed, zeros_of
 
-# What a cycle does, as bits: the estimator learns; thresholds are in force; a collision's report is not final yet.
+# Tasks of a cycle, as bits: the estimator learns; thresholds are in force; a collision's report is not final yet.
 LEARN = 1
 ARMED = 2
 REPORTING = 4
 
 
 MOST_FILLED = 4
-"""Missing samples that are put on the line between their neighbours: with one more the model is blind by default. Over
-5 ms the line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
+"""Largest number of missing samples that are interpolated: with one more the model is blind by default. Over 5 ms the
+line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
 
 
 class PaperMemory:
-    """The memory of the paper's scheme. mode: of a step beside another scheme."""
+    """The memory of the paper's scheme. mode: that of a step beside another scheme."""
 
     has_gap: float
     mode: float
@@ -109,7 +109,7 @@ class PaperConstants:
 
 
 def constants_of(settings: Settings) -> Structured:
-    """Put the settings into the form that the compiled step reads."""
+    """Return the settings as the record that the compiled step reads."""
     count = len(settings.estimator.parameter_names)
     period_s = settings.bus.period_s
     hold = filter_bank.first_order_hold(settings.filter.a_rad_s, settings.filter.b_rad_s, period_s)
@@ -150,14 +150,14 @@ def new_memory(parameter_count: int) -> Structured:
 
 
 def new_block(parameter_count: int) -> Structured:
-    """Return a block before the first sample: zeros, and thresholds that nothing exceeds."""
+    """Return a block before the first sample: zeros, and infinite thresholds."""
     block = np.zeros(1, block_dtype(scheme_layout(parameter_count)))
     block["threshold"] = np.inf
     return block
 
 
 def numbers_of(settings: Settings) -> Numbers:
-    """Return what the kernel works on in a run, before the first sample."""
+    """Return the kernel's arrays for one run, before the first sample."""
     count = len(settings.estimator.parameter_names)
     block = new_block(count)
     return Numbers(constants_of(settings), new_memory(count), block, block.view(np.float64))
@@ -174,7 +174,7 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     m.W_f[:] = 0.0
     out["tau_f"][:] = 0.0
     external_torque.forget(m.wide)
-    m.mode = LEARN  # of a step beside; where it is in charge, the state says it
+    m.mode = LEARN  # used by a step beside; in charge, the mode follows from the state
     estimator.reset_gain(c.P0, m.P)
     termination.begin(m.motion)
     m.quiet_cycles = 0.0
@@ -184,10 +184,9 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
 
 @compiled
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
-    """Take in the block's q, dq, tau_J and fill the rest of it; return bits of `Observation`.
+    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of `Observation`.
 
-    is_complete: 1 if it is a fresh sample. steps: periods since the fresh sample before it. mode: LEARN, ARMED,
-    REPORTING.
+    is_complete: 1 for a fresh sample. steps: periods since the fresh sample before it. mode: LEARN, ARMED, REPORTING.
     """
     c, m, out = constants[0], memory[0], block[0]
     period_s = c.period_s
@@ -213,14 +212,15 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 
 @compiled
 def _filter(c: PaperConstants, m: PaperMemory, out: Any, steps: int) -> tuple[bool, float]:
-    """Take the filters to this sample and estimate the external torque with both models.
+    """Advance the filters to this sample and estimate the external torque with both models.
 
-    Return whether they took it in, and the time that it stands for: the measured interval, after a gap the nominal one.
+    Return whether they took the sample in, and the time that it covers: the measured interval, after a gap the nominal
+    one.
     """
     a, b = c.a_rad_s, c.b_rad_s
     nominal_s: float = c.period_s
     period_s: float = out["period_s"][0]
-    q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays as those of `between`: all is compiled once
+    q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays like those of `between`: all is compiled once
     is_seen = m.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
     if is_seen:
         step_s = period_s / steps
@@ -254,7 +254,7 @@ def _advance(
     hold: filter_bank.FirstOrderHold,
     tau_f: Vector,
 ) -> None:
-    """Take the filters over one period to a sample."""
+    """Advance the filters by one period to a sample."""
     a, b = c.a_rad_s, c.b_rad_s
     regressor.fill_momentum(q, dq, m.Y_p)
     regressor.fill_remainder(q, dq, c.level_rad, m.Y_h)
@@ -275,7 +275,7 @@ def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: A
 
 @compiled
 def _learn(c: PaperConstants, m: PaperMemory, out: Any, period_s: float) -> int:
-    """Judge the estimate of this sample by eq. (15), then correct it; return ADAPTED if the adaptation is over."""
+    """Test the estimate of this sample by eq. (15), then correct it; return ADAPTED if the adaptation is over."""
     if termination.gather(m.motion, out["q"], out["dq"], m.W_f, period_s):
         out["excitation"][0] = termination.eigenvalue_range(m.motion.information, c.scale, m.motion.scratch)[0]
     m.quiet_cycles = m.quiet_cycles + 1.0 if termination.is_quiet(out["tau_ext_hat"], c.beta_Nm) else 0.0
@@ -294,7 +294,7 @@ def _learn(c: PaperConstants, m: PaperMemory, out: Any, period_s: float) -> int:
 
 @compiled
 def _watch(c: PaperConstants, m: PaperMemory, out: Any, period_s: float, is_fresh: bool, is_reporting: bool) -> int:
-    """Compare with the thresholds; return the joints that are over, and that any of it is a collision."""
+    """Compare with the thresholds; return the joints over their threshold, and COLLISION if one is a collision."""
     F_c = out["theta_hat"][regressor.F_C1 : regressor.F_C2 + 1]
     external_torque.fill_threshold(c.threshold_Nm, m.standstill, F_c, out["threshold"])
     if is_fresh:
@@ -315,7 +315,7 @@ def _watch(c: PaperConstants, m: PaperMemory, out: Any, period_s: float, is_fres
 def step_beside(
     constants: Structured, memory: Structured, block: Structured, sample: Sample, period_s: float, main: Any
 ) -> None:
-    """Take a sample in beside the scheme in charge, and fill that one's block with what it comes to.
+    """Process a sample beside the scheme in charge, and write the results into that scheme's block.
 
     main: the block of the scheme in charge. It learns from `begin_adaptation` until eq. (15) holds, then it is armed.
     """

@@ -8,7 +8,7 @@ Split as the filter needs it, without acceleration:
 
 (C' dq)_i = 1/2 dq' (dM/dq_i) dq is the derivative of the kinetic energy T by q_i. With spatial vectors (angular part
 first), each in the frame of its link, v_k the velocity of link k, s_i the axis of joint i, I_k the inertia of link k
-and X_ki what carries a motion from the frame of link i to that of link k >= i:
+and X_ki the transform of a motion from the frame of link i to that of link k >= i:
 
     T = 1/2 sum_k v_k' I_k v_k,    dv_k/d(dq_i) = X_ki s_i,    dv_k/dq_i = X_ki (v_i x s_i)
 
@@ -20,10 +20,10 @@ so every entry is one bilinear form u' I_k x, which is linear in the ten paramet
 algebra: Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 2 and 5. The planar arm of
 `adacd_hil.scheme.model.regressor` is the case n = 2.
 
-**Parameters.** Of each link, about the origin of its joint and in the axes of its frame, in the order of
-`LINK_PARAMETERS`: mass, first moment, inertia; together theta_full (10 n,). Not all of them can be seen in the torque:
-`find_base` picks a smallest set of columns that spans what the others do and gives the map theta_base = B theta_full.
-A regressor for the filter has the chosen columns first, then F_v and F_c of each joint, then whatever the caller adds.
+**Parameters.** For each link, about the origin of its joint and in the axes of its frame, in the order of
+`LINK_PARAMETERS`: mass, first moment, inertia; together theta_full (10 n,). The torque doesn't show all of them:
+`find_base` picks a smallest set of columns that spans the others and gives the map theta_base = B theta_full. A
+regressor for the filter has the chosen columns first, then F_v and F_c of each joint, then those that the caller adds.
 
 `Chain` and `Scratch` are tuples of arrays, not structured arrays: their type does not hold n, so that one compilation
 serves every arm.
@@ -46,15 +46,16 @@ from adacd_hil.records import Vector
 Indices = NDArray[np.int64]
 
 LINK_PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-"""Of one link, in Pinocchio's order: kg, kg m, kg m²; the inertia is about the origin of the link's frame."""
+"""Parameters of one link, in Pinocchio's order: kg, kg m, kg m²; the inertia is about the origin of the link's
+frame."""
 
 PER_LINK = len(LINK_PARAMETERS)
 
 NOT_USED = -1
-"""In `place`: this parameter has no column."""
+"""Value in `place` of a parameter without a column."""
 
 _BASE_STATES_PER_PARAMETER = 4
-_RANK_TOLERANCE = 1e-9  # of the largest: what a dependent column leaves is rounding, 1e-15; a real one is over 1e-6
+_RANK_TOLERANCE = 1e-9  # of the largest: rounding leaves 1e-15 of a dependent column; a real one is over 1e-6
 
 
 class Chain(NamedTuple):
@@ -68,7 +69,7 @@ class Chain(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Room for one evaluation; nothing in it lasts."""
+    """Scratch arrays for one evaluation; the next one overwrites them."""
 
     E: Vector  # (n, 3, 3), from the frame of the link before to the link's
     r: Vector  # (n, 3), the link's origin in the frame of the link before, m
@@ -81,7 +82,7 @@ class Scratch(NamedTuple):
 
 
 def new_scratch(chain: Chain) -> Scratch:
-    """Return room for one evaluation of an arm."""
+    """Return scratch arrays for one evaluation of an arm."""
     n = chain.axis.shape[0]
     shapes = ((n, 3, 3), (n, 3), (n, 6), (n, 6), (6,), (6,), (6,), (PER_LINK,))
     return Scratch(*(np.zeros(shape) for shape in shapes))
@@ -295,7 +296,7 @@ def point_mass(mass_kg: float, at_m: Sequence[float] | Vector) -> Vector:
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """A smallest set of parameters that tells the torque of an arm: theta_base = map @ theta_full."""
+    """A smallest set of parameters that determines the torque of an arm: theta_base = map @ theta_full."""
 
     columns: Indices  # (n_base,), the chosen columns of theta_full, ascending
     place: Indices  # (10 n,), the column of each parameter of theta_full in the base, or NOT_USED

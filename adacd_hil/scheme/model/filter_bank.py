@@ -1,9 +1,8 @@
 """The torque filter F(s) = b / (s + a) of eq. (16), exact for inputs that are straight lines between samples; its bank.
 
-One discretisation serves the measured torque and every term of the regressor: what the filter does to the one it does
-to the other, so that the residual sees only what the model lacks. A zero-order hold on the velocity terms costs 14 mNm
-at a = 10 rad/s; the straight line costs less than 1 mNm. Over one period T with x' = -a x + b u and u going straight
-from u_old to u_new:
+One discretisation serves the measured torque and each term of the regressor: the filter acts on both alike, so that the
+residual contains only the model's error. A zero-order hold on the velocity terms costs 14 mNm at a = 10 rad/s; the
+straight line costs less than 1 mNm. Over one period T with x' = -a x + b u and u going straight from u_old to u_new:
 
     x_new = E x_old + w_old u_old + w_new u_new,    E = exp(-a T)
     w_new = (b / a) (1 - (1 - E) / (a T)),          w_old = (b / a) (1 - E) - w_new
@@ -14,9 +13,9 @@ Filtered regressor, from the paper's eq. (5) with M dq = Y_p theta, and -C' dq +
 
 S(0) is the term -f(t) M(q(0)) dq(0) of eq. (5): L[Y_p] starts at (b / a) Y_p(0).
 
-**After a gap** (start-up, start of an adaptation, an overrun, a lost frame) nothing is known of the time between two
-samples. tau_f = W_f theta + tau_ef holds for convolutions over any set of times, as it does for the equation of motion
-at each of them, so the gap is cut out of time: tau_f and W_f go on with the values they had, and S is set to
+**After a gap** (start-up, start of an adaptation, an overrun, a lost frame) the motion between two samples is unknown.
+tau_f = W_f theta + tau_ef holds for convolutions over any set of times, as it does for the equation of motion at each
+of them, so the gap is cut out of time: tau_f and W_f go on with the values they had, and S is set to
 
     S = W_f - b Y_p(now).
 
@@ -42,9 +41,9 @@ differentiation: F s tau_J = a (tau_J - tau_f).
 
 A filter's output is smoothed to make its channel. The faster ones have a second channel that isn't, the bare one.
 
-What is learnt from is smoothed as well, regressor and torque alike. Least squares take noise in a regressor for motion
-that made no torque, and find the less inertia the more there is of it: with encoders of 18 bits 3 to 7 % less from the
-bare filter of 50 rad/s, less than 0.2 % from the smoothed one (profile P, nine minutes of motion, 2026-11).
+The learnt signals are smoothed as well, regressor and torque alike. Least squares take noise in a regressor for motion
+without torque, and find less inertia the more noise there is: with encoders of 18 bits 3 to 7 % less from the bare
+filter of 50 rad/s, less than 0.2 % from the smoothed one (profile P, nine minutes of motion, 2026-11).
 
 Shapes: C filters, 2 C - 1 channels, n joints, p columns. cutoff, decay, weight_old, weight_new (C,); Y_p, Y_h (n, p);
 tau_f (C, n); S, W_f, input_old (C, n, p); W_learnt (n, p), tau_learnt (n,). Units: rad/s, Nm.
@@ -61,7 +60,7 @@ from adacd_hil.settings.configuration import Settings
 
 
 class FirstOrderHold(NamedTuple):
-    """What one period does to a filter state: x_new = decay x_old + weight_old u_old + weight_new u_new."""
+    """Coefficients of a filter for one period: x_new = decay x_old + weight_old u_old + weight_new u_new."""
 
     decay: float
     weight_old: float
@@ -70,7 +69,7 @@ class FirstOrderHold(NamedTuple):
 
 @compiled
 def first_order_hold(a_rad_s: float, b_rad_s: float, period_s: float) -> FirstOrderHold:
-    """Discretise b / (s + a) for inputs that are straight lines over one period."""
+    """Return the discretisation of b / (s + a) for inputs that are straight lines over one period."""
     missing = -math.expm1(-a_rad_s * period_s)  # 1 - E without cancellation
     dc_gain = b_rad_s / a_rad_s
     weight_new = dc_gain * (1.0 - missing / (a_rad_s * period_s))
@@ -79,7 +78,7 @@ def first_order_hold(a_rad_s: float, b_rad_s: float, period_s: float) -> FirstOr
 
 @compiled
 def advance_torque(hold: FirstOrderHold, tau_old: Vector, tau_new: Vector, tau_f: Vector) -> None:
-    """Take tau_f (2,) over one period in place; tau_new becomes tau_old."""
+    """Advance tau_f (2,) over one period in place; tau_new becomes tau_old."""
     for i in range(tau_f.shape[0]):
         tau_f[i] = hold.decay * tau_f[i] + (hold.weight_old * tau_old[i] + hold.weight_new * tau_new[i])
         tau_old[i] = tau_new[i]
@@ -89,7 +88,7 @@ def advance_torque(hold: FirstOrderHold, tau_old: Vector, tau_new: Vector, tau_f
 def advance_regressor(
     hold: FirstOrderHold, a: float, b: float, Y_p: Vector, Y_h: Vector, input_old: Vector, S: Vector, W_f: Vector
 ) -> None:
-    """Take S and W_f (2, p) over one period in place; input_old (2, p) becomes Y_h - a Y_p of this sample.
+    """Advance S and W_f (2, p) over one period in place; input_old (2, p) becomes Y_h - a Y_p of this sample.
 
     a, b: of F(s), rad/s.
     """
@@ -122,12 +121,13 @@ def resume(
 
 
 SLOW = 0
-"""Filter by which a model is tested and reported: the slow one, whose noise is least."""
+"""Index of the filter for a model's test and report: the slow one, with the least noise."""
 LEARNT = 1
-"""Filter that is learnt from: faster than that, so its samples are soon independent, and reversals show."""
+"""Index of the filter for learning: faster than the slow one, so its samples are soon independent, and reversals
+show."""
 WIDE = 1
-"""Filter whose output, with the filter undone, is the external torque of contact reports: undoing a faster one would
-bring back the noise that it let through."""
+"""Index of the filter that is undone for the external torque of contact reports: undoing a faster one would bring back
+the noise that it let through."""
 
 
 VELOCITY_STD_SHARE = 0.12
@@ -142,13 +142,13 @@ def filter_of(channel: int, filters: int) -> int:
 
 
 def channels_of(settings: Settings) -> tuple[tuple[float, float | None], ...]:
-    """List cut-off and smoothing, rad/s, of the channels, in their order; smoothing None of a bare one."""
+    """Return cut-off and smoothing, rad/s, of the channels, in their order; smoothing None for a bare one."""
     cutoffs, smoothing = settings.certified.cutoffs_rad_s, settings.certified.smoothing_rad_s
     return (*((cutoff, smoothing) for cutoff in cutoffs), *((cutoff, None) for cutoff in cutoffs[1:]))
 
 
 def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> float:
-    """Return what a low-pass, or two in a row, shows of a step of 1: 1 - (b e^(-a t) - a e^(-b t)) / (b - a)."""
+    """Return the response to a step of 1 of a low-pass, or of two in a row: 1 - (b e^(-a t) - a e^(-b t)) / (b - a)."""
     if b_rad_s is None:
         return 1.0 - math.exp(-a_rad_s * after_s)
     a, b = a_rad_s, b_rad_s if b_rad_s != a_rad_s else b_rad_s * (1.0 + 1e-6)
@@ -157,7 +157,7 @@ def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> floa
 
 @compiled
 def forget(m: Memory) -> None:
-    """Forget the torque and the motion that were filtered."""
+    """Forget the filtered torque and motion."""
     m.filters.W_f[:] = 0.0
     m.filters.tau_f[:] = 0.0
     m.filters.W_learnt[:] = 0.0
@@ -166,7 +166,7 @@ def forget(m: Memory) -> None:
 
 @compiled
 def rest(m: Memory) -> None:
-    """Begin with filters that have seen this pose, and the torque that gravity makes there, for ever.
+    """Begin with filters that have always been in this pose, with gravity's torque there.
 
     From 0, that torque would be a step: the columns of the lag would have its derivative.
     """
@@ -177,7 +177,7 @@ def rest(m: Memory) -> None:
 
 @compiled
 def choose_rates(k: Constants, m: Memory, period_s: float) -> None:
-    """Fill what one period does to each filter."""
+    """Fill each filter's coefficients for one period."""
     decay, old, new = m.filters.rates[0], m.filters.rates[1], m.filters.rates[2]
     if period_s == k.period_s:
         decay[:] = k.decay
@@ -189,16 +189,16 @@ def choose_rates(k: Constants, m: Memory, period_s: float) -> None:
 
 @compiled
 def discretise(cutoff_rad_s: Vector, period_s: float, decay: Vector, weight_old: Vector, weight_new: Vector) -> None:
-    """Fill what one period does to each filter (C,)."""
+    """Fill the coefficients of each filter (C,) for one period."""
     for c in range(cutoff_rad_s.shape[0]):
         decay[c], weight_old[c], weight_new[c] = first_order_hold(cutoff_rad_s[c], cutoff_rad_s[c], period_s)
 
 
 @compiled
 def take_sample(k: Constants, m: Memory, tau_J: Vector, is_seen: bool) -> None:
-    """Take all filters over one period to a sample, Y_p, Y_h of `m` and tau_J (n,); after a gap they resume from it.
+    """Advance all filters over one period to a sample, Y_p, Y_h of `m` and tau_J (n,); after a gap they resume from it.
 
-    `rates` (3, C) of `m`: what the period does to each filter, see `FirstOrderHold`.
+    `rates` (3, C) of `m`: the filters' coefficients for the period, see `FirstOrderHold`.
     """
     rates = m.filters.rates
     for c in range(k.cutoff.shape[0]):
@@ -229,8 +229,7 @@ def fill_lag(cutoff_rad_s: Vector, tau_J: Vector, tau_f: Vector, first_column: i
 def fill_cross_talk(tau_f: Vector, first_column: int, W_f: Vector) -> None:
     """Fill the columns of cross-talk, one per joint from `first_column` on: the other joint's filtered torque.
 
-    Of two joints. What another joint's sensor shows too much or too little is in that torque as well, but to a share of
-    a share.
+    For two joints. The other joint's torque is itself distorted by cross-talk, but that error is of second order.
     """
     for c in range(W_f.shape[0]):
         W_f[c, 0, first_column] = tau_f[c, 1]
@@ -239,7 +238,7 @@ def fill_cross_talk(tau_f: Vector, first_column: int, W_f: Vector) -> None:
 
 @compiled
 def smooth_learnt(smoothing: float, W_f: Vector, tau_f: Vector, W_learnt: Vector, tau_learnt: Vector) -> None:
-    """Take what is learnt from, W_learnt (n, p) and tau_learnt (n,), over one period behind the filter `LEARNT`."""
+    """Advance the learnt signals, W_learnt (n, p) and tau_learnt (n,), over one period behind the filter `LEARNT`."""
     for i in range(tau_learnt.shape[0]):
         tau_learnt[i] = tau_f[LEARNT, i] + smoothing * (tau_learnt[i] - tau_f[LEARNT, i])
         for j in range(W_learnt.shape[1]):
@@ -256,11 +255,11 @@ def estimate_external(tau_f: Vector, W_f: Vector, theta: Vector, tau_ext_hat: Ve
 
 @compiled
 def smooth(smoothing: float, r: Vector, y: Vector) -> None:
-    """Take the channels y (2 C - 1, n) over one period: r (C, n) through a second low-pass, then all but r[0] as is.
+    """Advance the channels y (2 C - 1, n) by one period: r (C, n) through a second low-pass, then all but r[0] as is.
 
     The drive's velocity noise rises with frequency up to the bandwidth of its tracking loop. A first-order filter
     passes it on through the momentum undiminished; a second pole takes it away, for a few milliseconds of a small
-    step's detection. What is large enough is found in the bare residual first.
+    step's detection. A large step is detected in the bare residual first.
     """
     count = r.shape[0]
     for c in range(count):

@@ -13,18 +13,18 @@ Split as the filter needs it, without acceleration:
 
 Shapes: q, dq, ddq, tau (2,); theta (p,); W, Y_p, Y_h (2, p); M (2, 2). Units: rad, rad/s, rad/s², Nm.
 
-**Further friction.** Optional friction terms, linear in their parameters: what viscous and Coulomb friction leave out.
+**Further friction.** Optional friction terms, linear in their parameters, beside viscous and Coulomb friction.
 
     stribeck     sgn(dq) exp(-(dq / v_s)²)      static friction that falls off with speed, Nm
     load         sgn(dq) |tau_J|                friction in proportion to the transmitted torque, Nm/Nm
     asymmetric   |sgn(dq)|                      half the difference of the two directions' Coulomb friction, Nm
     width        -x / cosh²(x), x = dq / w      a width of tanh that is not w, to first order: F_c log(width / w), Nm
-    dahl_short   z - sgn(dq)                    what Coulomb friction lacks after a reversal, until bristles of a length
+    dahl_short   z - sgn(dq)                    deficit of Coulomb friction after a reversal, until bristles of a length
     dahl_long                                   d have bent the other way: z' = dq (1 - z sgn(dq)) / d, Nm
 
 sgn stands for tanh(dq / w), or with w = 0 for the sign itself, 0 of a joint that may stand still (no `width` then).
 One parameter per joint and term, in the order of the settings. While a joint moves its asymmetry looks like an offset
-of its torque sensor; only rest tells the two apart.
+of its torque sensor; only rest separates the two.
 
 Bristles don't bend while a joint may stand still. Two lengths together stand for those between them.
 
@@ -131,21 +131,21 @@ def mass_matrix(q: Vector, theta: Vector) -> Vector:
 
 @compiled
 def is_positive_definite(theta: Vector) -> bool:
-    """Tell whether M(q) is positive definite at every q: a3 > 0 and a3 (a1 - a3) > a2²; NaN is not."""
+    """Return whether M(q) is positive definite at every q: a3 > 0 and a3 (a1 - a3) > a2²; False for NaN."""
     return bool(theta[A3] > 0.0 and theta[A3] * (theta[A1] - theta[A3]) > theta[A2] ** 2)
 
 
 STRIBECK, LOAD, ASYMMETRIC, WIDTH, DAHL_SHORT, DAHL_LONG = range(len(FRICTION_TERMS))
 
 SLOW_RAD_S = 0.02
-"""Speed below which noise decides what friction is expected."""
+"""Speed below which noise dominates the expected friction."""
 SHARES = {"load": 0.25, "dahl": 0.5}
-"""Of the prior of further friction, by how a term's name begins; of the others all of it."""
+"""Share of the prior of further friction, by the first part of a term's name; 1 for the others."""
 
 
 @compiled
 def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
-    """Return tanh(dq / width); where the width is 0 the sign of dq, and 0 of what may stand still."""
+    """Return tanh(dq / width); for a width of 0 the sign of dq, or 0 for a joint that may stand still."""
     if width_rad_s > 0.0:
         return float(math.tanh(dq / width_rad_s))
     return float(np.sign(dq)) if abs(dq) >= still_rad_s else 0.0
@@ -153,7 +153,7 @@ def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
 
 @compiled
 def bend_bristles(dq: Vector, period_s: float, still_rad_s: float, dahl_rad: Vector, bent: Vector) -> None:
-    """Take the bristles of each length (2,) over one period: `bent` (2, n) from -1 to 1, where they slide."""
+    """Advance the bristles of each length (2,) by one period: `bent` (2, n) from -1 to 1, where they slide."""
     for length in range(bent.shape[0]):
         for i in range(dq.shape[0]):
             if abs(dq[i]) >= still_rad_s:
@@ -237,7 +237,10 @@ def fill(k: Constants, m: Memory, q: Vector, dq: Vector, tau_J: Vector, period_s
 
 
 def payload_direction(link_length_m: tuple[float, float], count: int, gravity_m_s2: float) -> Vector:
-    """Return what 1 kg at the tip of a 2R arm adds to its parameters (count,); gravity_m_s2: in the plane, 0: none."""
+    """Return the contribution of 1 kg at the tip of a 2R arm to its parameters (count,).
+
+    gravity_m_s2: in the plane, 0 without gravity there.
+    """
     l1, l2 = link_length_m
     direction = np.zeros(count)
     direction[:3] = l1**2 + l2**2, l1 * l2, l2**2

@@ -4,9 +4,10 @@ Read are link, inertial, joint, origin, parent, child, axis, limit, dynamics; th
 over. Links on fixed joints become part of the link that carries them, whose frame is the URDF's frame of that link.
 Angles are rad, rpy as in the URDF: R = Rz(yaw) Ry(pitch) Rx(roll). Source: http://wiki.ros.org/urdf/XML.
 
-The arm must be one chain of moving joints. A joint that is no part of it, as a finger of a gripper, is named in
-`locked`: it counts as fixed at its zero. Only what the arm needs is judged: of a fixed or locked joint its place, of a
-link its inertia where `theta_full` is asked for and the link moves. A limit of 0, as exporters write it, says nothing.
+The arm must be one chain of moving joints. A joint outside the chain, such as a finger of a gripper, is named in
+`locked`: it counts as fixed at its zero. Only the data that the arm needs are checked: the place of a fixed or locked
+joint, and the inertia of a link that moves, if `theta_full` needs it. A limit of 0, as exporters write it, means
+unlimited.
 """
 
 import math
@@ -24,9 +25,9 @@ from adacd_hil.scheme.model.chain import PER_LINK, Chain
 MOVING = ("revolute", "continuous", "prismatic")
 STANDARD_GRAVITY_M_S2 = (0.0, 0.0, -GRAVITY_M_S2)
 LARGEST = 1e18
-"""Of any number, in its unit: products of lengths, masses and speeds stay finite."""
+"""Largest number, in its unit: products of lengths, masses and speeds stay finite."""
 BASE = -1
-"""Index of what does not move."""
+"""Index of links that do not move."""
 
 
 class UrdfError(ValueError):
@@ -34,19 +35,19 @@ class UrdfError(ValueError):
 
 
 class FramePose(NamedTuple):
-    """Where a frame is in another."""
+    """Pose of a frame in another."""
 
     rotation: Vector  # (3, 3)
     translation: Vector  # (3,), m
 
     def then(self, other: "FramePose") -> "FramePose":
-        """Return where a frame is that `other` places in this one."""
+        """Return `other`, a pose in this frame, as a pose in this frame's parent."""
         return FramePose(self.rotation @ other.rotation, self.translation + self.rotation @ other.translation)
 
 
 @dataclass(frozen=True)
 class SerialArm:
-    """An arm as its URDF tells it; n moving joints, from the base outward."""
+    """An arm as described by its URDF; n moving joints, from the base outward."""
 
     name: str
     chain: Chain
@@ -55,11 +56,11 @@ class SerialArm:
     places: dict[
         str, tuple[int, FramePose]
     ]  # of every link: the index of the joint that carries it, or BASE, and where
-    position_low: Vector  # (n,), rad or m; -inf where there is no limit, as of every continuous joint
+    position_low: Vector  # (n,), rad or m; -inf without a limit, as for each continuous joint
     position_high: Vector  # (n,)
     velocity_limit: Vector  # (n,), rad/s or m/s
     torque_limit: Vector  # (n,), Nm or N
-    damping: Vector  # (n,), Nm s/rad or N s/m; 0 where <dynamics> says nothing
+    damping: Vector  # (n,), Nm s/rad or N s/m; 0 without <dynamics>
     friction: Vector  # (n,), Nm or N
     links: dict[str, Element]  # as the URDF has them
 
@@ -125,7 +126,7 @@ def _held(joints: dict[str, Element], locked: Collection[str]) -> set[str]:
 def _assemble(
     name: str, links: dict[str, Element], joints: list[_Joint], gravity_m_s2: tuple[float, float, float]
 ) -> SerialArm:
-    """Walk from the root outward and merge what is fixed."""
+    """Walk from the root outward and merge the links that are fixed to each other; return the arm."""
     children: dict[str, list[_Joint]] = {link: [] for link in (*links, *(joint.parent for joint in joints))}
     carried: set[str] = set()
     for joint in joints:
@@ -232,7 +233,7 @@ def _six(matrix: Vector) -> Vector:
 
 
 def _read_inertial(link: Element, name: str) -> Vector:
-    """Return the parameters (10,) of a link in its own frame; a link without <inertial> has none."""
+    """Return the parameters (10,) of a link in its own frame; zeros for a link without <inertial>."""
     where = f'link "{name}"'
     inertial = _only(link, "inertial", where)
     if inertial is None:
@@ -251,7 +252,7 @@ def _read_inertial(link: Element, name: str) -> Vector:
 
 
 def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bool) -> _Joint:
-    """Read one joint, of one that is fixed or locked only where it is."""
+    """Read one joint; for a fixed or locked one only its place."""
     where = f'joint "{name}"'
     kind = "fixed" if is_locked else joint.get("type", "")
     if kind != "fixed" and kind not in MOVING:
@@ -296,7 +297,7 @@ def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bo
 
 
 def _read_origin(element: Element, where: str) -> FramePose:
-    """Read <origin>, the identity if there is none."""
+    """Read <origin>; return the identity if it is missing."""
     origin = _only(element, "origin", where)
     if origin is None:
         return FramePose(np.eye(3), np.zeros(3))
@@ -358,7 +359,7 @@ def _numbers(element: Element, key: str, where: str, default: float | None = Non
 
 
 def _parse(word: str, where: str) -> float:
-    """Turn a word into a finite number that can be reckoned with."""
+    """Return a word as a finite number within the allowed size."""
     try:
         value = float(word)
     except ValueError:

@@ -1,4 +1,4 @@
-"""What the certified scheme says of its certificates, and what the user says to that."""
+"""Messages about the certified scheme's certificates, and the user's replies to them."""
 
 from enum import Enum, unique
 from typing import NamedTuple
@@ -14,11 +14,11 @@ from adacd_hil.scheme.model.regressor import A5
 from adacd_hil.structured import Structured
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
-"""A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
+"""A drag or a mass held from before the first motion is learnt as these: one run alone cannot separate them."""
 BY_WORD = "friction and inertia: by this run and the user's word, against "
 BY_FITS_THAT_AGREE = "friction and inertia: by fits of this run that agree, other than it had learnt before a touch"
 SAID_EACH = 5
-"""A cause that goes on is said of each so many refused fits, some 7 s."""
+"""A lasting cause is reported once in so many refused fits, about each 7 s."""
 _THE_RUN = "what the run had learnt before"
 _TAKEN_BACK = "the certificate that was taken back"
 _CHANGED = (
@@ -32,7 +32,7 @@ _POSITION_REMEDY = "if it is the arm's, `arm.position_torque_Nm` lets the model 
 
 @unique
 class _Cause(Enum):
-    """What contradicts what: the name of its event, what follows, and what the user can do."""
+    """Contradictions: the name of the event, the consequence, and the user's remedy."""
 
     READING = "anchor", "the drives stay off", "`accept` does without the tare"
     ANCHOR = "anchor", _BEGINS_ANEW, "`accept` takes it for the sensor's zero"
@@ -56,7 +56,7 @@ _CAUSES = {
 
 
 class _Refusal(NamedTuple):
-    """What was refused, in words; torques (n,) that were judged, their standard deviations. times: in a row."""
+    """A refusal: its text; torques (n,) that were judged, their standard deviations. times: refusals in a row."""
 
     cause: _Cause
     torque_Nm: Vector
@@ -66,7 +66,7 @@ class _Refusal(NamedTuple):
 
 
 class _Certified(NamedTuple):
-    """The model when it was certified (p,), its covariance (p, p), whether with a payload, and what was said."""
+    """The certified model (p,), its covariance (p, p), whether it has a payload, and the text of the certificate."""
 
     theta: Vector
     P: Vector
@@ -75,7 +75,7 @@ class _Certified(NamedTuple):
 
 
 class CertificateWatch:
-    """Says what the kernel has found, and hands it what the user accepts. last_utc: the last certificate's date."""
+    """Reports the kernel's findings, and passes on the user's acceptance. last_utc: the last certificate's date."""
 
     def __init__(self, constants: Structured, memory: Structured, last_utc: str) -> None:
         self._constants, self._memory = constants[0], memory[0]
@@ -88,16 +88,16 @@ class CertificateWatch:
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """All that were not taken back, in order."""
+        """All certificates that were not taken back, in order."""
         return tuple(certificate.certificate_of(self._constants, *certified) for certified in self._certified)
 
     @property
     def is_refusing(self) -> bool:
-        """Whether something has been refused since the last certificate, the user's last word or the enabling."""
+        """Whether a refusal has followed the last certificate, the user's last reply and the enabling."""
         return self._refusal is not None
 
     def enter(self, previous: SchemeState, state: SchemeState) -> Event | None:
-        """Take in a new state; return what a certificate says."""
+        """Process a new state; return the event of a new certificate, or None."""
         if state is SchemeState.ENABLE:
             self._refusal = None
         if state is not SchemeState.MONITOR or previous is not SchemeState.CERTIFY:
@@ -113,7 +113,7 @@ class CertificateWatch:
         return BriefedEvent.of(Event(level, "certificate", text), self._certified_in_brief(known_by))
 
     def _certified_in_brief(self, known_by: str) -> str:
-        """Say what a certificate lets expect, and for what it can't vouch."""
+        """Return the text of a certificate's promises and of its limits."""
         told = [margin.describe_push(self._memory)]
         joints = " and ".join(f"joint {i + 1}" for i in anchor.open_joints(self._constants, self._memory))
         if joints:
@@ -129,7 +129,10 @@ class CertificateWatch:
         return f"friction and inertia: within what {self._last} allows" if is_compared else THIS_RUN_ONLY
 
     def refuse(self, is_reading: bool) -> Event | None:
-        """Take in, before its traces are gone, that the reading at rest or a fit is refused; return what is said."""
+        """Record, before its traces are gone, that the reading at rest or a fit is refused.
+
+        Return the event to report.
+        """
         before = self._refusal
         cause = _Cause.READING if is_reading else _CAUSES[int(self._memory.certificate.withheld_by)]
         offsets = slice(int(self._constants.first_offset), int(self._constants.first_offset) + JOINTS)
@@ -148,13 +151,13 @@ class CertificateWatch:
         return Event("warning", name, "; ".join((*self._refusal.lines, *again, what, remedy)))
 
     def doubt(self, verdict: CommonCause) -> Event:
-        """Say that contacts have taken the certificate back, and why."""
+        """Return the event that contacts have taken the certificate back, with the reason."""
         self._take_back()
         remedy = "`changed` learns it" if verdict.is_payload else "`relearn` learns the arm anew"
         return Event("warning", "revoked", f"{verdict.text}: the certificate is taken back, {remedy}")
 
     def revoke(self) -> Event:
-        """Take in, before what was kept is forgotten, that the user takes the certificate back."""
+        """Record, before the kept evidence is forgotten, that the user takes the certificate back; return the event."""
         if earlier.is_keeping(self._memory):
             self._vouched_against = _THE_RUN
         self._take_back()
@@ -167,7 +170,7 @@ class CertificateWatch:
         self._is_standing = False
 
     def push(self, torque_Nm: Vector) -> Event:
-        """Say that the arm, stopped, is still pushed. torque_Nm (n,): external, filtered."""
+        """Return the event that the stopped arm is still pushed. torque_Nm (n,): external, filtered."""
         torque = ", ".join(f"{value:.2f}" for value in torque_Nm)
         remedy = "if nobody touches it the model is wrong, and `relearn` learns it anew"
         text = f"something still pushes the arm at rest, {torque} Nm by joint: {remedy}"
@@ -179,7 +182,7 @@ class CertificateWatch:
         return BriefedEvent.of(Event("warning", "touch", text), brief)
 
     def contradiction(self) -> CommonCause:
-        """Return what contradicts the certificate while the arm monitors: offset, torque by place, too little sight."""
+        """Return the contradiction of the certificate while the arm monitors: offset, torque by place, blindness."""
         cause = _CAUSES[int(self._memory.certificate.withheld_by)]
         return CommonCause("; ".join(self._describe(cause)), is_payload=False)
 
@@ -205,7 +208,7 @@ class CertificateWatch:
         return lines
 
     def accept(self) -> Event:
-        """Believe what was refused last, because the user says so; return what there is to say of that."""
+        """Accept the last refused fit or reading at the user's request; return the event to report."""
         refusal, self._refusal = self._refusal, None
         if refusal is None:
             return Event("warning", "anchor", "nothing to accept: no certificate is withheld")
@@ -228,7 +231,7 @@ class CertificateWatch:
         return Event("warning", refusal.cause.value[0], what)
 
     def describe(self) -> list[str]:
-        """Say what is refused, a line each; empty while nothing is."""
+        """Return the present refusal, a line per cause; empty without a refusal."""
         if self._refusal is None:
             return []
         is_reading = self._refusal.cause is _Cause.READING

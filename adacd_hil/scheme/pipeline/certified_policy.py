@@ -1,7 +1,7 @@
-"""What only the certified scheme does: it learns with a certificate, watches it, and takes it back.
+"""Tasks of the certified scheme alone: it learns with a certificate, watches it, and takes it back.
 
-The paper's scheme runs beside on the same stream: it adapts when this one does, ends by eq. (15), and its would-be
-alarms are in the block; it decides nothing.
+The paper's scheme runs beside on the same stream and makes no decision: it adapts with this one and ends by eq. (15);
+its would-be alarms are in the block.
 """
 
 import numpy as np
@@ -34,11 +34,11 @@ from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, SchemeEvent
 from adacd_hil.settings.configuration import Settings
 
 FORGOTTEN_S = 1.0
-"""An arm at rest is asked so long after a stop whether something pushes it: the slowest filter has forgotten 40 Nm."""
+"""Time from a stop to the check whether the arm at rest is pushed: the slowest filter has forgotten 40 Nm by then."""
 
 
 class CertifiedPolicy(SchemePolicy):
-    """Adaptation with a certificate. A model is valid while it has one, while another payload is learnt on it too."""
+    """Adaptation with a certificate. A certified model stays valid while another payload is learnt on top of it."""
 
     _cycle, _end, _run = staticmethod(certified_cycle), staticmethod(end_certified), staticmethod(run_certified)
 
@@ -47,7 +47,7 @@ class CertifiedPolicy(SchemePolicy):
         self.numbers = certified_memory.numbers_of(settings)
         self._m = m = self.numbers.memory[0]
         self._names = certified_memory.parameter_names(settings)
-        self.tau_ext_hat = m.filters.y[filter_bank.WIDE]  # what a reaction goes by: fast, and smooth
+        self.tau_ext_hat = m.filters.y[filter_bank.WIDE]  # for the reactions: fast, and smooth
         self.evidence = evidence = RecalledContact(settings, self._contact)
         course.fill_constants(settings, evidence.due_cycles, self._course_constants["contact"][0])
         self._paper = paper_kernel.numbers_of(settings)[:3]
@@ -72,7 +72,7 @@ class CertifiedPolicy(SchemePolicy):
     )
 
     def compile(self) -> None:
-        """Run every compiled function of the cycle once, on copies."""
+        """Run each compiled function of the cycle once, on copies."""
         constants, memory = self.numbers.constants, self.numbers.memory.copy()
         certified_kernel.begin_adaptation(constants, memory, False, True)
         certified_kernel.begin_test(constants, memory)
@@ -89,20 +89,20 @@ class CertifiedPolicy(SchemePolicy):
         super().compile()
 
     def compile_longest(self) -> None:
-        """Compile how a sample is learnt from, half of what a step takes, and the paper's scheme."""
+        """Compile the learning from a sample, half of a step's compile time, and the paper's scheme."""
         constants, memory, block, _ = self.numbers
         certified_kernel.improve(constants[0], memory.copy()[0], block.copy()[0], False, certified_kernel.LEARN)
         constants, memory, block = self._paper
         paper_kernel.step(constants, memory.copy(), block.copy(), 1, 1, paper_kernel.LEARN)
 
     def describe_missing(self) -> list[str]:
-        """Say what an adaptation that takes too long is waiting for, a line each."""
+        """Return the conditions that an adaptation still waits for, a line each."""
         constants, memory, _, _ = self.numbers
         missing = termination.describe_missing(constants[0], memory[0], self._names, PARAMETER_UNITS)
         return [*self._watch.describe(), *missing]
 
     def describe_withheld(self) -> list[str]:
-        """Say what contradicts a certificate that is withheld, a line each."""
+        """Return the contradictions of a certificate that is withheld, a line each."""
         return self._watch.describe()
 
     @property
@@ -111,12 +111,12 @@ class CertifiedPolicy(SchemePolicy):
         return self._watch.certificates
 
     def take_events(self) -> list[Event]:
-        """Return what is worth a line since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
-        """Take in what the kernel has found, and begin what a new state begins with."""
+        """Process the kernel's findings, and run the first actions of a new state."""
         state = self.supervisor.state
         if asked & ACCEPTED:
             self._events.append(self._watch.accept())
@@ -133,7 +133,7 @@ class CertifiedPolicy(SchemePolicy):
         self._course_memory["is_refusing"] = self._watch.is_refusing
 
     def attend(self, asked: int, cycle: int) -> ContactReport | None:
-        """Report the contact; forget what a touch has spoilt, judge the margin, and say what pushes the arm at rest."""
+        """Report the contact; forget the samples of a touch, judge the margin, and report a push on the arm at rest."""
         contact = super().attend(asked, cycle)
         if asked & FORGET:
             self._learn_anew(is_first=False)
@@ -148,7 +148,7 @@ class CertifiedPolicy(SchemePolicy):
             self._events.append(event)
 
     def _judge_margin(self) -> None:
-        """Judge how far residuals stayed below thresholds in a second of monitoring, and what would be found."""
+        """Judge the residuals' margin to thresholds in a second of monitoring, and the smallest detectable contact."""
         self._margin.add(sensitivity.take_peak_shares(self._m))
         dim = "; ".join(margin.describe_dim(self._m))
         for name, warning in (("margin", self._margin.warning), ("sight", dim)):
@@ -157,7 +157,10 @@ class CertifiedPolicy(SchemePolicy):
             self._warned = self._warned | {name} if warning else self._warned - {name}
 
     def _weigh(self, state: SchemeState, previous: SchemeState, cycle: int, is_touched: bool) -> SchemeState:
-        """Take in how a contact of the certified model goes on; return where the arm goes, STOPPED if it is doubted."""
+        """Weigh a contact of the certified model as it proceeds.
+
+        Return the next state, STOPPED if the model is doubted.
+        """
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
             is_contradicted = self.supervisor.cause is SchemeEvent.CONTRADICTED
             self._doubt.begin(cycle, is_touched, self._watch.contradiction() if is_contradicted else None)
@@ -176,7 +179,7 @@ class CertifiedPolicy(SchemePolicy):
         return state
 
     def _enter(self, state: SchemeState, previous: SchemeState) -> None:
-        """Do what a new state begins with, and what the previous one ends with."""
+        """Run the first actions of a new state, and the last ones of the state before."""
         if state is SchemeState.ADAPT:
             self._begin_adaptation(previous)
         elif state is SchemeState.CERTIFY:
@@ -190,7 +193,7 @@ class CertifiedPolicy(SchemePolicy):
             self._feed_forward()
 
     def _begin_adaptation(self, previous: SchemeState) -> None:
-        """Begin to learn anew: a payload on top of the certified arm, until that has failed; else everything."""
+        """Begin to learn anew: a payload on top of the certified arm; if that has failed, the whole arm."""
         cause = self.supervisor.cause
         if cause is SchemeEvent.REVOKED:
             self._revoke()
@@ -203,16 +206,16 @@ class CertifiedPolicy(SchemePolicy):
         self._learn_anew(is_first)
 
     def _learn_anew(self, is_first: bool) -> None:
-        """Begin to learn.
+        """Begin to learn, and forget the model learnt before.
 
-        Once a contact that interrupted an adaptation is reported, this forgets what the adaptation has learnt. It may
-        have learnt the contact's beginning, or this may be no contact but an earlier one that was learnt. Then only a
-        model that claims to know nothing lets the arm go on.
+        Runs, too, once a contact that interrupted an adaptation has been reported: the adaptation may have learnt the
+        contact's beginning. Or the arm is free of contact now, and the adaptation had learnt an earlier one. Then the
+        arm goes on only with a model that claims no knowledge.
         """
         certified_kernel.begin_adaptation(self.numbers.constants, self.numbers.memory, self._is_payload, is_first)
 
     def _revoke(self) -> None:
-        """Take back the certificate: nothing is known of the arm, and nothing is fed forward."""
+        """Take back the certificate: forget the arm's model and stop the feedforward."""
         self._is_payload = self.is_model_valid = False
         self.theta_ff = np.zeros(self.theta_ff.size)
         self._events.append(self._watch.revoke())
@@ -220,5 +223,5 @@ class CertifiedPolicy(SchemePolicy):
         paper_kernel.begin_adaptation(*self._paper)
 
     def _feed_forward(self) -> None:
-        """Take the model in use for the feedforward from now on."""
+        """Use the model in use for the feedforward from now on."""
         self.theta_ff = np.array(self._m.models.theta[: self.theta_ff.size])

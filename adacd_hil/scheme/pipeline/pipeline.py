@@ -1,13 +1,13 @@
 """The scheme: one ArmState in, one SchemeOutput out. No clock, no input or output; the same live and in replay.
 
-A cycle: the state reached so far says what the kernel does, the kernel says where the supervisor goes, and the new
-state leaves its traces: an adaptation begins or ends, a contact's report begins or becomes final. Where the schemes
-differ, a policy says what is done: `PaperPolicy`, `CertifiedPolicy`.
+A cycle: the present state selects the kernel's tasks, the kernel's findings move the supervisor, and the new state has
+its actions: an adaptation begins or ends, a contact's report begins or becomes final. A policy holds the actions that
+differ between the schemes: `PaperPolicy`, `CertifiedPolicy`.
 
-The cycle is compiled (`kernel.cycle`), the same live and in a replay. Once in a while it asks Python for something.
-`_attend` does it, in the same cycle, before the decision is given out.
+The cycle is compiled (`kernel.cycle`), the same live and in a replay. A few cycles have tasks for Python. `_attend`
+runs them in the same cycle, before the decision is issued.
 
-**The interval** between two samples is that between the SYNCs on which they were taken: a sample that comes late was
+**The interval** between two samples is that between the SYNCs on which they were taken: a sample that arrives late was
 still taken in time. It is 0 where it is unknown or not to be used.
 """
 
@@ -61,11 +61,11 @@ class SchemeBatch(NamedTuple):
 
 
 _STATES, _FAULTS, _REACTIONS = tuple(SchemeState), tuple(FaultReason), tuple(Reaction)
-"""By number."""
+"""Members of each enumeration, by number."""
 
 
 def layout_of(settings: Settings) -> Layout:
-    """Lay out the block of the pipeline that the settings ask for."""
+    """Return the layout of the block of the pipeline selected by the settings."""
     count = len(settings.estimator.parameter_names)
     if settings.scheme == "certified":
         return certified_layout(count, settings.further_count, settings.channel_count)
@@ -94,7 +94,7 @@ def arm_at(arms: ArmBatch, row: int) -> ArmState:
 
 
 class Pipeline:
-    """Adaptation and contact detection for one run, by the scheme that the settings ask for."""
+    """Adaptation and contact detection for one run, by the scheme selected in the settings."""
 
     def __init__(self, settings: Settings) -> None:
         self._policy: SchemePolicy = (
@@ -106,42 +106,45 @@ class Pipeline:
 
     @property
     def numbers(self) -> Numbers:
-        """What the kernel works on, for studies that look into it."""
+        """The kernel's arrays, for studies that inspect them."""
         return self._policy.numbers
 
     def compile(self) -> None:
-        """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
+        """Run each compiled function of the cycle once, on copies, so that no later call compiles."""
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._policy.theta_ff, 0.0)
         self._policy.compile()
 
     @property
     def compiled_functions(self) -> tuple[object, ...]:
-        """The largest that `compile` runs."""
+        """The largest compiled functions that `compile` runs."""
         return self._policy.compiled_functions
 
     def compile_longest(self) -> None:
-        """Compile about half of it, what `compile` comes to last: for another process, at the same time."""
+        """Compile the second half of `compile`'s work: for another process, at the same time."""
         self._policy.compile_longest()
 
     def describe_missing(self) -> list[str]:
-        """Say what an adaptation that takes too long is waiting for, a line each; none of the paper's, eq. (15)."""
+        """Return the conditions that an adaptation still waits for, a line each.
+
+        Empty for the paper's scheme, which waits for eq. (15).
+        """
         return self._policy.describe_missing()
 
     def describe_withheld(self) -> list[str]:
-        """Say what contradicts a certificate that is withheld, a line each."""
+        """Return the contradictions of a certificate that is withheld, a line each."""
         return self._policy.describe_withheld()
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """The certificates of the run that were not taken back, in order; the paper has none."""
+        """The certificates of the run that were not taken back, in order; empty for the paper's scheme."""
         return self._policy.certificates
 
     def take_events(self) -> list[Event]:
-        """Return what is worth a line since the last call: a margin that has shrunk, a certificate."""
+        """Return the events since the last call: a margin that has shrunk, a certificate."""
         return self._policy.take_events()
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
-        """Take in one cycle."""
+        """Process one cycle and return its output."""
         policy = self._policy
         fill_sample(self._sample, arm, request)
         asked = policy.cycle(self._sample, self._decision, self._block)
@@ -164,7 +167,7 @@ class Pipeline:
         )
 
     def run(self, arms: ArmBatch, requests: NDArray[np.uint8]) -> SchemeBatch:
-        """Take in n cycles, as `step` does one by one. requests (n,): of `Request`."""
+        """Process n cycles with the results of `step` on each. requests (n,): values of `Request`."""
         count = arms.cycle.size
         samples, decisions = samples_of(arms, requests), np.zeros(count, DECISION)
         blocks = np.empty((count, self.numbers.values.size))
@@ -187,7 +190,7 @@ class Pipeline:
         )
 
     def _attend(self, asked: int, samples: Structured, decisions: Structured, place: int) -> ContactReport | None:
-        """Do what a cycle asks of Python, and end it; return the contact's report that is due."""
+        """Run the tasks that a cycle has for Python, and end it; return the contact's report that is due, or None."""
         policy, cycle = self._policy, int(samples["cycle"][place])
         if asked & BEFORE_CONTACT:
             previous, observation = SchemeState(decisions["previous_state"][place]), decisions["observation"][place]

@@ -1,4 +1,4 @@
-"""What one scheme does differently from the other: the base of the policies, and the paper's.
+"""Policies, the differences between the schemes: their base class, and the paper's policy.
 
 The paper's `theta_hat` is the live estimate, after this cycle's correction; tau_f_hat of the same block was predicted
 before it.
@@ -25,10 +25,10 @@ from adacd_hil.structured import Structured
 
 
 class SchemePolicy(ABC):
-    """What a pipeline asks its scheme: the compiled cycle, and what a state begins and ends with.
+    """Interface of a scheme to its pipeline: the compiled cycle, and the first and last actions of a state.
 
-    numbers: what the kernel works on. tau_ext_hat (2,): external torque that is reported in each cycle, Nm, a view.
-    theta_ff: what the last finished adaptation left, for the feedforward, zeros before.
+    numbers: the kernel's arrays. tau_ext_hat (2,): external torque that is reported in each cycle, Nm, a view.
+    theta_ff: model from the last finished adaptation, for the feedforward; zeros before the first.
     """
 
     numbers: Numbers
@@ -37,12 +37,12 @@ class SchemePolicy(ABC):
     theta_ff: Vector
 
     compiled_functions: tuple[object, ...]
-    """The largest that `compile` runs."""
+    """The largest compiled functions that `compile` runs."""
     _cycle: Callable[..., int]
     _end: Callable[..., int]
     _run: Callable[..., tuple[int, int]]
     _cycle_arrays: tuple[Vector | Structured, ...]
-    """What the compiled cycle works on, in its order."""
+    """Arrays of the compiled cycle, in its order."""
     _end_arrays: tuple[Vector | Structured, ...]
 
     def __init__(self, settings: Settings) -> None:
@@ -60,7 +60,7 @@ class SchemePolicy(ABC):
         self._course_memory["is_model_valid"] = is_valid
 
     def compile(self) -> None:
-        """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
+        """Run each compiled function of the cycle once, on copies, so that no later call compiles."""
         supervisor.doubt(self._course_memory["supervisor"].copy()[0])
         course.goes_on(self._contact)
         self.evidence.compile()
@@ -69,34 +69,34 @@ class SchemePolicy(ABC):
         self._end(samples, decisions, 0, *(array.copy() for array in self._end_arrays))
 
     def compile_longest(self) -> None:
-        """Compile about half of it, what `compile` comes to last; nothing where all of it takes a moment."""
+        """Compile the second half of `compile`'s work; skip if the whole takes only a moment."""
 
     def cycle(self, samples: Structured, decisions: Structured, blocks: Vector) -> int:
-        """Take in the only cycle of the samples; return bits of what it asks (`kernel.cycle`)."""
+        """Process the only cycle of the samples; return bits of its tasks for Python (`kernel.cycle`)."""
         return self._cycle(samples, decisions, blocks, 0, *self._cycle_arrays)
 
     def run(self, samples: Structured, decisions: Structured, blocks: Vector, first: int) -> tuple[int, int]:
-        """Take in cycles up to one that asks for something; return its place and what it asks."""
+        """Process cycles until one has a task for Python; return its place and the bits of its tasks."""
         return self._run(samples, decisions, blocks, first, self._cycle_arrays)
 
     def end(self, samples: Structured, decisions: Structured, place: int) -> int:
-        """End a cycle that `follow` has attended to; return what it still asks."""
+        """End a cycle that `follow` has attended to; return bits of further tasks for Python."""
         return self._end(samples, decisions, place, *self._end_arrays)
 
     @abstractmethod
     def follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
-        """Do what a new state begins with, and what the previous one ends with: after the supervisor's step."""
+        """Run the first actions of a new state, and the last ones of the state before, after the supervisor's step."""
 
     def attend(self, asked: int, cycle: int) -> ContactReport | None:
-        """Do what the end of a cycle asks; return the contact's report that is due."""
+        """Run the tasks at the end of a cycle; return the contact's report that is due, or None."""
         return report_of(self.evidence, self._contact, cycle) if asked & REPORT else None
 
     def describe_missing(self) -> list[str]:
-        """Say what an adaptation that takes too long is waiting for, a line each."""
+        """Return the conditions that an adaptation still waits for, a line each."""
         return []
 
     def describe_withheld(self) -> list[str]:
-        """Say what contradicts a certificate that is withheld, a line each."""
+        """Return the contradictions of a certificate that is withheld, a line each."""
         return []
 
     @property
@@ -105,12 +105,12 @@ class SchemePolicy(ABC):
         return ()
 
     def take_events(self) -> list[Event]:
-        """Return what is worth a line since the last call."""
+        """Return the events since the last call."""
         return []
 
 
 class PaperPolicy(SchemePolicy):
-    """The paper's scheme: no certificate, and one condition for what an adaptation waits for, eq. (15).
+    """The paper's scheme: without a certificate; an adaptation waits for a single condition, eq. (15).
 
     A model is valid once an adaptation has finished with a mass matrix that is positive definite everywhere. It stays
     so during later adaptations.
@@ -139,7 +139,7 @@ class PaperPolicy(SchemePolicy):
         super().compile()
 
     def follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:  # noqa: ARG002
-        """Begin an adaptation, or take over what it has come to."""
+        """Begin an adaptation, or take over its result."""
         state = self.supervisor.state
         if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:
             self.theta_ff = self._theta_hat.copy()

@@ -1,1 +1,1 @@
-"""States, what leads from one to the next, and the bits that the numbers say."""
+"""The scheme's states, their transitions, and the findings that trigger them."""

@@ -1,19 +1,21 @@
-"""The scheme's state machine: what raises the events of its table, `adacd_hil.scheme.supervisor.transitions`.
+"""The scheme's state machine: raises the events of the table in `adacd_hil.scheme.supervisor.transitions`.
 
 INIT -> COMMISSION -> ENABLE -> ADAPT (-> CERTIFY) -> MONITOR; motion in ENABLE -> COMMISSION; a contact in any of
 ENABLE, ADAPT, CERTIFY, MONITOR and PAYLOAD -> REACT, and from there back; MONITOR or STOPPED -> PAYLOAD -> ADAPT;
-any -> FAULT, which is latched. A pair that is not in the table leaves the state as it is. One event per cycle: the
-first that applies in the order of `SchemeEvent`, so a fault outranks everything.
+any -> FAULT, which is latched. A pair that is not in the table leaves the state as it is. Each cycle has one event: the
+first that applies in the order of `SchemeEvent`, so a fault outranks all others.
 
-A collision is latched: REACT -> STOPPED until the user acknowledges. So are a host that was late, a contact that has
-grown into a collision, and one that has lasted too long. Any other contact clears itself: REACT -> where it came from.
-From CERTIFY that is ADAPT: the fit is forgotten, and an arm that still stands would pass a test of no model at all.
+A collision is latched: REACT -> STOPPED until the user acknowledges. So are a late host, a contact that has grown into
+a collision, and a contact that has lasted too long. Any other contact clears itself: REACT returns to the state before.
+CERTIFY is the exception: REACT leads to ADAPT and the fit is forgotten, because an arm that still stands would pass the
+test without a model.
 
-A request is kept until it can be served, but only in the states of `KEPT_IN`; elsewhere it is dropped. No word that was
-given before a stop releases it: an acknowledgement is dropped, and a change of payload waits until the stop has been
-acknowledged, but for one that is announced in STOPPED itself. `KeptRequest` outlives a fault that is acknowledged.
+A request is kept until it can be served, but only in the states of `KEPT_IN`; elsewhere it is dropped. A request from
+before a stop cannot release the stop: an acknowledgement is dropped, and a change of payload waits until the user has
+acknowledged the stop. A change of payload announced in STOPPED is served at once. `KeptRequest` outlives a fault that
+is acknowledged.
 
-`supervise` is compiled; all that it remembers is one record, `MEMORY`, of whole numbers.
+`supervise` is compiled; its whole memory is one record of whole numbers, `MEMORY`.
 """
 
 from collections.abc import Collection, Iterable
@@ -48,11 +50,11 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured
 
 REST_HOLD_S = 0.05
-"""How long |dq| stays below the rest velocity until the arm counts as at rest. At the reversal of a withdrawal with
-700 °/s² it stays below 0.05 rad/s for 8 ms: a margin of 6."""
+"""The arm counts as at rest once |dq| has stayed below the rest velocity this long. At the reversal of a withdrawal
+with 700 °/s² it stays below 0.05 rad/s for 8 ms: a margin of 6."""
 
 UNREST_S = 0.02
-"""How long an arm may move while its drives are asked to enable: one whose brakes have opened sags until it is held."""
+"""How long an arm may move while its drives enable: an arm whose brakes have opened sags until the drives hold it."""
 
 _REST_UNLOADED = AT_REST | UNLOADED
 
@@ -66,7 +68,7 @@ POWERED = frozenset(
         SchemeState.PAYLOAD,
     )
 )
-"""Where the drives are enabled and may have torque."""
+"""States in which the drives are enabled and may have torque."""
 LEARNING = frozenset((SchemeState.ADAPT, SchemeState.CERTIFY))
 REACTING = frozenset((SchemeState.REACT, SchemeState.STOPPED))
 
@@ -78,12 +80,12 @@ KEPT_IN = MappingProxyType(
         Request.RELEARN: frozenset((SchemeState.STOPPED,)),
     }
 )
-"""Where a request waits to be served. FINISH is the control layer's; ACCEPT and a fault are served at once, or
-not at all."""
+"""States in which a request waits to be served. The control layer serves FINISH; ACCEPT and a fault are served at once
+or dropped."""
 
 
 def among(states: Collection[SchemeState]) -> NDArray[np.bool_]:
-    """Tell of each state whether it is one of these."""
+    """Return, per state, whether it is in `states`."""
     return np.array([state in states for state in SchemeState])
 
 
@@ -92,9 +94,10 @@ _IS_CHECKED = among(POWERED | {SchemeState.ENABLE})
 _IS_LEARNING = among(LEARNING)
 IS_REACTING = among(REACTING)
 _IS_HELD_FROM = among((SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED))
-"""Where a host that is late holds the arm, or does so already; elsewhere there is no way to, and it is a fault."""
+"""States in which a late host makes the arm hold, or in which it holds already; in the others a late host is a
+fault."""
 _IS_KEPT = np.array([among(KEPT_IN.get(request, ())) for request in Request])
-"""Where a request waits (requests, states)."""
+"""Whether a request waits in a state (requests, states)."""
 _FAULT_ASKED = np.zeros(len(Request), np.int64)
 _FAULT_ASKED[Request.FAULT_TORQUE] = FaultReason.TORQUE
 _FAULT_ASKED[Request.FAULT_FOLLOWING] = FaultReason.FOLLOWING
@@ -104,11 +107,11 @@ _OVERDUE = np.zeros(len(SchemeState), np.int64)
 _OVERDUE[[SchemeState.INIT, SchemeState.COMMISSION]] = FaultReason.COMMISSION_TIMEOUT
 _OVERDUE[SchemeState.ENABLE] = FaultReason.ENABLE_TIMEOUT
 _OVERDUE[[SchemeState.ADAPT, SchemeState.CERTIFY]] = FaultReason.ADAPT_TIMEOUT
-"""The fault of a phase that takes too long; NONE of one that may take for ever."""
+"""Fault of a phase that takes too long, by state; NONE for a phase without a time limit."""
 
 
 class SupervisorConstants:
-    """Counts of cycles and periods. limit_periods: by state, of those that may take too long."""
+    """Counts of cycles and periods. limit_periods: longest stay, by state; only some states have one."""
 
     has_gravity: int
     max_age_cycles: int
@@ -123,12 +126,13 @@ class SupervisorConstants:
 
 
 class SupervisorMemory:
-    """Where the scheme stands.
+    """State of the supervisor.
 
-    origin: where the arm goes on after REACT or STOPPED: where it came from, but from a broken test to learn anew.
-    cause: the event by which the state was entered. is_latched: the user must acknowledge what REACT and STOPPED are
-    about. is_doubted: the model is wrong. pending: bits of the requests that wait. is_weight_told: of a payload, since
-    REACT. is_told_here: of a new payload, in this state. periods, cycles: counts up to now.
+    origin: state to which REACT or STOPPED returns: the state before, or ADAPT after a broken test. cause: the event by
+    which the state was entered. is_latched: the user must acknowledge the cause of REACT or STOPPED. is_doubted: the
+    model is wrong. pending: bits of the requests that wait. is_weight_told: the user has announced the payload's weight
+    since REACT began. is_told_here: the user has announced a new payload in this state. periods, cycles: counts up to
+    now.
     """
 
     state: int
@@ -151,7 +155,7 @@ class SupervisorMemory:
 
 
 def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
-    """Fill the constants."""
+    """Fill the supervisor's constants from the settings."""
     period_s, safety = settings.bus.period_s, settings.safety
     k.has_gravity = settings.estimator.gravity
     k.max_age_cycles = settings.bus.max_age_cycles
@@ -169,7 +173,7 @@ def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
 
 
 def begin(m: SupervisorMemory) -> None:
-    """Fill the memory before the first cycle."""
+    """Fill the supervisor's memory before the first cycle."""
     m.state, m.origin = SchemeState.INIT, SchemeState.MONITOR
 
 
@@ -177,10 +181,10 @@ def begin(m: SupervisorMemory) -> None:
 def supervise(
     k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
 ) -> None:
-    """Take in one cycle and go to the new state.
+    """Process one cycle and change to the new state.
 
-    observation: bits of `Observation`. is_reporting: a contact's report is
-    not final yet. goes_on: the reaction in force lets the arm move on, so that a contact clears without rest.
+    observation: bits of `Observation`. is_reporting: a contact's report is not final yet. goes_on: the reaction in
+    force lets the arm move on, so that a contact clears without rest.
     """
     _count(m, arm, observation)
     if arm.request != Request.NONE:
@@ -194,9 +198,9 @@ def supervise(
 
 @compiled
 def doubt(m: SupervisorMemory) -> None:
-    """Take in, once a contact is over, that the model is wrong: hold the arm until the user says how to go on.
+    """Record, once a contact is over, that the model is wrong: hold the arm until the user decides how to go on.
 
-    An acknowledgement then takes back what is known of the arm; a payload may change without an announcement.
+    An acknowledgement then takes back the knowledge of the arm; a payload may change without an announcement.
     """
     event: int = SchemeEvent.DOUBTED
     _enter(m, next_state(m.state, event, m.origin), event)
@@ -206,7 +210,7 @@ def doubt(m: SupervisorMemory) -> None:
 
 @compiled
 def _count(m: SupervisorMemory, arm: Sample, observation: int) -> None:
-    """Count this cycle, and what goes on in it."""
+    """Count this cycle and its findings: rest, motion, missing data, late host."""
     m.phase_periods += arm.periods
     if _IS_LEARNING[m.state]:
         m.learning_periods += arm.periods
@@ -230,7 +234,7 @@ def _take(m: SupervisorMemory, request: int) -> None:
 
 @compiled
 def _keeps(m: SupervisorMemory, request: int, state: int) -> bool:
-    """Tell whether a request waits in a state; hands that change a payload may touch the arm."""
+    """Return whether a request waits in a state; an operator who changes a payload may touch the arm."""
     if request == Request.PAYLOAD_CHANGED and IS_REACTING[state]:
         return bool(m.is_doubted != 0 or m.origin == SchemeState.PAYLOAD)
     return bool(_IS_KEPT[request, state])
@@ -243,23 +247,24 @@ def _is_pending(m: SupervisorMemory, request: int) -> bool:
 
 @compiled
 def _has_grown(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> bool:
-    """Tell whether a contact that would clear itself has become one to be acknowledged."""
+    """Return whether a contact that would clear itself now needs an acknowledgement."""
     is_over = observation & COLLISION != 0 or arm.is_late != 0 or m.phase_periods >= k.patience_cycles
     return bool(is_over or _is_told_of_payload(k, m))
 
 
 @compiled
 def _is_announced(m: SupervisorMemory) -> bool:
-    """Tell whether a change of payload is to be served in MONITOR or STOPPED; a stop ends only by a word about it."""
+    """Return whether a change of payload is due in MONITOR or STOPPED; it ends a stop only if announced in it."""
     is_awaited = _is_pending(m, Request.PAYLOAD) and m.state == SchemeState.MONITOR
     return bool(m.is_told_here != 0 or is_awaited)
 
 
 @compiled
 def _is_told_of_payload(k: SupervisorConstants, m: SupervisorMemory) -> bool:
-    """Tell whether the user has said that what looks like a contact is the payload: its weight, where gravity acts.
+    """Return whether the user has attributed the contact to the payload: to its weight, where gravity acts.
 
-    A weight is meant only by a word since the contact began: one of before knows nothing of who touches the arm.
+    The weight counts only if announced since the contact began: an earlier announcement cannot exclude a person's
+    touch.
     """
     is_weight = k.has_gravity != 0 and m.origin == SchemeState.PAYLOAD and m.is_weight_told != 0
     return bool((m.is_doubted != 0 or is_weight) and _is_pending(m, Request.PAYLOAD_CHANGED))
@@ -267,7 +272,7 @@ def _is_told_of_payload(k: SupervisorConstants, m: SupervisorMemory) -> bool:
 
 @compiled
 def _enter(m: SupervisorMemory, state: int, event: int) -> None:
-    """Go to a state, and drop the requests that it has served or that mean nothing there."""
+    """Enter a state, and drop the requests that it has served or that have no meaning there."""
     if state == m.state:
         return
     if state == SchemeState.REACT:
@@ -292,7 +297,7 @@ def _enter(m: SupervisorMemory, state: int, event: int) -> None:
 def _event(
     k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
 ) -> int:
-    """Return the first event of this cycle that means something in this state."""
+    """Return the first event of this cycle that applies in this state."""
     fault = 0
     if _IS_CHECKED[m.state]:
         fault = _check(k, m, arm, observation)
@@ -311,7 +316,7 @@ def _event(
 
 @compiled
 def _touch(m: SupervisorMemory, arm: Sample, observation: int) -> int:
-    """Return COLLISION or CONTACT where this state reacts to it, or none; an arm without torque can't react."""
+    """Return COLLISION or CONTACT if this state reacts to it, else 0; an arm without torque can't react."""
     if observation & ANY_CONTACT == 0 or arm.is_enabled == 0:
         return SchemeEvent.NONE
     event = SchemeEvent.COLLISION if observation & COLLISION else SchemeEvent.CONTACT
@@ -322,7 +327,7 @@ def _touch(m: SupervisorMemory, arm: Sample, observation: int) -> int:
 def _progress(
     k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
 ) -> int:
-    """Return the event with which this state is left as it should be, or none."""
+    """Return the event that completes this state, or 0 if it is not complete."""
     state = m.state
     event: int = SchemeEvent.NONE
     is_still = m.still_cycles >= k.rest_cycles
@@ -347,7 +352,7 @@ def _progress(
 
 @compiled
 def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_still: bool) -> int:
-    """Return how STOPPED ends in this cycle by a word of the user's, or none."""
+    """Return the event by which the user's request ends STOPPED in this cycle, or 0."""
     event: int = SchemeEvent.NONE
     is_late = arm.is_late != 0
     if _is_told_of_payload(k, m):
@@ -363,7 +368,7 @@ def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observat
 
 @compiled
 def _verdict(state: int, observation: int) -> int:
-    """Return what the numbers say of a model that is learnt or tested, or none."""
+    """Return the result of learning or testing the model in this cycle as an event, or 0."""
     event: int = SchemeEvent.NONE
     if state == SchemeState.ADAPT and observation & ADAPTED:
         event = SchemeEvent.ADAPTED
@@ -378,7 +383,7 @@ def _verdict(state: int, observation: int) -> int:
 
 @compiled
 def _begun(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> int:
-    """Return how a phase before the drives are enabled ends in this cycle, or none."""
+    """Return the event that ends a phase before the drives are enabled in this cycle, or 0."""
     state = m.state
     event: int = SchemeEvent.NONE
     if state == SchemeState.INIT and arm.is_complete != 0:
@@ -394,7 +399,7 @@ def _begun(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
 
 @compiled
 def _settled(k: SupervisorConstants, m: SupervisorMemory, is_still: bool, goes_on: bool) -> int:
-    """Return how REACT ends in this cycle, or none."""
+    """Return the event that ends REACT in this cycle, or 0."""
     event: int = SchemeEvent.NONE
     if m.is_latched != 0:
         if is_still:
@@ -406,9 +411,9 @@ def _settled(k: SupervisorConstants, m: SupervisorMemory, is_still: bool, goes_o
 
 @compiled
 def _is_commissioned(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> bool:
-    """Count this cycle if all is well in it, and tell whether enough have been counted in a row.
+    """Count this cycle if all its checks pass, and return whether enough cycles in a row have passed.
 
-    One whose data are not complete doesn't count and breaks nothing: how many may be missing, `_check` says.
+    A cycle with incomplete data doesn't count but doesn't break the row: `_check` limits how many may be missing.
     """
     is_resting = observation & (_REST_UNLOADED | WITHHELD) == _REST_UNLOADED
     is_good = is_resting and _check(k, m, arm, observation) == FaultReason.NONE
@@ -418,7 +423,7 @@ def _is_commissioned(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, o
 
 @compiled
 def _overdue(k: SupervisorConstants, m: SupervisorMemory) -> int:
-    """Return the fault of a phase that has taken too long, or NONE. A learning arm's clock stops in REACT."""
+    """Return the fault of a phase that has taken too long, or NONE. In REACT a learning arm's clock stops."""
     spent = m.learning_periods if _IS_LEARNING[m.state] else m.phase_periods
     is_over = spent >= k.limit_periods[m.state]
     return int(_OVERDUE[m.state]) if is_over else FaultReason.NONE
@@ -426,7 +431,7 @@ def _overdue(k: SupervisorConstants, m: SupervisorMemory) -> int:
 
 @compiled
 def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> int:
-    """Return why the arm must not go on, or NONE."""
+    """Return the reason why the arm must stop, or NONE."""
     state = m.state
     fault: int = FaultReason.NONE
     is_thrown = state == SchemeState.REACT and m.phase_periods <= k.rebound_cycles
@@ -448,19 +453,19 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
 
 
 class Supervisor:
-    """The state machine as the rest of the scheme sees it. memory: (1,) of MEMORY, which `supervise` changes."""
+    """The state machine's interface to the rest of the scheme. memory: (1,) of MEMORY, which `supervise` changes."""
 
     def __init__(self, memory: Structured) -> None:
         self._m = memory[0]
 
     @property
     def state(self) -> SchemeState:
-        """Where the scheme stands."""
+        """The scheme's present state."""
         return SchemeState(self._m.state)
 
     @property
     def origin(self) -> SchemeState:
-        """Where the arm goes on after REACT or STOPPED."""
+        """State to which the arm returns after REACT or STOPPED."""
         return SchemeState(self._m.origin)
 
     @property
@@ -469,15 +474,15 @@ class Supervisor:
         return SchemeEvent(self._m.cause)
 
     def doubt(self) -> SchemeState:
-        """Hold the arm: the model is wrong."""
+        """Hold the arm because the model is wrong; return the new state."""
         doubt(self._m)
         return self.state
 
 
 class KeptRequest:
-    """The end of the run, or a stop to change the payload, until it is served. One object per attempt.
+    """The end of the run, or a stop to change the payload, kept until it is served. One object per attempt.
 
-    carried: what the attempt before has left; it is asked once the drives are enabled again.
+    carried: request left over from the attempt before; it is repeated once the drives are enabled again.
     """
 
     def __init__(self, carried: Request = Request.NONE) -> None:
@@ -485,17 +490,17 @@ class KeptRequest:
         self._carried = carried
 
     def take(self) -> Request:
-        """Return what the attempt before has left, once; then NONE."""
+        """Return the request left over from the attempt before, once; then NONE."""
         carried, self._carried = self._carried, Request.NONE
         return carried
 
     def ask(self, request: Request, state: SchemeState) -> None:
-        """Take note of a request; state: that of the cycle before."""
+        """Record a request; state: that of the cycle before."""
         is_kept = request is Request.FINISH or (request is Request.PAYLOAD and state in KEPT_IN[request])
         if is_kept and self.request is not Request.FINISH:
             self.request = request
 
     def serve(self, states: Iterable[int]) -> None:
-        """Take note of the states that cycles have led to."""
+        """Drop a request to change the payload once cycles have reached PAYLOAD. states: those reached."""
         if self.request is Request.PAYLOAD and SchemeState.PAYLOAD in states:
             self.request = Request.NONE

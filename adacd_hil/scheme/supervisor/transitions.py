@@ -1,12 +1,12 @@
-"""What the scheme's state machine goes by: a cycle's findings, and the table of its states.
+"""Inputs and rules of the scheme's state machine: a cycle's findings, and the table of its transitions.
 
-**Findings.** What one cycle's numbers say, as far as the supervisor needs it: bits that compiled code sets.
+**Findings.** The findings of one cycle that the supervisor needs: bits that compiled code sets.
 
-Any kernel of the scheme sets them, and only those that it knows: the paper's never certifies.
+Each kernel sets only the bits that it knows: the paper's kernel never certifies.
 
-**Table.** The table of the scheme's state machine: where each event leads from each state.
+**Table.** For each state and event, the next state.
 
-A pair that is not in it leaves the state as it is. What raises the events: `adacd_hil.scheme.supervisor.supervisor`.
+A pair that is not in the table leaves the state as it is. `adacd_hil.scheme.supervisor.supervisor` raises the events.
 """
 
 from enum import Enum, IntEnum, IntFlag
@@ -20,13 +20,13 @@ from adacd_hil.records import SchemeState
 
 
 class SchemeEvent(IntEnum):
-    """What can move the scheme to another state, in order of precedence."""
+    """Events that can move the scheme to another state, in order of precedence."""
 
     NONE = 0
     FAULT = 1  # a check of the running arm failed, or a phase took too long
     COLLISION = 2  # a joint is over its upper threshold
     CONTACT = 3  # a joint is over its lower threshold
-    LATE = 4  # the host has missed so many deadlines that the arm is to be held
+    LATE = 4  # the host has missed so many deadlines that the arm must hold
     COMPLETE = 5  # a cycle with all its data
     COMMISSIONED = 6  # enough complete cycles at rest in a row
     ENABLED = 7  # both drives report Operation enabled
@@ -34,15 +34,15 @@ class SchemeEvent(IntEnum):
     FITTED = 9  # the estimate is ready to be tested
     CERTIFIED = 10  # the frozen model has passed its test
     REFUTED = 11  # the frozen model has failed its test
-    AT_REST = 12  # the arm has come to rest, the report is final, and all of it is to be acknowledged
-    CLEARED = 13  # nothing has pushed for a while, the report is final, and nothing is to be acknowledged
+    AT_REST = 12  # the arm is at rest, the report is final, and the contact must be acknowledged
+    CLEARED = 13  # the push has been over for a while, the report is final, and no acknowledgement is needed
     ACKNOWLEDGED = 14  # the user has acknowledged, no joint is over its threshold and the host is on time
     PAYLOAD_ANNOUNCED = 15  # the user wants to change the payload
     PAYLOAD_CHANGED = 16  # the user has changed the payload and the arm is at rest
-    REVOKED = 17  # the user takes back what is known of the arm, or acknowledges that it is doubted
+    REVOKED = 17  # the user takes back the knowledge of the arm, or acknowledges that it is doubted
     DOUBTED = 18  # contacts that have cleared have one cause in common: the certificate is wrong
     MOVED = 19  # the arm moves before all its drives are enabled
-    CONTRADICTED = 20  # what was learnt since contradicts the certificate: by an anchor, or by place
+    CONTRADICTED = 20  # later evidence contradicts the certificate: an anchor, or a torque by place
 
 
 class Back(Enum):
@@ -53,7 +53,7 @@ class Back(Enum):
 
 TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]] = MappingProxyType(
     {
-        # Gathers nothing yet. Out: the first complete cycle; too late is a fault.
+        # Gathers no data yet. Out: the first complete cycle; too late is a fault.
         SchemeState.INIT: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COMPLETE: SchemeState.COMMISSION,
@@ -63,8 +63,8 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COMMISSIONED: SchemeState.ENABLE,
         },
-        # Drives are asked to enable. Out: both have; an arm that moves meanwhile must lie still again; too late is a
-        # fault; a contact once they have.
+        # The host enables the drives. Out: both are enabled; an arm that moves meanwhile must lie still again; too late
+        # is a fault; a contact once they are enabled.
         SchemeState.ENABLE: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COLLISION: SchemeState.REACT,
@@ -88,8 +88,8 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
             SchemeEvent.CERTIFIED: SchemeState.MONITOR,
             SchemeEvent.REFUTED: SchemeState.ADAPT,
         },
-        # Moves, detection armed. Out: a contact; a host that is late; what was learnt since contradicts it; the
-        # announcement of a payload change; back from these, the doubt of the model.
+        # Moves, detection armed. Out: a contact; a late host; later evidence against the certificate; the announcement
+        # of a payload change; back from these, the doubt of the model.
         SchemeState.MONITOR: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COLLISION: SchemeState.REACT,
@@ -105,9 +105,9 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
             SchemeEvent.AT_REST: SchemeState.STOPPED,
             SchemeEvent.CLEARED: Back.TO_ORIGIN,
         },
-        # Holds its place. Out: acknowledged while nothing pushes; the announcement of a payload change; a payload that
-        # contacts looked like, or whose weight is one; with the certificate taken back, even while something seems to
-        # push.
+        # Holds its place. Out: acknowledged while no joint is pushed; the announcement of a payload change; a payload
+        # that looked like contacts, or whose weight looks like one; the certificate taken back, even while a push seems
+        # to last.
         SchemeState.STOPPED: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.ACKNOWLEDGED: Back.TO_ORIGIN,
@@ -145,7 +145,7 @@ _NEXT = _numbered()
 
 @compiled
 def next_state(state: int, event: int, origin: int) -> int:
-    """Look up the table; a pair that is not in it leaves the state as it is.
+    """Return the next state from the table; a pair that is not in it leaves the state as it is.
 
     origin: the state from which REACT was entered last.
     """
@@ -157,12 +157,12 @@ def next_state(state: int, event: int, origin: int) -> int:
 
 @compiled
 def leads_on(state: int, event: int) -> bool:
-    """Tell whether the table has this pair."""
+    """Return whether the table has this pair."""
     return bool(_NEXT[state, event] != STAYS)
 
 
 CONTACT_SHIFT = 16
-"""The joints over their lower threshold are the bits of an observation from here on."""
+"""Index of an observation's first bit for a joint over its lower threshold; one bit per joint."""
 
 
 class Observation(IntFlag):
@@ -170,7 +170,7 @@ class Observation(IntFlag):
 
     NONE = 0
     NOT_A_NUMBER = 1  # a measurement is not finite
-    OVER_LIMIT = 2  # beyond the arm's limits: |q|, or |dq| where OVER_SPEED is not told apart
+    OVER_LIMIT = 2  # beyond the arm's limits: |q|, or |dq| where OVER_SPEED is not a bit of its own
     AT_REST = 4  # every |dq| below the rest velocity
     UNLOADED = 8  # every |tau_J| below the rest torque
     ADAPTED = 16  # eq. (15) holds with the evidence for it
@@ -180,8 +180,8 @@ class Observation(IntFlag):
     REFUTED = 256  # the frozen model has failed its test
     COLLISION = 512  # a joint is over its upper threshold
     OVER_SPEED = 1024  # |dq| beyond the arm's limit, which a blow may do for a moment
-    UNSEEN = 2048  # the filters took no sample in: the residual is not of now
-    WITHHELD = 4096  # an anchor, a touch or a torque by place excludes what would be certified, or what is
+    UNSEEN = 2048  # the filters took no new sample in: the residual is an old one
+    WITHHELD = 4096  # an anchor, a touch or a torque by place excludes the model to be certified, or the certified one
 
 
 (
