@@ -87,7 +87,7 @@ def test_a_name_in_a_text_is_one_of_the_code(sources: dict[Path, str], words: se
         for name in stale_names(text, words, modules)
         if name not in ELSEWHERE
     ]
-    assert stale == []
+    assert not stale, "\n".join(stale)
 
 
 @pytest.mark.parametrize(

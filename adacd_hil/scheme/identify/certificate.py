@@ -53,7 +53,7 @@ class Certificate(NamedTuple):
 
 
 def constants_of(settings: Settings) -> LastConstants:
-    """Return `last`, `last_variance`, `last_slack` (Q,): the last certificate's value per quantity; inf: unknown.
+    """Return value, variance and slack (Q,): the last certificate's value per quantity; inf: unknown.
 
     A viscous friction is computed from two frictions. Their deviations count as independent, which overestimates its
     own.

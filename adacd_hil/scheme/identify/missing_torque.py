@@ -19,9 +19,9 @@ over the first 2 s of learnt samples, the next 4, 8, 16 s and then each 16 s. Lo
 of a sensor over a minute looks like such a torque. One stretch is not enough there, since on one way many effects
 depend on the place: its result must explain SAID_SHARE of the squares that the basic model leaves in a later one.
 
-Shapes: p parameters, n joints, t = PLACE_TERMS, f = p + n t; evidence_L (n, f, f): by the joint of the row, lower half;
-evidence_b, _basic, _full, _row, _scale (f,); evidence_M (f, f); evidence_said (n t,): coefficients of the last stretch
-that came to a torque by place, else all 0; missing_rms_Nm (n,): the last torque found, 0 without one.
+Shapes: p parameters, n joints, t = PLACE_TERMS, f = p + n t; L (n, f, f): by the joint of the row, lower half;
+b, basic, full, row, scale (f,); M (f, f); said (n t,): coefficients of the last stretch
+that came to a torque by place, else all 0; rms_Nm (n,): the last torque found, 0 without one.
 """
 
 import math
@@ -51,7 +51,7 @@ FIRST_S, LONGEST_S = 2.0, 16.0
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> TermConstants:
-    """Return `evidence_std` (f,), and `evidence_first`, `evidence_longest` in learnt samples. prior_std (p,)."""
+    """Return the prior deviations (f,), and two counts of learnt samples. prior_std (p,)."""
     learn_s = settings.bus.period_s * settings.certified.learn_every
     return TermConstants(
         prior_std=np.concatenate([prior_std, np.full(JOINTS * PLACE_TERMS, EXPECTED_NM)]),
@@ -170,7 +170,7 @@ def is_found_in_time(k: Constants, m: Memory) -> bool:
 
 @compiled
 def is_found(k: Constants, m: Memory) -> bool:
-    """Return whether the place explains the model's residual over all samples; fill `missing_rms_Nm` (n,)."""
+    """Return whether the place explains the model's residual over all samples; fill `rms_Nm` (n,)."""
     m.missing_torque.rms_Nm[:] = 0.0
     if k.position_torque_Nm != 0.0:
         return False
@@ -201,7 +201,7 @@ def _scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
 
 @compiled
 def _is_said_again(k: Constants, m: Memory) -> bool:
-    """Return whether an earlier stretch's torque explains this one, of which `evidence_basic` is the model."""
+    """Return whether an earlier stretch's torque explains this one, of which `basic` is the model."""
     m.missing_torque.rms_Nm[:] = 0.0
     said, count, basic, full = (
         m.missing_torque.said,

@@ -15,7 +15,7 @@ before a stop cannot release the stop: an acknowledgement is dropped, and a chan
 acknowledged the stop. A change of payload announced in STOPPED is served at once. `KeptRequest` outlives a fault that
 is acknowledged.
 
-`supervise` is compiled; its whole memory is one record of whole numbers, `MEMORY`.
+`supervise` is compiled; its whole memory is one record of whole numbers, `SupervisorMemory`.
 """
 
 from collections.abc import Collection, Iterable
@@ -453,7 +453,7 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
 
 
 class Supervisor:
-    """The state machine's interface to the rest of the scheme. memory: (1,) of MEMORY, which `supervise` changes."""
+    """The state machine's interface to the rest of the scheme. memory: (1,) of `SupervisorMemory`, which `supervise` changes."""
 
     def __init__(self, memory: Structured) -> None:
         self._m = memory[0]
