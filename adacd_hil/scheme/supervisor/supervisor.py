@@ -453,7 +453,7 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
 
 
 class Supervisor:
-    """The state machine's interface to the rest of the scheme. memory: (1,) of `SupervisorMemory`, which `supervise` changes."""
+    """The state machine as the rest of the scheme sees it. memory: (1,) of `SupervisorMemory`."""
 
     def __init__(self, memory: Structured) -> None:
         self._m = memory[0]
