@@ -72,7 +72,7 @@ def test_a_field_that_numpy_s_records_have_themselves_is_refused():
 def owners() -> dict[str, set[str]]:
     """Return by record of `Memory` the modules that its docstring names."""
     return {
-        name: set(re.findall(r"`(?:\w+\.)*(\w+)`", kind.__doc__.partition("written by")[2]))
+        name: set(re.findall(r"`(?:\w+\.)*(\w+)`", re.split("written by", kind.__doc__, flags=re.IGNORECASE)[-1]))
         for name, kind in get_type_hints(memory.Memory).items()
     }
 
