@@ -22,7 +22,6 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _LOG_MAGIC = b"\x89MCAP0\r\n"
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCKS = Path("/proc/locks")
-_PIECE = 1 << 20
 _ANOTHER = "another one is there already, which is left as it is"
 
 
@@ -168,32 +167,6 @@ def replacing(path: Path, is_durable: bool = False) -> Iterator[Path]:
         replacement.discard()
         raise
     replacement.commit(is_durable)
-
-
-@contextmanager
-def placing(path: Path, dated_lines: int = 0) -> Iterator[Path]:
-    """Yield the path of a new file that takes its place only if that is free, empty, or holds the same contents.
-
-    For files that could be a user's own, since they don't show which program made them. dated_lines: lines at the
-    beginning that may differ, as with the date of writing. See `Replacement`. Raises FileExistsError when the block
-    ends and another file is there, OSError.
-    """
-    with replacing(path) as beside:
-        yield beside
-        if path.is_file() and path.stat().st_size and not _is_same(path, beside, dated_lines):
-            raise FileExistsError(errno.EEXIST, _ANOTHER, str(path))
-
-
-def _is_same(one: Path, other: Path, dated_lines: int) -> bool:
-    """Compare two files without their first `dated_lines` lines."""
-    with one.open("rb") as left, other.open("rb") as right:
-        for _ in range(dated_lines):
-            left.readline(_PIECE)
-            right.readline(_PIECE)
-        while piece := left.read(_PIECE):
-            if piece != right.read(len(piece)):
-                return False
-        return not right.read(1)
 
 
 def replace_file(path: Path, content: bytes | str) -> None:

@@ -44,9 +44,9 @@ def described(kind: type[Any], sizes: Mapping[str, int]) -> Record:
     )
 
 
-def zeros_of(kind: type[Any], sizes: Mapping[str, int], count: int = 1) -> Structured:
-    """Return records (count,) of zeros, see `described`."""
-    return np.zeros(count, described(kind, sizes))
+def zeros_of(kind: type[Any], sizes: Mapping[str, int]) -> Structured:
+    """Return one record (1,) of zeros, see `described`."""
+    return np.zeros(1, described(kind, sizes))
 
 
 def packed(values: Any) -> Structured:
