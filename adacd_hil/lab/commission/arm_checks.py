@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.clock import Clock
-from adacd_hil.control.host_checks import Check, CheckOutcome, failed, ok, skipped, warning
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.device_setup import contract_differences, describe_torque_scale, read_pdos
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import host_frames
-from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, survey
 from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.lab.commission.communication_test import (
     CommunicationReport,
@@ -28,12 +26,14 @@ from adacd_hil.lab.commission.communication_test import (
     ZeroTorqueCycle,
     ZeroTorqueLoop,
 )
+from adacd_hil.lab.commission.host_checks import Check, CheckOutcome, failed, ok, skipped, warning
+from adacd_hil.lab.commission.survey import NMT_STATES, compare, expected_nodes, survey
+from adacd_hil.lab.commission.traffic import Traffic, listen
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, BusError, Tap
 from adacd_hil.wire.can_interface import InterfaceState
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.traffic import Traffic, listen
 
 LISTEN_S = 0.5
 """Listening time for other masters: five of the usual heartbeats of 100 ms."""

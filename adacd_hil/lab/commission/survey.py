@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.device_setup import Slave
+from adacd_hil.lab.commission.traffic import Talk, Traffic, listen
 from adacd_hil.wire.bus import Bus, Frame, Tap
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID
@@ -23,7 +24,6 @@ from adacd_hil.wire.dbc_decoder import DbcDecoder, MessageDecoder
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 from adacd_hil.wire.frame_time import LoadMeter
-from adacd_hil.wire.traffic import Talk, Traffic, listen
 
 LISTEN_S = 1.5
 """Default time to listen: longer than the usual heartbeat and status periods of up to 1 s."""
