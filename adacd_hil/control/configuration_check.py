@@ -19,7 +19,7 @@ from adacd_hil.settings.configuration import (
 )
 from adacd_hil.settings.schema import ConfigError, find_problems, parse
 from adacd_hil.settings.toml_files import builtin_names
-from adacd_hil.wire.budget import check_budget
+from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.codec import Codec, CodecError
 
 Pair = tuple[float, float]
@@ -58,7 +58,8 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
         codec = load_contract(settings)
     except (ConfigError, CodecError) as error:
         return ConfigurationFindings([str(error)], [], None)
-    late = list(_budget_warnings(codec, settings))
+    excess = describe_excess(codec, settings)
+    late = [excess] if excess else []
     guesses = [*settings.assumed, *profile_guesses(settings)]
     assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in guesses)}"] if guesses else []
     warnings = [*oddities(settings), *_narrow(codec, settings), *assumed, *_layer_warnings(layers), *late]
@@ -178,13 +179,6 @@ def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
                 f"{message.name} carries ±{most_Nm:.3g} Nm, `arm.rated_torque_Nm[{joint}]` = {rated_Nm:g} Nm: is "
                 f"`torque_Nm` of {settings.devices.sensor[joint]} right?"
             )
-
-
-def _budget_warnings(codec: Codec, settings: Settings) -> Iterator[str]:
-    if b'"Trigger"' in codec.text:
-        budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
-        if not budget.is_fit:
-            yield f"contract {codec.path.stem}: {budget.line}"
 
 
 def _pair(values: Sequence[float]) -> str:

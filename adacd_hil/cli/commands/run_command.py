@@ -37,22 +37,9 @@ from adacd_hil.scheme.identify.anchor import unanchored_joints
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line
-from adacd_hil.wire.budget import check_budget
+from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.can_interface import CanInterface
-from adacd_hil.wire.codec import Codec
-
-
-def check_budget_of(codec: Codec, settings: Settings) -> None:
-    """Refuse a contract whose frames miss their deadlines in the configured period. Raises ConfigError, CodecError.
-
-    A DBC without attribute Trigger can't be judged and passes.
-    """
-    if b'"Trigger"' not in codec.text:
-        return
-    budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
-    if not budget.is_fit:
-        raise ConfigError(f"contract {codec.path.stem}: {budget.line}")
 
 
 def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
@@ -108,8 +95,8 @@ def run_on_bus(
     if settings.scheme == "certified" and not without_anchor and may_be_hardware(interface, channel):
         ask_without_anchor(unanchored_joints(settings), connection.arguments)
     codec = load_contract(settings)
-    if clock_name == "realtime":
-        check_budget_of(codec, settings)
+    if clock_name == "realtime" and (excess := describe_excess(codec, settings)):
+        raise ConfigError(excess)
     clock = make_clock(clock_name)
     with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack, never_stopped():
         bus = connection.open(clock, codec, settings)
