@@ -94,6 +94,7 @@ def run_on_bus(
         ask_first_run(history)
     if settings.scheme == "certified" and not without_anchor and may_be_hardware(interface, channel):
         ask_without_anchor(unanchored_joints(settings), connection.arguments)
+    files = [file for file in (tare, history) if file is not None]
     codec = load_contract(settings)
     if clock_name == "realtime" and (excess := describe_excess(codec, settings)):
         raise ConfigError(excess)
@@ -115,15 +116,14 @@ def run_on_bus(
             folder.path,
             interface,
             progress=progress,
-            tare=tare,
-            history=history,
+            files=files,
             live=live,
             on_started=functools.partial(folder.link, progress),
         )
         if guesses := guesses_in_brief(settings, () if tare is None else TARED):
             progress(f"warning: {guesses}")
-        for used in (tare, history):
-            for line in () if used is None else used.warnings:
+        for file in files:
+            for line in file.warnings:
                 progress(f"warning: {line}")
         with on_interrupt(session.interrupt, signal.SIGTSTP):  # Ctrl-Z parks: a stopped process would send no commands
             summary = session.run()
