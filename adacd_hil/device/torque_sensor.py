@@ -46,7 +46,7 @@ class TorqueSensor(CyclicDevice):
         Raises CodecError when the contract lacks a message or signal.
         """
         name = f"Sensor{joint}"
-        message = self.torque_message = codec.message(f"{name}Torque")
+        message = codec.message(f"{name}Torque")
         super().__init__(codec, name, message, "torque", period_s)
         self._torque_rate_Nm_s = torque_rate_Nm_s
         self.torque_range_Nm = torque_range_Nm
