@@ -15,7 +15,7 @@ from adacd_hil.control.fault_recovery import Recovery
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.pacing import Pacer, make_pacer, prepare_spin
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_checks
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.profile import enable_timeout_s, place_devices
@@ -225,7 +225,7 @@ class Session:
             recorder.cycle(self.clock.now_ns(), [], tap.take())
             recorder.event(self.clock.now_ns(), Event("error", "run", ending.error))
             self.progress(ending.error)
-        for line in (*ArmReport(arm).describe_checks(), *master.describe_checks()):
+        for line in (*describe_checks(arm), *master.describe_checks()):
             recorder.event(self.clock.now_ns(), Event("info", "frame checks", line))
         for certificate in cycle.certificates:  # as numbers, to compare runs
             recorder.event(self.clock.now_ns(), Event("info", CERTIFIED_MODEL, json.dumps(certificate._asdict())))

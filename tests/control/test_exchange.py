@@ -6,7 +6,7 @@ from rig import CODEC, PERIOD_NS, Rig
 
 from adacd_hil.control.exchange import Exchange, say_trouble
 from adacd_hil.control.pacing import GridPacer
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_checks
 from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.records import ArmCommand, ArmState
 from adacd_hil.wire.bus import EmbeddedBus, Frame
@@ -56,7 +56,7 @@ def test_a_frame_that_comes_after_its_cycle_was_given_up_is_of_that_cycle() -> N
     state = rig.read()
     assert state.is_complete
     assert state.age_tau_J == (0, 0)
-    assert "0 NO_NEW_DATA" in ArmReport(rig.bench.arm).describe_checks()[2]
+    assert "0 NO_NEW_DATA" in describe_checks(rig.bench.arm)[2]
 
 
 def test_the_feedback_is_in_when_its_last_frame_came_not_when_it_was_read() -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
@@ -438,10 +438,7 @@ def test_a_strangers_fault_takes_the_torque_away_is_named_and_recovered_from_by_
     rig.drives[1].fail(0x8611)
     states = [rig.step(6.0, 3.0) for _ in range(3)]
     assert states[-1].fault is FaultReason.DRIVE
-    assert (
-        "Drive2: FAULT, error code 0x8611: following error" in ArmReport(rig.arm).describe_faults()
-        or rig.drives[1].resets
-    )
+    assert "Drive2: FAULT, error code 0x8611: following error" in describe_faults(rig.arm) or rig.drives[1].resets
     assert any(e.name == "Drive2" and "EMCY 0x8611: following error" in e.message for e in rig.master.take_events())
     assert rig.drives[1].torque_Nm == 0.0
     for _ in range(10):
@@ -456,9 +453,7 @@ def test_an_unwanted_drive_in_fault_is_not_reset() -> None:
     for _ in range(5):
         rig.step(enable=False)
     assert (rig.drives[0].resets, rig.drives[0].state) == (0, "fault")
-    assert (
-        ArmReport(rig.arm).describe_faults()[0] == "Drive1: FAULT, error code 0x2310: continuous over-current, output"
-    )
+    assert describe_faults(rig.arm)[0] == "Drive1: FAULT, error code 0x2310: continuous over-current, output"
 
 
 def test_a_quick_stop_stops_strangers() -> None:

@@ -22,11 +22,12 @@ from adacd_hil.cli.connection import (
     never_stopped,
     on_interrupt,
 )
+from adacd_hil.cli.console_operator import ConsoleOperator
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
 from adacd_hil.clock import format_date, wall_ns
 from adacd_hil.control.configuration_check import guesses_in_brief
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
-from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
+from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.control.tare_file import TARED, use_tare
 from adacd_hil.device.contract import load_contract

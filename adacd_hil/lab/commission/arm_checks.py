@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from adacd_hil.clock import Clock
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import read_object
-from adacd_hil.device.device_setup import contract_differences, describe_torque_scale, read_pdos
+from adacd_hil.device.device_setup import Slave, command_deadline_ms, pdo_differences, torque_unit
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.device.torque_sensor import SensorStatus
@@ -192,12 +192,25 @@ def check_pdo_map(patient: ArmExamination) -> CheckOutcome:
     """Check that the devices' PDO parameters and mappings are those of the contract."""
     lines = []
     for slave in patient.master.slaves:
-        lines += contract_differences(slave.device, read_pdos(patient.master.nodes[slave.name]))
+        lines += pdo_differences(slave, command_deadline_ms(patient.settings))
     if lines:
         return failed(
             "; ".join(lines), "correct [[pdo]] of the devices' profiles, or map the devices' PDOs accordingly"
         )
     return ok("read back, equal to the contract")
+
+
+def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
+    """Say how the rated torque of a motor becomes that of its joint, `rated_Nm`. Raises DeviceError."""
+    if not slave.has(0x6076):
+        return f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint"
+    scale = slave.device.settings.scale
+    parts = [f"{slave.read(0x6076)} {torque_unit(scale)}"]
+    if scale.gear_ratio != 1.0:
+        parts.append(f"gear {scale.gear_ratio:g}")
+    if scale.gear_efficiency != 1.0:
+        parts.append(f"efficiency {scale.gear_efficiency:g}")
+    return f"{slave.name}: 0x6076 = {' x '.join(parts)}, {rated_Nm:.4g} Nm at the joint, 0.1 % of it a count"
 
 
 def check_torque_scale(patient: ArmExamination) -> CheckOutcome:
@@ -290,7 +303,7 @@ def check_heartbeats(patient: ArmExamination) -> CheckOutcome:
 
 def check_devices(patient: ArmExamination) -> CheckOutcome:
     """Check that no drive is in fault and no device reports an error."""
-    lines = [line for line in ArmReport(patient.arm).describe_faults() if ": status" not in line]
+    lines = [line for line in describe_faults(patient.arm) if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
     if lines or events:
         return warning("; ".join([*lines, *events]), "a run resets the fault if its cause has gone")
