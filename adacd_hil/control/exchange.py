@@ -147,7 +147,7 @@ class Exchange:
 
         `log_queue_bytes`: bytes that wait for the log's writer. Raises BusError.
         """
-        self._arm.write(command)
+        self._arm.send_command(command)
         record = self._record(turn, log_queue_bytes)
         if self._heartbeats.is_due(record.cycle):
             self._master.send_heartbeat()

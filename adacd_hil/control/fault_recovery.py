@@ -148,10 +148,10 @@ class FaultReport:
             FaultReason.DATA_AGE: (lambda: describe_gaps(arm),),
             FaultReason.BLIND: (lambda: describe_gaps(arm),),
             FaultReason.LIMIT: (lambda: describe_excess(arm),),
-            FaultReason.DEADLINE: (lambda: [watch.deadline.describe()],),
+            FaultReason.DEADLINE: (lambda: [watch.deadline.describe_misses()],),
             FaultReason.COMMISSION_TIMEOUT: (
                 pipeline.describe_withheld,
-                self._commission.describe,
+                self._commission.list_unrest,
                 lambda: describe_excess(arm),
             ),
             FaultReason.ENABLE_TIMEOUT: (lambda: describe_disabled(arm),),
@@ -162,7 +162,7 @@ class FaultReport:
         """Take in a cycle; `state`: of the scheme after the previous one."""
         self._commission.count_cycle(state, arm)
 
-    def describe(self, fault: FaultReason) -> list[str]:
+    def list_causes(self, fault: FaultReason) -> list[str]:
         """Describe the causes of a fault, one line each: first those of its reason."""
         return [
             *([self._checks.line] if fault is self._checks.reason else ()),
@@ -212,7 +212,7 @@ class CommissionReport:
                     self._causes[joint, place] += 1
                     self._worst[joint, place] = max(self._worst.get((joint, place), 0.0), abs(value))
 
-    def describe(self) -> list[str]:
+    def list_unrest(self) -> list[str]:
         """Name the causes, the most frequent first, one line each; empty if every cycle was good."""
         lines = [
             f"{self._text(cause)} in {count} of {self._cycles} cycles" for cause, count in self._causes.most_common()
@@ -295,7 +295,7 @@ class Recovery:
                     break
         except BusError:
             pass  # logged when it ended the run, and again if it can't be emptied
-        self._recorder.cycle(self._clock.now_ns(), [], self._tap.take())
+        self._recorder.cycle(self._clock.now_ns(), [], self._tap.take_passed())
 
     def _say(self, level: str, line: str) -> None:
         self._recorder.event(self._clock.now_ns(), Event(level, "recovery", line))

@@ -222,7 +222,7 @@ class Session:
         except (BusError, DeviceError) as reason:
             line = reason.line if isinstance(reason, DeviceError) else str(reason)
             ending = Ending(None, line, isinstance(reason, BusError))
-            recorder.cycle(self.clock.now_ns(), [], tap.take())
+            recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
             recorder.event(self.clock.now_ns(), Event("error", "run", ending.error))
             self.progress(ending.error)
         for line in (*describe_checks(arm), *master.describe_checks()):
@@ -241,7 +241,7 @@ class Session:
             for event in file.check_devices(identities):
                 recorder.event(self.clock.now_ns(), event)
         master.configure()
-        recorder.cycle(self.clock.now_ns(), [], tap.take())
+        recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
         if not self._has_started:
@@ -260,7 +260,7 @@ class Session:
             master.stop()
         except BusError as error:
             recorder.event(self.clock.now_ns(), Event("error", "run", f"devices were not stopped: {error}"))
-        recorder.cycle(self.clock.now_ns(), [], tap.take())
+        recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
         self.out.mkdir(parents=True, exist_ok=True)

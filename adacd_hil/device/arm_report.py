@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 
 from adacd_hil.device.arm import REMEMBERED_GAPS, Arm
+from adacd_hil.device.arm_watch import EventSource
 from adacd_hil.device.canopen_bus import name_error
 from adacd_hil.device.drive import Cia402State, Drive
 from adacd_hil.device.torque_sensor import SensorStatus
@@ -46,10 +47,11 @@ class DataShares:
     excesses: tuple[str, ...]
 
 
-class DataWatch:
+class DataWatch(EventSource):
     """Follows one attempt."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
+        super().__init__()
         limits = settings.data
         self._arm = arm
         self._window_cycles = max(1, round(DATA_WINDOW_S / settings.bus.period_s))
@@ -65,7 +67,6 @@ class DataWatch:
         self._cycles = self._all_cycles = self._incomplete = self._late = 0
         self._in_a_row = self._rows = 0  # cycles without a sample; rows of them in the present window
         self._has_rows = False
-        self._events: list[Event] = []
 
     def note(self, state: ArmState) -> None:
         """Take in one cycle, once its frames are in."""
@@ -92,7 +93,7 @@ class DataWatch:
         if not self._has_rows:
             self._has_rows = True
             text = f"no sample for the model in {MOST_IN_A_ROW} cycles in a row: so much later a contact is found"
-            self._events.append(Event("warning", "data", text))
+            self.events.append(Event("warning", "data", text))
 
     def _end_window(self) -> None:
         """Judge the cycles of a window; report shares that now exceed their limit, and those that are back below."""
@@ -106,20 +107,15 @@ class DataWatch:
             self._over ^= {name}
             level = "warning" if share > limit else "info"
             text = f"{name}: {share:.1%} of the last {self._cycles} cycles, {limit:.1%} allowed"
-            self._events.append(Event(level, "data", text))
+            self.events.append(Event(level, "data", text))
         if self._has_rows and not self._rows:
             self._has_rows = False
             text = f"a sample for the model at least every {MOST_IN_A_ROW} cycles again, for {self._cycles} cycles"
-            self._events.append(Event("info", "data", text))
+            self.events.append(Event("info", "data", text))
         self._rows = 0
         self._all_cycles += self._cycles
         self._cycles = self._incomplete = 0
         self._missing = [0] * len(self._names)
-
-    def take_events(self) -> list[Event]:
-        """Return and forget the events since the last call."""
-        events, self._events = self._events, []
-        return events
 
     def shares(self) -> DataShares:
         """Sum up the attempt."""
@@ -179,7 +175,7 @@ def describe_faults(arm: Arm) -> list[str]:
             lines.append(f"{drive.name}: {drive.state.name}, error code 0x{drive.error_code:04X}{name}")
         elif arm.was_enabled:
             lines += _describe_disabled(drive)
-    lines += arm.strangers.describe(arm.cycle)
+    lines += arm.strangers.describe_senders(arm.cycle)
     for sensor in arm.sensors:
         if sensor.status:
             words = ", ".join(text for bit, text in _STATUS_WORDS if sensor.status & bit)

@@ -60,23 +60,23 @@ class Slave:
 
     def read(self, index: int, sub: int = 0) -> int:
         """Read a number. Raises DeviceError."""
-        with explained(self.name, self.node_id, f"reading {self.describe(index, sub)}", self._answer_s):
+        with explained(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self._answer_s):
             return int(self._entry(index, sub).raw)
 
-    def write(self, index: int, sub: int, value: int) -> None:
+    def write_object(self, index: int, sub: int, value: int) -> None:
         """Write a number. Raises DeviceError."""
-        what = f"writing {self.describe(index, sub)} = {_number(value)}"
+        what = f"writing {self.name_object(index, sub)} = {_number(value)}"
         with explained(self.name, self.node_id, what, self._answer_s):
             self._entry(index, sub).raw = value
         self.known[index, sub] = value
 
     def write_checked(self, index: int, sub: int, value: int, unit: str = "") -> None:
         """Write a number and read it back. Raises DeviceError."""
-        self.write(index, sub, value)
+        self.write_object(index, sub, value)
         found = self.read(index, sub)
         if found != value:
             self.fail(
-                f"{self.describe(index, sub)} reads back {_with(found, unit)}, {_with(value, unit)} written",
+                f"{self.name_object(index, sub)} reads back {_with(found, unit)}, {_with(value, unit)} written",
                 f"the device limits or rounds it: see {ObjectName(index, sub)} in its manual",
             )
 
@@ -96,7 +96,7 @@ class Slave:
         if text := self.difference(index, sub, expected, quantity, unit):
             self.fail(text, remedy)
 
-    def describe(self, index: int, sub: int) -> str:
+    def name_object(self, index: int, sub: int) -> str:
         """Name an object as the EDS does."""
         variable = find_variable(self._node.object_dictionary, index, sub)
         return str(ObjectName(index, sub)) + ("" if variable is None else f" {variable.name}")
@@ -267,13 +267,13 @@ def _enter_mode(slave: Slave, codec: Codec) -> None:
     if not slave.can_write(0x6060):
         return
     try:
-        slave.write(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+        slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
     except RefusedError:
         if not (slave.can_write(0x6040) and slave.read(0x6040) & _HALT):
             raise
-        slave.write(0x6040, 0, 0)  # some drives refuse another mode under halt
+        slave.write_object(0x6040, 0, 0)  # some drives refuse another mode under halt
         slave.known.pop((0x6040, 0))
-        slave.write(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+        slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
     if not slave.has(0x6061):
         return
     for _ in range(_MODE_READS):
@@ -349,7 +349,7 @@ class _KnownObject(NamedTuple):
 
     @property
     def name(self) -> str:
-        return f"{self.slave.name} (node {self.slave.node_id}): {self.slave.describe(*self.place)}"
+        return f"{self.slave.name} (node {self.slave.node_id}): {self.slave.name_object(*self.place)}"
 
 
 class ParameterWatch(RateLimitedEvents):
@@ -478,7 +478,7 @@ def _switch_off_others(slave: Slave) -> None:
             continue
         cob_id = slave.read(index, _COB_ID)
         if not cob_id & NOT_VALID:
-            slave.write(index, _COB_ID, cob_id | NOT_VALID)
+            slave.write_object(index, _COB_ID, cob_id | NOT_VALID)
 
 
 def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
@@ -490,7 +490,7 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
     mapping = slave.device.settings.mapping
     is_all = mapping == "rewritten"
     if slave.can_write(index, _COB_ID):
-        slave.write(index, _COB_ID, cob_id | NOT_VALID)
+        slave.write_object(index, _COB_ID, cob_id | NOT_VALID)
     if is_all or (mapping != "fixed" and _mapping_difference(slave, pdo)):
         if not slave.has(mapping_index, len(entries)):
             slave.fail(
@@ -498,22 +498,22 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
                 f"{len(entries)}",
                 f"map fewer objects in [[pdo]] {pdo.message} of {slave.device.profile.name}",
             )
-        slave.write(mapping_index, 0, 0)
+        slave.write_object(mapping_index, 0, 0)
         for sub, entry in enumerate(entries, 1):
-            slave.write(mapping_index, sub, entry)
-        slave.write(mapping_index, 0, len(entries))
+            slave.write_object(mapping_index, sub, entry)
+        slave.write_object(mapping_index, 0, len(entries))
     if is_all or slave.can_write(index, _TYPE):
-        slave.write(index, _TYPE, pdo.transmission)
+        slave.write_object(index, _TYPE, pdo.transmission)
     for sub, value in ((_INHIBIT, pdo.inhibit_100us), (_EVENT_TIMER, event_timer_ms)):
         if slave.can_write(index, sub):
-            slave.write(index, sub, value)
+            slave.write_object(index, sub, value)
         elif value and not slave.has(index, sub):
             slave.fail(
                 f"{ObjectName(index, sub)} is not in the EDS, {value} wanted",
                 f"leave it out of [[pdo]] {pdo.message} in {slave.device.profile.name}",
             )
     if slave.can_write(index, _COB_ID):
-        slave.write(index, _COB_ID, cob_id)
+        slave.write_object(index, _COB_ID, cob_id)
 
 
 def pdo_differences(slave: Slave, command_deadline_ms: int) -> list[str]:

@@ -63,7 +63,7 @@ def listen_for_hosts(bus: Bus, clock: Clock, settings: Settings, codec: Codec, d
         frame = bus.receive(remaining_ns * 1e-9)
         if frame is not None and not frame.is_error:
             strangers.accept(frame, 0)
-    return strangers.describe(0)
+    return strangers.describe_senders(0)
 
 
 def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
@@ -132,6 +132,6 @@ class Strangers(RateLimitedEvents):
         """Return whether another sender has acted on the arm of late."""
         return cycle <= self._until_cycle
 
-    def describe(self, cycle: int) -> list[str]:
+    def describe_senders(self, cycle: int) -> list[str]:
         """Describe the actions of other senders on the arm of late, one line each."""
         return [text for text, heard in self._complaints.items() if cycle <= heard + self._hold_cycles]

@@ -118,7 +118,7 @@ def test_the_sync_counter_runs_from_1_to_240() -> None:
 def test_torque_goes_out_per_mille_of_rated_torque_with_the_joints_sign() -> None:
     devices = Devices({"sign": [1, -1], "rated_torque_Nm": [12.0, 6.0]})
     devices.enable()
-    devices.arm.write(ArmCommand(np.array((3.0, 1.5)), enable=True, quick_stop=False))
+    devices.arm.send_command(ArmCommand(np.array((3.0, 1.5)), enable=True, quick_stop=False))
     values = [CODEC.by_id[frame.can_id].decode_values(frame.data) for frame in devices.sent]
     assert values == [(15.0, 250.0), (15.0, -250.0)]
 
@@ -305,7 +305,7 @@ def sent_torques(devices: Devices) -> tuple[int, ...]:
 
 def test_commands_of_the_same_cycle_leave_at_once_and_once() -> None:
     devices = enabled_devices("same_cycle")
-    devices.arm.write(COMMANDED)
+    devices.arm.send_command(COMMANDED)
     assert [frame.can_id for frame in devices.sent] == [0x201, 0x202]
     assert sent_torques(devices) == TORQUES
     devices.arm.synchronise(1, 0, 1)
@@ -314,7 +314,7 @@ def test_commands_of_the_same_cycle_leave_at_once_and_once() -> None:
 
 def test_pipelined_commands_leave_behind_the_next_sync_and_once() -> None:
     devices = enabled_devices("pipelined")
-    devices.arm.write(COMMANDED)
+    devices.arm.send_command(COMMANDED)
     assert devices.sent == []
     devices.arm.synchronise(1, 0, 1)
     assert [frame.can_id for frame in devices.sent] == [0x080, 0x201, 0x202]
@@ -328,6 +328,6 @@ def test_a_pipelined_command_kept_for_longer_than_the_age_budget_carries_no_torq
     periods: int, torques: tuple[int, ...]
 ) -> None:
     devices = enabled_devices("pipelined")
-    devices.arm.write(COMMANDED)
+    devices.arm.send_command(COMMANDED)
     devices.arm.synchronise(periods, 0, periods)
     assert sent_torques(devices) == torques

@@ -54,7 +54,7 @@ class NetworkRig(Rig):
         self.arm.synchronise(self.cycle, self.cycle * self.period_ns, 1)
         while (frame := self.bus.receive(0.0)) is not None:
             self.accept(frame)
-        self.arm.write(ArmCommand(np.array(tau or (0.0, 0.0)), enable, False))
+        self.arm.send_command(ArmCommand(np.array(tau or (0.0, 0.0)), enable, False))
         if self.cycle % 100 == 0:
             self.master.send_heartbeat()
         self.cycle += 1

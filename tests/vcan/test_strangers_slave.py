@@ -307,7 +307,7 @@ class Rig:
             if not self.arm.accept(frame):
                 self.master.accept(frame)
         state = self.arm.state()
-        self.arm.write(ArmCommand(np.array(tau or (0.0, 0.0)), enable, quick_stop))
+        self.arm.send_command(ArmCommand(np.array(tau or (0.0, 0.0)), enable, quick_stop))
         self.cycle += 1
         return state
 

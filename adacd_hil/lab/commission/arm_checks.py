@@ -130,7 +130,7 @@ def check_other_masters(patient: ArmExamination) -> CheckOutcome:
     """Check that no other master is on the bus."""
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
-    patient.tap.take()
+    patient.tap.take_passed()
     doing = host_frames(patient.settings, patient.codec)
     if patient.settings.bus.is_shared:
         del doing[patient.codec.message("Nmt").can_id]
@@ -240,7 +240,7 @@ def check_protection(patient: ArmExamination) -> CheckOutcome:
 
 def check_cycle(patient: ArmExamination) -> CheckOutcome:
     """Run cycles at the period with disabled drives."""
-    patient.tap.take()
+    patient.tap.take_passed()
     patient.master.start()
     patient.loop.run(patient.cycle_s, patient.cycles.append)
     for cycle in patient.cycles:

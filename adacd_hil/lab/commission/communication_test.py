@@ -94,7 +94,7 @@ class ZeroTorqueLoop:
         turn = self._exchange.turn()
         self._exchange.leave()
         record = self._exchange.end(turn, ArmCommand(np.zeros(JOINTS), is_enabling, quick_stop))
-        return ZeroTorqueCycle(turn.arm, record, self._bus.take())
+        return ZeroTorqueCycle(turn.arm, record, self._bus.take_passed())
 
 
 SUFFICIENT_SHARE = 0.90

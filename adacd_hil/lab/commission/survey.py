@@ -164,7 +164,7 @@ def survey(
 def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
     """Return the nodes that sent frames, ascending by node id."""
     found: dict[int, Node] = {}
-    for is_sent, frame in tap.take():
+    for is_sent, frame in tap.take_passed():
         function, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
         if is_sent or frame.is_error or frame.can_id > MAX_STANDARD_ID or node_id == 0:
             continue
@@ -398,7 +398,7 @@ class BusView:
         """Note that this computer has lost frames: counters that jump now are no device's fault."""
         for entry in self._entries.values():
             if entry.receiver is not None:
-                entry.receiver.restart()
+                entry.receiver.restart_sequence()
 
     def snapshot(self, t_ns: int, node_id: int | None = None) -> Snapshot:
         """Sum up at `t_ns`; with `node_id`, only that node's part of it."""
