@@ -8,16 +8,9 @@ from typing import NamedTuple
 from adacd_hil.control.motions import motion_problems
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
-from adacd_hil.settings.configuration import (
-    ConfigurationLayer,
-    Settings,
-    configuration_layers,
-    explain_unknown,
-    known_keys,
-    resolved_table,
-    value_of,
-)
+from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
 from adacd_hil.settings.schema import ConfigError, find_problems, parse
+from adacd_hil.settings.setting_keys import explain_unknown, known_keys, value_of
 from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.codec import Codec, CodecError

@@ -15,7 +15,8 @@ from typing import Generic, NamedTuple, TypeVar
 from adacd_hil.control.configuration_check import oddities, profile_guesses
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeGrant, isolated_cpus
-from adacd_hil.settings.configuration import KnownKey, Settings, in_words, known_keys, value_of
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.setting_keys import KnownKey, in_words, known_keys, value_of
 from adacd_hil.wire.bus import BusError
 from adacd_hil.wire.can_interface import CANFD_MTU, InterfaceState, can_interfaces
 
