@@ -159,7 +159,7 @@ def test_the_layout_digest_of_the_classic_contract_is_that_of_wire_version_1() -
     assert (CLASSIC.wire_version, CLASSIC.layout_digest) == (1, 0xF80FDAE0)
 
 
-@pytest.mark.parametrize("length", range(65))
+@pytest.mark.parametrize("length", [0, 1, 8, 9, 11, 12, 13, 20, 24, 33, 48, 63, 64])
 def test_only_lengths_with_a_data_length_code_are_taken(tmp_path: Path, length: int) -> None:
     signals = "".join(f' SG_ b{index} : {8 * index}|8@1+ (1,0) [0|255] "" HOST\n' for index in range(length))
     fd = 'BA_DEF_ BO_ "VFrameFormat" ENUM ' + ",".join(f'"f{index}"' for index in range(14)) + ',"StandardCAN_FD";\n'
