@@ -165,14 +165,14 @@ class Cycle:
         output = None
         self._pacer.resume()
         while not self._is_over(output):
-            turn = self._exchange.turn()
-            arm = self._watch.judge(turn.arm)
+            tick, arm = self._exchange.turn()
+            arm = self._watch.judge(arm)
             request = self._checks.judge(arm, self._state) or self._request(arm.cycle)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
             self._follow(arm, output)
             command, flags = self._limit(arm, output, self._exchange.leave())
-            record = self._exchange.end(turn, command, recorder.waiting_bytes)
+            record = self._exchange.end(tick, arm, command, recorder.waiting_bytes)
             self._data.note(arm)
             self._faults.note(self._state, arm)
             self._first_motion.note(arm, self._state, self._tau_c)
@@ -186,7 +186,7 @@ class Cycle:
                 else f"not parked within {FINISH_S:g} s"
             )
             text = f"{why}: the drives are disabled where the arm is"
-            recorder.event(turn.tick.t_ns, Event("warning", "run", text))
+            recorder.event(tick.t_ns, Event("warning", "run", text))
             self._progress(text)
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(

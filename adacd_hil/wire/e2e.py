@@ -179,11 +179,6 @@ class E2eReceiver:
         self.counts[E2eStatus.NO_NEW_DATA] += 1
         return E2eStatus.NO_NEW_DATA
 
-    @property
-    def rejected(self) -> int:
-        """Number of frames that were not valid."""
-        return sum(self.counts[s] for s in E2eStatus if not s.is_valid) - self.counts[E2eStatus.NO_NEW_DATA]
-
     def tally(self) -> list[tuple[E2eStatus, int]]:
         """Return the number of frames by status."""
         return list(zip(E2eStatus, self.counts, strict=True))

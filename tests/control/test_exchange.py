@@ -23,7 +23,7 @@ class ExchangeRig:
         self.exchange = Exchange(bench.settings, bench.tap, bench.arm, bench.master, self.pacer, bench.clock)
 
     def read(self) -> ArmState:
-        return self.exchange.turn().arm
+        return self.exchange.turn()[1]
 
 
 def drain(bus: EmbeddedBus) -> list[Frame]:
@@ -99,12 +99,12 @@ def test_frames_that_the_kernel_dropped_are_counted_and_said_at_most_once_a_seco
     counted, said = [], []
     for count in (0, 1, 4, 4):
         lost.append(count)
-        counted.append(exchange.end(exchange.turn(), off).frames_lost)
+        counted.append(exchange.end(*exchange.turn(), off).frames_lost)
         said += exchange.events.take_events()
     assert counted == [0, 1, 4, 4]
     assert [event.message for event in said] == ["1 received frame dropped by the kernel: this host reads too late"]
     bench.clock.sleep_until_ns(bench.clock.now_ns() + 1_000_000_000)
-    exchange.end(exchange.turn(), off)
+    exchange.end(*exchange.turn(), off)
     (event,) = exchange.events.take_events()
     assert event.message.startswith("3 received frames")
 
