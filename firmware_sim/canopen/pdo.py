@@ -165,7 +165,7 @@ class ReceivePdo(PdoRecord):
     def restart(self) -> None:
         """Forget the sequence of the protected frames, and the last one."""
         if self.receiver is not None:
-            self.receiver.restart()
+            self.receiver.restart_sequence()
         self.forget()
         self.acted_ns = None
 

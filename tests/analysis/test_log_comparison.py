@@ -11,7 +11,8 @@ from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.runs.log_comparison import MATCH_S, ComparedContact, compare_logs, match_contacts
 from adacd_hil.log import logged_run
 from adacd_hil.log.log_files import LogError
-from adacd_hil.settings.configuration import apply_settings, load_settings
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.settings.toml_files import to_toml
 
 SETTINGS = load_settings("paper")

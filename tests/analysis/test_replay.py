@@ -19,7 +19,7 @@ from adacd_hil.replay.replay import replay, replay_many, replay_source
 from adacd_hil.replay.replayed_outcome import Replay, side_by_side
 from adacd_hil.score.emulator_truth import contacts_beside
 from adacd_hil.score.judge import Score
-from adacd_hil.settings.configuration import apply_settings
+from adacd_hil.settings.setting_keys import apply_settings
 from firmware_sim.bench.bench_time import TruthLog
 
 pytestmark = pytest.mark.slow

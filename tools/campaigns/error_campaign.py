@@ -33,7 +33,8 @@ from adacd_hil.scheme.detect.sensitivity import AGREES
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 from adacd_hil.score.judge import begins_of
-from adacd_hil.settings.configuration import Settings, apply_settings, load_settings, parse_changes
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.setting_keys import apply_settings, parse_changes
 from firmware_sim.arm.arms import ArmProfile
 from firmware_sim.arm.hardware_settings import MechanicsSettings, SensorSettings
 

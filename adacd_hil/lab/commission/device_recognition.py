@@ -13,8 +13,8 @@ from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.contract import compose
 from adacd_hil.device.profile import load_profile, place_devices, profile_names
-from adacd_hil.device.survey import BETWEEN_READS_S, Node
 from adacd_hil.lab.commission.profile_draft import KINDS, SENSOR, DeviceRatings, count_of, identity_of, is_of
+from adacd_hil.lab.commission.survey import BETWEEN_READS_S, Node
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adacd_hil.device.canopen_bus import EdsVariable, find_variable, read_eds
-from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT, SIGNAL_OBJECTS
+from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT
 from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, name_velocity_unit, read_drive_units
 from adacd_hil.device.profile import (
     HOST_SIGNALS,
@@ -37,6 +37,24 @@ _DEG_S_PER_RPM = 6.0
 _LEAST_LIMIT_DEG, _MOST_LIMIT_DEG, _MOST_SPEED_DEG_S = 1.0, 360.0, 720.0
 """Plausible limits of a joint; others are a drive's factory values. A wrist of a UR3e turns at 360 deg/s."""
 _Place = tuple[int, int]
+_SIGNAL_OBJECTS = {
+    "position": 0x6064,
+    "velocity": 0x606C,
+    "statusword": 0x6041,
+    "mode_display": 0x6061,
+    "torque_actual": 0x6077,
+    "torque_demand": 0x6074,
+    "error_code": 0x603F,
+    "error_register": 0x1001,
+    "controlword": 0x6040,
+    "target_torque": 0x6071,
+    "torque_offset": 0x60B2,
+    "max_torque": 0x6072,
+    "mode": 0x6060,
+    "torque": 0x9130,
+    "status": 0x6150,
+}
+"""CiA 301, 402 and 404: the object behind a signal's name."""
 
 
 class DeviceRatings(NamedTuple):
@@ -424,7 +442,7 @@ class _ProfileWriter(ABC):
         index, sub = place
         if place in _TORQUE_OBJECTS:
             return 'signal = "torque"'
-        name = next((name for name, known in SIGNAL_OBJECTS.items() if known == index), "")
+        name = next((name for name, known in _SIGNAL_OBJECTS.items() if known == index), "")
         unit = ', unit = "permille"' if name in _PERMILLE else ""
         return f'signal = "{name or f"object_{index:04X}_{sub}"}"{unit}'
 
@@ -593,7 +611,7 @@ class _DriveWriter(_ProfileWriter):
     def _command(self) -> _Record:
         wanted = ((0x6040, 0), (0x6071, 0))
         for record in self.records(is_received=True):
-            known = {SIGNAL_OBJECTS[name] for name in HOST_SIGNALS}
+            known = {_SIGNAL_OBJECTS[name] for name in HOST_SIGNALS}
             if record.room >= len(wanted) and self.find((0x6040, 0)):
                 return record
             if not record.room and record.carries(*wanted) and {index for index, _ in record.entries} <= known:

@@ -20,7 +20,8 @@ from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
 from adacd_hil.records import SchemeState
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.settings.configuration import Settings, changed_keys
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.setting_keys import changed_keys
 
 _TOPICS: Final = ("/scheme", "/cycle", "/contact")
 _TIMES: Final = ("lateness_ns", "feedback_ns", "command_ns", "compute_ns", "slack_ns")

@@ -26,8 +26,9 @@ from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.replay.replay import Watch, replay_many
 from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
-from adacd_hil.settings.configuration import Settings, apply_settings
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.setting_keys import apply_settings
 
 _FILTER_FACTORS: Final = (1.0, 0.5, 2.0, 4.0)
 _GAIN_FACTORS: Final = (1.0, 0.3, 3.0)

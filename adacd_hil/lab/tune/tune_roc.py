@@ -38,7 +38,8 @@ from adacd_hil.replay.log_source import LogSource
 from adacd_hil.score.emulator_truth import HostCycles, TrueContact, contacts_beside, windows_of
 from adacd_hil.score.judge import Times, TouchWindow, explained_until, rate_bound_per_h, share_bounds
 from adacd_hil.score.wording import delay_figures
-from adacd_hil.settings.configuration import Settings, changed_keys, keep_facts, load_settings
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.setting_keys import changed_keys, keep_facts
 
 Changes = dict[str, str]
 
