@@ -53,7 +53,7 @@ ARM_NUMBERS: Final = float_fields(
         "stop_damping_Nm_s": PAIR,
     }
 )
-"""Filled in by `firmware_sim.arm.arms.ArmProfile.numbers`. The table is here because
+"""Filled in by `firmware_sim.arm.arms.EmulatedArm.numbers`. The table is here because
 compiled code contains it, and the cache of compiled code is keyed by the modules that compile."""
 
 MECHANICAL_STATE: Final = float_fields(

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
-from firmware_sim.arm.arms import STRAIGHT, OwnArmSettings
+from firmware_sim.arm.arms import STRAIGHT, EmulatedArm
 from firmware_sim.arm.hardware_settings import HabitSettings
 from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
 from firmware_sim.arm.touch_settings import TICK_S
@@ -176,7 +176,7 @@ class BenchNodes:
             self.period_ns = self.told_period_ns
 
 
-def _scale_of(own: OwnArmSettings | None, place: int) -> DriveScale:
+def _scale_of(own: EmulatedArm | None, place: int) -> DriveScale:
     if own is None:
         return DriveScale()
     increments = own.increments_per_joint_rev[place] or ENCODER_COUNTS

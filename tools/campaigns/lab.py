@@ -24,7 +24,6 @@ from adacd_hil.control.controller import HANDOVER_S, fill_torque
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.settings.arm_settings import ArmSettings
 from adacd_hil.structured import Structured
-from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import external_torque
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
 from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, ticks
@@ -71,17 +70,6 @@ class Recording:
     tau_c: NDArray[np.float64]
     tau_ext: NDArray[np.float64]
     theta: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Experiment(Scenario):
-    """A scenario whose arm need not be one of the profiles."""
-
-    own_arm: ArmProfile = ARMS["P"]
-
-    @property
-    def arm(self) -> ArmProfile:
-        return self.own_arm
 
 
 @compiled
@@ -210,7 +198,7 @@ def record(
     """
     count = len(motion.q_d)
     degrees = np.degrees(motion.q_d[0])
-    scenario = _Experiment(
+    scenario = Scenario(
         own_arm=arm.arm,
         seed=seed,
         start_deg=(float(degrees[0]), float(degrees[1])),
