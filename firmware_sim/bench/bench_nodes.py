@@ -61,13 +61,10 @@ class BenchNodes:
         self.devices = tuple(
             EmulatedDevice(
                 ids[i],
-                described[i].eds,
+                described[i],
                 injector.sender(i),
                 own_messages(codec.by_id, right_ids[i], ids[i]),
                 longest,
-                described[i].defaults,
-                described[i].fallbacks,
-                described[i].made_up,
             )
             for i in range(len(_NODES))
         )

@@ -287,7 +287,7 @@ class Patience:
             return NEVER_NS
         return self.sync_ns + self._period_us * self._tenth_periods * 100
 
-    def restart(self) -> None:
+    def forget_command(self) -> None:
         """Forget the last command."""
         self.silent_syncs = _NO_COMMAND_YET
 

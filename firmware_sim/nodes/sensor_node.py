@@ -128,7 +128,7 @@ class SensorNode(Application):
         """Whether a host relies on its measurement."""
         return self.device.is_operational
 
-    def restart(self, is_node_reset: bool) -> None:
+    def restart_node(self, is_node_reset: bool) -> None:
         """Forget the zero at a node reset."""
         if is_node_reset:
             self._status = STATUS_NOT_VALID

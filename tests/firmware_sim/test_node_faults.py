@@ -160,7 +160,7 @@ def test_a_device_off_the_bus_does_not_hear_the_masters_heartbeat():
     for _ in range(60):
         host.put(0x77F, b"\x05")
         pass_ms(host, 1)
-    assert [int(watchdog) for watchdog in device.watchdogs.tripped] == [3]
+    assert [int(watchdog) for watchdog in device.tripped] == [3]
 
 
 @pytest.mark.parametrize("node", [1, 3])
@@ -324,9 +324,9 @@ def test_a_device_with_a_fast_clock_loses_the_masters_heartbeat_sooner(ppm, lost
     pass_ms(host, 400)
     host.put(0x77F, b"\x05")
     pass_ms(host, lost_ms - 1)
-    assert device.watchdogs.tripped == set()
+    assert device.tripped == set()
     pass_ms(host, 1)
-    assert [int(watchdog) for watchdog in device.watchdogs.tripped] == [3]
+    assert [int(watchdog) for watchdog in device.tripped] == [3]
 
 
 @pytest.mark.parametrize(("ppm", "patience_ns"), [(0.0, 1_500_000), (200_000.0, 1_250_000), (-250_000.0, 2_000_000)])

@@ -4,7 +4,6 @@ import configparser
 import random
 import struct
 
-import canopen
 import pytest
 from bench_host import (
     CODEC,
@@ -294,9 +293,3 @@ def test_no_sdo_frame_however_strange_breaks_the_server(host):
 
 def test_a_long_string_is_read_in_segments(host):
     assert host.nodes[1].sdo.upload(0x1008, 0) == b"adacd-hil torque drive"
-
-
-def test_the_devices_need_no_thread(host):
-    with pytest.raises(RuntimeError, match="timers belong to the bench"):
-        host.bench.devices[0]._node.network.send_periodic(0x701, b"\x7f", 0.1)
-    assert isinstance(host.bench.devices[0]._node, canopen.LocalNode)
