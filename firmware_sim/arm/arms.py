@@ -35,6 +35,15 @@ STOP_DAMPING_NM_S: Final = (10.0, 2.0)
 """Of the joint stops, per rad/s."""
 
 
+def pack_fields(settings: object, layout: np.dtype[np.void]) -> np.void:
+    """Make one element of a layout for compiled functions; its fields that the settings have, too, are filled."""
+    numbers: np.void = np.zeros(1, layout)[0]
+    for name in layout.names or ():
+        if hasattr(settings, name):
+            numbers[name] = getattr(settings, name)
+    return numbers
+
+
 Pair = tuple[float, float]
 Joints = tuple[int, int]
 IN_ORDER: Joints = (1, 2)
@@ -104,13 +113,8 @@ class EmulatedArm:
 
     def numbers(self) -> np.void:
         """Pack the empty arm for compiled functions, one element of ARM_NUMBERS."""
-        numbers: np.void = np.zeros(1, ARM_NUMBERS)[0]
+        numbers = pack_fields(self, ARM_NUMBERS)
         numbers["alpha"], numbers["beta"], numbers["gamma"] = self.inertia()
-        numbers["length_m"][:] = self.link_length_m
-        numbers["viscous_Nm_s"][:] = self.viscous_Nm_s
-        numbers["coulomb_Nm"][:] = self.coulomb_Nm
-        numbers["torque_limit_Nm"][:] = self.rated_torque_Nm
-        numbers["brake_damping_Nm_s"][:] = self.brake_damping_Nm_s
         numbers["current_loop_rad_s"][:] = CURRENT_LOOP_RAD_S
         numbers["stop_high_rad"][:] = np.radians(self.stop_deg)
         numbers["stop_low_rad"][:] = -numbers["stop_high_rad"]

@@ -13,13 +13,13 @@ its nominal torque constant. Equations: `firmware_sim.body.motor`, `firmware_sim
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from adacd_hil.settings.schema import ConfigError, setting
-from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, EmulatedArm
+from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, EmulatedArm, pack_fields
 from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS, REFERENCE_C
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
 from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
@@ -184,15 +184,10 @@ class MechanicsSettings:
 
     def numbers(self, arm: EmulatedArm) -> np.void:
         """Pack for compiled functions, one element of MECHANICS_NUMBERS."""
-        numbers: np.void = np.zeros(1, MECHANICS_NUMBERS)[0]
-        own = {field.name for field in fields(self)}
-        for name in own.intersection(MECHANICS_NUMBERS.names or ()):
-            numbers[name] = getattr(self, name)
+        numbers = pack_fields(self, MECHANICS_NUMBERS)
         surplus = [max(0.0, self.static_Nm[joint] - arm.coulomb_Nm[joint]) for joint in range(2)]
         numbers["surplus_Nm"] = surplus
-        numbers["stribeck_rad_s"] = self.stribeck_velocity_rad_s
         numbers["sigma2_Nm_s"] = self._sigma2(arm)
-        numbers["capacity_J_K"] = self.heat_capacity_J_K
         numbers["ripple_phase_rad"] = np.radians(self.ripple_phase_deg)
         numbers["is_encoder_on_link"] = self.encoder_side == "link"
         numbers["gravity_m_s2"] = STANDARD_GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))

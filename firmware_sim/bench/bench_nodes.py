@@ -54,7 +54,7 @@ class BenchNodes:
         self.wiring = wiring = scenario.wiring
         self.is_crossed = wiring != STRAIGHT
         """Whether some device isn't at its own joint or counts the other way."""
-        described = [contract.describe(place) for place in range(len(_NODES))]
+        described = [contract.describe_device(place) for place in range(len(_NODES))]
         right_ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
         ids = device_ids(scenario.faults, right_ids)
         longest = longest_pdo(codec)
@@ -87,7 +87,7 @@ class BenchNodes:
             for alias, place in description.aliases.items():
                 if alias != place:
                     device.serve(*alias, device.reader(*place))
-                    device.pdos.accept(*alias, device.pdos.writer(*place))
+                    device.pdos.accept_values(*alias, device.pdos.writer(*place))
         injector.attach(self.devices, self.drives, self.sensors)
         self.latch_motors()
         self.period_ns = contract.period_us * 1000 or _UNTOLD_PERIOD_NS

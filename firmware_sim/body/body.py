@@ -48,6 +48,8 @@ from firmware_sim.body.sensors import (
 )
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 
+PERIOD_TICKS: Final = 10
+"""Ticks of a period of 1 ms."""
 _POSES: Final = 181
 _POINTS: Final = 61
 """Grid on which the smallest effective mass of the arm is searched: 1° of the elbow, 1/60 of the link."""
@@ -200,7 +202,7 @@ class MovableArm(Protocol):
     def start_scenario(self) -> None: ...  # noqa: D102
 
     def advance(  # noqa: D102
-        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int | None = None
+        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int
     ) -> None: ...
 
     def sample(self) -> Measurement: ...  # noqa: D102
@@ -237,16 +239,9 @@ def _pack_numbers(scenario: Scenario) -> Vector:
 class Body:
     """One emulated arm, from power-on. After construction it compiles no code and allocates no large array."""
 
-    def __init__(self, scenario: Scenario, period_s: float = 1e-3, seed: int | None = None) -> None:
-        """Put the arm at the scenario's start pose, at rest.
-
-        `seed` outweighs the scenario's. Raises ValueError when the period isn't a multiple of 100 µs.
-        """
-        self._ticks_per_period = ticks(period_s)
-        if self._ticks_per_period < 1 or not math.isclose(self._ticks_per_period * TICK_S, period_s, rel_tol=1e-9):
-            raise ValueError(f"period_s = {period_s} s is no multiple of {TICK_S} s")
+    def __init__(self, scenario: Scenario, seed: int | None = None) -> None:
+        """Put the arm at the scenario's start pose, at rest. `seed` outweighs the scenario's."""
         self.scenario = scenario
-        self.period_s = period_s
         self._contacts = contact_table(scenario.contacts)
         self._payloads = payload_table(scenario.payloads)
         self._things = touch_table(scenario)
@@ -258,7 +253,7 @@ class Body:
         self._number_vector = _pack_numbers(scenario)
         self._numbers: np.void = self._number_vector.view(BODY_NUMBERS)[0]
         motor = self._numbers["motor"]
-        self._gain, self._offset_Nm = motor["gain"].tolist(), motor["offset_Nm"].tolist()
+        self._gain, self._offset_Nm = motor["gain"].tolist(), motor["torque_offset_Nm"].tolist()
         self._can_overload = float(motor["can_overload"])
         self.has_ideal_motors = not motor["has_limits"] and np.array_equal(
             motor["peak_Nm"], scenario.arm.rated_torque_Nm
@@ -370,19 +365,15 @@ class Body:
         return first, second
 
     def advance(
-        self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int], tick_count: int | None = None
+        self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int], tick_count: int = PERIOD_TICKS
     ) -> None:
-        """Advance by one period, or by `tick_count` ticks of 100 µs.
-
-        Set-points (2,) and `DriveMode` (2,) hold for the whole of it.
-        """
-        left = self._ticks_per_period if tick_count is None else tick_count
-        while left > 0:
-            count = left
+        """Advance by ticks of 100 µs. Set-points (2,) and `DriveMode` (2,) hold for the whole of it."""
+        while tick_count > 0:
+            count = tick_count
             if self._encoder_noise.is_on:
-                count = min(left, NOISE_TICKS)
+                count = min(tick_count, NOISE_TICKS)
                 self._encoder_noise.draw(int(self._course["tick"]) + count - 1)
-            left -= count
+            tick_count -= count
             advance_body(
                 self._state_vector,
                 self._number_vector,

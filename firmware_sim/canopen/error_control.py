@@ -351,7 +351,7 @@ class SyncCounts:
         """Whether SYNC can be relied on."""
         return self.odd <= TOLERATED
 
-    def note(self, kind: SyncKind, lost: int) -> None:
+    def count_sync(self, kind: SyncKind, lost: int) -> None:
         """Count a SYNC, and those that were lost before it."""
         self._counts[_LOST_SUB] += lost
         if kind is not SyncKind.RIGHT:

@@ -402,7 +402,7 @@ class EmulatedContract:
     devices: tuple[DeviceDescription, ...] = ()
     period_us: int = 0
 
-    def describe(self, place: int) -> DeviceDescription:
+    def describe_device(self, place: int) -> DeviceDescription:
         """Describe the device at a place: drive 1, drive 2, sensor 1, sensor 2."""
         if self.devices:
             return self.devices[place]

@@ -58,7 +58,7 @@ class TransmitPdo(PdoRecord):
         self._syncs = 0
         self.send = self._make_sender()
 
-    def begin(self, t_ns: int) -> None:
+    def begin_sending(self, t_ns: int) -> None:
         """Become active: an event-driven PDO begins with a frame."""
         self.is_due = True
         self._allowed_ns = t_ns
@@ -253,7 +253,7 @@ class Pdos:
         """Tell whether an exchanged PDO brings values of an object."""
         return any((index, subindex) in pdo.layout.keys for pdo in self._receiving)
 
-    def accept(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
+    def accept_values(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
         """Give received values of an object to a function instead of writing the object as SDO does."""
         self._writers[index, subindex] = write
 
@@ -283,7 +283,7 @@ class Pdos:
                 waiting.forget()
         for begun in sending:
             if begun not in self._sending:
-                begun.begin(self._now_ns)
+                begun.begin_sending(self._now_ns)
         self._sending = frozenset(sending)
         self.answers = frozenset(pdo.can_id for pdo in sending if pdo.type == 1)
         self.on_sync = tuple(pdo.send if pdo.type == 1 else pdo.on_sync for pdo in sending if pdo.is_synchronous)

@@ -231,7 +231,7 @@ class EmulatedDevice(ObjectDictionary):
             return
         t_ns = self.clock.own_ns(t_ns)
         counts = self.sync_counts
-        counts.note(kind, lost)
+        counts.count_sync(kind, lost)
         if kind is SyncKind.WRONG_LENGTH:
             self.trip(Watchdog.SYNC_LENGTH, t_ns)
         elif kind is SyncKind.RIGHT:

@@ -66,8 +66,8 @@ class DriveNode(Application):
         motor: Motor,
         rated_torque_Nm: float,
         is_free_running: bool,
-        scale: DriveScale = DriveScale(),  # noqa: B008 (a constant)
-        habits: HabitSettings = HabitSettings(),  # noqa: B008 (a constant)
+        scale: DriveScale,
+        habits: HabitSettings,
     ) -> None:
         """Connect the node to its device.
 
@@ -144,7 +144,7 @@ class DriveNode(Application):
         device = self.device
         device.open_at_work |= {_CONTROLWORD}
         self._pdos.events = _EVENTS
-        self._pdos.accept(*_CONTROLWORD, self._receive_word)
+        self._pdos.accept_values(*_CONTROLWORD, self._receive_word)
         device.watch(*_CONTROLWORD, check=self._obey_by_sdo)
         device.watch(0x605A, 0, check=one_of(*QUICK_STOPS))
         device.watch(0x605B, 0, check=one_of(*RAMPS))
@@ -412,7 +412,7 @@ class DriveNode(Application):
         self.motor_mode = stop.mode
         self._is_braking = True
         self.has_news = True
-        self._standstill.begin(t_ns)
+        self._standstill.begin_braking(t_ns)
 
     def _reset_fault(self, t_ns: int) -> None:
         """Leave Fault, unless its cause is still there."""

@@ -44,7 +44,7 @@ def run_arm(
             q1, q2, dq1, dq2 = state["q"][0], state["q"][1], state["dq"][0], state["dq"][1]
             change_touch(things, time_s, q1, q2, touch_state, contact.size != 0)
             tau1, tau2 = describe_touch(
-                things, time_s, q1, q2, dq1, dq2, touch_state, contact, 0.0, time_s, arm["length_m"][0], out
+                things, time_s, q1, q2, dq1, dq2, touch_state, contact, 0.0, time_s, arm["link_length_m"][0], out
             )
             seen[index] = (
                 time_s, q1, q2, dq1, dq2, out["force_N"], out["link"], out["index"], out["power_W"], out["energy_J"],
@@ -178,7 +178,7 @@ class GeneralArm:
         slope = 9.80665 * math.sin(math.radians(settings.tilt_deg))
         downhill = math.radians(settings.tilt_direction_deg)
         first, second = state["q"][0], state["q"][0] + state["q"][1]
-        length = self.numbers["length_m"][0]
+        length = self.numbers["link_length_m"][0]
         along1 = self.numbers["moment_kg_m"] + state["payload_kg"] * length
         along2, beside2 = state["beta"] / length, state["sigma"] / length
         height = along1 * math.cos(downhill - first) + along2 * math.cos(downhill - second)

@@ -114,22 +114,21 @@ def test_nobody_comes_before_the_drives_are_enabled():
     assert (truth.contact_force, truth.contact_index, truth.payload) == (20.0, 0.0, 1.0)
 
 
-@pytest.mark.parametrize("period_s", [0.5e-3, 1e-3, 2e-3, 4e-3])
-def test_a_contact_acts_exactly_from_its_onset_to_its_end(period_s):
+@pytest.mark.parametrize("ticks", [5, 10, 40])
+def test_a_contact_acts_exactly_from_its_onset_to_its_end(ticks):
     """tau_J is known, so what the arm does in the last period before the onset and in the first after it tells."""
-    body = Body(Scenario(contacts=(step(0.02), step(0.1, link=2, point_m=0.2, angle_deg=-90.0))), period_s)
+    body = Body(Scenario(contacts=(step(0.02), step(0.1, link=2, point_m=0.2, angle_deg=-90.0))))
     for _ in range(7):
         body.advance((0.0, 0.0), OFF)
     body.start_scenario()
     rows = []
-    for period in range(round(0.16 / period_s)):
+    for tick in range(0, 1_600, ticks):
         truth = Truth(body)
-        if period == 5:
+        if tick == 5 * ticks:
             body.start_scenario()  # again: without effect
-        rows.append((period * period_s, truth.contact_force, truth.contact_link, truth.contact_index, *truth.dq))
-        body.advance((0.0, 0.0), OFF)
-    for time_s, force_N, link, index, dq1, _ in rows:
-        tick = round(time_s * 1e4)
+        rows.append((tick, truth.contact_force, truth.contact_link, truth.contact_index, *truth.dq))
+        body.advance((0.0, 0.0), OFF, ticks)
+    for tick, force_N, link, index, dq1, _ in rows:
         first, second = 200 <= tick < 700, 1000 <= tick < 1500
         assert force_N == (20.0 if first or second else 0.0)
         assert link == (1.0 if first else 2.0 if second else 0.0)
@@ -174,18 +173,3 @@ def test_asking_for_the_truth_changes_nothing():
             body.advance((math.sin(0.02 * cycle), 0.3), TORQUE)
         ends.append((body.sample(), Truth(body).block.tobytes()))
     assert ends[0] == ends[1]
-
-
-@pytest.mark.parametrize("period_s", [0.0, 0.5e-4, 1.05e-3, -1e-3])
-def test_a_period_off_the_drives_ticks_is_refused(period_s):
-    with pytest.raises(ValueError, match=r"is no multiple of 0\.0001 s"):
-        Body(load_scenario("idle"), period_s)
-
-
-def test_two_half_periods_are_one_period():
-    whole, halves = (Body(load_scenario("idle"), period_s) for period_s in (1e-3, 5e-4))
-    for _ in range(100):
-        whole.advance((0.7, -0.3), TORQUE)
-        halves.advance((0.7, -0.3), TORQUE)
-        halves.advance((0.7, -0.3), TORQUE)
-    assert Truth(whole).block.tobytes() == Truth(halves).block.tobytes()

@@ -379,7 +379,7 @@ def test_truth_balances_on_the_link_side(is_elastic):
         else {"rotor_inertia_kg_m2": (0.3, 0.05), "motor_viscous_Nm_s": (0.2, 0.1)}
     )
     settings = MechanicsSettings(**others, motor_coulomb_Nm=(0.3, 0.1), tilt_deg=10.0)
-    body = Body(Scenario(profile="M", start_deg=(10.0, 50.0), contacts=(contact,), mechanics=settings), 1e-4)
+    body = Body(Scenario(profile="M", start_deg=(10.0, 50.0), contacts=(contact,), mechanics=settings))
     body.start_scenario()
     pushes, momenta = [], []
     for _ in range(1_000):
@@ -388,7 +388,7 @@ def test_truth_balances_on_the_link_side(is_elastic):
         cosine = math.cos(truth["q"][1])
         momenta.append((a1 + 2.0 * a2 * cosine) * truth["dq"][0] + (a3 + a2 * cosine) * truth["dq"][1])
         pushes.append((truth["tau_J"] + truth["tau_ext"] - truth["tau_friction"] - truth["tau_gravity"])[0])
-        body.advance((2.0, -0.5), TORQUE)
+        body.advance((2.0, -0.5), TORQUE, 1)
     gained = np.concatenate([[0.0], np.cumsum(np.add(pushes[1:], pushes[:-1]) * 0.5e-4)])
     assert np.abs(momenta).max() > 0.1
     assert np.abs(gained - momenta).max() < 1e-4

@@ -212,11 +212,11 @@ def record(
     )
     if any(arm.sensors.encoder_noise_counts) or any(arm.sensors.offset_walk_Nm_rs):
         raise ValueError("encoder noise and a walk of the torque offset are drawn outside the compiled loop")
-    body = Body(scenario, PERIOD_S)
+    body = Body(scenario)
     body.start_scenario()
     parts = body.parts
     numbers = parts.numbers.view(BODY_NUMBERS)[0]
-    numbers["arm"]["torque_limit_Nm"][:] = numbers["motor"]["peak_Nm"][:] = _UNLIMITED_NM
+    numbers["arm"]["rated_torque_Nm"][:] = numbers["motor"]["peak_Nm"][:] = _UNLIMITED_NM
     rated_Nm = np.array(arm.arm.rated_torque_Nm)
     rate_share = np.array(ArmSettings().torque_rate_limit_Nm_s) / ArmSettings().rated_torque_Nm
     noise = np.random.default_rng(seed).standard_normal((count, JOINTS)) * arm.sensors.torque_noise_Nm
