@@ -110,12 +110,10 @@ def paper_torque(arm: GeneralArm, seconds: float) -> tuple[np.ndarray, np.ndarra
         1,
         [
             (MechanicsSettings(**SPRINGS, damping_Nm_s=(3.0, 1.0), tilt_deg=20.0), BODY_PAYLOAD, 2.0, 1e-5),
-            (AS_RIGID, NONE, 10.0, 1e-4),
             (AS_RIGID, POINT_PAYLOAD, 10.0, 1e-4),
             (MechanicsSettings(tilt_deg=20.0, tilt_direction_deg=-60.0), BODY_PAYLOAD, 10.0, 1e-4),
             # a spring that is off by 1 % moves the links by 4e-5 rad
             (MechanicsSettings(**SPRINGS), POINT_PAYLOAD, 10.0, 1e-5),
-            (MechanicsSettings(**SPRINGS, damping_Nm_s=(3.0, 1.0), tilt_deg=20.0), BODY_PAYLOAD, 10.0, 1e-5),
             # flanks that rattle undamped forget their past: each knock enlarges what the knock before it left
             (MechanicsSettings(**SPRINGS, backlash_rad=(2e-3, 2e-3)), NONE, 2.0, 1e-3),
         ],
@@ -205,8 +203,7 @@ def test_a_prescribed_pulse_changes_the_momentum_as_in_mujoco(settings, link, po
     assert np.linalg.norm(gained - expected) < 0.002 * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("speed_m_s", [0.5, 2.0])
-@pytest.mark.parametrize("payload", [NONE, POINT_PAYLOAD])
+@pytest.mark.parametrize(("speed_m_s", "payload"), [(0.5, NONE), (2.0, POINT_PAYLOAD)])
 def test_a_ball_that_hits_link_2_in_mujoco_moves_our_arm_alike(speed_m_s, payload):
     """The ball's loss of momentum in the engine, given to our arm as a pulse, changes the arm's momentum within 2 %."""
     arm = GeneralArm(without_friction("S"), AS_RIGID, q=(0.3, 0.9), payload=payload)

@@ -11,7 +11,6 @@ import pytest
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_toml
-from firmware_sim.arm.hardware_settings import DriveSettings, SensorSettings
 from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     VELOCITY_LSB_RAD_S,
@@ -175,13 +174,6 @@ def test_a_scenario_with_every_error_can_be_written_and_read_again(tmp_path):
     path = tmp_path / "all.toml"
     path.write_text(to_toml(scenario), encoding="utf-8")
     assert load_scenario(str(path)) == scenario
-
-
-@pytest.mark.parametrize("name", ["paper", "idle"])
-def test_the_built_in_scenarios_have_no_errors(name):
-    scenario = load_scenario(name)
-    assert scenario.sensors == SensorSettings()
-    assert scenario.drives == DriveSettings()
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ def test_an_elastic_blow_has_the_force_time_and_speeds_of_two_masses(profile, li
     assert set(seen["link"][touched]) == {link}
 
 
-@pytest.mark.parametrize("damping_ratio", [0.05, 0.2, 0.5])
+@pytest.mark.parametrize("damping_ratio", [0.2])
 def test_a_damped_blow_has_the_restitution_of_spring_and_damper_that_part_without_pull(damping_ratio):
     """δ = (v/ω_d) e^(−ζωt) sin ω_d t; they part where K δ + c δ̇ = 0."""
     bare = beside(**SOFT)
@@ -119,7 +119,7 @@ def depth_of(body: BodySettings, arm: TouchedArm, seen) -> np.ndarray:
     return np.maximum(np.array(depths), 0.0)
 
 
-@pytest.mark.parametrize("damping_N_s_m", [0.0, 12.0, 60.0])
+@pytest.mark.parametrize("damping_N_s_m", [12.0])
 def test_what_the_arm_gives_is_the_bodys_motion_its_spring_and_its_heat(damping_N_s_m):
     body = beside(**SOFT, damping_N_s_m=damping_N_s_m, radius_m=0.05)
     # The damper's force jumps at the first touch: a step that holds it is wrong by up to its own share of the impulse.
@@ -140,17 +140,7 @@ def test_what_the_arm_gives_is_the_bodys_motion_its_spring_and_its_heat(damping_
     assert lost_J[touched] == pytest.approx(seen["energy"][touched], abs=2e-4 * motion_J.max())
 
 
-def test_the_impulse_on_the_joints_is_the_bodys_momentum():
-    body = beside(**SOFT, damping_N_s_m=5.0)
-    arm = strike(body, 0.2, speed_m_s=0.005, substeps=2)
-    seen = arm.play(0.12)
-    torque = np.array([seen["tau1"], seen["tau2"]])
-    impulse_Nm_s = torque.sum(axis=1) * TICK_S
-    momentum = 1.5 * arm.own(0, "shift_rate_m_s")[-1] * normal_of(2, POSE)
-    assert impulse_Nm_s == pytest.approx(-arm.jacobian(2, 0.2, POSE).T @ momentum, rel=5e-3)
-
-
-@pytest.mark.parametrize("damping_N_s_m", [0.0, 30.0, 3000.0])
+@pytest.mark.parametrize("damping_N_s_m", [0.0, 3000.0])
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_body_pushes_the_arm_off_and_never_pulls_it(side, damping_N_s_m):
     body = beside(1, 0.25, side, **SOFT, damping_N_s_m=damping_N_s_m)
@@ -187,7 +177,7 @@ def test_a_bodys_torque_is_that_of_a_prescribed_force_of_its_size(link, side):
         )
 
 
-@pytest.mark.parametrize("region", ["hand_finger", "chest", "skull_forehead"])
+@pytest.mark.parametrize("region", ["hand_finger", "chest"])
 def test_a_clamped_body_is_pressed_with_the_force_that_the_motor_gives(region):
     body = beside(1, 0.25, region=region, clamped=True)
     arm = TouchedArm(q=POSE, motor=(8.0, 0.0), damping=0.6, bodies=(body,))
@@ -232,24 +222,6 @@ def test_a_body_in_the_arms_place_waits_until_the_arm_has_gone():
     assert arm.own(0, "presence")[-1] == 1.0
 
 
-def test_a_body_that_leaves_takes_its_force_with_it():
-    body = beside(1, 0.25, region="chest", clamped=True, duration_s=0.5)
-    arm = TouchedArm(q=POSE, motor=(5.0, 0.0), damping=0.6, bodies=(body,))
-    seen = arm.play(0.6)
-    assert seen["force"][4999] > 10.0
-    assert abs(seen["force"][5000:]).max() == 0.0
-    assert abs(seen["energy"][5000:]).max() == 0.0
-    assert (seen["index"][5000:] == -1.0).all()
-
-
-def test_nothing_touches_before_the_scenario_begins():
-    body = beside(1, 0.25, region="chest")
-    arm = strike(body, 0.25, speed_m_s=0.5)
-    arm.tick = -1000
-    seen = arm.play(0.1)
-    assert seen["force"].max() == 0.0
-
-
 def test_the_energy_of_a_second_touch_counts_from_its_own_beginning():
     first = beside(1, 0.25, 1, 0.01, region="chest", duration_s=0.2)
     second = beside(1, 0.25, -1, 0.01, region="chest", at_s=0.0)
@@ -292,8 +264,7 @@ def test_an_empty_table_touches_nothing_and_writes_nothing():
     assert rates.tolist() == [7.0]
 
 
-@pytest.mark.parametrize("profile", ["P", "S", "M"])
-@pytest.mark.parametrize("region", ["skull_forehead", "abdomen"])
+@pytest.mark.parametrize(("profile", "region"), [("P", "skull_forehead"), ("M", "abdomen")])
 def test_the_largest_rate_bounds_every_pose_and_is_reached_in_one(profile, region):
     rig = TouchedArm(profile=profile)
     for link in (1, 2):
@@ -308,13 +279,6 @@ def test_the_largest_rate_bounds_every_pose_and_is_reached_in_one(profile, regio
             mobility = rig.mobility(link, point_m, q, (math.cos(turn), math.sin(turn)))
             rates.append(math.sqrt(body.stiffness * (mobility + 1.0 / body.mass)))
         assert 0.85 * bound < max(rates) < 1.0001 * bound
-
-
-def test_a_damper_faster_than_its_spring_sets_the_largest_rate():
-    body = BodySettings(at_s=1.0, link=1, x_m=9.0, y_m=9.0, mass_kg=1e3, stiffness_N_m=1.0, damping_N_s_m=500.0)
-    rig = TouchedArm(bodies=(body,))
-    mobility = max(rig.mobility(1, 0.35, (0.0, bend), (0.0, 1.0)) for bend in np.linspace(0.0, 3.1, 200))
-    assert largest_rate_rad_s(rig.things) == pytest.approx(500.0 * mobility, rel=2e-3)
 
 
 def test_things_that_are_never_there_together_do_not_add_up():
