@@ -156,25 +156,16 @@ class SmallestPush:
 
 
 @dataclass(frozen=True)
-class BesideContact:
-    """A true contact as the paper's scheme would have seen it; number as in the list of contacts."""
-
-    number: int
-    is_armed: bool
-    detected_s: float | None
-    delay_ms: float | None
-
-
-@dataclass(frozen=True)
 class Beside:
     """The results of the paper's scheme beside, by the definitions of the module's first lines.
 
-    Without the truth there are no contacts, and false alarms and misses are None.
+    contacts: of each true contact `number`, as in the list of contacts, `is_armed`, `detected_s`, `delay_ms`. Without
+    the truth there are no contacts, and false alarms and misses are None.
     """
 
     adaptation_s: dict[str, float | None]
     frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
-    contacts: tuple[BesideContact, ...]
+    contacts: tuple[dict[str, Any], ...]
     false_alarms: int | None
     false_alarms_s: tuple[float, ...] | None
     missed: int | None

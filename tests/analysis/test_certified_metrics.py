@@ -179,13 +179,13 @@ def touched_beside(row, crossing):
 
 def test_the_papers_scheme_detects_where_it_crosses_its_threshold():
     theirs = beside(touched_beside(3000, 3005))
-    assert [(c.number, c.is_armed, c.delay_ms) for c in theirs.contacts] == [(1, True, pytest.approx(5.0))]
+    assert [(c["number"], c["is_armed"], c["delay_ms"]) for c in theirs.contacts] == [(1, True, pytest.approx(5.0))]
     assert (theirs.missed, theirs.false_alarms) == (0, 0)
 
 
 def test_the_papers_scheme_does_not_detect_before_it_is_armed():
     theirs = beside(touched_beside(1500, 1505))
-    assert [(c.is_armed, c.delay_ms) for c in theirs.contacts] == [(False, None)]
+    assert [(c["is_armed"], c["delay_ms"]) for c in theirs.contacts] == [(False, None)]
     assert theirs.missed == 0
 
 

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from functools import partialmethod
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,16 +12,16 @@ from test_run_report import record_truth
 
 from adacd_hil.cli.main import cli
 from adacd_hil.lab.report import run_reading
-from adacd_hil.lab.report.outline import Facts, TruthClock
 from adacd_hil.lab.report.page import left_out_text, shown_contacts
 from adacd_hil.lab.report.report_files import write_run_report
 from adacd_hil.lab.report.report_json import report_json
-from adacd_hil.lab.report.run_reading import read_run
+from adacd_hil.lab.report.run_reading import TruthClock, read_run
 from adacd_hil.lab.report.timeline import timeline_of
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.verdict import identified_text
 from adacd_hil.log import reader
 from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.logged_run import AttemptBegins, Truth
 from adacd_hil.log.reader import Series, start_of_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme
@@ -48,6 +47,7 @@ def few_kept(monkeypatch):
         ("TRACED_CONTACTS", 0),
         ("ADAPTATIONS", 0),
         ("_NOISE_CYCLES", 4),
+        ("_WAITING", 700),
     ):
         monkeypatch.setattr(run_reading, name, value)
     in_short_pieces = partialmethod(reader.LogStream.__init__, cycles_per_piece=PIECE)
@@ -171,7 +171,7 @@ def test_around_the_first_contacts_every_cycle_is_kept(few_kept, monkeypatch, ce
 def test_the_page_of_a_long_run_says_that_cycles_are_left_out(few_kept, certified, tmp_path):
     read = read_run(certified, truth_of(certified), full_cycles=1000)
     report = write_run_report(read.run, tmp_path, read.source, read.gathered)
-    assert f"Of 9050 cycles {len(read.run.cycle)} are here: of every 2263" in report.html_path.read_text()
+    assert f"Of 9050 cycles {len(read.run.cycle)} are here: of every 4096" in report.html_path.read_text()
 
 
 def test_a_log_of_just_so_many_cycles_is_kept_whole(certified):
@@ -180,10 +180,10 @@ def test_a_log_of_just_so_many_cycles_is_kept_whole(certified):
 
 
 def test_a_truth_keeps_of_long_contacts_the_ends_and_the_peaks(monkeypatch, certified):
-    whole = read_truth(truth_of(certified))
+    whole = read_truth(truth_of(certified)).rows
     for name, value in (("_BEGINNING", (50, 20)), ("_ENDING", 60), ("_HELD", 150), ("_BUCKET", 10)):
         monkeypatch.setattr(emulator_truth, name, value)
-    thinned = read_truth(truth_of(certified))
+    thinned = read_truth(truth_of(certified)).rows
     assert (len(whole.cycle), len(thinned.cycle) < 450) == (250 + 250 + 700 + 3, True)
     for index in (0, 1, 2):
         ours, theirs = (rows.tau_ext[rows.contact_index == index] for rows in (thinned, whole))
@@ -196,12 +196,12 @@ def test_a_truth_keeps_of_long_contacts_the_ends_and_the_peaks(monkeypatch, cert
 
 
 def test_a_truth_says_from_when_on_the_payload_is_another(certified):
-    truth = read_truth(truth_of(certified))
+    truth = read_truth(truth_of(certified)).rows
     assert list(zip(truth.model_cycle.tolist(), truth.payload_kg.tolist(), strict=True)) == [(100, 0.0), (5400, 1.0)]
 
 
 def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s():
-    rows = TruthTable(
+    rows = Truth(
         attempt=np.zeros(5, np.int64),
         cycle=np.arange(98, 103),
         tau_ext=np.arange(10.0).reshape(5, 2),
@@ -212,11 +212,10 @@ def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s()
         model_cycle=np.array([98]),
         payload_kg=np.zeros(1),
         theta=np.zeros((1, 7)),
-        metadata={},
-        problem="",
-        is_complete=True,
     )
-    truth = emulator_truth.host_truth(rows, np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
+    truth = emulator_truth.host_truth(
+        TruthTable(rows, {}, "", True), np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5)
+    )
     assert truth.cycle.tolist() == [98, 99, 100]
     columns = (truth.tau_ext, truth.contact_link, truth.contact_index, truth.force_N, truth.time_s)
     assert [len(column) for column in columns] == [3] * 5
@@ -316,33 +315,28 @@ def scheme_of(cycles, state=SchemeState.MONITOR):
 def truth_at(cycles, attempt=0):
     nothing = np.zeros(len(cycles))
     cycle, attempts = np.array(cycles), np.full(len(cycles), attempt)
-    return TruthTable(attempts, cycle, np.zeros((len(cycles), 2)), nothing, nothing, None, attempts, cycle, nothing,
-                     nothing, {}, "", True)  # fmt: skip
+    truth = Truth(cycle, np.zeros((len(cycles), 2)), nothing, nothing, nothing, nothing, attempt=attempts)
+    return TruthTable(truth, {}, "", True)
 
 
 def test_the_truth_of_a_cycle_that_was_skipped_between_two_pieces_lies_between_them():
     clock = TruthClock(truth_at([11, 12, 13, 20]))
     begins = np.array([0])
-    told = [clock.add(scheme_of(cycles), begins)[0].tolist() for cycles in ([10, 11], [13, 14])]
-    clock.end()
-    assert (told, clock.t_ns.tolist()) == ([[0], [1, 2]], [11_000_000, 12_000_000, 13_000_000, 14_000_000])
+    told = [clock.place_rows(scheme_of(cycles), begins)[0].tolist() for cycles in ([10, 11], [13, 14])]
+    assert (told, clock.t_ns.tolist()) == ([[0], [1, 2]], [11_000_000, 12_000_000, 13_000_000, 0])
 
 
 def test_the_truth_of_an_attempt_waits_for_its_first_cycle():
     clock = TruthClock(truth_at([3, 4], attempt=1))
-    assert clock.add(scheme_of([480, 481, 482, 483, 484]), np.array([0]))[0].size == 0
-    assert clock.add(scheme_of([485, 486]), np.array([0, 482]))[1].tolist() == [483, 484]
+    assert clock.place_rows(scheme_of([480, 481, 482, 483, 484]), np.array([0]))[0].size == 0
+    assert clock.place_rows(scheme_of([485, 486]), np.array([0, 482]))[1].tolist() == [483, 484]
 
 
 def test_an_attempt_that_begins_in_two_pieces_begins_once():
-    facts, shell = Facts(), SimpleNamespace(events=lambda piece: [])
+    attempts = AttemptBegins()
     for cycles, state in (([0, 1], SchemeState.INIT), ([2, 3], SchemeState.COMMISSION), ([4], SchemeState.ENABLE)):
-        series = {"/scheme": scheme_of(cycles, state), "/contact": NOTHING, "/frame_checks": NOTHING}
-        facts.add(shell, SimpleNamespace(series=series))
-    assert facts.begins.tolist() == [0]
-
-
-NOTHING = Series(np.zeros(0, np.dtype([("sec", "<u4"), ("nanosec", "<u4")])), 0)
+        attempts.add(np.array(cycles), np.full(len(cycles), state, np.uint8))
+    assert attempts.begins.tolist() == [0]
 
 
 @pytest.mark.parametrize(

@@ -196,7 +196,10 @@ def contact_rows(
     beside = shown_beside(metrics)
     if beside is None or not beside.contacts:
         return _CONTACT_HEAD, rows
-    delays = {c.number: number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts}
+    delays = {
+        theirs["number"]: number_text(theirs["delay_ms"], 0) if theirs["is_armed"] else "not armed"
+        for theirs in beside.contacts
+    }
     return (*_CONTACT_HEAD, "paper's scheme ms"), [
         (*row, delays[contact.number]) for row, contact in zip(rows, contacts, strict=True)
     ]

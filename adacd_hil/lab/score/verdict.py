@@ -298,9 +298,9 @@ def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str
         return (NONE,) * 11
     times_s = list(beside.adaptation_s.values())
     frozen = [beside.frozen_residual_max_Nm[label] for label in detections]
-    armed = [contact for contact in beside.contacts if contact.is_armed]
-    found = [contact for contact in armed if contact.detected_s is not None]
-    seen = [contact.detected_s for contact in beside.contacts if contact.detected_s is not None]
+    armed = [contact for contact in beside.contacts if contact["is_armed"]]
+    delays_ms = [contact["delay_ms"] for contact in armed if contact["delay_ms"] is not None]
+    seen = [contact["detected_s"] for contact in beside.contacts if contact["detected_s"] is not None]
     return (
         _seconds(times_s, 0),
         _seconds(times_s, 1),
@@ -309,8 +309,8 @@ def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str
         _residual_text(frozen, 1),
         *same[1:],
         f"{seen[0]:.2f} s" if seen else NONE,
-        NONE if beside.missed is None else found_text(len(found), len(armed)),
-        _median_text([contact.delay_ms for contact in found if contact.delay_ms is not None]),
+        NONE if beside.missed is None else found_text(len(delays_ms), len(armed)),
+        _median_text(delays_ms),
         NONE if beside.false_alarms is None else str(beside.false_alarms),
     )
 
