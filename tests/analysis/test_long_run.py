@@ -376,7 +376,7 @@ def test_of_many_contacts_the_first_are_listed_and_those_that_went_wrong(certifi
     metrics = evaluate(read_run(certified, truth_of(certified)).run)
     right = next(contact for contact in metrics.contacts if contact.direction_ok)
     many = tuple(replace(right, number=number) for number in range(1, 51))
-    wrong = replace(right, number=51, link=2, link_detected=1)
+    wrong = replace(right, number=51, link=2, link_detected=1, link_ok=False)
     metrics = replace(metrics, contacts=(*many, wrong), evidence=None)
     assert [contact.number for contact in shown_contacts(metrics, 5)] == [1, 2, 3, 4, 5, 51]
     assert left_out_text(metrics, 5) == (

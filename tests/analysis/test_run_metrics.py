@@ -346,6 +346,36 @@ def test_a_detection_without_report_has_no_link():
     assert one_contact().link_detected is None
 
 
+def test_a_link_that_a_second_person_touches_before_the_report_is_final_is_right():
+    run = make_run()
+    touch(run, 2000, 50, (6.0, 0.0))
+    touch(run, 2050, 100, (-9.0, -4.0), link=2, index=1)
+    first, _ = evaluate(react(run, 2005, link=2, direction=(1, -1))).contacts
+    assert (first.link, first.link_detected, first.link_ok) == (1, 2, True)
+
+
+@pytest.mark.parametrize(("second_row", "direction"), [(2020, (-1, -1)), (2900, (1, 0))])
+def test_a_direction_is_that_of_all_who_push_until_the_report_is_final(second_row, direction):
+    run = make_run()
+    touch(run, 2000, 20, (6.0, 0.0))
+    touch(run, second_row, 100, (-9.0, -4.0), link=2, index=1)
+    first, _ = evaluate(react(run, 2005, direction=direction)).contacts
+    assert first.direction_ok
+
+
+@pytest.mark.parametrize(
+    ("link", "direction", "is_clean"), [(1, (1, 0), True), (2, (1, 0), False), (1, (-1, 0), False)]
+)
+def test_a_run_with_a_contact_on_a_link_that_nobody_touched_or_in_a_wrong_direction_is_not_good(
+    link, direction, is_clean
+):
+    run = make_run()
+    touch(run, 2000, 250, (6.0, 0.0))
+    metrics = evaluate(react(run, 2005, link=link, direction=direction))
+    assert metrics.is_clean is is_clean
+    assert metrics.contacts[0].link_ok is (link == 1)
+
+
 def test_the_true_link_is_told():
     assert one_contact(tau_ext=(6.0, 3.0), link=2).link == 2
 

@@ -90,8 +90,8 @@ KEYS = {
     "frozen_residual_max_Nm.B": "identified cad cycles",
     "contacts.0": "number section state link onset_s end_s is_armed detected_s delay_ms law_ms ideal_ms link_at_alarm "
     "link_detected direction direction_ok tau_ext_Nm tau_ext_peak_hat_Nm torque_error_ratio true_force_N level kind "
-    "reaction location is_two_sided tau_ext_peak_sigma_Nm impulse_Nm_s impulse_sigma_Nm_s force_N force_sigma_N "
-    "lever_m lever_sigma_m blind_deg",
+    "link_ok reaction location is_two_sided tau_ext_peak_sigma_Nm impulse_Nm_s impulse_sigma_Nm_s force_N "
+    "force_sigma_N lever_m lever_sigma_m blind_deg",
     "parameters.A": "a1 a2 a3 F_v1 F_v2 F_c1 F_c2",
     "cycle": "count duration_s clock scheduler",
     "timing": "is_modelled period_us cycles times_us reaction_us data_age_cycles queues_bytes counts histograms_us",

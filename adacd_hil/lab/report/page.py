@@ -173,10 +173,9 @@ def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
 
 
 def went_wrong(contact: ReportedContact) -> bool:
-    """Tell whether a contact was missed, or its link or direction is not the true one."""
+    """Tell whether a contact was missed, or named on a link that nobody touched or with a wrong direction."""
     is_missed = contact.is_armed and contact.detected_s is None
-    is_wrong_link = contact.link is not None and contact.link_detected not in (None, contact.link)
-    return is_missed or is_wrong_link or contact.direction_ok is False
+    return is_missed or contact.link_ok is False or contact.direction_ok is False
 
 
 def left_out_text(metrics: Metrics, most: int) -> str:

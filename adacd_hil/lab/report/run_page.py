@@ -20,6 +20,7 @@ from adacd_hil.lab.report.page import (
     render_page,
     shown_contacts,
     stretch_text,
+    went_wrong,
 )
 from adacd_hil.lab.report.report_tables import (
     counted_sentence,
@@ -165,7 +166,7 @@ def contacts_table(metrics: Metrics) -> Table | None:
     head, words = contact_rows(metrics, contacts)
     for contact, row in zip(contacts, words, strict=True):
         wrong = {
-            3: contact.link is not None and contact.link_detected not in (None, contact.link),
+            3: contact.link_ok is False,
             6: contact.detected_s is None,
             10: contact.direction_ok is False,
         }
@@ -197,13 +198,12 @@ def _card(contact: ReportedContact, run: Run, strongest_N: float) -> ContactCard
     if contact.link is not None:
         force = number_text(contact.true_force_N, 1, "N") if contact.true_force_N is not None else NONE
         entries.append(("truth", f"link {contact.link}, {force}"))
-    is_right = contact.detected_s is not None and contact.link in (None, contact.link_detected)
     return ContactCard(
         number=contact.number,
         link=contact.link if contact.link_detected is None else contact.link_detected,
         at_s=contact.at_s,
         stretch_s=(contact.at_s - 0.15, contact.at_s + 0.6),
-        is_wrong=contact.is_armed and not is_right,
+        is_wrong=went_wrong(contact),
         kind=_kind(contact),
         entries=[(term, text) for term, text in entries if text != NONE],
         arm=_arm(contact, run, strongest_N),
@@ -352,7 +352,7 @@ def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
         times_s = [*times_s[:LISTED], "…"]
     delays_ms = [contact.delay_ms for contact in seen if contact.delay_ms is not None]
     links = [contact for contact in seen if contact.link is not None]
-    right = sum(contact.link == contact.link_detected for contact in links)
+    right = sum(contact.link_ok is True for contact in links)
     found = f"{len(seen)} of {len(armed)}" if metrics.missed is not None else str(len(seen))
     if not armed and not metrics.contacts:
         found = NONE

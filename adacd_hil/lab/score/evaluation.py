@@ -124,7 +124,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         evidence=evidence,
         paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
         findings=list_findings(
-            run, sections, score, adaptation_s, payload_kg, evidence, faults, find_causes(run), gathered.data
+            run, sections, score, contacts, adaptation_s, payload_kg, evidence, faults, find_causes(run), gathered.data
         ),
         armed_false_alarms=score.armed_false_alarms if has_truth else None,
     )
@@ -261,7 +261,7 @@ def _contact(
     # The host sees samples up to the detection for the delay, up to the end of the window for the rest.
     until_alarm = np.abs(tau_ext[since_s <= delay_s]).max(axis=0)
     is_seen = since_s <= delay_s + _window_s(run)
-    until_final = tau_ext[is_seen]
+    until_final, links = _touches(run, onset_s, onset_s + delay_s + _window_s(run) if reported else float(time_s[-1]))
     channels = channels_at(run, onset_s)
     steps_s = [delay for channel in channels if (delay := channel.step_delay_s(until_alarm)) is not None]
     responses = [channel.respond(contact.tau_ext, contact.cycle, run.settings.bus.period_s) for channel in channels]
@@ -279,12 +279,25 @@ def _contact(
         delay_ms=contact.delay_ms,
         law_ms=min(steps_s) * 1e3 if steps_s else None,
         ideal_ms=float(time_s[over[0]] - onset_s) * 1e3 if over.size else None,
+        link_ok=None if reported.get("link_detected") is None else reported["link_detected"] in links,
         direction_ok=_is_direction_right(reported.get("direction"), until_final.sum(axis=0)),
         tau_ext_Nm=(float(peak[0]), float(peak[1])),
         torque_error_ratio=_torque_ratio(reported.get("tau_ext_peak_hat_Nm"), peak),
         true_force_N=None if contact.force_N is None else float(contact.force_N[touched][is_seen].max()),
         **reported,
     )
+
+
+def _touches(run: Run, from_s: float, until_s: float) -> tuple[Vector, Cycles]:
+    """Give the true torque (k, 2) and the touched link (k,) of all contacts between two times.
+
+    A second person who joins is in the report of the contact before.
+    """
+    assert run.truth is not None
+    time_s = run.truth_time_s()
+    rows = slice(np.searchsorted(time_s, from_s), np.searchsorted(time_s, until_s, side="right"))
+    is_touched = run.truth.contact_index[rows] >= 0.0
+    return run.truth.tau_ext[rows][is_touched], run.truth.contact_link[rows][is_touched].astype(np.int64)
 
 
 def _window_s(run: Run) -> float:

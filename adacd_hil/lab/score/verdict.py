@@ -39,6 +39,7 @@ def list_findings(
     run: Run,
     sections: tuple[Section, ...],
     score: Score,
+    contacts: tuple[ReportedContact, ...],
     adaptation_s: dict[str, float | None],
     payload_kg: dict[str, float | None],
     evidence: CertifiedEvidence | None,
@@ -67,6 +68,9 @@ def list_findings(
         grave.append(f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}")
     has_wrong = score.missed > 0 or (run.truth is not None and bool(score.false_alarms))
     findings = [*(Finding(text, True) for text in grave), Finding(found, has_wrong)]
+    misread = [contact for contact in contacts if contact.link_ok is False or contact.direction_ok is False]
+    if misread:
+        findings.append(Finding(f"link or direction of {number_of(len(misread), 'contact')} is wrong", True))
     if adaptation_s or run.stretch is None:  # a part of a run need not have any
         findings.append(Finding(identified, not adaptation_s or None in adaptation_s.values()))
     findings += [Finding(beside), Finding(data_text(data), bool(data.excesses))]
