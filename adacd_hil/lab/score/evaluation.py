@@ -29,7 +29,6 @@ from adacd_hil.log.logged_run import (
     split_sections,
 )
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
-from adacd_hil.scheme.contact.contact_report import KIND_S
 from adacd_hil.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
 from adacd_hil.score.judge import (
     Detection,
@@ -53,6 +52,7 @@ from adacd_hil.score.metrics import (
     TimingEvidence,
 )
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.scheme_settings import KIND_S
 
 
 class RunGatherer:
