@@ -62,7 +62,7 @@ def test_a_contact_while_adapting_has_its_delay_and_is_not_missed():
     metrics = evaluate(touched_in_adaptation())
     (contact,) = metrics.contacts
     assert (contact.state, contact.is_armed, contact.delay_ms) == ("ADAPT", False, pytest.approx(2.0))
-    assert "1 more while it was not armed (1 of them detected)" in metrics.verdict
+    assert "1 more while it was not watched (1 of them detected)" in metrics.verdict
     assert metrics.missed == 0
 
 

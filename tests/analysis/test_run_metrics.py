@@ -505,12 +505,12 @@ def faulted():
         ),
         (
             contact_in_adaptation(),
-            "All 2 contacts detected within 5 ms, 1 more while it was not armed, none false; the model was identified "
-            "in 1.00 s and again in 0.80 s after 1 kg.",
+            "All 2 contacts detected within 5 ms, 1 more while it was not watched, none false; the model was "
+            "identified in 1.00 s and again in 0.80 s after 1 kg.",
         ),
         (
             payload_taken_off(),
-            "No contact while detection was armed, no false alarm; the model was identified in 1.00 s and again in "
+            "No contact while the arm was watched, no false alarm; the model was identified in 1.00 s and again in "
             "0.80 s after taking off 1.5 kg.",
         ),
         (one_detected(), "The one contact detected within 5 ms, none false; the model was identified in 1.00 s."),
@@ -521,21 +521,21 @@ def faulted():
         ),
         (
             make_run((A, 1000)),
-            "No contact while detection was armed, no false alarm; the model was not identified.",
+            "The arm was not watched for contacts; the model was not identified.",
         ),
         (
             make_run((A, 1000), (M, 10), (P, 10), (A, 10)),
-            "No contact while detection was armed, no false alarm; the model was identified in 1.00 s, but not again "
+            "No contact while the arm was watched, no false alarm; the model was identified in 1.00 s, but not again "
             "after the payload change.",
         ),
         (
             faulted(),
-            "The run ended in FAULT (DATA_AGE) at 1.50 s; no contact while detection was armed, no false alarm; the "
+            "The run ended in FAULT (DATA_AGE) at 1.50 s; no contact while the arm was watched, no false alarm; the "
             "model was identified in 1.00 s.",
         ),
         (
             make_run((SchemeState.COMMISSION, 10)),
-            "No contact while detection was armed, no false alarm; the arm never moved to adapt.",
+            "The arm was not watched for contacts; the arm never moved to adapt.",
         ),
     ],
 )

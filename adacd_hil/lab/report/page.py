@@ -51,7 +51,7 @@ _PACKAGE: Final = "adacd_hil.lab.report"
 
 
 STEPS: Final = 2
-"""Next steps on the first screen; the others are folded."""
+"""Next steps on the first screen, at most; the others are folded."""
 
 
 class Heading(NamedTuple):
@@ -122,7 +122,6 @@ def _environment() -> Environment:
         "CONTACTS": CONTACTS,
         "NOTICES": NOTICES,
         "SECTIONS": SECTIONS,
-        "STEPS": STEPS,
     }
     environment.globals["bounds"] = bounds
     environment.filters |= {"number": number_text, "keep_units": lambda text: keep_units(text, "\u00a0")}

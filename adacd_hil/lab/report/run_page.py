@@ -292,6 +292,7 @@ def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Pus
 
 def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
     """Write the page."""
+    steps, more_steps = next_steps(metrics, run, source)
     since_ns = None if run.log_start_ns is None else run.zero_ns - run.log_start_ns
     return render_page(
         "run_page.html.j2",
@@ -300,7 +301,8 @@ def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
         traces_of(run, metrics),
         run=run,
         metrics=metrics,
-        next_steps=next_steps(metrics, run, source),
+        next_steps=steps,
+        more_steps=more_steps,
         tiles=_tiles(metrics),
         timeline=timeline_of(run, metrics),
         state_key=state_key(run),
@@ -356,10 +358,11 @@ def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
     found = f"{len(seen)} of {len(armed)}" if metrics.missed is not None else str(len(seen))
     if not armed and not metrics.contacts:
         found = NONE
+    is_watched = any(section.kind == "detection" for section in metrics.sections) or bool(metrics.false_alarms)
     tiles = [
         ("model learned in", " · ".join(times_s) or NONE, "s"),
         ("contacts found", found, ""),
-        ("false alarms", NONE if metrics.false_alarms is None else str(metrics.false_alarms), ""),
+        ("false alarms", str(metrics.false_alarms) if is_watched and metrics.false_alarms is not None else NONE, ""),
         ("link named rightly", f"{right} of {len(links)}" if links else NONE, ""),
         ("found after, median", number_text(float(np.median(delays_ms)), 1) if delays_ms else NONE, "ms"),
     ]

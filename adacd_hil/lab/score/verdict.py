@@ -54,8 +54,11 @@ def list_findings(
     done = "identified" if evidence is None else "certified"
     identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
     found = score_sentence(score)
+    has_wrong = score.missed > 0 or (run.truth is not None and bool(score.false_alarms))
     if run.truth is None:
         found = f"{number_of(len(score.false_alarms), 'detection')}, whose truth is not recorded"
+    elif not has_wrong and not score.contacts and all(section.kind != "detection" for section in sections):
+        found = "the arm was not watched for contacts"
     if evidence is not None and not evidence.is_anchored:
         identified += ", with torque offsets that nothing anchors"
     beside = ""
@@ -66,7 +69,6 @@ def list_findings(
     grave += evidence.revoked if is_revoked(evidence) else ()
     if is_margin_below_1(evidence):
         grave.append(f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}")
-    has_wrong = score.missed > 0 or (run.truth is not None and bool(score.false_alarms))
     findings = [*(Finding(text, True) for text in grave), Finding(found, has_wrong)]
     misread = [contact for contact in contacts if contact.link_ok is False or contact.direction_ok is False]
     if misread:
