@@ -68,7 +68,7 @@ def test_pieces_come_to_the_same_as_the_whole(size):
     gatherer = CyclicDataGatherer(run.settings)
     for start in range(0, len(run.cycle), size):
         rows = np.arange(start, min(start + size, len(run.cycle)))
-        gatherer.add(run.timing.rows(rows), run.cycle[rows], run.state[rows])
+        gatherer.add_columns(run.timing.rows(rows), run.cycle[rows], run.state[rows])
     assert gatherer.data(run) == gather_data(run)
 
 

@@ -11,7 +11,7 @@ from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.lab.report.report_files import write_report
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
-from adacd_hil.log.logged_run import Run
+from adacd_hil.log.logged_run import Run, Truth
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.score import emulator_truth
 from adacd_hil.score.emulator_truth import TruthTable, config_digest, contacts_beside, foreign_truth
@@ -115,10 +115,11 @@ def test_a_demo_writes_logs_of_one_run(tmp_path: Path) -> None:
 
 def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end() -> None:
     nothing = np.zeros(1, np.int64)
-    rows = TruthTable(
-        nothing, nothing, np.zeros((1, 2)), np.zeros(1), np.full(1, -1.0), None, nothing, nothing, np.zeros(1),
-        np.zeros((1, 7)), {}, "", True, ((0, 3), (1, 50)),
+    truth = Truth(
+        nothing, np.zeros((1, 2)), np.zeros(1), np.full(1, -1.0), np.zeros(1), np.zeros((1, 7)),
+        model_cycle=nothing, model_attempt=nothing, attempt=nothing,
     )  # fmt: skip
+    rows = TruthTable(truth, {}, "", True, ((0, 3), (1, 50)))
     begun = ([0], [0, 480])
     one, both = (emulator_truth.host_truth(rows, np.array(begins), 1000, np.zeros(1)) for begins in begun)
     assert one is not None

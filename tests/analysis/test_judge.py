@@ -1,15 +1,17 @@
 """The one judge: which alarm is about which contact, what was found, how late, and what was false."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from adacd_hil.log.logged_run import enters_react
 from adacd_hil.records import SchemeState
 from adacd_hil.score.judge import (
-    Alarm,
+    Detection,
     Score,
     StreamJudge,
-    TouchWindow,
+    TrueContact,
     begins_of,
     contact_bounds,
     explained_until,
@@ -20,11 +22,11 @@ MS = 1_000_000
 
 
 def touch(onset_ms, forgotten_ms, number=1, is_armed=True, is_reacting=False):
-    return TouchWindow(number, 1, onset_ms * MS, forgotten_ms * MS, is_armed, is_reacting)
+    return TrueContact(number, 1, onset_ms * MS, forgotten_ms * MS, is_armed, is_reacting)
 
 
 def alarms(*at_ms, **changes):
-    return [Alarm(at * MS, True)._replace(**changes) for at in at_ms]
+    return [replace(Detection(at * MS, True), **changes) for at in at_ms]
 
 
 def found_ms(score: Score):
@@ -99,10 +101,11 @@ def test_of_a_stretch_only_what_begins_in_it_counts():
 def stream(touches, over_ms, judged=lambda t_ms: t_ms == t_ms, pieces=1):
     t_ms = np.arange(1000)
     over = np.isin(t_ms, over_ms)
-    streamed = StreamJudge(touches, 100 * MS)
+    streamed = StreamJudge(100 * MS)
     for part in np.array_split(t_ms, pieces):
-        streamed.add(part * MS, over[part], judged(part))
-    return streamed.score()
+        begun = [each for each in touches if each.onset_ns <= part[-1] * MS]
+        streamed.add_samples(begun, part * MS, over[part], judged(part))
+    return streamed.score(touches)
 
 
 @pytest.mark.parametrize("pieces", [1, 7, 1000])

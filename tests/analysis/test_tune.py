@@ -421,7 +421,7 @@ def log_settings(log):
 def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
-    contacts = contacts_beside(log).contacts
+    contacts, _ = contacts_beside(log)
     assert [cycle[window.first] for window in read.windows] == [contact.onset for contact in contacts]
     assert [(window.is_armed, window.is_chosen_on) for window in read.windows] == [(True, True)]
     for window, contact in zip(read.windows, contacts, strict=True):
@@ -434,11 +434,11 @@ def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
 
 
 def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
-    truth, (whole,) = contacts_beside(log), read_logs([log])
-    ((attempt, _), _) = truth.span
+    (contacts, span), (whole,) = contacts_beside(log), read_logs([log])
+    ((attempt, _), _) = span
     cycle = read_log(log, ("/scheme",)).scheme["cycle"].reshape(-1)
     first, last = np.quantile(cycle[whole.motion.is_free], (0.2, 0.8), method="lower").tolist()
-    short = truth._replace(span=((attempt, first), (attempt, last)))
+    short = contacts, ((attempt, first), (attempt, last))
     monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: short)
     (read,) = read_logs([log])
     is_covered = (first <= cycle) & (cycle <= last)
@@ -447,10 +447,9 @@ def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
 
 
 def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeypatch):
-    truth = contacts_beside(log)
-    (first,) = truth.contacts
+    (first,), span = contacts_beside(log)
     later = [dataclasses.replace(first, number=n + 1, attempt=n) for n in range(3)]
-    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: truth._replace(contacts=later))
+    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: (later, span))
     monkeypatch.setattr(tune_roc, "_begins", lambda *_: [0, 241])
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
@@ -478,9 +477,9 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
 
 
 def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
-    truth = contacts_beside(log)
-    three = [dataclasses.replace(truth.contacts[0], number=number) for number in (1, 2, 3)]
-    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: truth._replace(contacts=three))
+    (first,), span = contacts_beside(log)
+    three = [dataclasses.replace(first, number=number) for number in (1, 2, 3)]
+    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: (three, span))
     assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
 
 

@@ -71,7 +71,7 @@ def test_lockstep_on_vcan_logs_the_same_as_the_embedded_bus_bit_for_bit(lockstep
 @pytest.mark.long
 def test_a_run_on_vcan_adapts_finds_the_contact_and_ends_well(lockstep: Played) -> None:
     assert (lockstep.status, lockstep.json["state"], lockstep.json["dropped"]) == (0, "MONITOR", 0)
-    assert {contact.report.link for contact in read_log(lockstep.log).contacts} == {1}
+    assert {report.link for _, report in read_log(lockstep.log).contacts} == {1}
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import LogError, log_in
 from adacd_hil.log.logged_run import settings_of
-from adacd_hil.log.reader import LoggedContact, LoggedEvent, RunLog, read_log
+from adacd_hil.log.reader import LoggedEvent, RunLog, read_log
 from adacd_hil.records import ContactReport, SchemeState, Vector
 from adacd_hil.remedies import install_command, nearest_name
 from adacd_hil.score.metrics import certificates_in
@@ -193,10 +193,11 @@ def _in_order(events: Iterable[LoggedEvent]) -> list[LoggedEvent]:
     return sorted(events, key=lambda event: event.t_ns)
 
 
-def _contacts(contacts: Iterable[LoggedContact], zero_ns: int) -> Iterator[RunContact]:
+def _contacts(reports: Iterable[tuple[int, ContactReport]], zero_ns: int) -> Iterator[RunContact]:
     """Yield each contact once: the time of its first report, and its last report."""
     found: dict[int, RunContact] = {}
-    for t_ns, report in contacts:
+    for t_ns, report in reports:
         first = found.get(report.cycle)
-        found[report.cycle] = RunContact((t_ns - zero_ns) * 1e-9 if first is None else first.t_s, report)
+        t_s = (t_ns - zero_ns) * 1e-9 if first is None else first.t_s
+        found[report.cycle] = RunContact(t_s, report)
     yield from found.values()

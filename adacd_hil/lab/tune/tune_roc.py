@@ -35,8 +35,8 @@ from adacd_hil.log.logged_run import AttemptBegins, Progress, host_span
 from adacd_hil.log.reader import Series
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.replay.log_source import LogSource
-from adacd_hil.score.emulator_truth import HostCycles, TrueContact, contacts_beside, windows_of
-from adacd_hil.score.judge import Times, TouchWindow, explained_until, rate_bound_per_h, share_bounds
+from adacd_hil.score.emulator_truth import HostCycles, contacts_beside, placed_contacts
+from adacd_hil.score.judge import Times, TrueContact, explained_until, rate_bound_per_h, share_bounds
 from adacd_hil.score.wording import delay_figures
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.setting_keys import changed_keys, keep_facts
@@ -293,12 +293,10 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeW
     if truth is not None:
         begins = _begins(motion, parts)
         contacts = [
-            contact
-            for contact in _on_cycles(truth.contacts, begins)
-            if stretch.is_whole or index.cycle[0] <= contact.onset
+            contact for contact in _on_cycles(truth[0], begins) if stretch.is_whole or index.cycle[0] <= contact.onset
         ]
-        windows = _windows(windows_of(contacts, index, own), index.t_ns, None if count == 1 else place)
-        is_free = motion.is_free & host_span(truth.span, np.array(begins)).covers(index.cycle)
+        windows = _windows(placed_contacts(contacts, index, own), index.t_ns, None if count == 1 else place)
+        is_free = motion.is_free & host_span(truth[1], np.array(begins)).covers(index.cycle)
         apart = round(APART_S / motion.period_s)
         for window in windows:
             is_free[max(window.first - apart, 0) : window.last + apart] = False
@@ -352,7 +350,7 @@ def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterat
             yield contact.counted_from(begins[contact.attempt])
 
 
-def _windows(touches: Sequence[TouchWindow], t_ns: Times, place: int | None) -> tuple[Window, ...]:
+def _windows(touches: Sequence[TrueContact], t_ns: Times, place: int | None) -> tuple[Window, ...]:
     """Give the rows of contacts. place: of the log; None for a single log."""
     onsets_ns = np.array([touch.onset_ns for touch in touches], np.int64)
     until_ns = explained_until(onsets_ns, np.array([touch.forgotten_ns for touch in touches], np.int64))
