@@ -17,8 +17,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
-from adacd_hil.lab.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
-from adacd_hil.lab.thresholds.recorded_thresholds import BLOCK_S, Statistics
+from adacd_hil.lab.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError
+from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, calibrate_all
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import detectors
 
@@ -155,24 +155,6 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
                 )
             )
     return Comparison(rate_per_h, statistics.hours, _ROC_RATES_PER_H, tuple(rows), missing)
-
-
-def calibrate_all(statistics: Statistics, rate_per_h: float) -> tuple[dict[str, DetectorCalibration], tuple[str, ...]]:
-    """Calibrate each detector; also return those whose tail can't be fitted.
-
-    Raises TooLittleMotionError if no tail can be fitted.
-    """
-    found: dict[str, DetectorCalibration] = {}
-    missing: list[str] = []
-    for name, places in statistics.settings.detectors.items():
-        try:
-            found[name] = calibrate_detector(statistics.peaks[:, list(places), :], BLOCK_S, rate_per_h)
-        except TooLittleMotionError as error:
-            missing.append(name)
-            problem = error
-    if not found:
-        raise problem
-    return found, tuple(missing)
 
 
 def _ratios(
