@@ -38,7 +38,7 @@ class ThreadWorkers:
     def submit(self, work, task):
         return self.pool.submit(work, task)
 
-    def restart(self) -> None:
+    def replace_dead(self) -> None:
         raise AssertionError("no thread has died")
 
 

@@ -113,7 +113,7 @@ def test_the_bound_of_the_tail_is_the_wanted_rate():
     assert choice.method == "tail model, extrapolated 12-fold"
     assert choose(observed(), 60.0).method == "tail model"
     assert calibration.bound > 1.05 * calibration.threshold
-    calibrated = calibrate_detector(observed().half(True), 0.1, 1.0)
+    calibrated = calibrate_detector(observed().half(True), 1.0)
     surer = calibrated.calibration.bound / calibrated.calibration.threshold
     np.testing.assert_allclose(choice.thresholds, surer * calibrated.thresholds, rtol=1e-12)
     predicted = dict(zip(FACTORS, (rate for _, _, rate in choice.roc), strict=True))
@@ -205,7 +205,7 @@ def hand_made_log(count=400):
     """400 cycles, all free but for a contact in rows 200 to 249; a second one, of which nobody was armed."""
     is_free = np.ones(count, bool)
     is_free[150:300] = False
-    windows = (Window(1, 1, 200, 249, True, True), Window(2, 1, 260, 270, False, False))
+    windows = (Window(1, 200, 249, True, True), Window(2, 260, 270, False, False))
     return SimpleNamespace(
         t_ns=np.arange(count) * 1_000_000,
         windows=windows,
@@ -230,7 +230,7 @@ def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_moni
     states = [A] * 50 + [M] * 350
     value = np.linspace(0.0, 1.0, 400)[:, None] * [1.0, -2.0]
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
-    shown.take(rows, batch_of(settings, states, tau_ext_hat=value, threshold=100.0 + np.array([0.0, 0.5])))
+    shown.take_stretch(rows, batch_of(settings, states, tau_ext_hat=value, threshold=100.0 + np.array([0.0, 0.5])))
     peaks = shown.peaks()
     np.testing.assert_allclose(peaks[0, 0], [99 / 399, 2 * 99 / 399 - 0.5], atol=1e-12)
     assert np.isnan(peaks[1:3]).all(), "a block of which a part doesn't count"
@@ -246,7 +246,7 @@ def test_a_candidate_that_does_not_monitor_misses_the_contact_and_counts_no_moti
     shown = ShownLog(hand_made_log(), settings)
     states = [M] * 100 + [A] * 300
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
-    shown.take(rows, batch_of(settings, states, tau_ext_hat=1.0, threshold=100.0))
+    shown.take_stretch(rows, batch_of(settings, states, tau_ext_hat=1.0, threshold=100.0))
     assert np.isfinite(shown.peaks()[:, 0, 0]).tolist() == [True, False, False, False]
     assert [len(contact.since_s) for contact in shown.touches()] == [0]
 
@@ -257,7 +257,7 @@ def test_the_certified_scheme_s_statistic_is_the_largest_ratio_to_its_thresholds
     bank = np.zeros(2 * settings.channel_count)
     bank[3] = -0.3
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000 + np.where(np.arange(400) < 100, 0, 7))
-    shown.take(rows, batch_of(settings, [M] * 400, tau_ext_bank=bank, threshold_bank=0.2))
+    shown.take_stretch(rows, batch_of(settings, [M] * 400, tau_ext_bank=bank, threshold_bank=0.2))
     peaks = shown.peaks()
     assert peaks[0].item() == pytest.approx(1.5)
     assert np.isnan(peaks[1:]).all(), "cycles that the log knows nothing of"

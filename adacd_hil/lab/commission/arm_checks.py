@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,9 +63,7 @@ class ArmExamination:
     no_move_reason: str = "give --move and move the joints when asked"
     cycle_s: float = 1.0
     move_s: float = 15.0
-    _tap: Tap | None = None
     _bus: Bus | None = None
-    _loop: ZeroTorqueLoop | None = None
     _has_reset: bool = False
     cycles: list[ZeroTorqueCycle] = field(default_factory=list)
     traffic: Traffic = field(default_factory=Traffic)
@@ -72,22 +71,14 @@ class ArmExamination:
     def connect(self) -> None:
         """Open the bus; make arm and master on it. Raises BusMissingError."""
         self._bus = self.open_bus()
-        self._tap = Tap(self._bus, self.clock)
-        self.arm = Arm(self.settings, self.codec, self._tap)
-        self.master = Master(self.settings, self.codec, self._tap)
+        self.tap = Tap(self._bus, self.clock)
+        self.arm = Arm(self.settings, self.codec, self.tap)
+        self.master = Master(self.settings, self.codec, self.tap)
 
-    @property
-    def tap(self) -> Tap:
-        """The open bus."""
-        assert self._tap is not None
-        return self._tap
-
-    @property
+    @cached_property
     def loop(self) -> ZeroTorqueLoop:
         """The zero-torque loop of this examination; later runs continue its cycle count."""
-        if self._loop is None:
-            self._loop = ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
-        return self._loop
+        return ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
 
     def reset(self) -> None:
         """Reset the nodes' communication; `leave` then has to stop them. Raises DeviceError, BusError."""

@@ -30,6 +30,7 @@ from adacd_hil.lab.signal_noise import low_pass
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 
+BLOCK_S: Final = 0.1
 CLUSTER_S: Final = 0.5
 """Values above a threshold that are closer in time than this are one alarm."""
 FITTED_CLUSTERS: Final = (25, 400)
@@ -38,6 +39,7 @@ _SHAPES: Final = (-0.5, 0.25)
 """Bounds of xi. Encoder counts and friction are bounded, so most tails end; a heavier tail than the upper bound has not
 been seen on contact-free motion and would make every extrapolation infinite."""
 _RESAMPLES: Final = 400
+_CONFIDENCE: Final = 0.95
 _BISECTIONS: Final = 60
 _S_PER_H: Final = 3600.0
 
@@ -46,12 +48,12 @@ class TooLittleMotionError(LogError):
     """The recorded motion is too short for the figure; the message names the missing amount."""
 
 
-def clusters(peaks: Vector, level: float, block_s: float) -> Vector:
+def clusters(peaks: Vector, level: float) -> Vector:
     """Return the largest value of each alarm above `level` (m,), of block maxima (B,); NaN blocks don't count."""
     above = np.flatnonzero(np.nan_to_num(peaks, nan=-np.inf) > level)
     if above.size == 0:
         return np.zeros(0)
-    starts = np.flatnonzero(np.r_[True, np.diff(above) * block_s > CLUSTER_S])
+    starts = np.flatnonzero(np.r_[True, np.diff(above) * BLOCK_S > CLUSTER_S])
     return np.asarray(np.maximum.reduceat(peaks[above], starts))
 
 
@@ -98,26 +100,26 @@ def _moments_fit(excesses: Vector) -> tuple[Vector, Vector]:
     return np.maximum(first * (1.0 - shape), 1e-300), shape
 
 
-def counted_hours(peaks: Vector, block_s: float) -> float:
+def counted_hours(peaks: Vector) -> float:
     """Return the time of the block maxima (B,), without the NaN blocks, h."""
-    return float(np.count_nonzero(~np.isnan(peaks))) * block_s / _S_PER_H
+    return float(np.count_nonzero(~np.isnan(peaks))) * BLOCK_S / _S_PER_H
 
 
-def threshold_by_count(peaks: Vector, block_s: float, alarms: float) -> float:
+def threshold_by_count(peaks: Vector, alarms: float) -> float:
     """Find the lowest threshold with at most that many alarms in the recording."""
     low, high = float(np.nanmin(peaks)), float(np.nanmax(peaks))
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        if clusters(peaks, middle, block_s).size > alarms:
+        if clusters(peaks, middle).size > alarms:
             low = middle
         else:
             high = middle
     return high
 
 
-def fit_tail(peaks: Vector, block_s: float) -> Tail:
+def fit_tail(peaks: Vector) -> Tail:
     """Fit the tail of block maxima (B,). Raises TooLittleMotionError with fewer than 25 clusters to fit."""
-    hours = counted_hours(peaks, block_s)
+    hours = counted_hours(peaks)
     least, most = FITTED_CLUSTERS
     if hours * _S_PER_H < 4.0 * least * CLUSTER_S or float(np.nanmax(peaks)) <= float(np.nanmin(peaks)):
         raise TooLittleMotionError(
@@ -129,7 +131,7 @@ def fit_tail(peaks: Vector, block_s: float) -> Tail:
     levels = np.sort(peaks[~np.isnan(peaks)])[::-1]
     level, found = math.inf, np.zeros(0)
     for place in np.unique(np.geomspace(least, min(levels.size - 1, 40 * wanted), 16).astype(int)):
-        deeper = clusters(peaks, float(levels[place]), block_s)
+        deeper = clusters(peaks, float(levels[place]))
         if found.size < deeper.size <= wanted:
             level, found = float(levels[place]), deeper
     if found.size < least // 2:
@@ -150,27 +152,25 @@ class TailCalibration:
     tail: Tail
 
 
-def calibrate(
-    peaks: Vector, block_s: float, rate_per_h: float, confidence: float = 0.95, seed: int = 0
-) -> TailCalibration:
+def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
     """Find the threshold for a rate, with one-sided confidence bounds, from block maxima (B,).
 
     Raises TooLittleMotionError.
     """
-    tail = fit_tail(peaks, block_s)
+    tail = fit_tail(peaks)
     if rate_per_h >= tail.rate_per_h:
         alarms = rate_per_h * tail.hours
-        threshold = threshold_by_count(peaks, block_s, alarms)
+        threshold = threshold_by_count(peaks, alarms)
         deviation = 1.6448536269514722 * math.sqrt(alarms)
-        bound = threshold_by_count(peaks, block_s, max(alarms - deviation, 0.0))
+        bound = threshold_by_count(peaks, max(alarms - deviation, 0.0))
         return TailCalibration(threshold, bound, rate_per_h, (alarms + deviation) / tail.hours, False, tail)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     threshold = tail.threshold_at(rate_per_h)
-    excesses = clusters(peaks, tail.level, block_s) - tail.level
+    excesses = clusters(peaks, tail.level) - tail.level
     fits = _moments_fit(np.sort(generator.choice(excesses, (_RESAMPLES, tail.count)), axis=1))
     rates = np.maximum(generator.poisson(tail.count, _RESAMPLES) / tail.hours, 1e-9)
-    bound = tail.level + float(np.quantile(_excesses(rate_per_h, *fits, rates), confidence))
-    rate_bound = float(np.quantile(_rates(threshold - tail.level, *fits, rates), confidence))
+    bound = tail.level + float(np.quantile(_excesses(rate_per_h, *fits, rates), _CONFIDENCE))
+    rate_bound = float(np.quantile(_rates(threshold - tail.level, *fits, rates), _CONFIDENCE))
     return TailCalibration(
         threshold, max(bound, threshold), rate_per_h, max(rate_bound, rate_per_h), rate_per_h * tail.hours < 1.0, tail
     )
@@ -183,33 +183,24 @@ class DetectorCalibration:
     thresholds: Vector  # (channels, n)
     calibration: TailCalibration  # of the largest ratio of statistic to threshold; `threshold` is 1
 
-    def ratio(self, peaks: Vector) -> Vector:
-        """Return the largest ratio of statistic to threshold per block (B,), of block maxima (B, channels, n)."""
-        return largest_ratio(peaks, self.thresholds)
-
 
 def largest_ratio(peaks: Vector, thresholds: Vector) -> Vector:
     """Divide block maxima (B, channels, n) by thresholds (channels, n); return the largest of each block (B,)."""
     return np.asarray((peaks / thresholds).max(axis=(1, 2)))
 
 
-def calibrate_detector(
-    peaks: Vector, block_s: float, rate_per_h: float, confidence: float = 0.95
-) -> DetectorCalibration:
+def calibrate_detector(peaks: Vector, rate_per_h: float) -> DetectorCalibration:
     """Find the thresholds of a detector, which alarms on any channel and joint; peaks (B, channels, n).
 
     Raises TooLittleMotionError.
     """
     share = rate_per_h / (peaks.shape[1] * peaks.shape[2])
     thresholds = np.array(
-        [
-            [calibrate(peaks[:, row, i], block_s, share, confidence).threshold for i in range(peaks.shape[2])]
-            for row in range(peaks.shape[1])
-        ]
+        [[calibrate(peaks[:, row, i], share).threshold for i in range(peaks.shape[2])] for row in range(peaks.shape[1])]
     )
-    together = calibrate(largest_ratio(peaks, thresholds), block_s, rate_per_h, confidence)
+    together = calibrate(largest_ratio(peaks, thresholds), rate_per_h)
     thresholds *= together.threshold
-    return DetectorCalibration(thresholds, calibrate(largest_ratio(peaks, thresholds), block_s, rate_per_h, confidence))
+    return DetectorCalibration(thresholds, calibrate(largest_ratio(peaks, thresholds), rate_per_h))
 
 
 def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[float, float]:

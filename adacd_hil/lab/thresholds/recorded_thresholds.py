@@ -15,6 +15,7 @@ import numpy as np
 
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
 from adacd_hil.lab.thresholds.false_alarms import (
+    BLOCK_S,
     DetectorCalibration,
     Sensing,
     TooLittleMotionError,
@@ -23,6 +24,7 @@ from adacd_hil.lab.thresholds.false_alarms import (
     counted_hours,
     find_limits,
     gains,
+    largest_ratio,
     mean_square,
 )
 from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, read_motion, sample_of, torque_streams
@@ -33,7 +35,6 @@ from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.model.regressor import mass_matrix
 from adacd_hil.settings.schema import setting
 
-BLOCK_S: Final = 0.1
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
 """Corner frequency below which the model's errors exceed the noise."""
@@ -82,7 +83,7 @@ class Statistics:
     @property
     def hours(self) -> float:
         """Contact-free time, h."""
-        return counted_hours(self.peaks[:, 0, 0], BLOCK_S)
+        return counted_hours(self.peaks[:, 0, 0])
 
 
 def run_detectors(
@@ -182,7 +183,7 @@ def calibrate_all(statistics: Statistics, rate_per_h: float) -> tuple[dict[str, 
     missing: list[str] = []
     for name, places in statistics.settings.detectors.items():
         try:
-            found[name] = calibrate_detector(statistics.peaks[:, list(places), :], BLOCK_S, rate_per_h)
+            found[name] = calibrate_detector(statistics.peaks[:, list(places), :], rate_per_h)
         except TooLittleMotionError as error:
             missing.append(name)
             problem = error
@@ -227,13 +228,13 @@ def check_prediction(peaks: Vector) -> tuple[float, float] | None:
     seen, held_out = peaks.copy(), peaks.copy()
     seen[~is_first] = np.nan
     held_out[is_first] = np.nan
-    hours = counted_hours(held_out[:, 0, 0], BLOCK_S)
+    hours = counted_hours(held_out[:, 0, 0])
     try:
         rate = _CHECKED_ALARMS / hours
-        found = calibrate_detector(seen, BLOCK_S, rate)
+        found = calibrate_detector(seen, rate)
     except (TooLittleMotionError, ZeroDivisionError):
         return None
-    return rate, clusters(found.ratio(held_out), 1.0, BLOCK_S).size / hours
+    return rate, clusters(largest_ratio(held_out, found.thresholds), 1.0).size / hours
 
 
 def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple[tuple[str, ...], tuple[float, ...]]]:
