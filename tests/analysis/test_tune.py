@@ -51,26 +51,18 @@ M, A = SchemeState.MONITOR, SchemeState.ADAPT
 # what was counted
 
 
-@pytest.mark.parametrize(
-    ("alarms", "hours", "bound"), [(0, 10.0, 0.299573), (3, 1.0, 7.753657), (3, 2.0, 3.876828), (0, 0.0, math.inf)]
-)
-def test_a_rate_has_an_exact_upper_bound(alarms, hours, bound):
-    assert rate_bound_per_h(alarms, hours) == pytest.approx(bound, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("alarms", "hours", "bound"), [(0, 1.0, 0.0), (1, 1.0, 0.0512933), (3, 2.0, 0.408846), (1, 0.0, 0.0)]
-)
-def test_a_rate_has_an_exact_lower_bound(alarms, hours, bound):
-    assert least_rate_per_h(alarms, hours) == pytest.approx(bound, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("found", "count", "bounds"),
-    [(0, 10, (0.0, 0.308497)), (10, 10, (0.691503, 1.0)), (8, 10, (0.443905, 0.974789)), (0, 0, (0.0, 1.0))],
-)
-def test_a_share_has_the_interval_of_clopper_and_pearson(found, count, bounds):
-    assert share_bounds(found, count) == pytest.approx(bounds, rel=1e-5)
+def test_rates_and_shares_have_exact_bounds():
+    for alarms, hours, most, least in (
+        (0, 10.0, 0.299573, 0.0),
+        (3, 1.0, 7.753657, 0.817692),
+        (3, 2.0, 3.876828, 0.408846),
+        (0, 0.0, math.inf, 0.0),
+    ):
+        assert rate_bound_per_h(alarms, hours) == pytest.approx(most, rel=1e-5)
+        assert least_rate_per_h(alarms, hours) == pytest.approx(least, rel=1e-5)
+    shares = {(0, 10): (0.0, 0.308497), (10, 10): (0.691503, 1.0), (8, 10): (0.443905, 0.974789), (0, 0): (0.0, 1.0)}
+    for found, bounds in shares.items():
+        assert share_bounds(*found) == pytest.approx(bounds, rel=1e-5)
 
 
 # thresholds from one half
@@ -165,12 +157,6 @@ def test_too_little_motion_gives_the_largest_value_seen_and_says_so():
     made.peaks[:100] = np.nan
     with pytest.raises(TooLittleMotionError, match="no contact-free motion"):
         choose(made, 1.0)
-
-
-def test_without_truth_there_are_no_contacts():
-    found = choose(observed(touches=None), 1.0).checked
-    assert found.contacts is None
-    assert set(found.as_json()) == {"hours", "false_alarms", "rate_bound_per_h", "contacts"}
 
 
 # candidates
@@ -386,6 +372,7 @@ def test_the_report_has_the_figures_and_what_they_show(tmp_path):
     assert content["suggested"]["thresholds"]["checked_on"]["found"] == 1
     assert len(content["suggested"]["thresholds"]["roc"]) == len(FACTORS)
     blind = dataclasses.replace(candidate(), choice=choose(observed(touches=None), 1.0))
+    assert blind.choice.checked.contacts is None
     (tmp_path / "file").write_text("")
     with pytest.raises(LogError, match="can't be written"):
         write_tuning(tuning_of(blind), tmp_path / "file")
@@ -450,7 +437,7 @@ def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeyp
     (first,) = truth.contacts
     later = [dataclasses.replace(first, number=n + 1, attempt=n) for n in range(3)]
     monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: truth._replace(contacts=later))
-    monkeypatch.setattr(tune_roc, "_begins", lambda *_: [0, 241])
+    monkeypatch.setattr(tune_roc.AttemptBegins, "begins", np.array([0, 241]))
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
     assert [(window.number, cycle[window.first] - first.onset) for window in read.windows] == [(1, 0), (2, 240)]
@@ -546,8 +533,8 @@ def test_what_can_not_be_tuned_is_said_in_one_line(log, tmp_path):
 
 
 def test_logs_of_different_settings_are_not_tuned_together(log, monkeypatch):
-    one = read_logs([log])[0]
-    others = iter([one, dataclasses.replace(one, settings=apply_settings(one.settings, {"filter.a_rad_s": "12"}))])
-    monkeypatch.setattr(tune_roc, "_read", lambda *_: next(others))
+    own = log_settings(log)
+    sources = iter([own, apply_settings(own, {"filter.a_rad_s": "12"})])
+    monkeypatch.setattr(tune_roc, "LogSource", lambda _: SimpleNamespace(settings=next(sources)))
     with pytest.raises(LogError, match=r"different settings, such as filter.a_rad_s"):
         read_logs([log, log])

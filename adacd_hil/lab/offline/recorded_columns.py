@@ -25,7 +25,7 @@ SHORTEST_SAMPLES: Final = 50
 """A shorter stretch can't be used: the filters have not settled."""
 LARGEST: Final = 1e6
 """Limit in rad, rad/s or Nm: a larger value isn't a measurement, and its square would spoil all others."""
-_BLOCK_ROWS = 50_000
+BLOCK_ROWS: Final = 50_000
 _SPARE_S = 1.0
 """Time kept before and after the requested span, for derived velocities and the grid of samples."""
 _FEW_ROWS, _FEW_SHARE = 3, 0.01
@@ -70,7 +70,7 @@ class RecordedRows:
         self._block.append(number)
         self._block += row
         self.count += 1
-        if self.count % _BLOCK_ROWS == 0:
+        if self.count % BLOCK_ROWS == 0:
             self._flush()
 
     def drop(self, kind: str, first: str, count: int = 1) -> None:
