@@ -123,6 +123,7 @@ def test_resolution_and_noise_of_a_measurement_are_found():
     generator = np.random.default_rng(8)
     smooth = np.sin(np.arange(20_000) * 1e-3)
     assert resolution(np.round(smooth / 5e-4) * 5e-4) == pytest.approx(5e-4, rel=1e-6)
+    assert resolution(np.array([2e-3, 0.0, 5e-4, 5e-4])) == 5e-4
     assert resolution(np.ones(5)) == 0.0
     assert white_noise(smooth + 0.02 * generator.standard_normal(20_000)) == pytest.approx(0.02, rel=0.05)
 

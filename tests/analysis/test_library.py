@@ -55,6 +55,7 @@ def test_a_contact_is_found_in_arrays_and_the_model_is_the_arms(arm: OfflineArm,
     assert repr(found).startswith("<Detection: 1 contact in 12.0 s; model explained; margin ")
     assert repr(found.model) == f"<Model of 1 joint: explained; margin {found.model.margin:.2f}>"
     assert repr(arm) == "<Arm one: 1 joint, shoulder>"
+    assert found.model.identified.described.columns.dq == ("1",)
     assert [(each.link, each.direction) for each in found.contacts] == [(1, (1,))]
     assert found.contacts[0].t_s - 100.0 == pytest.approx(PUSH_S[0], abs=0.03)
     assert found.t_s.shape == (6000,)

@@ -299,6 +299,10 @@ def check_saturation(patient: ArmExamination) -> CheckOutcome:
     return ok("within range")
 
 
+def _by_joint(form: str, values: Vector) -> str:
+    return ", ".join(f"joint {number} {form.format(value)}" for number, value in enumerate(values.tolist(), start=1))
+
+
 def check_rest(patient: ArmExamination) -> CheckOutcome:
     """Check that the arm stands still with its drives off."""
     dq = patient.joint_values("dq")
@@ -306,7 +310,7 @@ def check_rest(patient: ArmExamination) -> CheckOutcome:
         return skipped("no complete cycle")
     fastest = np.abs(dq).max(axis=0)
     bound = patient.settings.safety.rest_velocity_rad_s
-    text = ", ".join(f"joint {joint + 1} up to {fastest[joint]:.4f} rad/s" for joint in range(JOINTS))
+    text = _by_joint("up to {:.4f} rad/s", fastest)
     if np.any(fastest > bound):
         return failed(f"{text}, above {bound:g}", "let the arm come to rest and keep hands off")
     return ok(text)
@@ -319,7 +323,7 @@ def check_torque_zero(patient: ArmExamination) -> CheckOutcome:
         return skipped("no complete cycle")
     mean = tau_J.mean(axis=0)
     bound = patient.settings.safety.rest_torque_Nm
-    text = ", ".join(f"joint {joint + 1} {mean[joint]:+.4f} Nm" for joint in range(JOINTS))
+    text = _by_joint("{:+.4f} Nm", mean)
     remedy = "let the arm hang free, then `adacd-hil tare`"
     if np.any(np.abs(mean) > bound):
         return failed(f"{text}, above {bound:g}", remedy)
@@ -334,7 +338,7 @@ def check_noise(patient: ArmExamination) -> CheckOutcome:
     if len(tau_J) < 2:
         return skipped("no complete cycles")
     spread = tau_J.std(axis=0)
-    text = ", ".join(f"joint {joint + 1} {1000.0 * spread[joint]:.3f} mNm rms" for joint in range(JOINTS))
+    text = _by_joint("{:.3f} mNm rms", 1000.0 * spread)
     if np.any(np.ptp(tau_J, axis=0) == 0.0):
         return warning(f"{text}: a value that never changes", "check the cable to the strain gauge")
     if np.any(spread > np.array(patient.settings.detector.threshold_Nm) / 3.0):

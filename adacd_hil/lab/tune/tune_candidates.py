@@ -204,8 +204,7 @@ def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: N
     """Run all detectors over logs. Raises LogError, TooLittleMotionError."""
     settings = detectors.DetectorBankSettings()
     statistics = run_detectors([log.motion for log in logs], settings, progress)
-    chosen = [np.repeat(log.is_chosen_on, log.block)[: len(log.motion.is_free)] for log in logs]
-    is_chosen_on = np.concatenate(chosen)[:: logs[0].block]
+    is_chosen_on = chosen_blocks(logs)
     touches: dict[str, list[Touched]] = {name: [] for name in settings.detectors}
     for log in logs:
         for touched in _touches(log, statistics):
@@ -216,6 +215,12 @@ def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: N
         Observed(name, statistics.peaks[:, list(rows), :], is_chosen_on, tuple(touches[name]) if has_truth else None)
         for name, rows in settings.detectors.items()
     ]
+
+
+def chosen_blocks(logs: Sequence[TunedLog]) -> NDArray[np.bool_]:
+    """Tell of each block of the logs' joined motion whether thresholds are chosen on it, by its first cycle (B,)."""
+    chosen = [np.repeat(log.is_chosen_on, log.block)[: len(log.motion.is_free)] for log in logs]
+    return np.concatenate(chosen)[:: logs[0].block]
 
 
 def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:
