@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hand_made_run import record, record_truth, touched_run
 
-from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.lab.report.report_files import write_report
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
@@ -36,7 +35,6 @@ def make_logs(
 @pytest.mark.parametrize(
     ("host", "emulator", "seed", "reason"),
     [
-        ({}, {}, None, ""),
         ({}, {"scenario": "idle", "seed": "1"}, None, ""),  # on a bus the host doesn't know
         ({"scenario": "idle", "seed": "1"}, {}, None, ""),
         ({"scenario": "idle", "seed": "1"}, {"scenario": "idle", "seed": "1"}, None, ""),
@@ -104,13 +102,8 @@ def test_a_report_without_the_truth_of_another_run_says_so(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_demo_writes_logs_of_one_run(tmp_path: Path) -> None:
-    (tmp_path / "short.toml").write_text("lasts_s = 0.3\n")
-    for name, seed in (("a", 1), ("b", 2)):
-        run_embedded(resolve("paper", str(tmp_path / "short.toml"), None, seed), "lockstep", tmp_path / name)
-    for name in "ab":
-        assert foreign_truth(tmp_path / name / "run.mcap", tmp_path / name / "truth.mcap") == ""
-    assert "its seed is 2" in foreign_truth(tmp_path / "a" / "run.mcap", tmp_path / "b" / "truth.mcap")
+def test_host_and_emulator_write_logs_of_one_run(log: Path) -> None:
+    assert foreign_truth(log, log.with_name("truth.mcap")) == ""
 
 
 def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end() -> None:

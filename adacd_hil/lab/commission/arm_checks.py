@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,9 +63,7 @@ class ArmExamination:
     no_move_reason: str = "give --move and move the joints when asked"
     cycle_s: float = 1.0
     move_s: float = 15.0
-    _tap: Tap | None = None
     _bus: Bus | None = None
-    _loop: ZeroTorqueLoop | None = None
     _has_reset: bool = False
     cycles: list[ZeroTorqueCycle] = field(default_factory=list)
     traffic: Traffic = field(default_factory=Traffic)
@@ -72,22 +71,14 @@ class ArmExamination:
     def connect(self) -> None:
         """Open the bus; make arm and master on it. Raises BusMissingError."""
         self._bus = self.open_bus()
-        self._tap = Tap(self._bus, self.clock)
-        self.arm = Arm(self.settings, self.codec, self._tap)
-        self.master = Master(self.settings, self.codec, self._tap)
+        self.tap = Tap(self._bus, self.clock)
+        self.arm = Arm(self.settings, self.codec, self.tap)
+        self.master = Master(self.settings, self.codec, self.tap)
 
-    @property
-    def tap(self) -> Tap:
-        """The open bus."""
-        assert self._tap is not None
-        return self._tap
-
-    @property
+    @cached_property
     def loop(self) -> ZeroTorqueLoop:
         """The zero-torque loop of this examination; later runs continue its cycle count."""
-        if self._loop is None:
-            self._loop = ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
-        return self._loop
+        return ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
 
     def reset(self) -> None:
         """Reset the nodes' communication; `leave` then has to stop them. Raises DeviceError, BusError."""
@@ -321,6 +312,10 @@ def check_saturation(patient: ArmExamination) -> CheckOutcome:
     return ok("within range")
 
 
+def _by_joint(form: str, values: Vector) -> str:
+    return ", ".join(f"joint {number} {form.format(value)}" for number, value in enumerate(values.tolist(), start=1))
+
+
 def check_rest(patient: ArmExamination) -> CheckOutcome:
     """Check that the arm stands still with its drives off."""
     dq = patient.joint_values("dq")
@@ -328,7 +323,7 @@ def check_rest(patient: ArmExamination) -> CheckOutcome:
         return skipped("no complete cycle")
     fastest = np.abs(dq).max(axis=0)
     bound = patient.settings.safety.rest_velocity_rad_s
-    text = ", ".join(f"joint {joint + 1} up to {fastest[joint]:.4f} rad/s" for joint in range(JOINTS))
+    text = _by_joint("up to {:.4f} rad/s", fastest)
     if np.any(fastest > bound):
         return failed(f"{text}, above {bound:g}", "let the arm come to rest and keep hands off")
     return ok(text)
@@ -341,7 +336,7 @@ def check_torque_zero(patient: ArmExamination) -> CheckOutcome:
         return skipped("no complete cycle")
     mean = tau_J.mean(axis=0)
     bound = patient.settings.safety.rest_torque_Nm
-    text = ", ".join(f"joint {joint + 1} {mean[joint]:+.4f} Nm" for joint in range(JOINTS))
+    text = _by_joint("{:+.4f} Nm", mean)
     remedy = "let the arm hang free, then `adacd-hil tare`"
     if np.any(np.abs(mean) > bound):
         return failed(f"{text}, above {bound:g}", remedy)
@@ -356,7 +351,7 @@ def check_noise(patient: ArmExamination) -> CheckOutcome:
     if len(tau_J) < 2:
         return skipped("no complete cycles")
     spread = tau_J.std(axis=0)
-    text = ", ".join(f"joint {joint + 1} {1000.0 * spread[joint]:.3f} mNm rms" for joint in range(JOINTS))
+    text = _by_joint("{:.3f} mNm rms", 1000.0 * spread)
     if np.any(np.ptp(tau_J, axis=0) == 0.0):
         return warning(f"{text}: a value that never changes", "check the cable to the strain gauge")
     if np.any(spread > np.array(patient.settings.detector.threshold_Nm) / 3.0):

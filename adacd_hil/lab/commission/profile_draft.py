@@ -10,7 +10,8 @@ CiA 404.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT
 from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, name_velocity_unit, read_drive_units
 from adacd_hil.device.profile import (
     HOST_SIGNALS,
+    DeviceProfile,
     ObjectName,
     PatienceSettings,
     ProfileSettings,
@@ -99,13 +101,13 @@ class Guess(NamedTuple):
 
 
 class ProfileDraft(NamedTuple):
-    """The text of a profile. remarks: limits of the device, a line each.
+    """The text of a profile, and what it says. remarks: limits of the device, a line each.
 
     rated_torque_Nm: at the joint, by 0x6076; None if unknown. is_rated_known: no guess went into it.
     """
 
-    kind: str
     text: str
+    settings: ProfileSettings
     guessed: tuple[Guess, ...]
     remarks: tuple[str, ...] = ()
     rated_torque_Nm: float | None = None
@@ -115,11 +117,6 @@ class ProfileDraft(NamedTuple):
     def guesses(self) -> tuple[str, ...]:
         """The guesses as text, a line each."""
         return tuple(f"{guess.key.partition('.')[2]} = {guess.text}" for guess in self.guessed)
-
-    @property
-    def settings(self) -> ProfileSettings:
-        """The draft, parsed as a profile."""
-        return parse(ProfileSettings, parse_toml(self.text))
 
 
 def identity_of(eds: Path) -> tuple[int | None, int | None]:
@@ -181,13 +178,13 @@ def draft_profile(
     writer = make(eds, objects, ratings, answers or {})
     text = writer.text()
     try:
-        parse(ProfileSettings, parse_toml(text))
+        settings = parse(ProfileSettings, parse_toml(text))
     except ConfigError as error:
         raise ConfigError(f"EDS {eds}: {error}") from None
     keys = {guess.key for guess in writer.guessed}
     is_rated_known = not (keys & TORQUE_KEYS or writer.is_factory(0x6076, 0))
     return ProfileDraft(
-        kind, text, tuple(writer.guessed), tuple(writer.remarks), writer.rated_torque_Nm, is_rated_known
+        text, settings, tuple(writer.guessed), tuple(writer.remarks), writer.rated_torque_Nm, is_rated_known
     )
 
 
@@ -197,14 +194,17 @@ def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
     Its values that are not `assumed` hold for all devices of this maker.
     """
     vendor, _ = identity_of(eds)
-    for name in profile_names():
-        try:
-            profile = load_profile(name, kind)
-        except ConfigError:  # of the other kind
-            continue
+    for _, profile in shipped_profiles(kind):
         if vendor is not None and profile.settings.assumed and identity_of(profile.eds)[0] == vendor:
             return profile.settings
     return None
+
+
+def shipped_profiles(kind: str) -> Iterator[tuple[str, DeviceProfile]]:
+    """Yield the shipped profiles of drives, or of sensors, with their names."""
+    for name in profile_names():
+        with suppress(ConfigError):  # of the other kind
+            yield name, load_profile(name, kind)
 
 
 _TORQUE_OBJECTS = ((0x9130, 1), (0x7130, 1))
