@@ -20,7 +20,7 @@ from adacd_hil.settings.configuration import (
     resolved_table,
     value_of,
 )
-from adacd_hil.settings.schema import ConfigError, find_problems, parse
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.wire.budget import check_budget
 from adacd_hil.wire.codec import Codec, CodecError
@@ -47,12 +47,9 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
     """Return all errors and likely mistakes of a configuration."""
     try:
         layers = configuration_layers(name_or_file, profile)
+        settings = parse(Settings, resolved_table(layers))
     except ConfigError as error:
-        return ConfigurationFindings([str(error)], [], None)
-    table = resolved_table(layers)
-    if problems := find_problems(Settings, table):
-        return ConfigurationFindings(problems, [], None)
-    settings = parse(Settings, table)
+        return ConfigurationFindings([*error.problems], [], None)
     if problems := motion_problems(settings):
         return ConfigurationFindings([*problems, *_radians(settings)], [], None)
     if problems := _device_problems(settings):
