@@ -1,6 +1,5 @@
 """`adacd-hil`: the commands. Each one parses its options, calls one function, and prints the result."""
 
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
@@ -20,7 +19,7 @@ from adacd_hil.cli.options import (
     on_bus,
     run_folder_option,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, complain, show
+from adacd_hil.cli.output import EPILOG, ExitCode, answer, complain
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.terminal import is_interrupted, one_line, open_terminals
 
@@ -83,10 +82,7 @@ def run(
     from adacd_hil.cli.commands.run_command import as_text, next_of_run, run_on_bus
 
     result, code = run_on_bus(connection, clock, out, tare, live, history, scenario, without_anchor)
-    if as_json:
-        print(json.dumps(result, indent=2))
-    else:
-        show(as_text(result), *next_of_run(result))
+    answer(as_json, result, as_text(result), *next_of_run(result))
     return code
 
 

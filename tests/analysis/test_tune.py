@@ -170,7 +170,7 @@ def test_too_little_motion_gives_the_largest_value_seen_and_says_so():
 def test_without_truth_there_are_no_contacts():
     found = choose(observed(touches=None), 1.0).checked
     assert found.contacts is None
-    assert set(found.as_json()) == {"hours", "false_alarms", "rate_bound_per_h", "contacts"}
+    assert set(found.by_key()) == {"hours", "false_alarms", "rate_bound_per_h", "contacts"}
 
 
 # candidates
