@@ -1,8 +1,7 @@
 """The emulator plays the arm of the configuration that the host reads, and what a truth says otherwise."""
 
+import contextlib
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -35,7 +34,6 @@ sensor_node = [21, 22]
 contract = ""
 """
 SHORT = "lasts_s = 0.4\n"
-HOST = "from adacd_hil.cli.main import main; main()"
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +46,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def rehearse(folder: Path, name: str, *words: str) -> tuple[int, str]:
     """Play a short demo of the arm; return the exit status, and what was said on stderr."""
-    command = ["demo", "--config", "my-arm.toml", "--scenario", "short.toml", "--out", name, *words]
-    ran = subprocess.run(
-        [sys.executable, "-c", HOST, *command], cwd=folder, capture_output=True, text=True, check=False
-    )
-    return ran.returncode, ran.stderr
+    with contextlib.chdir(folder):
+        command = ["demo", "--config", "my-arm.toml", "--scenario", "short.toml", "--out", name, *words]
+        ran = CliRunner().invoke(cli, command)
+    return ran.exit_code, ran.stderr
 
 
 def test_an_own_arm_is_composed_and_what_is_assumed_of_it_is_said(folder: Path) -> None:

@@ -551,8 +551,9 @@ def test_the_port_is_free_while_the_last_viewers_say_goodbye(monkeypatch, unstar
 
 
 @pytest.mark.parametrize("steps", range(5))
-def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarted):
+def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarted, monkeypatch):
     """It comes so many steps of the server's loop after the end was said."""
+    monkeypatch.setattr(server_module, "LINGER_S", 0.1)
     server, listening, address, writer = unstarted
 
     async def meet():
