@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import dataclasses
 import gc
 import json
 import os
@@ -16,7 +17,7 @@ from typing import NamedTuple
 
 import pytest
 from hang import HANG_S
-from live_rig import EPOCH_NS, LINK_LENGTH_M, SETUP, URDF, Feed, receive_until_last, setup_of
+from live_rig import EPOCH_NS, SETUP, Feed, receive_until_last, setup_of
 from recorded_run import CODEC, feed, make_run, start
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -25,7 +26,7 @@ from adacd_hil.lab.live import server as server_module
 from adacd_hil.lab.live.admission import FULL, NOTICES, Admission
 from adacd_hil.lab.live.client import live_client
 from adacd_hil.lab.live.feed import ServerSetup
-from adacd_hil.lab.live.live_setup import LiveSetup
+from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.server import listen, make_server, url_of
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.ring import Ring, RingReader
@@ -36,8 +37,8 @@ OLD = "foxglove.websocket.v1"
 CHANNEL_IDS = {channel.id: channel.id for channel in run_channels(7, tuple(CODEC.messages.values()))}
 
 
-def live_setup(**changes) -> LiveSetup:
-    return LiveSetup(**{**vars(SETUP), **changes})
+def live_setup(**changes) -> LiveView:
+    return dataclasses.replace(SETUP, **changes)
 
 
 @pytest.fixture
@@ -576,7 +577,7 @@ def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarte
 
 
 def test_an_address_of_version_6_is_written_so_that_it_can_be_opened():
-    setup = LiveSetup("::1", 0, URDF, LINK_LENGTH_M)
+    setup = live_setup(host="::1")
     with socket.socket(socket.AF_INET6) as listening:
         try:
             listening.bind(("::1", 0))
