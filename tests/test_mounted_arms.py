@@ -22,12 +22,12 @@ MOUNTINGS = {
     "level, lowered by +q1": ("--mounting", "wall", "--at-zero", "90"),
     "tilted": ("--mounting", "10", "--at-zero", "level"),
 }
-TOUCHED = """
+START = "start_deg = [-20.0, 25.0]\n"
+TOUCHED = f"""
 lasts_s = 8.0
-start_deg = [-20.0, 25.0]
-contacts = [
-    { at_s = 5.0, link = 1, point_m = 0.25, angle_deg = 90.0, force_N = 20.0, duration_s = 0.25 },
-    { at_s = 6.5, link = 2, point_m = 0.20, angle_deg = -90.0, force_N = 15.0, duration_s = 0.25 },
+{START}contacts = [
+    {{ at_s = 5.0, link = 1, point_m = 0.25, angle_deg = 90.0, force_N = 20.0, duration_s = 0.25 }},
+    {{ at_s = 6.5, link = 2, point_m = 0.20, angle_deg = -90.0, force_N = 15.0, duration_s = 0.25 }},
 ]
 """
 HEAVIER = "[factor]\nmass = [1.25, 0.8]\n"
@@ -87,7 +87,7 @@ def test_a_mounted_arm_is_certified_and_its_touches_are_found(tmp_path: Path, mo
 )
 def test_a_wrong_mounting_is_named_before_a_certificate(tmp_path: Path, mounting: str, hangs_deg: float) -> None:
     tilt_deg = 10.0 if mounting == "tilted" else 90.0
-    outcome, said = play(tmp_path, MOUNTINGS[mounting], mounted(tilt_deg, hangs_deg))
+    outcome, said = play(tmp_path, MOUNTINGS[mounting], mounted(tilt_deg, hangs_deg), f"lasts_s = 3.0\n{START}")
     found = re.search(r"link 1 (?:hung|hangs) at about q1 = (-?[0-9]+) deg", said)
     assert found is not None, said
     assert abs(float(found[1]) - hangs_deg) < 25.0
@@ -96,13 +96,13 @@ def test_a_wrong_mounting_is_named_before_a_certificate(tmp_path: Path, mounting
 
 @pytest.mark.slow
 def test_an_arm_that_stands_and_is_told_to_hang_is_named_with_its_certificate(tmp_path: Path) -> None:
-    said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 180.0)).said
+    said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 180.0), f"lasts_s = 4.5\n{START}").said
     assert re.search(r"arm.mounting_deg\[1\] = 0 deg; link 1 hangs at q1 = 180", said), said
 
 
 @pytest.mark.slow
 def test_a_stop_before_the_first_motion_is_acknowledged_and_the_run_ends(tmp_path: Path) -> None:
-    still = TOUCHED.replace("[-20.0, 25.0]", "[0.0, 0.0]")
+    still = "lasts_s = 4.0\nstart_deg = [0.0, 0.0]\n"
     said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 20.0), still).said
     assert "[ENABLE -> REACT]" in said
     assert "[STOPPED -> ENABLE]" in said
@@ -110,7 +110,7 @@ def test_a_stop_before_the_first_motion_is_acknowledged_and_the_run_ends(tmp_pat
 
 @pytest.mark.slow
 def test_the_weight_of_an_arm_that_is_told_to_be_flat_is_named_with_the_mounting(tmp_path: Path) -> None:
-    said = play(tmp_path, ("--mounting", "flat"), mounted(90.0, -90.0)).said
+    said = play(tmp_path, ("--mounting", "flat"), mounted(90.0, -90.0), f"lasts_s = 2.0\n{START}").said
     assert re.search(r"joint 1 is loaded: .* the mounting is not flat: estimator.gravity = true", said), said
 
 
