@@ -4,7 +4,6 @@ A request goes to the scheme in one cycle. The progress lines also show the stat
 """
 
 import contextlib
-import difflib
 import io
 import sys
 import threading
@@ -14,6 +13,7 @@ from enum import Enum
 from typing import Protocol, TextIO
 
 from adacd_hil.records import ContactLevel, ContactReport, Reaction, Request, SchemeOutput, SchemeState
+from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.run_settings import OperatorSettings
 
 CONSOLE_WORDS = {
@@ -149,8 +149,8 @@ class ConsoleOperator:
 
 def _unknown(word: str) -> str:
     """Answer a word that is none of `CONSOLE_WORDS`."""
-    nearest = difflib.get_close_matches(word, CONSOLE_WORDS, n=1)
-    meant = f"; did you mean `{nearest[0]}`?" if nearest else ""
+    nearest = nearest_name(word, CONSOLE_WORDS)
+    meant = f"; did you mean `{nearest}`?" if nearest else ""
     return f"unknown word {word[:_MOST_LETTERS]!r}{meant} (known: {', '.join(CONSOLE_WORDS)})"
 
 
