@@ -24,6 +24,7 @@ from adacd_hil.lab.thresholds.detector_comparison import (
 from adacd_hil.lab.thresholds.free_motion import read_motion, sample_of
 from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
 from adacd_hil.log.log_files import LogError
+from adacd_hil.plain_values import plain_values
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.detectors import DetectorBankSettings, register, unregister
 from adacd_hil.settings.schema import parse
@@ -293,7 +294,7 @@ def test_never_is_a_dash_and_null_and_the_worst_rank():
     comparison = Comparison(1.0, 2.0, (0.1,), (fast, slow), ())
     assert comparison.ranking == ("a", "b")
     assert comparison.table()[1][1][2] == "–"
-    assert comparison.as_json()["rows"][0]["delay_ms"][0] is None
+    assert plain_values(comparison.by_key())["rows"][0]["delay_ms"][0] is None
 
 
 def run(logs, *arguments):

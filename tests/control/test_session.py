@@ -19,7 +19,7 @@ from rig import (
 )
 
 from adacd_hil.control.gate import GateFlag
-from adacd_hil.lab.live.live_view import LiveAddress
+from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.log.robot_description import ROBOT_NAME
 from adacd_hil.log.viewer_layout import LAYOUT_NAME
 from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState
@@ -201,7 +201,7 @@ def test_the_log_says_which_drive_faulted_and_why(tmp_path: Path) -> None:
 def test_viewers_find_the_arm_and_a_layout_in_the_log_and_beside_it_and_the_address(tmp_path: Path) -> None:
     rig = SessionRig(tmp_path, finish_s=0.3)
     said: list[str] = []
-    rig.session.live, rig.session.progress = LiveAddress("127.0.0.1", 0), said.append
+    rig.session.live, rig.session.progress = LiveView("127.0.0.1", 0), said.append
     summary, log = rig.run()
     assert summary.log.is_complete
     for name in (ROBOT_NAME, LAYOUT_NAME):

@@ -1,6 +1,5 @@
 """Monitor: a live table of the traffic on a bus. Listens only."""
 
-import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.lab.commission.survey import BusView, MessageView, Snapshot
 from adacd_hil.lab.commission.traffic import receive_until
+from adacd_hil.plain_values import json_text
 from adacd_hil.terminal import fold, moves_cursor, plain, terminal_columns, write_screen
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
@@ -140,7 +140,7 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
                         screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
             finally:  # the last table is printed even if the bus fails
                 described = monitor.describe()
-                screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))
+                screen.end(json_text(described) if as_json else fold(as_text(described), terminal_columns()))
     return ExitCode.OK
 
 
