@@ -72,3 +72,11 @@ def test_a_file_that_can_not_be_read_is_named(
 def test_docstrings_of_attributes_and_nested_functions_count(tmp_path: Path) -> None:
     source = 'LIMIT = 1\n"""What it is."""\ndef f():\n    def g():\n        """Who asks."""\n    return f"what {g}"\n'
     assert list(prose.prose(source)) == [(2, "What it is."), (5, "Who asks.")]
+
+
+def test_code_and_targets_of_links_on_a_page_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("Run it:\n\n```sh\necho what\n```\n\nSee `what` and [this](that.md#what). It says so.\n")
+    assert prose.main([str(tmp_path)]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert [line.removeprefix(str(page)).split(": ")[:2] for line in shown[:-5]] == [[":7", "hearsay"]]
