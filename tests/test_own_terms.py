@@ -26,6 +26,6 @@ def test_a_word_that_others_use_as_often_is_not_found() -> None:
     assert own_terms.frequent_terms(["write the tare"] * 30, ["write the tare"] * 9) == []
 
 
-def test_the_glossary_explains_the_words_of_its_first_column() -> None:
-    page = "| term | meaning |\n|---|---|\n| earlier belief | the knowledge of a run |\n"
-    assert own_terms.glossary_stems(page) == {own_terms.stem(word) for word in ("term", "earlier", "belief")}
+def test_the_glossary_explains_the_words_in_bold() -> None:
+    page = "- **earlier belief, sight**: the knowledge of a **run**\n"
+    assert own_terms.glossary_stems(page) == {own_terms.stem(word) for word in ("earlier", "belief", "sight")}

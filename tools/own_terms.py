@@ -32,7 +32,7 @@ PACKAGES = (
 )
 LEAST_USES, LEAST_FILES, LEAST_RATIO = 25, 5, 20.0
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
-_TERM = re.compile(r"^\| ([^|]+) \|", re.MULTILINE)
+_TERM = re.compile(r"^(?:- \*\*(.+?)\*\*:|\| ([^|]+) \|)", re.MULTILINE)
 _stemmer = snowballstemmer.stemmer("english")
 
 
@@ -102,8 +102,8 @@ def package_texts() -> Iterator[str]:
 
 
 def glossary_stems(page: str) -> set[str]:
-    """Return the stems of the words in the first column of the glossary's tables."""
-    return {key for cell in _TERM.findall(page) for key in count_stems(cell)}
+    """Return the stems of the words that the glossary explains: in bold, or in the first column of a table."""
+    return {key for found in _TERM.findall(page) for key in count_stems(" ".join(found))}
 
 
 def ordinary_words() -> dict[str, str]:
