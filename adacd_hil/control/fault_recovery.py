@@ -161,7 +161,7 @@ class FaultReport:
         }
 
     def note(self, state: SchemeState, arm: ArmState) -> None:
-        """Take in a cycle; `state`: of the scheme after the previous one."""
+        """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
         self._commission.count_cycle(state, arm)
 
     def describe(self, fault: FaultReason) -> list[str]:
@@ -213,7 +213,7 @@ class CommissionReport:
         self._worst: dict[_Unrest, float] = {}
 
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
-        """Take in a cycle; `state`: of the scheme after the previous one."""
+        """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
         if state not in _STATES:
             return
         self._cycles += 1
