@@ -49,14 +49,12 @@ def test_a_notebook_is_in_the_site_with_what_it_prints_and_draws(site):
 
 
 def test_a_broken_link_is_found(tmp_path):
-    (tmp_path / "pyproject.toml").symlink_to(ROOT / "pyproject.toml")
+    for name in ("adacd_hil", "CONTRIBUTING.md", "CHANGELOG.md", "pyproject.toml"):
+        (tmp_path / name).symlink_to(ROOT / name)
     pages = tmp_path / "docs"
-    pages.mkdir()
-    shutil.copy(ROOT / "docs" / "conf.py", pages)
-    (pages / "scheme.md").write_text("# The scheme\n")
-    (pages / "index.md").write_text(
-        "# Contents\n\n```{toctree}\nscheme\n```\n\n[x](no-such-page.md) [y](scheme.md#no-such-heading)\n"
-    )
+    shutil.copytree(ROOT / "docs", pages, ignore=shutil.ignore_patterns("_site"))
+    glossary = pages / "glossary.md"
+    glossary.write_text(f"{glossary.read_text()}\n[x](no-such-page.md) [y](scheme.md#no-such-heading)\n")
     (pages / "stray.md").write_text("# A page that nothing leads to\n")
     complaints = build(pages, tmp_path / "site")
     assert "no-such-page" in complaints
