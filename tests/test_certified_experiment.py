@@ -75,6 +75,7 @@ def test_the_notebook_prints_what_is_stored_in_it(played: Played) -> None:
     run_notebook(now := copy.deepcopy(stored), folder, path.name)
     assert printed(now) == printed(stored)
     assert len(pictures(now)) == len(pictures(stored)) == 2
+    assert (ROOT / "docs" / "figures" / "demo.png").read_bytes() == pictures(stored)[0]
 
 
 def test_a_velocity_whose_lag_nobody_gives_costs_what_the_page_says() -> None:

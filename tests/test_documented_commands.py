@@ -21,14 +21,9 @@ from documents import PAGES, ROOT, Document, Piece, read_document
 
 from adacd_hil.api import load
 from adacd_hil.cli.embedded_run import resolve, run_embedded
-from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.frames.can_io import McapReader
-from adacd_hil.log.reader import FRAME_DTYPE
-from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.detectors import DetectorBankSettings, unregister
 from adacd_hil.scheme.model.regressor import inverse_dynamics
-from adacd_hil.settings.configuration import load_settings
-from adacd_hil.wire.codec import load_codec
 from firmware_sim.cli.emulator_main import main as emulator_main
 
 PAGE_NAMES = [str(path.relative_to(ROOT)) for path in PAGES]
@@ -297,12 +292,9 @@ SHOWN = {
     r"make test": "it is what runs this test",
     r"(ip|groupadd|usermod|useradd|udevadm|systemctl|cp .* /etc/.*|echo 1)\b.*": "changes the computer, as root",
     r"(python3 -m venv /opt/|/opt/adacd-hil/bin/pip ).*": "changes the computer, as root",
-    r"grep -E .* run.log": "chooses lines of a text file",
     r"grep .* /proc/interrupts": "asks for the interrupts of a computer with an adapter",
     r"podman .*": "needs a container engine and a network",
     r"duckdb .*": "a program of others, which only reads what `log export` and `sweep` have written",
-    r"openssl .*|dask (scheduler|worker) .*": "others' programs, on several computers",
-    r"canplayer .*": "needs two buses",
 }
 """Commands that are only shown, and why."""
 
@@ -373,15 +365,6 @@ def free_and_pushed_motion() -> dict[str, Any]:
     return free | {"q_later": q[12_000:], "dq_later": dq[12_000:], "tau_J_later": tau_J[12_000:]}
 
 
-def cycles_of_a_bus_without_devices() -> dict[str, Any]:
-    """What docs/scheme.md has at hand: cycles as a log has them, and what the user asked for."""
-    settings = load_settings("certified")
-    count = 300
-    ticks = Ticks(np.arange(count), 1_000_000 * np.arange(1, count + 1), np.ones(count, np.int64))
-    arms = RecordedArm(settings, load_codec()).read(ticks, np.empty(0, FRAME_DTYPE))
-    return {"settings": settings, "arms": arms, "requests": np.zeros(count, np.uint8), "SchemeState": SchemeState}
-
-
 def a_joint_that_is_pushed() -> dict[str, Any]:
     """Give the arrays of one joint with an inertia and friction, which somebody pushes at 9 s."""
     urdf = (
@@ -400,9 +383,7 @@ def a_joint_that_is_pushed() -> dict[str, Any]:
 EXAMPLES: dict[str, Callable[[], dict[str, Any]]] = {
     "api.md": a_joint_that_is_pushed,
     "detectors.md": dict,
-    "formats.md": dict,
     "scheme-any-arm.md": free_and_pushed_motion,
-    "scheme.md": cycles_of_a_bus_without_devices,
 }
 """What a page's Python takes as given."""
 
@@ -426,10 +407,6 @@ def test_a_python_example_runs(page, documents, folder, capsys):
     elif page == "detectors.md":
         assert "magnitude" in DetectorBankSettings().detectors
         unregister("magnitude")
-    elif page == "formats.md":  # the last message of the log
-        assert names["message"].__msgtype__ == names["connection"].msgtype
-    else:
-        assert names["tau_ext_hat"].shape == (300, 2)
 
 
 # -- the checks themselves ---------------------------------------------------------------------------------------------

@@ -203,9 +203,8 @@ def prose(text: str) -> str:
 
 def glossary() -> dict[str, str]:
     """Return the terms of docs/glossary.md with their meaning."""
-    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8").partition("\n## Terms\n")[2]
-    rows = re.findall(r"^\| (?!term \|)(.+?) \| (.+) \|$", text, re.MULTILINE)
-    return dict(rows)
+    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    return dict(re.findall(r"^- \*\*(.+?)\*\*: (.+)$", text, re.MULTILINE))
 
 
 def concepts(text: str) -> list[str]:

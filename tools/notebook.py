@@ -1,7 +1,8 @@
 """Runs the code of the documentation's notebooks, top to bottom, and stores what each cell prints and draws.
 
-    .venv/bin/python tools/notebook.py docs/notebooks/a-run.ipynb
+    .venv/bin/python tools/notebook.py docs/notebooks/a-run.ipynb --picture docs/figures/demo.png
 
+--picture: also write the first picture of the first notebook to this file; README shows the demo's.
 Cells are plain Python here, without IPython's magics, so no Jupyter has to be installed. They run in the notebook's
 folder. A test runs them as well, and compares what they print.
 
@@ -66,11 +67,15 @@ def main() -> None:
     """Run notebooks where they lie and store them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("notebooks", nargs="+", type=Path, metavar="NOTEBOOK")
-    for path in parser.parse_args().notebooks:
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="write the first picture to this PNG file, too")
+    given = parser.parse_args()
+    for path in given.notebooks:
         notebook = json.loads(path.read_text(encoding="utf-8"))
         run_notebook(notebook, path.parent, path.name)
         path.write_text(json.dumps(notebook, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         print(f"{path}: {len(printed(notebook))} cells, {len(pictures(notebook))} pictures")
+        if given.picture is not None and path == given.notebooks[0]:
+            given.picture.write_bytes(pictures(notebook)[0])
 
 
 if __name__ == "__main__":

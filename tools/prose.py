@@ -1,15 +1,17 @@
-"""Counts turns of phrase that readers stumble over, in docstrings and comments of Python files.
+"""Counts turns of phrase that readers stumble over, in docstrings and comments of Python files, and in pages.
 
     python tools/prose.py adacd_hil firmware_sim
+    python tools/prose.py --figures docs README.md CONTRIBUTING.md CHANGELOG.md
     python tools/prose.py --figures adacd_hil/wire ../another-checkout
 
 Prints each place as `file:line: pattern: text` and then, per 1000 words of prose, how often each pattern occurs. Prose
 is every string that stands alone as a statement (docstrings) and every comment; messages and other strings don't count.
+Of a page (`.md`) it is everything but fenced blocks, code in backticks and the targets of links.
 
 Patterns: a relative clause as the subject of a sentence ("What is through ..."), the word "what", hearsay ("is told"),
 negations as nouns ("nobody", "is no").
 
-Exit status: 0 counted, 2 a path doesn't exist or isn't Python.
+Exit status: 0 counted, 2 a path doesn't exist, or is neither Python nor a page.
 """
 
 import argparse
@@ -32,10 +34,19 @@ PATTERNS = {
     "is no, nobody, nothing, none": re.compile(r"\b(?:is no|are no|nobody|nothing|none)\b"),
 }
 _LONGEST = 110
+_NO_PROSE = re.compile(r"^ *```.*?^ *```$|`[^`\n]+`|(?<=\])\([^)]*\)", re.MULTILINE | re.DOTALL)
+
+
+def page_prose(page: str) -> str:
+    """Return the text of a page, its lines as they are, each piece of code or link target replaced by one letter."""
+    return _NO_PROSE.sub(lambda found: "x" + "\n" * found[0].count("\n"), page)
 
 
 def prose(source: str, name: str = "") -> Iterator[tuple[int, str]]:
     """Yield line number and text of every docstring and comment of a source; name: for errors. Raises SyntaxError."""
+    if name.endswith(".md"):
+        yield 1, page_prose(source)
+        return
     for node in ast.walk(ast.parse(source, name)):
         match node:
             case ast.Expr(value=ast.Constant(value=str(text))):
@@ -55,13 +66,13 @@ def find_hits(text: str) -> Iterator[tuple[str, int, str]]:
             yield name, line, words[max(found.start() - _LONGEST // 3, 0) :][:_LONGEST]
 
 
-def python_files(paths: list[Path]) -> list[Path]:
-    """Return the given files and all Python files below the given folders, sorted. Raises FileNotFoundError."""
+def files_with_prose(paths: list[Path]) -> list[Path]:
+    """Return the given files, all Python files and pages below the given folders, sorted. Raises FileNotFoundError."""
     found: set[Path] = set()
     for path in paths:
         if not path.exists():
             raise FileNotFoundError(f"{path}: no such file or folder")
-        found |= set(path.rglob("*.py")) if path.is_dir() else {path}
+        found |= {*path.rglob("*.py"), *path.rglob("*.md")} if path.is_dir() else {path}
     return sorted(found)
 
 
@@ -70,13 +81,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
-    parser.add_argument("paths", nargs="+", type=Path, help="Python files, or folders that are searched for them")
+    parser.add_argument(
+        "paths", nargs="+", type=Path, help="Python files, pages, or folders that are searched for them"
+    )
     parser.add_argument("--figures", action="store_true", help="print the figures only, not the places")
     given = parser.parse_args(arguments)
     words = 0
     hits: Counter[str] = Counter()
     try:
-        for path in python_files(given.paths):
+        for path in files_with_prose(given.paths):
             for number, text in prose(path.read_text(), str(path)):
                 words += len(text.split())
                 for name, line, shown in find_hits(text):

@@ -12,11 +12,11 @@ from adacd_hil.settings.setting_keys import keys_of, sections
 
 HEAD = (
     "# Settings\n\n"
-    "Every key that a configuration may have. `python tools/settings_page.py` prints this page from the declarations "
-    "in `adacd_hil/settings`, where a new setting goes; a test compares the two. How a configuration is found, "
-    "extended and overridden: [overview.md](overview.md#configuration).\n\n"
-    "The default is the declaration's. The built-in configurations in `adacd_hil/configs` and their profiles override "
-    "many of them, above all those of `arm`, `controller` and the thresholds.\n"
+    "For whoever writes a configuration: every key with its default, its bounds in brackets, and its meaning. "
+    "`adacd-hil config docs` explains them on the terminal. `python tools/settings_page.py` prints this page. How a "
+    "configuration is found, extended and overridden: [overview.md](overview.md#configuration).\n\n"
+    "The built-in configurations in `adacd_hil/configs` and their profiles override many defaults, above all those of "
+    "`arm`, `controller` and the thresholds.\n"
 )
 
 
@@ -25,11 +25,10 @@ def page() -> str:
     lines = [HEAD]
     for name, section, meaning in sections():
         lines.append(f"## {name}: {meaning}\n" if name else "## Top of the file\n")
-        lines += ["| key | default | bounds | meaning |", "|---|---|---|---|"]
         prefix = f"{name}." if name else ""
         for known in keys_of(section, prefix):
-            cells = (cell.replace("|", chr(92) + "|") for cell in (known.default, known.bounds, known.meaning))
-            lines.append(f"| `{known.key}` | {' | '.join(cells)} |")
+            bounds = f" ({known.bounds})" if known.bounds else ""
+            lines.append(f"- `{known.key}` {known.default}{bounds}: {known.meaning}")
         lines.append("")
     return "\n".join(lines)
 

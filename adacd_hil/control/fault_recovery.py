@@ -159,7 +159,7 @@ class FaultReport:
         }
 
     def note(self, state: SchemeState, arm: ArmState) -> None:
-        """Take in a cycle; `state`: of the scheme after the previous one."""
+        """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
         self._commission.count_cycle(state, arm)
 
     def list_causes(self, fault: FaultReason) -> list[str]:
@@ -198,7 +198,7 @@ class CommissionReport:
         self._worst: dict[tuple[int, int], float] = {}
 
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
-        """Take in a cycle; `state`: of the scheme after the previous one."""
+        """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
         if state not in _STATES:
             return
         self._cycles += 1

@@ -69,7 +69,7 @@ class DataWatch(EventSource):
         self._has_rows = False
 
     def note(self, state: ArmState) -> None:
-        """Take in one cycle, once its frames are in."""
+        """Count missing frames and cycles without a sample; call it once the cycle's frames are in."""
         if not state.is_enabled:
             return
         if self._cycles == 0:

@@ -61,7 +61,7 @@ class RecordedArm:
         self._begin()
 
     def _begin(self) -> None:
-        """Begin anew."""
+        """Make a new arm and heartbeat watch, as at the start of an attempt."""
         settings = self._settings
         self._arm = Arm(settings, self._codec, EmbeddedBus(VirtualClock()))  # with nobody on it
         self._heartbeats = follow_devices(self._devices, settings.bus.heartbeat_ms, lambda _: None)

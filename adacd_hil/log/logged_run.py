@@ -139,7 +139,7 @@ class Milestones:
         self._tell, self._step, self._told = tell, step or PROGRESS_CYCLES, 0
 
     def reach(self, count: int) -> None:
-        """Take note of the count so far."""
+        """Call `tell` if the count has grown by a step since the last call."""
         if count - self._told >= self._step:
             self._told = count
             self._tell(count)

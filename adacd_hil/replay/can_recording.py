@@ -249,7 +249,7 @@ class RecordingAlone:
         return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
 
     def parts(self, with_frames: bool) -> Iterator[Part]:  # noqa: ARG002 (there are only frames)
-        """Yield one part."""
+        """Yield the whole recording as one part; it has frames only."""
         yield Part(list(self._stretches()), {}, (), frozenset())
 
     def _stretches(self) -> Iterator[CycleStretch]:

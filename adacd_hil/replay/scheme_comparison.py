@@ -141,7 +141,7 @@ class SchemeComparison:
         self._keep(mismatch)
 
     def _keep(self, mismatch: Mismatch) -> None:
-        """Keep the earliest ones, in order of time."""
+        """Keep a mismatch; drop all but the earliest when there are many."""
         self.mismatches.append(mismatch)
         if len(self.mismatches) > 2 * self._shown:
             self.first()

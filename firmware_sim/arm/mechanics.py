@@ -128,9 +128,9 @@ def _fill_rates(row: int, rates: int, around: Surroundings, slips: Slips, work: 
 
 @compiled
 def _set_stage(rates: int, length_s: float, mechanics: np.void, work: _StepWork) -> None:
-    """Fill the stage with the start plus `length_s` times the rates; bristles advance by the rates' velocity.
+    """Fill the row `_STAGE` with the start plus `length_s` times the rates in the row `rates`.
 
-    The level of the bristles is the one of the same velocity.
+    The bristles of LuGre friction advance by the mean velocity over `length_s`.
     """
     values = work.values
     for place in range(_INTEGRATED):

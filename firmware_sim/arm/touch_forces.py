@@ -376,7 +376,7 @@ def change_touch(things: Structured, time_s: float, q1: float, q2: float, state:
 
 @compiled
 def _note(out: np.void, force_x: float, force_y: float, link: float, index: float) -> None:
-    """Keep the strongest force."""
+    """Store force, link and index in `out` if the force is the strongest so far."""
     size = math.sqrt(force_x * force_x + force_y * force_y)
     if out["index"] < 0.0 or size > out["force_N"]:
         out["force_N"], out["link"], out["index"] = size, link, index

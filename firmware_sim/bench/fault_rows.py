@@ -57,7 +57,7 @@ class FaultRow:
 
     @property
     def next_ns(self) -> int:
-        """When it begins or ends."""
+        """Time of the fault's next beginning or end, ns."""
         return NEVER_NS if self.is_over else self.end_ns if self.is_active else self.begin_ns
 
     @property

@@ -99,7 +99,7 @@ def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float])
 
 
 def motor_state(settings: DriveSettings) -> np.void:
-    """Give the motors at power-on."""
+    """Return the state of both motors at power-on, MOTOR_STATE."""
     state: np.void = np.zeros(1, MOTOR_STATE)[0]
     state["housing_K"][:] = settings.preheat_K
     return state

@@ -219,7 +219,7 @@ class HeartbeatConsumer:
         dictionary.watch(0x1016, 1, self._configure, _check_node)
 
     def on_heartbeat(self, node_id: int, t_ns: int) -> None:
-        """Take note of a heartbeat."""
+        """Restart the timeout if the heartbeat is of the watched node."""
         if self._timeout_ns == 0 or node_id != self._node_id:
             return
         self._due_ns = t_ns + self._timeout_ns

@@ -350,7 +350,7 @@ class Pdos:
         return sum(receiver.counts[s] for receiver in receivers for s in E2eStatus if not s.is_valid)
 
     def notify(self) -> None:
-        """Say that an object of `events` has changed."""
+        """Make each event-driven PDO due, except those that compare their data."""
         for pdo in self._sending:
             if not pdo.is_compared:
                 pdo.is_due = True

@@ -211,7 +211,7 @@ class EmulatedDevice(ObjectDictionary):
             self.on_request(data, t_ns)
 
     def on_heartbeat(self, node_id: int, t_ns: int) -> None:
-        """Take note of another node's heartbeat."""
+        """Pass another node's heartbeat to the heartbeat consumer."""
         if self.is_on_bus:
             self._consumer.on_heartbeat(node_id, self.clock.own_ns(t_ns))
 
@@ -395,7 +395,7 @@ class SyncListeners:
         self._remember()
 
     def miss(self, count: int) -> None:
-        """Keep SYNCs from all devices."""
+        """Count SYNCs that none of the devices has heard."""
         self._unheard = [unheard + count for unheard in self._unheard]
         self._remember()
 

@@ -123,7 +123,7 @@ class DriveNode(Application):
         self.restart_node(is_node_reset=True)
 
     def _serve(self, codec: Codec) -> None:
-        """Give the dictionary its live values."""
+        """Register readers of the drive's live objects in the object dictionary."""
         serve = self.device.serve
         serve(0x2000, 1, lambda: codec.wire_version)
         serve(0x2000, 2, lambda: codec.layout_digest)
@@ -463,7 +463,7 @@ class DriveNode(Application):
         return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)
 
     def _clear_watchdogs(self, t_ns: int) -> None:
-        """At a SYNC: it has come, and maybe a command with it."""
+        """Clear, at a SYNC, the watchdogs of SYNC, command and command PDO whose causes have gone."""
         if self.device.sync_counts.is_in_order:
             self.device.clear(Watchdog.SYNC, t_ns)
         if not self._is_command_missing(t_ns):

@@ -8,6 +8,9 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import prose
 
+ROOT = Path(__file__).parents[2]
+MOST_PER_1000_WORDS = {"relative clause as subject": 0.5, "what": 3.0, "hearsay": 0.3}
+PAGES = ("docs", "README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 SOURCE = '''"""What is sent.
 
 Where the bus is silent, nobody is told what happened.
@@ -72,3 +75,22 @@ def test_a_file_that_can_not_be_read_is_named(
 def test_docstrings_of_attributes_and_nested_functions_count(tmp_path: Path) -> None:
     source = 'LIMIT = 1\n"""What it is."""\ndef f():\n    def g():\n        """Who asks."""\n    return f"what {g}"\n'
     assert list(prose.prose(source)) == [(2, "What it is."), (5, "Who asks.")]
+
+
+def test_code_and_targets_of_links_on_a_page_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("Run it:\n\n```sh\necho what\n```\n\nSee `what` and [this](that.md#what). It says so.\n")
+    assert prose.main([str(tmp_path)]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert [line.removeprefix(str(page)).split(": ")[:2] for line in shown[:-5]] == [[":7", "hearsay"]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tops", [("adacd_hil", "firmware_sim"), PAGES], ids=["code", "pages"])
+def test_code_and_pages_keep_to_plain_sentences(tops: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert prose.main(["--figures", *(str(ROOT / top) for top in tops)]) == 0
+    lines = capsys.readouterr().out.splitlines()[1:]
+    figures = {
+        name: float(line.removeprefix(name).split()[0]) for name in prose.PATTERNS for line in lines if name in line
+    }
+    assert {name: figures[name] for name, most in MOST_PER_1000_WORDS.items() if figures[name] > most} == {}

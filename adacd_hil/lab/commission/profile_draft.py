@@ -572,7 +572,7 @@ class _DriveWriter(_ProfileWriter):
         return increments, [*lines, f"increments_per_joint_rev = {increments:.16g}"]
 
     def _numbers_with_gear(self) -> Any:
-        """Return a reader of the drive's numbers, without a 0x6091 that is 1 : 1 by default or answered otherwise."""
+        """Return a reader of the drive's objects; 0x6091 is hidden if it is 1 : 1, or if the user gave a gear."""
         by_drive = read_drive_units(self.number).gear_ratio
         is_set = by_drive not in (None, 1.0) and "gear_ratio" not in self.answers
         return lambda index, sub: None if index == 0x6091 and not is_set else self.number(index, sub)

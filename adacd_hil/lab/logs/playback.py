@@ -42,7 +42,7 @@ class Lateness:
         self._counts: Counter[int] = Counter()
 
     def add_lateness(self, lateness_ns: int) -> None:
-        """Count a frame."""
+        """Count a frame that was sent so much later than due, ns."""
         self.frames += 1
         self.late_frames += lateness_ns > LATE_NS
         self.worst_ns = max(self.worst_ns, lateness_ns)

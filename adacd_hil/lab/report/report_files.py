@@ -50,7 +50,7 @@ class Report:
         return self.source.is_complete
 
     def as_json(self) -> dict[str, Any]:
-        """Give the content of report.json."""
+        """Return the content of report.json as a dictionary."""
         return report_json(self.metrics, self.metadata, self.source, self.stretch)
 
     def as_text(self) -> str:

@@ -237,7 +237,7 @@ def _why_not(contact: ReportedContact) -> str:
 
 
 def _found(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Give the entries of the contact's report."""
+    """Return name and text of each value that the run has reported of a contact."""
     lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
     return [
         ("found after", number_text(contact.delay_ms, 0, "ms")),

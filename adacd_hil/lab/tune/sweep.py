@@ -98,7 +98,7 @@ class Plan:
                 yield Task(subject, self.config, self.profile, tuple(rows[start : start + rows_per_task]))
 
     def row_keys(self) -> Iterator[str]:
-        """Give the keys of all rows."""
+        """Yield the keys of all rows, one per subject and variant."""
         return (self._key(subject, changes) for subject in self.subjects for changes in self.variants)
 
     def _key(self, subject: Subject, changes: Changes) -> str:

@@ -277,7 +277,7 @@ class _PassedOver(logging.Handler):
             self.pass_over(words)
 
     def pass_over(self, words: str) -> None:
-        """Count a record."""
+        """Count a record that was not read; keep the text of the first."""
         self.count += 1
         self.first = self.first or " ".join(words.split())[:_LONGEST]
 

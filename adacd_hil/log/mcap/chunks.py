@@ -195,12 +195,12 @@ class Contents:
 
     @cached_property
     def log_times(self) -> NDArray[np.uint64]:
-        """Their log times, ns."""
+        """Log times of the messages, ns (k,)."""
         return self.heads["log_time"].copy()
 
     @cached_property
     def publish_times(self) -> NDArray[np.uint64]:
-        """Their publish times, ns."""
+        """Publish times of the messages, ns (k,)."""
         return self.heads["publish_time"].copy()
 
     @property

@@ -1,4 +1,4 @@
-"""What the offline scheme finds in a run's arrays, beside what the run itself found.
+"""Contacts and parameters of the offline scheme on the arrays of a run, beside those of the run itself.
 
 python docs/examples/api/compare_offline.py runs/latest
 """

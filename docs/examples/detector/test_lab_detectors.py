@@ -1,4 +1,4 @@
-"""What a lab tests of its detector: that it keeps the contract, and what it finds."""
+"""Tests of a lab's detector: it keeps the contract, and finds a push."""
 
 import numpy as np
 from lab_detectors import MeanOfTwenty
