@@ -325,9 +325,3 @@ def test_the_command_refuses_what_is_too_short():
     assert played.stderr.splitlines() == [
         "adacd-hil: 19 s of contact-free motion are too few for a tail, at least 50 s that move are needed"
     ]
-
-
-def test_the_command_names_a_log_that_is_not_there(tmp_path):
-    played = CliRunner().invoke(cli, ["thresholds", str(tmp_path / "none.mcap")])
-    assert (played.exit_code, played.stdout) == (1, "")
-    assert "none.mcap" in played.stderr
