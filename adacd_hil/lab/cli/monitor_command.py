@@ -31,23 +31,16 @@ class Screen:
     """Output of tables: redrawn in place on a terminal, one after the other elsewhere."""
 
     def __init__(self, is_terminal: bool, write: Callable[[str], None]) -> None:
-        self._is_terminal = is_terminal
-        self._write = write
-
-    @property
-    def is_redrawn(self) -> bool:
+        self.is_redrawn = is_terminal
         """Whether a table replaces the previous one."""
-        return self._is_terminal
-
-    @property
-    def redraw_s(self) -> float:
+        self.redraw_s = REDRAW_S if is_terminal else PLAIN_S
         """Time between two tables."""
-        return REDRAW_S if self._is_terminal else PLAIN_S
+        self._write = write
 
     def draw_table(self, text: str) -> None:
         """Show a table, cut to the terminal; `end` shows the whole one."""
         text = plain(text)
-        if not self._is_terminal:
+        if not self.is_redrawn:
             self._write(text + "\n\n")
             return
         columns, rows = shutil.get_terminal_size()
@@ -58,7 +51,7 @@ class Screen:
 
     def end(self, text: str) -> None:
         """Show the last table."""
-        self._write((_HOME + _CLEAR_BELOW if self._is_terminal else "") + plain(text) + "\n")
+        self._write((_HOME + _CLEAR_BELOW if self.is_redrawn else "") + plain(text) + "\n")
 
 
 class Monitor:
