@@ -261,7 +261,7 @@ class RunReading:
         self._times.add_columns(columns)
         if not len(scheme):
             return
-        self._attempts.add(cycle, state)
+        self._attempts.add_cycles(cycle, state)
         self._add_facts(scheme, cycle, state)
         rows = np.concatenate((self._edges(scheme), self._onset_rows(scheme, cycle)))
         self._rows.add_records(scheme, rows[(rows >= 0) & (rows < len(scheme))])
