@@ -314,7 +314,7 @@ class _Index:
 
     def add_scheme(self, scheme: Series) -> None:
         """Add the next piece of /scheme."""
-        self.attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+        self.attempts.add_cycles(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
         self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
         self._t_ns.frombytes(scheme.t_ns.tobytes())
         self._before.frombytes(scheme["previous_state"].astype(np.uint8).tobytes())
@@ -336,7 +336,7 @@ def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
     if motion.bounds_ns is not None:
         attempts = AttemptBegins()
         for scheme in schemes(motion.path, (EVER_NS[0], motion.bounds_ns[1])):
-            attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+            attempts.add_cycles(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
     begins: list[int] = attempts.begins.tolist()
     return begins
 
