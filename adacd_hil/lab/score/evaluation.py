@@ -29,7 +29,7 @@ from adacd_hil.log.logged_run import (
     split_sections,
 )
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
-from adacd_hil.scheme.contact.contact_report import KIND_S
+from adacd_hil.scheme.contact.course import KIND_S
 from adacd_hil.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
 from adacd_hil.score.judge import (
     LoggedDetection,
