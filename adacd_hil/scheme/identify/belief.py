@@ -217,8 +217,9 @@ def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
 
 @compiled
 def discard(m: Memory) -> None:
-    """Discard the waiting samples."""
+    """Discard the waiting samples; the next one comes first in the ring."""
     m.ring.used = 0.0
+    m.ring.next = 0.0
     m.models.since_learnt = 0.0
 
 
