@@ -40,6 +40,16 @@ def quadratic(A: Vector, x: Vector) -> float:
 
 
 @compiled
+def add_row(v: Vector, r: float, R: float, L: Vector, b: Vector) -> None:
+    """Add v v'/R to the lower half of L and v r/R to b: one row of variance R to the sums of a least-squares fit."""
+    for j in range(v.shape[0]):
+        if v[j] != 0.0:
+            b[j] += v[j] * r / R
+            for n in range(j + 1):
+                L[j, n] += v[j] * v[n] / R
+
+
+@compiled
 def factor(A: Vector, least: float) -> bool:
     """Put the Cholesky factor L, A = L L', into the lower half of A; False if A is not positive definite.
 

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Final, NamedTuple, Self
+from typing import Annotated, Final, NamedTuple, Self, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,35 +30,24 @@ GRAVITY_PARAMETER_NAMES = ("a4", "a5")
 """Appended where the joint axes are not vertical; Nm."""
 POSITION_TERMS = ("sin_q", "cos_q", "sin_2q", "cos_2q", "sin_sum", "cos_sum")
 """Torque that depends on the joint position, one parameter per joint each, of `arm.position_torque_Nm`."""
+_JOINT_UNITS = {
+    "F_v": "Nm s/rad",
+    "F_c": "Nm",
+    "offset": "Nm",
+    "lag": "s",
+    "stribeck": "Nm",
+    "load": "Nm/Nm",
+    "asymmetric": "Nm",
+    "width": "Nm",
+    "dahl_short": "Nm",
+    "dahl_long": "Nm",
+    "cross_talk": "Nm/Nm",
+    **dict.fromkeys(POSITION_TERMS, "Nm"),
+}
 PARAMETER_UNITS = {
-    "a1": "kg m²",
-    "a2": "kg m²",
-    "a3": "kg m²",
-    "F_v1": "Nm s/rad",
-    "F_v2": "Nm s/rad",
-    "F_c1": "Nm",
-    "F_c2": "Nm",
-    "a4": "Nm",
-    "a5": "Nm",
-    "offset1": "Nm",
-    "offset2": "Nm",
-    "lag1": "s",
-    "lag2": "s",
-    "stribeck1": "Nm",
-    "stribeck2": "Nm",
-    "load1": "Nm/Nm",
-    "load2": "Nm/Nm",
-    "asymmetric1": "Nm",
-    "asymmetric2": "Nm",
-    "width1": "Nm",
-    "width2": "Nm",
-    "dahl_short1": "Nm",
-    "dahl_short2": "Nm",
-    "dahl_long1": "Nm",
-    "dahl_long2": "Nm",
-    "cross_talk1": "Nm/Nm",
-    "cross_talk2": "Nm/Nm",
-    **{f"{term}{joint + 1}": "Nm" for term in POSITION_TERMS for joint in range(JOINTS)},
+    **dict.fromkeys(("a1", "a2", "a3"), "kg m²"),
+    **dict.fromkeys(GRAVITY_PARAMETER_NAMES, "Nm"),
+    **{f"{name}{joint + 1}": unit for name, unit in _JOINT_UNITS.items() for joint in range(JOINTS)},
 }
 
 
@@ -93,51 +82,77 @@ class Layout:
         return sum(field.size for field in self.fields)
 
 
-def scheme_layout(parameter_count: int) -> Layout:
-    """Lay out the scheme's per-cycle block for `parameter_count` dynamic parameters (7, or 9 with gravity)."""
-    return Layout(
-        (
-            Field("q", JOINTS, "rad", "measured joint position"),
-            Field("dq", JOINTS, "rad/s", "measured joint velocity"),
-            Field("tau_J", JOINTS, "Nm", "measured joint torque"),
-            Field("tau_f", JOINTS, "Nm", "filtered measured torque, eq. (3)"),
-            Field("tau_f_hat", JOINTS, "Nm", "its prediction by theta_hat, eq. (7)"),
-            Field("tau_f_cad", JOINTS, "Nm", "its prediction by the CAD model"),
-            Field("tau_ext_hat", JOINTS, "Nm", "estimated external torque, filtered, eq. (13) with our sign"),
-            Field("tau_ext_hat_cad", JOINTS, "Nm", "the same with the CAD model"),
-            Field("tau_ext_wide_hat", JOINTS, "Nm", "estimated external torque with the filter undone"),
-            Field("theta_hat", parameter_count, "see PARAMETER_UNITS", "estimated parameters"),
-            Field("threshold", JOINTS, "Nm", "detection threshold in force, inf while detection is off"),
-            Field("quiet_s", 1, "s", "how long eq. (15) has held"),
-            Field("excitation", 1, "Nm² s", "smallest eigenvalue of the scaled information matrix of this adaptation"),
-            Field("period_s", 1, "s", "measured time since the sample before"),
-        )
-    )
+class SchemeBlock:
+    """The block of a cycle, one field a line: sizes, unit, meaning.
+
+    Sizes: n joints, p dynamic parameters (7, or 9 with gravity).
+    """
+
+    q: Annotated[Vector, "n", "rad", "measured joint position"]
+    dq: Annotated[Vector, "n", "rad/s", "measured joint velocity"]
+    tau_J: Annotated[Vector, "n", "Nm", "measured joint torque"]
+    tau_f: Annotated[Vector, "n", "Nm", "filtered measured torque, eq. (3)"]
+    tau_f_hat: Annotated[Vector, "n", "Nm", "its prediction by theta_hat, eq. (7)"]
+    tau_f_cad: Annotated[Vector, "n", "Nm", "its prediction by the CAD model"]
+    tau_ext_hat: Annotated[Vector, "n", "Nm", "estimated external torque, filtered, eq. (13) with our sign"]
+    tau_ext_hat_cad: Annotated[Vector, "n", "Nm", "the same with the CAD model"]
+    tau_ext_wide_hat: Annotated[Vector, "n", "Nm", "estimated external torque with the filter undone"]
+    theta_hat: Annotated[Vector, "p", "see PARAMETER_UNITS", "estimated parameters"]
+    threshold: Annotated[Vector, "n", "Nm", "detection threshold in force, inf while detection is off"]
+    quiet_s: Annotated[float, "", "s", "how long eq. (15) has held"]
+    excitation: Annotated[float, "", "Nm² s", "smallest eigenvalue of the scaled information matrix of this adaptation"]
+    period_s: Annotated[float, "", "s", "measured time since the sample before"]
 
 
-def certified_layout(parameter_count: int, further_count: int, channel_count: int) -> Layout:
-    """Lay out the block of the certified scheme: the fields of `scheme_layout`, then its own.
+class CertifiedBlock(SchemeBlock):
+    """The block of the certified scheme: the fields of `SchemeBlock`, then its own.
 
-    parameter_count: dynamic parameters. further_count: offsets, lags and friction terms. channel_count: channels of the
+    Sizes: further parameters (offsets, lags, friction terms), all parameters, bank: joints times channels of the
     detector bank. tau_f, tau_ext_hat and threshold are those of the slowest filter. The bank holds first the smoothed
     channel of each filter, then the unsmoothed channels of all filters but the slowest.
     """
-    bank = JOINTS * channel_count
+
+    tau_ext_bank: Annotated[Vector, "bank", "Nm", "estimated external torque of each channel"]
+    threshold_bank: Annotated[Vector, "bank", "Nm", "its threshold in force, inf while detection is off"]
+    theta_further: Annotated[Vector, "further", "see PARAMETER_UNITS", "estimated offsets, lags and friction terms"]
+    theta_std: Annotated[Vector, "all", "see PARAMETER_UNITS", "how well theta is known"]
+    condition: Annotated[float, "", "", "condition number of the scaled information matrix of this adaptation"]
+    promotions: Annotated[float, "", "", "refined models that have taken over since the certificate"]
+    paper_is_armed: Annotated[float, "", "", "whether the paper's scheme, run beside, has ended its adaptation"]
+    paper_tau_ext_hat: Annotated[Vector, "n", "Nm", "its estimated external torque"]
+    paper_threshold: Annotated[Vector, "n", "Nm", "its threshold in force, inf while it adapts"]
+    paper_theta_hat: Annotated[Vector, "p", "see PARAMETER_UNITS", "its estimated parameters"]
+
+
+def block_sizes(parameter_count: int, further_count: int = 0, channel_count: int = 0) -> dict[str, int]:
+    """Return the sizes named in `SchemeBlock` and `CertifiedBlock`."""
+    return {
+        "n": JOINTS,
+        "p": parameter_count,
+        "further": further_count,
+        "all": parameter_count + further_count,
+        "bank": JOINTS * channel_count,
+    }
+
+
+def _layout(block: type, sizes: dict[str, int]) -> Layout:
+    hints = get_type_hints(block, include_extras=True)
     return Layout(
-        (
-            *scheme_layout(parameter_count).fields,
-            Field("tau_ext_bank", bank, "Nm", "estimated external torque of each channel"),
-            Field("threshold_bank", bank, "Nm", "its threshold in force, inf while detection is off"),
-            Field("theta_further", further_count, "see PARAMETER_UNITS", "estimated offsets, lags and friction terms"),
-            Field("theta_std", parameter_count + further_count, "see PARAMETER_UNITS", "how well theta is known"),
-            Field("condition", 1, "", "condition number of the scaled information matrix of this adaptation"),
-            Field("promotions", 1, "", "refined models that have taken over since the certificate"),
-            Field("paper_is_armed", 1, "", "whether the paper's scheme, run beside, has ended its adaptation"),
-            Field("paper_tau_ext_hat", JOINTS, "Nm", "its estimated external torque"),
-            Field("paper_threshold", JOINTS, "Nm", "its threshold in force, inf while it adapts"),
-            Field("paper_theta_hat", parameter_count, "see PARAMETER_UNITS", "its estimated parameters"),
+        tuple(
+            Field(name, sizes[size] if size else 1, unit, meaning)
+            for name, (size, unit, meaning) in ((name, hint.__metadata__) for name, hint in hints.items())
         )
     )
+
+
+def scheme_layout(parameter_count: int) -> Layout:
+    """Lay out `SchemeBlock` for `parameter_count` dynamic parameters (7, or 9 with gravity)."""
+    return _layout(SchemeBlock, block_sizes(parameter_count))
+
+
+def certified_layout(parameter_count: int, further_count: int, channel_count: int) -> Layout:
+    """Lay out `CertifiedBlock`; channel_count: of the detector bank."""
+    return _layout(CertifiedBlock, block_sizes(parameter_count, further_count, channel_count))
 
 
 CONTROL_LAYOUT = Layout(

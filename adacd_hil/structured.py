@@ -68,10 +68,10 @@ def _flat(shapes: tuple[tuple[str, Shape], ...]) -> Record:
 
 def _field_of(name: str, hint: Any, sizes: Mapping[str, int]) -> _Field:
     if hasattr(hint, "__metadata__"):
-        array, dimensions = get_args(hint)
+        kind, dimensions = hint.__origin__, hint.__metadata__[0]
         if isinstance(dimensions, type):
             return name, dimensions, ()
-        (number,) = get_args(get_args(array)[1])
+        number = _NUMBERS[kind] if kind in _NUMBERS else get_args(get_args(kind)[1])[0]
         return name, number, tuple(int(d) if d.isdigit() else sizes[d] for d in dimensions.split())
     if hint in _NUMBERS:
         return name, _NUMBERS[hint], ()

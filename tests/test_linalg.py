@@ -45,3 +45,14 @@ def test_a_form_that_rounding_makes_negative_is_zero():
 def test_a_misfit_is_predicted_less_measured():
     assert linalg.misfit(np.array([1.0, 2.0]), np.array([3.0, 0.5]), 1.5) == 2.5
     assert linalg.dot(np.array([1.0, 2.0]), np.array([3.0, 0.5])) == 4.0
+
+
+def test_rows_add_up_to_the_sums_of_weighted_least_squares():
+    random = np.random.default_rng(2)
+    rows, residuals, R = random.standard_normal((20, 5)), random.standard_normal(20), random.uniform(0.1, 2.0, 20)
+    rows[:, 2] = 0.0
+    L, b = np.zeros((5, 5)), np.zeros(5)
+    for each in zip(rows, residuals, R, strict=True):
+        linalg.add_row(*each, L, b)
+    np.testing.assert_allclose(L, np.tril(rows.T @ (rows / R[:, None])), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(b, rows.T @ (residuals / R), rtol=1e-12, atol=1e-15)

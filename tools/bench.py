@@ -37,7 +37,7 @@ from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_scheme
 from adacd_hil.records import ArmState, FaultReason, Request
-from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
@@ -139,8 +139,8 @@ def bench_in_process() -> None:
     time_calls("cantools: encode command, no protection", lambda: their_command.encode(fields))
 
     settings = load_settings("paper")
-    pipeline = Pipeline(settings)
-    pipeline.compile()
+    pipeline = new_pipeline(settings)
+    pipeline.compile_cycle()
     arm = ArmState(
         0, 0, 1, np.array((0.1, 0.2)), np.array((0.01, 0.02)), np.zeros(2), (0, 0), (0, 0), True, True, FaultReason.NONE
     )

@@ -13,7 +13,7 @@ from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
 from adacd_hil.records import TRUTH_LAYOUT, Vector
-from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.score.emulator_truth import config_digest
 from adacd_hil.settings.configuration import Settings, configuration_layers, load_settings, resolved_table
 from adacd_hil.settings.run_settings import RequestSettings
@@ -112,7 +112,7 @@ def run_embedded(
                 bench = Bench(
                     scenario, codec, embedded.deliver, contract=contract, on_truth=write_truth, on_event=truth.event
                 )
-                Pipeline(settings).compile()
+                new_pipeline(settings).compile_cycle()
             embedded.attach(bench.on_frame)
             bench.boot()
             session = Session(

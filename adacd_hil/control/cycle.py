@@ -47,7 +47,7 @@ from adacd_hil.records import (
     SchemeState,
 )
 from adacd_hil.scheme.identify.certificate import Certificate
-from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.supervisor.supervisor import POWERED, KeptRequest
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Tap
@@ -100,7 +100,7 @@ class Cycle:
         self._watch = ArmWatch(settings, master.watch)
         self._data = DataWatch(settings, arm)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
-        self._pipeline = Pipeline(settings)
+        self._pipeline = new_pipeline(settings)
         self._controller = Controller(settings)
         self._floating = Floating(settings)
         self._gate = Gate(settings.arm, self._period_s)
@@ -148,7 +148,7 @@ class Cycle:
 
     def compile(self) -> None:
         """Compile everything the loop calls; to be done before the drives are enabled."""
-        self._pipeline.compile()
+        self._pipeline.compile_cycle()
         self._reference.compile_motion()
         self._controller.compile_law()
         self._first_motion.compile_readings()
@@ -210,7 +210,7 @@ class Cycle:
         if self._interrupts and not self._is_finishing:
             return self._finish()
         elapsed_s = None if self._enabled_cycle is None else (cycle - self._enabled_cycle) * self._period_s
-        carried = Request.NONE if elapsed_s is None else self._kept.take()
+        carried = Request.NONE if elapsed_s is None else self._kept.take_carried()
         request = carried or self._operator.request(elapsed_s, self._state)
         self._kept.ask(request, self._state)
         return self._finish() if request is Request.FINISH else request

@@ -12,7 +12,7 @@ from typing import Any
 
 from adacd_hil.compiled import compiling
 from adacd_hil.log.recording.processes import read_setup, start_module
-from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration import Settings
 
 _MODULE = "adacd_hil.control.cycle_compilation"
@@ -32,7 +32,7 @@ def compiling_cycle(settings: Settings, further: Sequence[Any] = ()) -> Iterator
                 helpers.append(start_module(_MODULE, (), settings, subprocess.DEVNULL))
 
     try:
-        with compiling([*Pipeline(settings).compiled_functions, *further], start):
+        with compiling([*new_pipeline(settings).compiled_functions, *further], start):
             yield
     finally:
         for helper in helpers:
@@ -41,4 +41,4 @@ def compiling_cycle(settings: Settings, further: Sequence[Any] = ()) -> Iterator
 
 
 if __name__ == "__main__":
-    Pipeline(read_setup()).compile_longest()
+    new_pipeline(read_setup()).compile_longest()

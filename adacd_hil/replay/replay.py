@@ -35,7 +35,8 @@ from adacd_hil.replay.scheme_comparison import (
     ScriptOf,
     different_arithmetic,
 )
-from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch, arm_at
+from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, arm_at
 from adacd_hil.score.emulator_truth import KnownContacts, contacts_beside
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
@@ -110,7 +111,7 @@ class _Player:
         self.attempts = 0
         self._asking = asking
         self._checks_arms = checks_arms
-        self._pipeline: Pipeline = Pipeline(settings)
+        self._pipeline = new_pipeline(settings)
         self._state = SchemeState.INIT
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
         self._cycles: dict[int, int] = {}
@@ -160,7 +161,7 @@ class _Player:
         self.comparison.compare_events(logged, replayed, int(ticks.cycle[0]))
 
     def _begin(self) -> None:
-        self._pipeline = Pipeline(self.settings)
+        self._pipeline = new_pipeline(self.settings)
         self._state = SchemeState.INIT
         self.attempts += 1
         if self._asking is not None:

@@ -268,7 +268,7 @@ class Asking:
     def ask(self, cycle: int, state: SchemeState) -> Request:
         """Return the request in a cycle; state: that of the cycle before."""
         elapsed_s = None if self._enabled is None else (cycle - self._enabled) * self._period_s
-        carried = Request.NONE if elapsed_s is None else self._kept.take()
+        carried = Request.NONE if elapsed_s is None else self._kept.take_carried()
         return carried or self._script.request(elapsed_s, state)
 
     def note(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:

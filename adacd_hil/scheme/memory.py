@@ -102,12 +102,15 @@ class Models:
 
 
 class Ring:
-    """Learnt samples that wait until no contact can have bent them: written by `belief`."""
+    """Learnt samples that wait until no contact can have bent them: written by `belief`.
 
-    W: Annotated[Vector, "waiting n p"]
-    tau: Annotated[Vector, "waiting n"]
-    R: Annotated[Vector, "waiting n"]
-    still: Annotated[Vector, "waiting n"]
+    It may have more places than samples wait.
+    """
+
+    W: Annotated[Vector, "places_in_ring n p"]
+    tau: Annotated[Vector, "places_in_ring n"]
+    R: Annotated[Vector, "places_in_ring n"]
+    still: Annotated[Vector, "places_in_ring n"]
     used: float
     next: float
 
@@ -191,13 +194,13 @@ class Margin:
 class Evidence:
     """Each source's value of each quantity, and the fit's difference from it: written by `evidence`."""
 
-    said: Annotated[Vector, "sources quantities"]
-    said_variance: Annotated[Vector, "sources quantities"]
-    said_floor: Annotated[Vector, "sources quantities"]
-    said_slack: Annotated[Vector, "sources quantities"]
+    value: Annotated[Vector, "sources quantities"]
+    variance: Annotated[Vector, "sources quantities"]
+    floor: Annotated[Vector, "sources quantities"]
+    slack: Annotated[Vector, "sources quantities"]
     difference: Annotated[Vector, "sources quantities"]
     limit: Annotated[Vector, "sources quantities"]
-    said_age_s: Annotated[Vector, "sources"]
+    age_s: Annotated[Vector, "sources"]
     fitted: Annotated[Vector, "quantities"]
     fitted_variance: Annotated[Vector, "quantities"]
 
@@ -249,15 +252,13 @@ class Certificate:
 class Doubt:
     """Evidence on the cause of a certified model's contacts: written by `doubt`."""
 
-    cause_rw: Annotated[Vector, "causes"]
-    cause_ww: Annotated[Vector, "causes"]
-    cause_ws: Annotated[Vector, "causes n"]
-    contact_rr: float
-    contact_rows: float
-    contact_peak: float
-    contact_rs: PerJoint
-    contact_ss: PerJoint
+    L: Annotated[Vector, "causes_n causes_n"]
+    b: Annotated[Vector, "causes_n"]
+    row: Annotated[Vector, "causes_n"]
     load_ww: Annotated[Vector, "2"]
+    rr: float
+    rows: float
+    peak: float
 
 
 class MissingTorque:
@@ -266,7 +267,7 @@ class MissingTorque:
     X_old: PlaceColumns
     X_f: PlaceColumns
     X_learnt: PlaceColumns
-    ring_X: Annotated[Vector, "waiting n t"]
+    ring_X: Annotated[Vector, "places_in_ring n t"]
     L: Annotated[Vector, "n f f"]
     M: Annotated[Vector, "f f"]
     b: EachTerm
@@ -274,7 +275,7 @@ class MissingTorque:
     full: EachTerm
     row: EachTerm
     scale: EachTerm
-    said: Annotated[Vector, "places"]
+    last_found: Annotated[Vector, "places"]
     yy: float
     weight: PerJoint
     ways: Annotated[Vector, "n 2"]
@@ -284,7 +285,7 @@ class MissingTorque:
 
 
 class Watch:
-    """Tasks left to Python at intervals: written by `cycle` and `certified_policy`."""
+    """Tasks left to Python at intervals: written by `cycle` and `certified_pipeline`."""
 
     has_forgotten: float
     monitored_cycles: float
@@ -344,13 +345,6 @@ class AnchorConstants:
 
 
 @dataclass(frozen=True)
-class DoubtConstants:
-    """Constants of `doubt`: causes (h, p), a payload of 1 kg, then by joint Coulomb and viscous friction."""
-
-    causes: Vector
-
-
-@dataclass(frozen=True)
 class EvidenceConstants:
     """Constants of `evidence`.
 
@@ -362,30 +356,6 @@ class EvidenceConstants:
     torque_Nm: Vector
     sigmas: Vector
     less_counts: Vector
-
-
-@dataclass(frozen=True)
-class FitCheckConstants:
-    """Constants of `fit_check`: learnt samples from one step to the next."""
-
-    step_samples: float
-
-
-@dataclass(frozen=True)
-class EarlierConstants:
-    """Constants of `earlier`: by quantity, a difference and a share of the value that are ignored."""
-
-    kept_floor: Vector
-    kept_share: Vector
-
-
-@dataclass(frozen=True)
-class LastConstants:
-    """Constants of `certificate`: values of the last certificate (Q,), variances, inf where unknown, and slack."""
-
-    value: Vector
-    variance: Vector
-    slack: Vector
 
 
 @dataclass(frozen=True)
@@ -419,7 +389,11 @@ class Limits:
 
 @dataclass(frozen=True)
 class Constants:
-    """The constants of the certified scheme; names as in `CertifiedSettings` and the other sections."""
+    """The constants of the certified scheme; names as in `CertifiedSettings` and the other sections.
+
+    causes (h, p): see `doubt`. step_samples: learnt samples from one step of `fit_check` to the next. waiting: number
+    of samples that wait in the ring.
+    """
 
     period_s: float
     second_cycles: float
@@ -440,6 +414,9 @@ class Constants:
     terms: Vector
     dahl_rad: Vector
     theta_cad: Vector
+    causes: Vector
+    step_samples: float
+    waiting: float
     prior: Vector
     prior_std: Vector
     enough_std: Vector
@@ -471,11 +448,7 @@ class Constants:
     collision_Nm: Vector
     noise: NoiseConstants
     anchor: AnchorConstants
-    doubt: DoubtConstants
     evidence: EvidenceConstants
-    fit_check: FitCheckConstants
-    earlier: EarlierConstants
-    last: LastConstants
     margin: MarginConstants
     missing_torque: TermConstants
     limits: Limits

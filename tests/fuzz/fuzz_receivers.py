@@ -23,7 +23,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, Request, SchemeState
-from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import CodecError, MessageCodec, load_codec
@@ -122,8 +122,8 @@ class HostReceiver:
         bus.attach(self._sent.append)
         self.arm = Arm(settings, CODEC, bus)
         self._master = Master(settings, CODEC, bus)
-        self._pipeline = Pipeline(settings)
-        self._pipeline.compile()
+        self._pipeline = new_pipeline(settings)
+        self._pipeline.compile_cycle()
         self._owner = {}
         for device in (*self.arm.drives, *self.arm.sensors):
             prefix = device.name

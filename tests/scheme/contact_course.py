@@ -8,18 +8,15 @@ from adacd_hil.structured import zeros_of
 
 
 class Course:
-    """The course of contacts under these settings; reports are due so many cycles after a detection."""
+    """The course of contacts under these settings."""
 
-    def __init__(self, settings, due_cycles=(0,)):
+    def __init__(self, settings):
         sizes = {"n": JOINTS, "levels": len(ContactLevel)}
         self.k, self.memory = zeros_of(course.CourseConstants, sizes), zeros_of(course.CourseMemory, sizes)
         self.m, self.state = self.memory[0], zeros_of(supervisor.SupervisorMemory, {})
         course.begin(self.m)
-        self.fill(settings, due_cycles)
+        course.fill_constants(settings, self.k[0])
         self.cycle = 0
-
-    def fill(self, settings, due_cycles):
-        course.fill_constants(settings, due_cycles, self.k[0])
 
     def step(
         self, joints, tau, level=ContactLevel.COLLISION, state=SchemeState.REACT, is_latched=False, is_valid=True,

@@ -12,7 +12,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.control.motions import Excitation
 from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.kernel import certified_memory
-from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration import Settings, load_settings
 
 PERIOD_S = 1e-3
@@ -140,10 +140,12 @@ class ExcitedLoop:
     It moves on the excitation wherever the arm moves, brakes where it reacts, and is led back from there.
     """
 
-    def __init__(self, settings: Settings = SETTINGS, theta: np.ndarray = THETA["P"], seed: int = 1):
+    def __init__(
+        self, settings: Settings = SETTINGS, theta: np.ndarray = THETA["P"], seed: int = 1, motion: Motion | None = None
+    ):
         self.settings = settings
-        self.pipeline = Pipeline(settings)
-        self.motion = motion_of(settings.trajectory, settings.excitation)
+        self.pipeline = new_pipeline(settings)
+        self.motion = motion_of(settings.trajectory, settings.excitation) if motion is None else motion
         self.theta = theta.copy()
         self.random = np.random.default_rng(seed)
         self.desired = self.motion.at(0).copy()

@@ -44,8 +44,8 @@ def run_kernel(settings, q, dq, tau_J, theta_hat, mode, is_complete=None, period
     blocks = np.zeros((count, numbers.values.size))
     out = numbers.block[0]
     for k in range(count):
-        out["q"][:], out["dq"][:], out["tau_J"][:] = q[k], dq[k], tau_J[k]
-        out["period_s"][0] = 0.0 if period_s is None else period_s[k]
+        out.q, out.dq, out.tau_J = q[k], dq[k], tau_J[k]
+        out.period_s = 0.0 if period_s is None else period_s[k]
         is_fresh = 1 if is_complete is None else int(is_complete[k])
         paper_kernel.step(*numbers[:3], is_fresh, 1 if periods is None else int(periods[k]), mode)
         blocks[k] = numbers.values

@@ -9,8 +9,8 @@ from planar_arm import PAYLOAD_1KG, THETA
 
 from adacd_hil.control.motions import Excitation
 from adacd_hil.records import ArmBatch, Request, SchemeState, certified_layout, scheme_layout
-from adacd_hil.scheme.detect.margin import MarginWatch
-from adacd_hil.scheme.pipeline.pipeline import Pipeline, arm_at, layout_of
+from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
+from adacd_hil.scheme.pipeline.pipeline import arm_at, layout_of
 
 REST = 60
 """Cycles at rest, the first of them without drives."""
@@ -110,11 +110,8 @@ def steps_of(cycle, is_complete, periods):
     return steps
 
 
-def pipeline_for(scheme):
-    pipeline = Pipeline(settings_of(scheme))
-    if scheme == "certified":
-        pipeline._policy._margin = MarginWatch(2, memory_blocks=1.0, warn_share=5.0)
-    return pipeline
+def pipeline_of(scheme):
+    return new_pipeline(settings_of(scheme))
 
 
 def part(arms, begin, end):
@@ -162,37 +159,37 @@ SCHEMES = ("paper", "certified")
 
 @pytest.fixture(scope="module", params=SCHEMES)
 def lived(request, life):
-    """The scheme's name, its pipeline after the life, and its outputs, cycle by cycle."""
-    pipeline = pipeline_for(request.param)
+    """The scheme's name, what its pipeline remembers after the life, its outputs cycle by cycle, and its events."""
+    pipeline = pipeline_of(request.param)
     outputs = stepped(pipeline, *life)
-    return request.param, pipeline, outputs
+    return request.param, state_of(pipeline), outputs, pipeline.take_events()
 
 
 def test_the_life_has_all_of_it(lived):
-    scheme, pipeline, outputs = lived
+    scheme, _, outputs, events = lived
     missing = {state.name for state in set(SchemeState) - {output.state for output in outputs}}
     assert missing == ({"FAULT", "CERTIFY"} if scheme == "paper" else {"FAULT"})
     assert len([output for output in outputs if output.contact is not None]) >= 6
     if scheme == "certified":
         assert {output.reaction.name for output in outputs} == {"NONE", "STOP", "WITHDRAW", "SLOW_DOWN"}
         assert outputs[6000].block[layout_of(settings_of(scheme)).slices["promotions"]] >= 5
-        assert [event.name for event in pipeline._policy._events] == ["certificate", "margin", "touch"]
+        assert [event.name for event in events] == ["certificate", "touch"]
 
 
 def test_a_batch_decides_as_single_steps_do(life, lived):
-    scheme, pipeline, outputs = lived
-    again = pipeline_for(scheme)
+    scheme, remembered, outputs, _ = lived
+    again = pipeline_of(scheme)
     batch = again.run(*life)
     assert rows_of_batches([batch]) == rows_of(outputs)
-    assert state_of(again) == state_of(pipeline)
+    assert state_of(again) == remembered
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_it_may_be_split_anywhere_and_mixed_with_single_steps(life, lived, seed):
-    scheme, pipeline, outputs = lived
+    scheme, remembered, outputs, _ = lived
     arms, requests = life
     random = np.random.default_rng(seed)
-    again, rows = pipeline_for(scheme), []
+    again, rows = pipeline_of(scheme), []
     begin = 0
     while begin < len(requests):
         end = min(begin + int(random.choice((0, 1, 2, 7, 60, 400, 2000))), len(requests))
@@ -203,7 +200,7 @@ def test_it_may_be_split_anywhere_and_mixed_with_single_steps(life, lived, seed)
             rows += rows_of_batches([again.run(*few)])
         begin = end
     assert rows == rows_of(outputs)
-    assert state_of(again) == state_of(pipeline)
+    assert state_of(again) == remembered
 
 
 def test_the_layout_is_that_of_the_scheme():

@@ -123,6 +123,25 @@ def test_samples_that_wait_are_thrown_away_when_they_turn_out_to_be_a_touch():
     assert np.max(np.abs(beliefs[0])) > 0.1
 
 
+def test_after_a_touch_the_ring_holds_what_was_seen_since():
+    """Its first places: a contact that follows soon is weighed by these alone."""
+    W_f, tau_f = samples()
+    m = prior()
+    teach(m, W_f[: 7 * EVERY], tau_f[: 7 * EVERY])
+    belief.discard(m)
+    teach(m, W_f[100 : 100 + 3 * EVERY], tau_f[100 : 100 + 3 * EVERY])
+    assert m.ring.used == 3.0
+    np.testing.assert_array_equal(m.ring.tau[:3], tau_f[100 + EVERY - 1 : 100 + 3 * EVERY : EVERY])
+
+
+def test_runs_of_other_periods_share_their_machine_code():
+    memories = [
+        certified_memory.new_memory(replace(SETTINGS, bus=replace(SETTINGS.bus, period_us=period_us)))
+        for period_us in (500, 1000, 5000)
+    ]
+    assert len({id(memory.dtype) for memory in memories}) == 1
+
+
 def test_a_payload_widens_the_belief_along_one_direction():
     P = np.zeros((COUNT, COUNT))
     direction = regressor.payload_direction((0.35, 0.30), COUNT, 0.0)

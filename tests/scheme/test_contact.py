@@ -6,7 +6,7 @@ from contact_course import Course
 from smooth_motion import PLACES, run_kernel, settings_with
 
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.contact.contact_report import IntegratedContact, report_of
+from adacd_hil.scheme.contact.contact_report import integrated_report
 from adacd_hil.scheme.detect.external_torque import follow_contact
 from adacd_hil.scheme.kernel import paper_kernel
 
@@ -50,16 +50,15 @@ class Touch:
     def __init__(self, window_cycles=50):
         settings = settings_with(detector={"isolation_window_s": window_cycles * T})
         self.constants, self.memory, self.block, _ = paper_kernel.numbers_of(settings)
-        memory, block = self.memory[0], self.block[0]
-        self.tau_ext_hat = block["tau_ext_hat"]
-        self.evidence = IntegratedContact(settings, self.tau_ext_hat, memory.integral, memory.peak)
-        self.course = Course(settings, self.evidence.due_cycles)
+        self.m, self.tau_ext_hat = self.memory[0], self.block[0].tau_ext_hat
+        self.a_rad_s = settings.filter.a_rad_s
+        self.course = Course(settings)
         self.reports = []
 
     def run(self, tau_ext):
         has_begun = False
-        for cycle, torque in enumerate(tau_ext):
-            self.block[0]["tau_J"][:] = -torque
+        for torque in tau_ext:
+            self.block[0].tau_J = -torque
             mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.course.m.is_open else 0)
             joints = (
                 paper_kernel.step(self.constants, self.memory, self.block, 1, 1, mode) >> paper_kernel.CONTACT_SHIFT
@@ -67,7 +66,8 @@ class Touch:
             has_begun = has_begun or joints != 0
             state = SchemeState.REACT if has_begun else SchemeState.MONITOR
             if self.course.step(joints, self.tau_ext_hat, state=state):
-                self.reports.append(report_of(self.evidence, self.course.m, cycle))
+                report = integrated_report(self.course.m, self.tau_ext_hat, self.m.integral, self.m.peak, self.a_rad_s)
+                self.reports.append(report)
         return self.reports
 
 

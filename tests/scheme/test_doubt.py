@@ -140,29 +140,28 @@ def test_who_touches_the_arm_again_and_again_takes_nothing_back():
     assert loop.said("revoked") == []
 
 
-def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD, others=5):
+def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD):
     """The sums of a contact that one cause explains to this share, with this sigma of its size."""
     correlated = 2.0 / (SETTINGS.certified.cutoffs_rad_s[filter_bank.LEARNT] * PERIOD_S)
     ww = correlated * (doubt.RESIDUAL_NM / sigma) ** 2
-    rw = np.zeros(others)
+    rw = np.zeros(doubt.CAUSES)
     rw[cause] = size * ww
-    return rw, np.full(others, ww), size * size * ww / share
+    return rw, ww, size * size * ww / share
 
 
 def verdict_of(contacts, gap_s=1.0, lasts_s=0.5, peak=3.0, ways=(0.5, 0.5)):
-    memory = certified_memory.new_memory(SETTINGS)
-    values = memory[0]
-    values.models.theta = 0.0
-    judge, cycle, verdict = Doubt(SETTINGS, certified_memory.constants_of(SETTINGS), memory), 0, None
+    m = certified_memory.new_memory(SETTINGS)[0]
+    m.models.theta = 0.0
+    judge, cycle, verdict = Doubt(SETTINGS, certified_memory.constants_of(SETTINGS)[0], m), 0, None
     for rw, ww, rr in contacts:
         judge.go_on(cycle)
         cycle += round(gap_s / PERIOD_S)
-        judge.begin(cycle, is_touched=True)
-        values.doubt.cause_rw, values.doubt.cause_ww, values.doubt.contact_rr = rw, ww, rr
-        values.doubt.load_ww = np.array(ways) * ww[doubt.LOAD]
-        values.doubt.contact_peak = peak
+        judge.begin_contact(cycle, is_touched=True)
+        m.doubt.b[: doubt.CAUSES], m.doubt.L, m.doubt.rr = rw, ww * np.eye(len(m.doubt.L)), rr
+        m.doubt.load_ww = np.array(ways) * ww
+        m.doubt.peak = peak
         cycle += round(lasts_s / PERIOD_S)
-        verdict = judge.end(cycle)
+        verdict = judge.end_contact(cycle)
     return verdict
 
 

@@ -201,7 +201,7 @@ class Compared:
 
     def keep(self, theta, std, unit=1.0, age_s=0.0):
         """Keep one more belief."""
-        earlier._keep(self.k, self.m, theta, std**2 * np.eye(len(NAMES)), unit, age_s)
+        earlier.keep_belief(self.k, self.m, theta, std**2 * np.eye(len(NAMES)), unit, age_s)
 
     def keep_only(self, theta, std):
         """Keep one belief in place of all."""
@@ -270,7 +270,7 @@ def test_what_the_prior_alone_says_judges_nothing():
     prior = Compared()
     earlier.forget(prior.m)
     P = np.diag(certified_memory.new_memory(FREE)[0].models.P_belief.diagonal())
-    earlier._keep(prior.k, prior.m, prior.m.models.belief, P, fit_check.SMALLEST_UNIT, 0.0)
+    earlier.keep_belief(prior.k, prior.m, prior.m.models.belief, P, fit_check.SMALLEST_UNIT, 0.0)
     assert prior.agrees_with("F_c1", 1.0)
     assert prior.agrees_with("a1", 1.0)
 
@@ -293,7 +293,7 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
     assert (fit_check.last_unsteady_step(m) == fit_check.NONE) is is_steady
     earlier.keep(compared.k, m)
     assert m.earlier.kept_count == (2.0 if is_steady else 1.0)
-    assert m.evidence.said[evidence.KEPT, evidence.FRICTIONS] == 0.1
+    assert m.evidence.value[evidence.KEPT, evidence.FRICTIONS] == 0.1
 
 
 UPRIGHT = replace(
@@ -374,7 +374,7 @@ def test_where_gravity_acts_later_samples_may_differ_by_what_they_do_not_know(sh
 def test_a_fit_that_no_model_explains_names_the_mounting_where_gravity_acts(settings, has_mounting):
     constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
     memory[0].certificate.withheld_by = certificate.CHANGED
-    said = CertificateWatch(constants, memory, "").refuse(is_reading=False)
+    said = CertificateWatch(constants[0], memory[0], "").refuse()
     assert "no one model explains the whole fit" in said.message
     assert ("arm.mounting_deg" in said.message) is has_mounting
 
@@ -412,7 +412,7 @@ def test_what_is_kept_is_from_before_the_contact():
     kept = steps - earlier.YOUNG_STEPS
     loop.lean(0, 3.0, 0.05)
     assert m.earlier.kept_count == kept + 1 > 3
-    said = m.evidence.said[evidence.KEPT : evidence.KEPT + kept + 1]
+    said = m.evidence.value[evidence.KEPT : evidence.KEPT + kept + 1]
     a1 = of_steps[earlier.YOUNG_STEPS : steps, NAMES.index("a1")]
     np.testing.assert_array_equal(said[:kept, evidence.FRICTIONS], a1)
     friction = said[-1, 0] - (THETA["P"][5] + evidence.SPEEDS_RAD_S[0] * THETA["P"][3])
@@ -449,7 +449,7 @@ def test_of_several_kept_beliefs_the_one_that_knew_the_arm_untouched_judges():
     for touched, std in ((0.3, 0.01), (0.0, 1.0)):  # one that has learnt the hand, one that knows nothing
         compared_with[NAMES.index("F_c1")] = 0.1 + touched
         compared.keep(compared_with, std, age_s=1.0)
-    m.evidence.said_age_s[evidence.KEPT] = 7.0
+    m.evidence.age_s[evidence.KEPT] = 7.0
     assert not compared.agrees_with("F_c1", 0.3)
     (line,) = earlier.describe_more(m)
     assert line.startswith("friction of joint 1 at 0.2 rad/s is 0.300 Nm more than 7.0 s ago, bound 0.05")
@@ -507,7 +507,7 @@ def test_a_kept_belief_that_was_leant_on_is_forgotten_and_the_others_go_on_judgi
     leant[NAMES.index("offset1")] += 0.3
     compared.keep(leant, 1e-5)
     assert not compared.agrees_with("F_c1", 0.04)
-    assert np.isinf(compared.m.evidence.said_variance[evidence.KEPT : evidence.KEPT + 2, 0]).tolist() == [False, True]
+    assert np.isinf(compared.m.evidence.variance[evidence.KEPT : evidence.KEPT + 2, 0]).tolist() == [False, True]
 
 
 @pytest.mark.parametrize(("begins_s", "drag_Nm"), long_but(1, [(0.87, 0.14), (0.55, 0.27)]))

@@ -17,7 +17,7 @@ class Table:
     def __init__(self, s, q, variance=0.0, floor=0.0, slack=0.0, fitted_variance=0.0):
         self.k, self.m = certified_memory.constants_of(SETTINGS)[0], certified_memory.new_memory(SETTINGS)[0]
         self.s, self.q, self.fitted_variance = s, q, fitted_variance
-        evidence.say(self.m, s, q, 1.0, variance, floor, slack)
+        evidence.set_row(self.m, s, q, 1.0, variance, floor, slack)
 
     def excess(self, fitted):
         evidence.put_fitted(self.m, self.q, fitted, self.fitted_variance)
@@ -55,9 +55,9 @@ def test_a_source_that_says_nothing_contradicts_nothing_but_what_is_not_a_number
     table = Table(KEPT, DRAG, variance=np.inf)
     assert table.excess(99.0) == 0.0
     assert not abs(table.excess(np.nan)) <= 1.0
-    evidence.say(table.m, KEPT, DRAG, 1.0, 0.0, 0.1, 0.0)
+    evidence.set_row(table.m, KEPT, DRAG, 1.0, 0.0, 0.1, 0.0)
     assert table.excess(99.0) > 1.0
-    evidence.retract(table.m, KEPT)
+    evidence.empty_source(table.m, KEPT)
     assert evidence.excess(table.m, KEPT, DRAG) == 0.0
     assert table.excess(99.0) == 0.0
 
@@ -65,7 +65,7 @@ def test_a_source_that_says_nothing_contradicts_nothing_but_what_is_not_a_number
 def test_of_several_sources_the_one_that_contradicts_most_is_named():
     table = Table(KEPT, DRAG, floor=0.2)
     for s, floor in ((KEPT + 1, 0.1), (KEPT + 2, 0.4)):
-        evidence.say(table.m, s, DRAG, 1.0, 0.0, floor, 0.0)
+        evidence.set_row(table.m, s, DRAG, 1.0, 0.0, floor, 0.0)
     evidence.put_fitted(table.m, DRAG, 1.3, 0.0)
     for s in range(KEPT, KEPT + 3):
         evidence.weigh(table.k, table.m, s, DRAG)

@@ -7,7 +7,7 @@ from planar_arm import THETA
 
 from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.supervisor.transitions import Observation
+from adacd_hil.scheme.supervisor import transitions
 
 K = certified_memory.constants_of(SETTINGS)[0]
 MODE = certified_kernel.WATCH | certified_kernel.REFINE
@@ -61,10 +61,10 @@ class LossyArm:
             is_lost = lost(k) and mode == MODE
             found = certified_kernel.step(constants, self.m, self.block, 0 if is_lost else 1, since, mode)
             since = since + 1 if is_lost else 1
-            if found & int(Observation.FITTED):
+            if found & transitions.FITTED:
                 certified_kernel.begin_test(constants, self.m)
                 mode = certified_kernel.WATCH | certified_kernel.TEST
-            elif found & int(Observation.CERTIFIED):
+            elif found & transitions.CERTIFIED:
                 certified_kernel.begin_refinement(constants, self.m)
                 mode = MODE
             elif mode == MODE:
@@ -78,10 +78,10 @@ class LossyArm:
 @pytest.mark.parametrize("burst", [1, 4, 8])
 def test_bursts_that_are_put_on_a_line_raise_no_alarm(burst):
     whole, lossy = LossyArm(lambda _k: False), LossyArm(lambda k: k % 40 < burst)
-    assert not np.bitwise_or.reduce(lossy.found) & int(Observation.CONTACT)
+    assert not np.bitwise_or.reduce(lossy.found) & transitions.CONTACT
     assert len(lossy.found) == len(whole.found)
     assert np.max(np.array(lossy.h) / np.array(whole.h)) > 1.0
-    assert np.sum([found & int(Observation.UNSEEN) != 0 for found in lossy.found]) == pytest.approx(
+    assert np.sum([found & transitions.UNSEEN != 0 for found in lossy.found]) == pytest.approx(
         burst / 40 * len(lossy.found), rel=0.05
     )
 
@@ -89,7 +89,7 @@ def test_bursts_that_are_put_on_a_line_raise_no_alarm(burst):
 def test_an_arm_whose_every_second_sample_is_lost_is_not_taken_for_one_that_stands_still():
     """No sample follows on the one before it then; each is compared with the last there was all the same."""
     whole, lossy = LossyArm(lambda _k: False), LossyArm(lambda k: k % 2 == 1)
-    assert not np.bitwise_or.reduce(lossy.found) & int(Observation.CONTACT)
+    assert not np.bitwise_or.reduce(lossy.found) & transitions.CONTACT
     np.testing.assert_allclose(np.array(lossy.still)[:, :2], np.array(whole.still)[:, :2], atol=0.25)
     moving = np.abs(np.array(whole.dq)) > 0.3
     assert moving.any(axis=0).all()

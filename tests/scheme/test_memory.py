@@ -79,12 +79,16 @@ def owners() -> dict[str, set[str]]:
 
 def written(path: Path) -> set[str]:
     """Name the records of `Memory` of which a module writes a field: `m.record.field = ...`, or a part of it."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    found, tree = set(), ast.parse(path.read_text())
+    own = {ast.unparse(node.value)[2:] for node in ast.walk(tree) if isinstance(node, ast.Assign)
+           and ast.unparse(node.targets[0]) == "own" and ast.unparse(node.value).startswith("m.")}  # fmt: skip
+    assert len(own) <= 1, path
+    for node in ast.walk(tree):
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         for target in targets:
             for place in target.elts if isinstance(target, ast.Tuple) else [target]:
                 text = "" if place is None else ast.unparse(place)
+                text = re.sub(r"^own\.", f"m.{next(iter(own), '')}.", text)
                 match = re.fullmatch(r"(?:self\._)?m\.(\w+)\.\w+(?:\[.*\])?", text)
                 if match is not None:
                     found.add(match[1])

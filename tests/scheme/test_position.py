@@ -81,13 +81,13 @@ def test_the_evidence_is_that_of_a_dense_gaussian_model():
         s = np.diag(k.missing_torque.prior_std[columns])
         M = np.eye(len(columns)) + s @ L[np.ix_(columns, columns)] @ s
         x = np.zeros(len(b))
-        found = missing_torque._log_evidence(m, b, missing_torque._scale_of(k, m, is_by_place), x)
+        found = missing_torque.log_evidence(m, b, missing_torque.scale_of(k, m, is_by_place), x)
         expected = 0.5 * (s @ b[columns] @ np.linalg.solve(M, s @ b[columns]) - np.linalg.slogdet(M)[1])
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-6)
         assert x[columns] == pytest.approx(s @ np.linalg.solve(M, s @ b[columns]), rel=1e-6, abs=1e-9)
         assert np.count_nonzero(np.delete(x, columns)) == 0
         left = m.missing_torque.yy - 2.0 * x @ b + x @ L @ x
-        assert missing_torque._squares_left(m, x) == pytest.approx(left, rel=1e-6)
+        assert missing_torque.squares_left(m, x) == pytest.approx(left, rel=1e-6)
 
 
 @pytest.mark.parametrize(("cable_Nm", "is_found"), [(0.0, False), (0.005, False), (CABLE_NM, True)])

@@ -7,7 +7,7 @@ from planar_arm import THETA
 
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.margin import WITHIN_S
-from adacd_hil.scheme.supervisor.transitions import Observation
+from adacd_hil.scheme.supervisor import transitions
 from adacd_hil.score.margins import PushGatherer
 
 SECONDS = 9.0
@@ -31,7 +31,7 @@ def test_a_push_as_large_as_at_the_worst_moment_is_found_where_it_is_hardest_and
             tau_J = measured.tau_J.copy()
             tau_J[at:, joint] += torque_Nm
             seen = play(Record(measured.q, measured.dq, tau_J)).observation[at : at + within + 1]
-            return bool((seen.astype(int) & Observation.CONTACT).any())
+            return bool((seen.astype(int) & transitions.CONTACT).any())
 
         assert all(is_found(at, sign * figures["max"]) for at in hard for sign in (-1.0, 1.0))
         assert not all(is_found(at, sign * 0.4 * figures["max"]) for at in hard for sign in (-1.0, 1.0))

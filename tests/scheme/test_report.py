@@ -8,7 +8,7 @@ from contact_course import Course
 from smooth_motion import settings_with
 
 from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction, SchemeState
-from adacd_hil.scheme.contact.contact_report import RecalledContact, last_rows, put_row, report_of
+from adacd_hil.scheme.contact.contact_report import last_rows, new_rows, put_row, recalled_report
 
 SETTINGS = settings_with(scheme="certified", reaction={"collision": ["stop", "stop"]})
 SIGMA, THRESHOLD = np.array([0.03, 0.015]), np.array([0.15, 0.08])
@@ -26,16 +26,14 @@ def course(force_N=20.0, lever_m=0.2, duration=40, onset=50, length=400):
 def play(tau, detected, joints=3, level=ContactLevel.COLLISION):
     """Return the reports of a contact that is detected in a cycle."""
     touch = Course(SETTINGS)
-    evidence = RecalledContact(SETTINGS, touch.m)
-    touch.fill(SETTINGS, evidence.due_cycles)
-    reports = []
+    rows, reports = new_rows(SETTINGS), []
     for cycle, row in enumerate(tau):
-        put_row(evidence.rows, int(touch.m.kept_rows), Q, row, SIGMA, THRESHOLD)
+        put_row(rows, int(touch.m.kept_rows), Q, row, SIGMA, THRESHOLD)
         touch.m.kept_rows += 1
         over = joints if cycle - detected >= 5 else joints & 1
         state = SchemeState.REACT if cycle >= detected else SchemeState.MONITOR
         if touch.step(over if cycle >= detected else 0, row, level, state, is_latched=True):
-            reports.append(report_of(evidence, touch.m, cycle))
+            reports.append(recalled_report(SETTINGS, touch.m, rows, cycle))
     return reports, touch
 
 
@@ -103,7 +101,7 @@ def test_the_peak_of_a_blow_is_that_of_its_half_sine_however_short_it_is(duratio
 
 
 def test_a_fault_ends_the_report():
-    touch = Course(SETTINGS, due_cycles=(0, 10, 100))
+    touch = Course(SETTINGS)
     assert touch.step(1, np.ones(2))
     assert touch.m.is_open
     assert not touch.step(1, np.ones(2), state=SchemeState.FAULT)

@@ -33,13 +33,6 @@ def motion():
     return (t_s, *smooth_motion(t_s))
 
 
-@pytest.mark.long
-def test_with_the_true_model_nothing_is_left(motion):
-    _, q, dq, ddq = motion
-    blocks = run_kernel(settings_with(), q, dq, torque_of(q, dq, ddq, SMOOTH), SMOOTH, 0)
-    assert np.max(np.abs(tau_ext_hat_of(blocks))) < LEFT_NM
-
-
 def test_with_the_true_model_the_external_torque_is_left(motion):
     t_s, q, dq, ddq = motion
     tau_ext = np.column_stack((0.5 * np.sin(20.0 * t_s), np.where(t_s % 1.0 < 0.1, 2.0, 0.0)))
@@ -158,16 +151,6 @@ def test_the_residual_is_the_momentum_observer(minute, a):
     settings = settings_with(filter={"a_rad_s": a, "b_rad_s": a})
     blocks = run_kernel(settings, q, dq, tau_J, THETA["M"], 0)
     np.testing.assert_allclose(tau_ext_hat_of(blocks), expected, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_the_trapezoid_momentum_observer_differs_by_less_than_a_millinewtonmetre(minute):
-    q, dq, tau_J = minute
-    K, half = 10.0, 10.0 * T / 2.0
-    weights = ((1.0 - half) / (1.0 + half), T / 2.0 / (1.0 + half), T / 2.0 / (1.0 + half))
-    expected = momentum_observer(q, dq, tau_J, THETA["M"], K, weights)
-    blocks = run_kernel(settings_with(), q, dq, tau_J, THETA["M"], 0)
-    np.testing.assert_allclose(tau_ext_hat_of(blocks), expected, atol=1e-3)
 
 
 def late_samples(most_late_s, count=3000):

@@ -1,6 +1,7 @@
 """The state machine: its table against one written by hand, and the conditions that raise its events."""
 
 import itertools
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,8 @@ from smooth_motion import settings_with
 
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
-from adacd_hil.scheme.supervisor import supervisor
-from adacd_hil.scheme.supervisor.supervisor import REST_HOLD_S, UNREST_S, Supervisor
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, TRANSITIONS, Observation, SchemeEvent, next_state
+from adacd_hil.scheme.supervisor import supervisor, transitions
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, TRANSITIONS, SchemeEvent, next_state
 from adacd_hil.structured import zeros_of
 
 # What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens, "back"
@@ -78,81 +78,121 @@ SETTINGS = settings_with(
     reaction={"clear_s": 0.2, "patience_s": 3.0, "rebound_s": 0.1},
     bus={"max_age_cycles": 3},
 )
-REST_CYCLES = round(REST_HOLD_S / SETTINGS.bus.period_s)
-UNREST_CYCLES = round(UNREST_S / SETTINGS.bus.period_s)
-CLEAR_CYCLES = 200
-PATIENCE_CYCLES = 3000
-RESTING = Observation.AT_REST | Observation.UNLOADED
-CONTACT = Observation.CONTACT
-COLLISION = Observation.CONTACT | Observation.COLLISION
-
-GOOD = ArmState(
-    cycle=0,
-    t_ns=0,
-    periods=1,
-    q=np.zeros(2),
-    dq=np.zeros(2),
-    tau_J=np.zeros(2),
-    age_q=(0, 0),
-    age_tau_J=(0, 0),
-    is_enabled=True,
-    is_complete=True,
-    fault=FaultReason.NONE,
+"""Cycles of 1 ms: 20 to commission, 100 for a phase, 1000 to learn, 50 until the arm counts as at rest, 200 until a
+contact has cleared, 3000 until it needs an acknowledgement."""
+UPRIGHT = replace(
+    SETTINGS,
+    arm=replace(SETTINGS.arm, cad_theta=()),
+    estimator=replace(SETTINGS.estimator, gravity=True, P0=(*SETTINGS.estimator.P0, 50.0, 50.0)),
 )
-DISABLED = GOOD._replace(is_enabled=False)
+PATIENT = replace(SETTINGS, safety=replace(SETTINGS.safety, enable_timeout_s=0.3))
+
+GOOD = ArmState(0, 0, 1, np.zeros(2), np.zeros(2), np.zeros(2), (0, 0), (0, 0), True, True, FaultReason.NONE)
+ARM = {
+    "off": {"is_enabled": False},
+    "late": {"is_late": True},
+    "incomplete": {"is_complete": False},
+    "sensor": {"fault": FaultReason.SENSOR},
+    "drive": {"fault": FaultReason.DRIVE},
+    "old": {"age_q": (2, 2), "age_tau_J": (2, 2)},
+    "older": {"age_q": (3, 3), "age_tau_J": (3, 3)},
+    "q1-too-old": {"age_q": (4, 0)},
+    "q2-too-old": {"age_q": (0, 4)},
+    "tau1-too-old": {"age_tau_J": (4, 0)},
+    "tau2-too-old": {"age_tau_J": (0, 4)},
+    "skips": {"periods": 60},
+    "skips-999": {"periods": 999},
+}
+FOUND = {
+    "rest": transitions.AT_REST,
+    "unloaded": transitions.UNLOADED,
+    "resting": transitions.AT_REST | transitions.UNLOADED,
+    "contact": transitions.CONTACT,
+    "collision": transitions.CONTACT | transitions.COLLISION,
+    "nan": transitions.NOT_A_NUMBER,
+    "over-limit": transitions.OVER_LIMIT,
+    "over-speed": transitions.OVER_SPEED,
+    "unseen": transitions.UNSEEN,
+    "adapted": transitions.ADAPTED,
+    "fitted": transitions.FITTED,
+    "certified": transitions.CERTIFIED,
+    "refuted": transitions.REFUTED,
+    "withheld": transitions.WITHHELD,
+}
+ASKED = {request.name.lower(): request for request in Request}
+WAY = {
+    SchemeState.INIT: "off",
+    SchemeState.COMMISSION: "off+resting*20",
+    SchemeState.ENABLE: "good",
+    SchemeState.ADAPT: "adapted",
+    SchemeState.MONITOR: "collision",
+    SchemeState.REACT: "rest*50",
+    SchemeState.STOPPED: "payload",
+}
+"""How an arm gets from state to state the usual way; to CERTIFY and FAULT: `Run.to`."""
 
 
 class Run:
-    """A supervisor driven cycle by cycle."""
+    """A supervisor driven cycle by cycle, by words.
+
+    A step is what is found, asked or wrong in a cycle, joined by +, times a number of cycles; `= STATE`: where it
+    leads, `~ STATE`: through which. `is`: the cause by which that state was entered.
+    """
 
     def __init__(self, settings=SETTINGS):
         self.k = zeros_of(supervisor.SupervisorConstants, {"states": len(SchemeState)})
         self.memory = zeros_of(supervisor.SupervisorMemory, {})
+        self.m = self.memory[0]
         supervisor.fill_constants(settings, self.k[0])
-        supervisor.begin(self.memory[0])
-        self.supervisor = Supervisor(self.memory)
+        supervisor.begin(self.m)
         self.sample = np.zeros(1, SAMPLE)
 
     @property
     def state(self):
-        return self.supervisor.state
+        return SchemeState(self.m.state)
 
     @property
     def fault(self):
-        return FaultReason(self.memory[0].fault)
+        return FaultReason(self.m.fault)
 
-    @property
-    def is_latched(self):
-        return bool(self.memory[0].is_latched)
-
-    def step(
-        self, arm=GOOD, request=Request.NONE, observation=Observation.NONE, is_reporting=False, goes_on=False, cycles=1
-    ):
+    def cycle(self, words):
+        arm, request, found, flags = GOOD, Request.NONE, 0, {"reporting": False, "goes-on": False}
+        for word in words.split("+"):
+            if word in ARM:
+                arm = arm._replace(**ARM[word])
+            elif word in FOUND:
+                found |= FOUND[word]
+            elif word in ASKED:
+                request = ASKED[word]
+            elif word in flags:
+                flags[word] = True
+            else:
+                assert word == "good", word
         fill_sample(self.sample, arm, request)
-        for _ in range(cycles):
-            supervisor.supervise(self.k[0], self.memory[0], self.sample[0], int(observation), is_reporting, goes_on)
-        return self.state
+        supervisor.supervise(self.k[0], self.m, self.sample[0], found, *flags.values())
+
+    def play(self, steps):
+        """Play steps, separated by commas, and check the states that they name."""
+        for step in steps.split(","):
+            what, sign, state = (part.strip() for part in re.split(r"([=~]|$)", step, maxsplit=1))
+            words, _, count = what.partition("*")
+            for _ in range(int(count or 1)):
+                if sign == "~" and self.state.name == state:
+                    break
+                self.cycle(words)
+            if state:
+                assert self.state.name == state, f"after {step.strip()} of: {steps}"
+        return self
 
     def to(self, state):
         """Walk to a state the usual way."""
         if state is SchemeState.FAULT:
-            self.to(SchemeState.MONITOR).step(GOOD._replace(fault=FaultReason.SENSOR))
-            return self
+            return self.to(SchemeState.MONITOR).play("sensor")
         if state is SchemeState.CERTIFY:
-            assert self.to(SchemeState.ADAPT).step(observation=Observation.FITTED) is state
-            return self
-        next_step = {
-            SchemeState.INIT: lambda: self.step(DISABLED),
-            SchemeState.COMMISSION: lambda: self.step(DISABLED, observation=RESTING, cycles=20),
-            SchemeState.ENABLE: self.step,
-            SchemeState.ADAPT: lambda: self.step(observation=Observation.ADAPTED),
-            SchemeState.MONITOR: lambda: self.step(observation=COLLISION),
-            SchemeState.REACT: lambda: self.step(observation=Observation.AT_REST, cycles=REST_CYCLES),
-            SchemeState.STOPPED: lambda: self.step(request=Request.PAYLOAD),
-        }
-        for _ in next_step:
+            return self.to(SchemeState.ADAPT).play("fitted")
+        for _ in WAY:
             if self.state is not state:
-                next_step[self.state]()
+                self.play(WAY[self.state])
         assert self.state is state
         return self
 
@@ -161,664 +201,232 @@ def run_in(state):
     return Run().to(state)
 
 
-POWERED = (
-    SchemeState.ADAPT,
-    SchemeState.CERTIFY,
-    SchemeState.MONITOR,
-    SchemeState.REACT,
-    SchemeState.STOPPED,
-    SchemeState.PAYLOAD,
-)
-CHECKED = (SchemeState.ENABLE, *POWERED)
-BAD = [
-    (GOOD._replace(is_enabled=False), Observation.NONE, FaultReason.DRIVE),
-    (GOOD._replace(fault=FaultReason.DRIVE), Observation.NONE, FaultReason.DRIVE),
-    (GOOD._replace(fault=FaultReason.SENSOR), Observation.NONE, FaultReason.SENSOR),
-    (GOOD, Observation.NOT_A_NUMBER, FaultReason.NOT_A_NUMBER),
-    (GOOD, Observation.OVER_LIMIT, FaultReason.LIMIT),
-    (GOOD._replace(age_q=(4, 0)), Observation.NONE, FaultReason.DATA_AGE),
-    (GOOD._replace(age_q=(0, 4)), Observation.NONE, FaultReason.DATA_AGE),
-    (GOOD._replace(age_tau_J=(4, 0)), Observation.NONE, FaultReason.DATA_AGE),
-    (GOOD._replace(age_tau_J=(0, 4)), Observation.NONE, FaultReason.DATA_AGE),
-]
-LATE = GOOD._replace(is_late=True)
+POWERED = tuple(SchemeState[name] for name in ("ADAPT", "CERTIFY", "MONITOR", "REACT", "STOPPED", "PAYLOAD"))
+BAD = {
+    "off": FaultReason.DRIVE,
+    "drive": FaultReason.DRIVE,
+    "sensor": FaultReason.SENSOR,
+    "nan": FaultReason.NOT_A_NUMBER,
+    "over-limit": FaultReason.LIMIT,
+    "q1-too-old": FaultReason.DATA_AGE,
+    "q2-too-old": FaultReason.DATA_AGE,
+    "tau1-too-old": FaultReason.DATA_AGE,
+    "tau2-too-old": FaultReason.DATA_AGE,
+    "fault_torque": FaultReason.TORQUE,
+    "fault_following": FaultReason.FOLLOWING,
+    "fault_tampered": FaultReason.TAMPERED,
+    "fault_misconfigured": FaultReason.MISCONFIGURED,
+}
+"""A cycle that ends the run of an arm that may have torque, and the reason."""
 
 
 @pytest.mark.parametrize("state", POWERED)
-@pytest.mark.parametrize(("arm", "observation", "reason"), BAD)
-def test_a_powered_arm_that_is_not_well_faults(state, arm, observation, reason):
+@pytest.mark.parametrize("words", BAD)
+def test_a_powered_arm_that_is_not_well_faults_whatever_else_there_is(state, words):
     run = run_in(state)
-    assert run.step(arm, observation=observation) is SchemeState.FAULT
-    assert run.fault is reason
+    assert run.fault is FaultReason.NONE
+    everything = "" if words in ASKED else "+acknowledge"
+    run.play(f"{words}+collision+adapted+rest{everything} = FAULT")
+    assert run.fault is BAD[words]
+    run.play("sensor+over-limit")
+    assert run.fault is BAD[words]  # the first reason is kept
 
 
-@pytest.mark.parametrize(("arm", "observation", "reason"), BAD[1:])
-def test_an_arm_that_is_not_well_while_its_drives_enable_faults(arm, observation, reason):
-    run = run_in(SchemeState.ENABLE)
-    run.step(arm._replace(is_enabled=False), observation=observation)
-    assert run.fault is reason
-
-
-@pytest.mark.parametrize("state", CHECKED)
-def test_data_as_old_as_allowed_is_no_fault(state):
-    run = run_in(state)
-    assert run.step(GOOD._replace(age_q=(3, 3), age_tau_J=(3, 3))) is not SchemeState.FAULT
-
-
-@pytest.mark.parametrize("state", [state for state in POWERED if state is not SchemeState.REACT])
-def test_an_arm_that_is_too_fast_without_a_blow_faults(state):
-    assert run_in(state).step(observation=Observation.OVER_SPEED) is SchemeState.FAULT
+@pytest.mark.parametrize("words", [words for words in BAD if words != "off"])
+def test_an_arm_that_is_not_well_while_its_drives_enable_faults(words):
+    run = run_in(SchemeState.ENABLE).play(f"off+{words} = FAULT")
+    assert run.fault is BAD[words]
 
 
 @pytest.mark.parametrize("state", POWERED)
-def test_a_fault_outranks_everything_else_in_its_cycle(state):
-    run = run_in(state)
-    everything = COLLISION | Observation.ADAPTED | Observation.AT_REST | Observation.OVER_LIMIT
-    assert run.step(observation=everything, request=Request.ACKNOWLEDGE) is SchemeState.FAULT
-
-
-@pytest.mark.parametrize("request_", Request)
-def test_a_faulted_run_stays_faulted(request_):
-    run = run_in(SchemeState.FAULT)
-    good_news = RESTING | Observation.ADAPTED
-    assert run.step(observation=good_news, request=request_, cycles=300) is SchemeState.FAULT
-
-
-def test_a_fault_keeps_its_first_reason():
-    run = run_in(SchemeState.FAULT)
-    run.step(observation=Observation.OVER_LIMIT)
-    assert run.fault is FaultReason.SENSOR
-
-
-@pytest.mark.parametrize("state", [SchemeState.INIT, SchemeState.COMMISSION, SchemeState.ENABLE, *POWERED])
-def test_without_a_fault_there_is_no_reason(state):
-    assert run_in(state).fault is FaultReason.NONE
-
-
-def test_the_first_complete_cycle_begins_commissioning():
-    run = Run()
-    assert run.step(DISABLED._replace(is_complete=False), cycles=50) is SchemeState.INIT
-    assert run.step(DISABLED) is SchemeState.COMMISSION
-
-
-def test_commissioning_takes_as_many_good_cycles_as_asked():
-    run = run_in(SchemeState.COMMISSION)
-    assert run.step(DISABLED, observation=RESTING, cycles=19) is SchemeState.COMMISSION
-    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
-
-
-@pytest.mark.parametrize(
-    ("arm", "observation"),
-    [
-        (DISABLED, Observation.AT_REST),
-        (DISABLED, Observation.UNLOADED),
-        (DISABLED._replace(fault=FaultReason.SENSOR), RESTING),
-        (DISABLED._replace(age_tau_J=(9, 0)), RESTING),
-        (DISABLED, RESTING | Observation.NOT_A_NUMBER),
-        (DISABLED, RESTING | Observation.OVER_LIMIT),
-        (DISABLED._replace(is_late=True), RESTING),
-    ],
-)
-def test_one_bad_cycle_begins_commissioning_anew(arm, observation):
-    run = run_in(SchemeState.COMMISSION)
-    run.step(DISABLED, observation=RESTING, cycles=19)
-    run.step(arm, observation=observation)
-    assert run.step(DISABLED, observation=RESTING, cycles=19) is SchemeState.COMMISSION
-    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
-
-
-def test_an_arm_that_moves_before_its_drives_are_enabled_must_lie_still_again():
-    run = run_in(SchemeState.ENABLE)
-    assert run.step(DISABLED, cycles=UNREST_CYCLES - 1) is SchemeState.ENABLE
-    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
-    assert run.step(DISABLED, cycles=UNREST_CYCLES - 1) is SchemeState.ENABLE
-    assert run.step(DISABLED) is SchemeState.COMMISSION
-    assert run.step(DISABLED, observation=RESTING, cycles=19) is SchemeState.COMMISSION
-    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
-    assert run.step(observation=RESTING) is SchemeState.ADAPT
-
-
-def test_an_arm_that_sags_until_its_drives_hold_it_is_enabled():
-    run = run_in(SchemeState.ENABLE)
-    assert run.step(DISABLED, cycles=UNREST_CYCLES - 1) is SchemeState.ENABLE
-    assert run.step() is SchemeState.ADAPT
-
-
-def test_a_cycle_without_all_its_data_does_not_count_and_begins_nothing_anew():
-    run = run_in(SchemeState.COMMISSION)
-    run.step(DISABLED, observation=RESTING, cycles=19)
-    missing = DISABLED._replace(is_complete=False)
-    assert run.step(missing, observation=RESTING | Observation.UNSEEN, cycles=3) is SchemeState.COMMISSION
-    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
-
-
-def test_a_blind_model_is_not_commissioned():
-    run = run_in(SchemeState.COMMISSION)
-    run.step(DISABLED, observation=RESTING, cycles=19)
-    run.step(DISABLED._replace(is_complete=False), observation=RESTING | Observation.UNSEEN, cycles=5)
-    assert run.step(DISABLED, observation=RESTING, cycles=19) is SchemeState.COMMISSION
-
-
-@pytest.mark.parametrize("state", sorted(POWERED))
 def test_a_model_without_a_fresh_sample_is_a_fault_in_the_fifth_cycle_and_so_is_one_with_old_ones(state):
-    unseen = Observation.UNSEEN
-    run = run_in(state)
-    assert run.step(GOOD._replace(is_complete=False), observation=unseen, cycles=4) is state
-    assert run.step(GOOD) is state
-    assert run.step(GOOD._replace(is_complete=False), observation=unseen, cycles=4) is state
-    assert run.step(GOOD._replace(is_complete=False), observation=unseen) is SchemeState.FAULT
-    assert run.fault is FaultReason.BLIND
-    run = run_in(state)
-    old = GOOD._replace(age_q=(2, 2), age_tau_J=(2, 2))
-    assert run.step(old, cycles=5) is state
-    assert run.step(old) is SchemeState.FAULT
-    assert run.fault is FaultReason.DATA_AGE
+    name = state.name
+    blind = run_in(state).play(f"incomplete+unseen*4 = {name}, good = {name}, incomplete+unseen*4 = {name}")
+    assert blind.play("incomplete+unseen = FAULT").fault is FaultReason.BLIND
+    old = run_in(state).play(f"older = {name}, good = {name}, old*5 = {name}, old = FAULT")
+    assert old.fault is FaultReason.DATA_AGE
+    if state is not SchemeState.REACT:
+        assert run_in(state).play("over-speed = FAULT").fault is FaultReason.LIMIT
+
+
+@pytest.mark.parametrize("request_", ASKED)
+def test_a_faulted_run_stays_faulted(request_):
+    run_in(SchemeState.FAULT).play(f"resting+adapted+{request_}*300 = FAULT")
+
+
+@pytest.mark.parametrize("words", ["rest", "unloaded", "resting+sensor", "resting+tau1-too-old", "resting+nan",
+                                   "resting+over-limit", "resting+late"])  # fmt: skip
+def test_one_bad_cycle_begins_commissioning_anew(words):
+    run_in(SchemeState.COMMISSION).play(
+        f"off+resting*19, off+{words}, off+resting*19 = COMMISSION, off+resting = ENABLE"
+    )
 
 
 @pytest.mark.parametrize(
-    ("request_", "reason"),
+    ("state", "words", "cycles", "reason"),
     [
-        (Request.FAULT_TORQUE, FaultReason.TORQUE),
-        (Request.FAULT_FOLLOWING, FaultReason.FOLLOWING),
-        (Request.FAULT_TAMPERED, FaultReason.TAMPERED),
-        (Request.FAULT_MISCONFIGURED, FaultReason.MISCONFIGURED),
+        ("INIT", "off+incomplete", 100, FaultReason.COMMISSION_TIMEOUT),
+        ("COMMISSION", "off", 100, FaultReason.COMMISSION_TIMEOUT),
+        ("ENABLE", "off+resting", 100, FaultReason.ENABLE_TIMEOUT),
+        ("ADAPT", "good", 1000, FaultReason.ADAPT_TIMEOUT),
+        ("CERTIFY", "good", 999, FaultReason.ADAPT_TIMEOUT),
     ],
 )
-def test_the_host_s_own_checks_ask_for_a_fault_of_an_arm_that_may_have_torque(request_, reason):
-    for state in POWERED:
-        run = run_in(state)
-        assert run.step(GOOD, request=request_) is SchemeState.FAULT
-        assert run.fault is reason
-    run = run_in(SchemeState.COMMISSION)
-    assert run.step(DISABLED, request=request_) is SchemeState.COMMISSION
-
-
-@pytest.mark.parametrize(
-    ("state", "cycles", "reason"),
-    [
-        (SchemeState.COMMISSION, 100, FaultReason.COMMISSION_TIMEOUT),
-        (SchemeState.ENABLE, 100, FaultReason.ENABLE_TIMEOUT),
-        (SchemeState.ADAPT, 1000, FaultReason.ADAPT_TIMEOUT),
-        (SchemeState.CERTIFY, 1000 - 1, FaultReason.ADAPT_TIMEOUT),
-    ],
-)
-def test_a_phase_that_takes_too_long_faults(state, cycles, reason):
-    run = run_in(state)
-    arm = DISABLED if reason in (FaultReason.COMMISSION_TIMEOUT, FaultReason.ENABLE_TIMEOUT) else GOOD
-    observation = RESTING if state is SchemeState.ENABLE else Observation.NONE
-    assert run.step(arm, observation=observation, cycles=cycles - 1) is state
-    assert run.step(arm, observation=observation) is SchemeState.FAULT
+def test_a_phase_that_takes_too_long_faults(state, words, cycles, reason):
+    run = run_in(SchemeState[state]).play(f"{words}*{cycles - 1} = {state}, {words} = FAULT")
     assert run.fault is reason
 
 
-def test_drives_may_be_given_longer_to_be_enabled_than_the_other_phases():
-    patient = replace(SETTINGS, safety=replace(SETTINGS.safety, enable_timeout_s=0.3))
-    run = Run(patient).to(SchemeState.ENABLE)
-    assert run.step(DISABLED, observation=RESTING, cycles=299) is SchemeState.ENABLE
-    assert run.step(DISABLED, observation=RESTING) is SchemeState.FAULT
-    run = Run(patient).to(SchemeState.COMMISSION)
-    assert run.step(DISABLED, cycles=100) is SchemeState.FAULT
-
-
-def test_an_arm_that_never_completes_a_cycle_faults_in_time():
-    run = Run()
-    arm = DISABLED._replace(is_complete=False)
-    assert run.step(arm, cycles=99) is SchemeState.INIT
-    assert run.step(arm) is SchemeState.FAULT
-    assert run.fault is FaultReason.COMMISSION_TIMEOUT
-
-
-def test_skipped_periods_count_toward_a_timeout():
-    run = run_in(SchemeState.ADAPT)
-    assert run.step(GOOD._replace(periods=999)) is SchemeState.ADAPT
-    assert run.step() is SchemeState.FAULT
-
-
-def test_success_in_the_last_moment_is_no_timeout():
-    run = run_in(SchemeState.ADAPT)
-    run.step(cycles=999)
-    assert run.step(observation=Observation.ADAPTED) is SchemeState.MONITOR
-
-
-@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD])
-def test_a_state_without_a_time_limit_lasts(state):
-    assert run_in(state).step(cycles=5000) is state
-
-
-def test_an_arm_that_rests_in_payload_waits_until_the_payload_has_been_changed():
-    assert run_in(SchemeState.PAYLOAD).step(observation=Observation.AT_REST, cycles=200) is SchemeState.PAYLOAD
-
-
-def test_each_step_returns_the_state_that_it_leads_to():
-    run = Run()
-    assert run.step(DISABLED._replace(is_complete=False)) is SchemeState.INIT
-    assert run.step(DISABLED) is SchemeState.COMMISSION
-
-
-TOUCHABLE = [SchemeState[name] for name in ORIGINS]
-
-
-def goes_on_in(state):
-    """Return where an arm goes on that was touched in a state: where it was, but a test of a fit is broken off."""
-    return SchemeState.ADAPT if state is SchemeState.CERTIFY else state
+TOUCHABLE = {name: "ADAPT" if name == "CERTIFY" else name for name in ORIGINS}
+"""States in which a touch is reacted to, and where the arm goes on: a test of a fit is broken off."""
 
 
 @pytest.mark.parametrize("state", TOUCHABLE)
-@pytest.mark.parametrize(("observation", "is_latched"), [(CONTACT, False), (COLLISION, True)])
-def test_a_touch_is_reacted_to_wherever_it_is_found(state, observation, is_latched):
-    run = run_in(state)
-    assert run.step(observation=observation) is SchemeState.REACT
-    assert run.supervisor.origin is goes_on_in(state)
-    assert run.is_latched is is_latched
-
-
-def test_an_arm_whose_drives_are_still_off_does_not_react_to_a_touch():
-    run = run_in(SchemeState.ENABLE)
-    assert run.step(DISABLED, observation=COLLISION) is SchemeState.ENABLE
-
-
-@pytest.mark.parametrize("state", [SchemeState.ADAPT, SchemeState.CERTIFY])
-def test_a_touch_outranks_whatever_the_estimate_says_in_the_same_cycle(state):
-    verdicts = Observation.ADAPTED | Observation.FITTED | Observation.CERTIFIED | Observation.REFUTED
-    assert run_in(state).step(observation=CONTACT | verdicts) is SchemeState.REACT
-
-
-@pytest.mark.parametrize("state", TOUCHABLE)
-def test_a_contact_that_has_cleared_lets_the_arm_go_on_where_it_was(state):
-    run = run_in(state)
-    run.step(observation=CONTACT | Observation.AT_REST, cycles=500)
-    assert run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES - 1) is SchemeState.REACT
-    assert run.step(observation=Observation.AT_REST) is goes_on_in(state)
-
-
-@pytest.mark.parametrize("state", TOUCHABLE)
-def test_an_acknowledged_collision_lets_the_arm_go_on_where_it_was(state):
-    run = run_in(state)
-    run.step(observation=COLLISION)
-    assert run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES) is SchemeState.STOPPED
-    assert run.step(cycles=1000) is SchemeState.STOPPED
-    assert run.step(request=Request.ACKNOWLEDGE) is goes_on_in(state)
-
-
-def test_a_contact_that_comes_back_clears_anew():
-    run = run_in(SchemeState.MONITOR)
-    run.step(observation=CONTACT)
-    run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES - 1)
-    run.step(observation=CONTACT | Observation.AT_REST)
-    assert run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES - 1) is SchemeState.REACT
-    assert run.step(observation=Observation.AT_REST) is SchemeState.MONITOR
-
-
-def test_a_contact_does_not_clear_before_the_arm_rests_and_its_report_is_final():
-    run = run_in(SchemeState.MONITOR)
-    run.step(observation=CONTACT)
-    assert run.step(cycles=1000) is SchemeState.REACT
-    assert run.step(observation=Observation.AT_REST, is_reporting=True, cycles=500) is SchemeState.REACT
-    assert run.step(observation=Observation.AT_REST) is SchemeState.MONITOR
-
-
-def test_a_contact_of_an_arm_that_goes_on_clears_without_rest():
-    run = run_in(SchemeState.MONITOR)
-    run.step(observation=CONTACT)
-    assert run.step(goes_on=True, cycles=CLEAR_CYCLES - 1) is SchemeState.REACT
-    assert run.step(goes_on=True) is SchemeState.MONITOR
-
-
-@pytest.mark.parametrize(
-    ("arm", "observation", "cycles"),
-    [(GOOD, COLLISION, 1), (LATE, CONTACT, 1), (GOOD, CONTACT, PATIENCE_CYCLES)],
-)
-def test_a_contact_that_grows_or_lasts_is_to_be_acknowledged(arm, observation, cycles):
-    run = run_in(SchemeState.ADAPT)
-    run.step(observation=CONTACT)
-    run.step(arm, observation=observation, cycles=cycles)
-    assert run.is_latched
-    assert run.step(observation=Observation.AT_REST, cycles=1000) is SchemeState.STOPPED
-
-
-def test_a_contact_after_a_collision_is_not_latched_by_it():
-    run = run_in(SchemeState.STOPPED)
-    run.step(request=Request.ACKNOWLEDGE)
-    run.step(observation=CONTACT)
-    assert run.step(observation=Observation.AT_REST, cycles=1000) is SchemeState.MONITOR
-
-
-def test_a_fit_is_tested_and_a_refuted_one_is_learnt_on():
-    run = run_in(SchemeState.CERTIFY)
-    assert run.step(observation=Observation.ADAPTED | Observation.FITTED) is SchemeState.CERTIFY
-    assert run.step(observation=Observation.REFUTED | Observation.CERTIFIED) is SchemeState.ADAPT
-    run.step(observation=Observation.FITTED)
-    assert run.step(observation=Observation.CERTIFIED) is SchemeState.MONITOR
-
-
-def test_a_test_and_what_was_learnt_before_it_share_one_time_limit():
-    run = run_in(SchemeState.ADAPT)
-    run.step(cycles=500)
-    run.step(observation=Observation.FITTED)
-    run.step(cycles=300)
-    run.step(observation=Observation.REFUTED)
-    assert run.step(cycles=197) is SchemeState.ADAPT
-    assert run.step() is SchemeState.FAULT
-
-
-def test_a_contact_stops_the_clock_of_the_adaptation_and_does_not_set_it_back():
-    run = run_in(SchemeState.ADAPT)
-    run.step(cycles=600)
-    run.step(observation=CONTACT)
-    run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES)
-    assert run.step(cycles=398) is SchemeState.ADAPT
-    assert run.step() is SchemeState.FAULT
-
-
-def test_an_adaptation_after_a_payload_has_its_own_time():
-    run = run_in(SchemeState.ADAPT)
-    run.step(cycles=900)
-    run.step(observation=Observation.ADAPTED)
-    run.step(request=Request.PAYLOAD)
-    run.step(observation=Observation.AT_REST, cycles=REST_CYCLES)
-    assert run.step(observation=Observation.AT_REST, request=Request.PAYLOAD_CHANGED) is SchemeState.ADAPT
-    assert run.step(cycles=999) is SchemeState.ADAPT
-
-
-@pytest.mark.parametrize("observation", [CONTACT, COLLISION])
-def test_hands_that_change_the_payload_do_not_make_the_arm_forget_that_it_was_changed(observation):
-    run = run_in(SchemeState.PAYLOAD)
-    run.step(observation=observation)
-    run.step(request=Request.PAYLOAD_CHANGED)
-    run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES)
-    run.step(observation=Observation.AT_REST, request=Request.ACKNOWLEDGE)
-    assert run.step(observation=Observation.AT_REST, cycles=2) is SchemeState.ADAPT
-
-
-UPRIGHT = replace(
-    SETTINGS,
-    arm=replace(SETTINGS.arm, cad_theta=()),
-    estimator=replace(SETTINGS.estimator, gravity=True, P0=(*SETTINGS.estimator.P0, 50.0, 50.0)),
-)
-
-
-@pytest.mark.parametrize("observation", [CONTACT, COLLISION])
-def test_the_weight_of_a_changed_payload_does_not_hold_an_upright_arm(observation):
-    pulled = observation | Observation.AT_REST
-    for settings, is_learnt in ((UPRIGHT, True), (SETTINGS, False)):
-        run = Run(settings).to(SchemeState.PAYLOAD)
-        run.step(observation=pulled, cycles=10)
-        run.step(observation=pulled, request=Request.PAYLOAD_CHANGED)
-        states = {run.step(observation=pulled) for _ in range(2 * REST_CYCLES)}
-        assert (SchemeState.ADAPT in states) is is_learnt
-
-
-def test_the_weight_of_a_payload_holds_an_upright_arm_until_somebody_says_that_it_was_changed():
-    run = Run(UPRIGHT).to(SchemeState.PAYLOAD)
-    run.step(observation=CONTACT | Observation.AT_REST, cycles=12_000)
-    assert run.step(observation=CONTACT | Observation.AT_REST, request=Request.ACKNOWLEDGE) is SchemeState.STOPPED
-    assert run.step(observation=CONTACT | Observation.AT_REST, request=Request.PAYLOAD_CHANGED) is SchemeState.ADAPT
-
-
-@pytest.mark.parametrize("observation", [CONTACT, COLLISION])
-def test_a_word_of_before_a_touch_does_not_let_an_upright_arm_go_on_beneath_it(observation):
-    run = Run(UPRIGHT).to(SchemeState.PAYLOAD)
-    run.step(request=Request.PAYLOAD_CHANGED)
-    assert run.step(observation=observation) is SchemeState.REACT
-    states = {run.step(observation=observation | Observation.AT_REST) for _ in range(2 * REST_CYCLES)}
-    assert SchemeState.ADAPT not in states
-    said = [run.step(observation=observation | Observation.AT_REST, request=Request.PAYLOAD_CHANGED)]
-    said += [run.step(observation=observation | Observation.AT_REST) for _ in range(2 * REST_CYCLES)]
-    assert SchemeState.ADAPT in said
-
-
-def test_a_touch_outside_of_a_payload_change_still_wants_to_be_acknowledged_of_an_upright_arm():
-    run = Run(UPRIGHT).to(SchemeState.MONITOR)
-    run.step(observation=COLLISION | Observation.AT_REST, cycles=REST_CYCLES)
-    run.step(observation=Observation.AT_REST, request=Request.PAYLOAD_CHANGED)
-    assert run.step(observation=Observation.AT_REST, cycles=12_000) is SchemeState.STOPPED
-
-
-def test_a_blow_may_throw_the_arm_faster_than_its_limit_for_a_moment():
-    run = run_in(SchemeState.MONITOR)
-    run.step(observation=COLLISION)
-    assert run.step(observation=COLLISION | Observation.OVER_SPEED, cycles=100) is SchemeState.REACT
-    assert run.step(observation=Observation.OVER_SPEED) is SchemeState.FAULT
-    assert run.fault is FaultReason.LIMIT
-
-
-def test_the_joints_of_an_observation_are_beyond_its_flags():
-    assert max(Observation) < 1 << CONTACT_SHIFT
-
-
-def test_a_collision_outranks_the_announcement_of_a_payload():
-    run = run_in(SchemeState.MONITOR)
-    assert run.step(request=Request.PAYLOAD, observation=COLLISION) is SchemeState.REACT
-
-
-def test_the_arm_counts_as_stopped_after_fifty_milliseconds_at_rest():
-    run = run_in(SchemeState.REACT)
-    assert run.step(observation=Observation.AT_REST, cycles=49) is SchemeState.REACT
-    assert run.step(observation=Observation.AT_REST) is SchemeState.STOPPED
-
-
-def test_rest_counts_from_the_first_cycle_on():
-    run = Run()
-    run.step(DISABLED, observation=RESTING, cycles=21)
-    run.step(observation=Observation.AT_REST)
-    run.step(observation=Observation.AT_REST | Observation.ADAPTED)
-    assert run.step(observation=Observation.AT_REST | COLLISION) is SchemeState.REACT
-    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES - 25) is SchemeState.REACT
-    assert run.step(observation=Observation.AT_REST) is SchemeState.STOPPED
-
-
-def test_a_twitch_begins_the_fifty_milliseconds_anew():
-    run = run_in(SchemeState.REACT)
-    run.step(observation=Observation.AT_REST, cycles=49)
-    run.step()
-    assert run.step(observation=Observation.AT_REST, cycles=49) is SchemeState.REACT
-
-
-def test_skipped_periods_do_not_count_as_rest():
-    run = run_in(SchemeState.REACT)
-    assert run.step(GOOD._replace(periods=60), observation=Observation.AT_REST) is SchemeState.REACT
-
-
-def test_the_arm_is_not_stopped_before_the_report_is_final():
-    run = run_in(SchemeState.REACT)
-    assert run.step(observation=Observation.AT_REST, is_reporting=True, cycles=500) is SchemeState.REACT
-    assert run.step(observation=Observation.AT_REST) is SchemeState.STOPPED
+def test_a_touch_is_reacted_to_wherever_it_is_found_and_the_arm_goes_on_where_it_was(state):
+    contact = run_in(SchemeState[state]).play("contact = REACT")
+    assert (contact.m.origin, contact.m.is_latched) == (SchemeState[TOUCHABLE[state]], 0)
+    contact.play(f"contact+rest*500, rest*199 = REACT, rest = {TOUCHABLE[state]}")
+    collision = run_in(SchemeState[state]).play("collision = REACT")
+    assert collision.m.is_latched == 1
+    collision.play(f"rest*200 = STOPPED, good*1000 = STOPPED, acknowledge = {TOUCHABLE[state]}")
 
 
 @pytest.mark.parametrize(
     ("state", "expected"),
     [
-        (SchemeState.INIT, SchemeState.COMMISSION),
-        (SchemeState.COMMISSION, SchemeState.COMMISSION),
-        (SchemeState.ENABLE, SchemeState.FAULT),
-        (SchemeState.ADAPT, SchemeState.FAULT),
-        (SchemeState.CERTIFY, SchemeState.FAULT),
-        (SchemeState.MONITOR, SchemeState.REACT),
-        (SchemeState.REACT, SchemeState.REACT),
-        (SchemeState.STOPPED, SchemeState.STOPPED),
-        (SchemeState.PAYLOAD, SchemeState.FAULT),
+        ("INIT", "COMMISSION"), ("COMMISSION", "COMMISSION"), ("ENABLE", "FAULT"), ("ADAPT", "FAULT"),
+        ("CERTIFY", "FAULT"), ("MONITOR", "REACT"), ("REACT", "REACT"), ("STOPPED", "STOPPED"), ("PAYLOAD", "FAULT"),
     ],
-)
+)  # fmt: skip
 def test_a_host_that_is_late_holds_the_arm_or_faults(state, expected):
-    run = run_in(state)
-    assert run.step(LATE) is expected
-    assert (run.fault is FaultReason.DEADLINE) == (expected is SchemeState.FAULT)
+    run = run_in(SchemeState[state]).play(f"late = {expected}")
+    assert (run.fault is FaultReason.DEADLINE) == (expected == "FAULT")
 
 
-def test_an_arm_that_is_held_rests_and_waits_for_an_acknowledgement():
-    run = run_in(SchemeState.MONITOR)
-    run.step(LATE)
-    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.STOPPED
-    assert run.step(cycles=100) is SchemeState.STOPPED
-    assert run.step(request=Request.ACKNOWLEDGE) is SchemeState.MONITOR
+# A sentence about the arm, the state in which it begins, and what happens.
+STORIES = """
+the first complete cycle begins commissioning | INIT | off+incomplete*50 = INIT, off = COMMISSION
+commissioning takes as many good cycles as asked | COMMISSION | off+resting*19 = COMMISSION, off+resting = ENABLE
+a cycle without all its data does not count and begins nothing anew | COMMISSION | off+resting*19, off+incomplete+resting+unseen*3 = COMMISSION, off+resting = ENABLE
+a blind model is not commissioned | COMMISSION | off+resting*19, off+incomplete+resting+unseen*5, off+resting*19 = COMMISSION
+before there can be torque the host's checks ask for nothing | COMMISSION | off+fault_torque = COMMISSION, off+fault_tampered = COMMISSION
+an arm that moves before its drives are enabled must lie still again | ENABLE | off*19 = ENABLE, off+resting = ENABLE, off*19 = ENABLE, off = COMMISSION, off+resting*19 = COMMISSION, off+resting = ENABLE, resting = ADAPT
+an arm that sags until its drives hold it is enabled | ENABLE | off*19 = ENABLE, good = ADAPT
+an arm whose drives are still off does not react to a touch | ENABLE | off+collision = ENABLE
+skipped periods count toward a timeout | ADAPT | skips-999 = ADAPT, good = FAULT
+success in the last moment is no timeout | ADAPT | good*999, adapted = MONITOR
+the other states have no time limit: monitoring | MONITOR | good*5000 = MONITOR
+the other states have no time limit: reacting | REACT | good*5000 = REACT
+the other states have no time limit: stopped | STOPPED | good*5000 = STOPPED
+the other states have no time limit: a payload | PAYLOAD | good*5000 = PAYLOAD, rest*200 = PAYLOAD
+a touch outranks what the estimate says in the same cycle | ADAPT | contact+adapted+fitted+certified+refuted = REACT
+a touch outranks what a test says in the same cycle | CERTIFY | contact+adapted+fitted+certified+refuted = REACT
+a contact that comes back clears anew | MONITOR | contact, rest*199, contact+rest, rest*199 = REACT, rest = MONITOR
+a contact does not clear before the arm rests and its report is final | MONITOR | contact, good*1000 = REACT, rest+reporting*500 = REACT, rest = MONITOR
+a contact of an arm that goes on clears without rest | MONITOR | contact, goes-on*199 = REACT, goes-on = MONITOR
+a contact that grows is to be acknowledged | ADAPT | contact, collision, rest*1000 = STOPPED
+a contact with a late host is to be acknowledged | ADAPT | contact, contact+late, rest*1000 = STOPPED
+a contact that lasts is to be acknowledged | ADAPT | contact, contact*3000, rest*1000 = STOPPED
+a contact that lasts a little less is not | ADAPT | contact, contact*2799, rest*199 = REACT, rest = ADAPT
+a contact after a collision is not latched by it | STOPPED | acknowledge, contact, rest*1000 = MONITOR
+a fit is tested and a refuted one is learnt on | CERTIFY | adapted+fitted = CERTIFY, refuted+certified = ADAPT, fitted, certified = MONITOR
+a test and the learning before it share one time limit | ADAPT | good*500, fitted, good*300, refuted, good*197 = ADAPT, good = FAULT
+a contact stops the clock of the adaptation and does not set it back | ADAPT | good*600, contact, rest*200, good*398 = ADAPT, good = FAULT
+an adaptation after a payload has its own time | ADAPT | good*900, adapted, payload, rest*50, rest+payload_changed = ADAPT, good*999 = ADAPT
+hands that change the payload do not make the arm forget it: a contact | PAYLOAD | contact, payload_changed, rest*200, rest+acknowledge, rest*2 = ADAPT
+hands that change the payload do not make the arm forget it: a collision | PAYLOAD | collision, payload_changed, rest*200, rest+acknowledge, rest*2 = ADAPT
+a blow may throw the arm faster than its limit for a moment | MONITOR | collision, collision+over-speed*100 = REACT, over-speed = FAULT
+a collision outranks the announcement of a payload | MONITOR | payload+collision = REACT
+a late host outranks the announcement of a payload | MONITOR | late+payload = REACT
+the arm counts as stopped after fifty milliseconds at rest | REACT | rest*49 = REACT, rest = STOPPED
+rest counts from the first cycle on | INIT | off+resting*21, rest, rest+adapted, rest+collision = REACT, rest*25 = REACT, rest = STOPPED
+a twitch begins the fifty milliseconds anew | REACT | rest*49, good, rest*49 = REACT, rest = STOPPED
+skipped periods do not count as rest | REACT | skips+rest = REACT
+the arm is not stopped before the report is final | REACT | rest+reporting*500 = REACT, rest = STOPPED
+an arm that is held rests and waits for an acknowledgement | MONITOR | late, rest*50 = STOPPED, good*100 = STOPPED, acknowledge = MONITOR
+an acknowledgement waits until the host is on time | STOPPED | late+acknowledge = STOPPED, late*300 = STOPPED, good = MONITOR
+an acknowledgement waits until nothing pushes | STOPPED | acknowledge+contact = STOPPED, contact*300 = STOPPED, good = MONITOR
+an acknowledgement while the arm monitors releases no later stop | MONITOR | acknowledge, collision, rest*50 = STOPPED, good*100 = STOPPED
+an acknowledgement before the stop does not release it | REACT | acknowledge, rest*50 = STOPPED, good*100 = STOPPED
+an acknowledgement is good for one stop | STOPPED | acknowledge = MONITOR, collision, rest*50 = STOPPED, good*100 = STOPPED
+later evidence against the certificate stops the arm for the user | MONITOR | withheld = REACT is CONTRADICTED, rest*50 = STOPPED
+a stopped arm is learnt anew at a word even while something seems to push | STOPPED | relearn+contact = STOPPED, contact+rest*49 = STOPPED, contact+rest = ADAPT is REVOKED
+a changed payload means nothing in a stop that nothing doubts | STOPPED | payload_changed, rest*100 = STOPPED
+a payload is announced to an arm that monitors | MONITOR | payload = PAYLOAD
+a payload is announced to an arm that is stopped | STOPPED | payload = PAYLOAD
+a payload announced during the test of the fit waits for its end | CERTIFY | payload, refuted, fitted, certified = MONITOR, good = PAYLOAD
+a payload announced during adaptation waits for its end | ADAPT | payload = ADAPT, adapted = MONITOR, good = PAYLOAD
+a payload announced before a stop does not release it: learning | ADAPT | payload+collision, rest*50 = STOPPED, good*300 = STOPPED, payload = PAYLOAD
+a payload announced before a stop does not release it: testing | CERTIFY | payload+collision, rest*50 = STOPPED, good*300 = STOPPED, payload = PAYLOAD
+a payload announced before a stop is served once that is acknowledged | MONITOR | payload+collision, rest*50 = STOPPED, good*300 = STOPPED, acknowledge = MONITOR, good = PAYLOAD
+a payload announced while the arm reacts is served once that is acknowledged | REACT | payload+collision, rest*50 = STOPPED, good*300 = STOPPED, acknowledge = MONITOR, good = PAYLOAD
+a payload announced in one stop does not release another | STOPPED | payload, collision, rest*50 = STOPPED, good*300 = STOPPED
+a changed payload waits until the arm rests | PAYLOAD | good*10, payload_changed = PAYLOAD, rest*49 = PAYLOAD, rest = ADAPT
+a changed payload that was not announced is ignored while the arm monitors | MONITOR | payload_changed+rest*200 = MONITOR
+a changed payload that was not announced is ignored in a stop | STOPPED | payload_changed+rest*200 = STOPPED
+the end of the run is left to the control layer: learning | ADAPT | finish*10 = ADAPT
+the end of the run is left to the control layer: monitoring | MONITOR | finish*10 = MONITOR
+the end of the run is left to the control layer: stopped | STOPPED | finish*10 = STOPPED
+"""  # noqa: E501
+UPRIGHT_STORIES = """
+the weight of a changed payload does not hold the arm: a contact | PAYLOAD | contact+rest*10, contact+rest+payload_changed, contact+rest*100 ~ ADAPT
+the weight of a changed payload does not hold the arm: a collision | PAYLOAD | collision+rest*10, collision+rest+payload_changed, collision+rest*100 ~ ADAPT
+the weight holds the arm until somebody says that the payload was changed | PAYLOAD | contact+rest*12000, contact+rest+acknowledge = STOPPED, contact+rest+payload_changed = ADAPT
+a word of before a touch does not let the arm go on beneath it: a contact | PAYLOAD | payload_changed, contact = REACT, contact+rest*100 = REACT, contact+rest+payload_changed, contact+rest*100 ~ ADAPT
+a word of before a touch does not let the arm go on beneath it: a collision | PAYLOAD | payload_changed, collision = REACT, collision+rest*100 = STOPPED, collision+rest+payload_changed, collision+rest*100 ~ ADAPT
+a touch outside of a payload change wants to be acknowledged | MONITOR | collision+rest*51 = STOPPED, rest+payload_changed, rest*12000 = STOPPED
+"""  # noqa: E501
+LEVEL_STORIES = """
+without gravity a payload's weight is no contact: the touch holds the arm | PAYLOAD | contact+rest*10, contact+rest+payload_changed, contact+rest*100 = REACT
+without gravity the same of a collision | PAYLOAD | collision+rest*10, collision+rest+payload_changed, collision+rest*100 = STOPPED
+"""  # noqa: E501
+PATIENT_STORIES = """
+drives may be given longer to be enabled than the other phases | ENABLE | off+resting*299 = ENABLE, off+resting = FAULT
+the other phases then take no longer | COMMISSION | off*99 = COMMISSION, off = FAULT
+"""
+TOLD = [
+    pytest.param(settings, *(part.strip() for part in line.split("|")[1:]), id=line.split("|")[0].strip())
+    for settings, stories in (
+        (SETTINGS, STORIES), (UPRIGHT, UPRIGHT_STORIES), (SETTINGS, LEVEL_STORIES), (PATIENT, PATIENT_STORIES)
+    )
+    for line in stories.strip().splitlines()
+]  # fmt: skip
 
 
-def test_an_acknowledgement_waits_until_the_host_is_on_time():
-    run = run_in(SchemeState.STOPPED)
-    assert run.step(LATE, request=Request.ACKNOWLEDGE) is SchemeState.STOPPED
-    assert run.step(LATE, cycles=300) is SchemeState.STOPPED
-    assert run.step() is SchemeState.MONITOR
-
-
-def test_an_offset_that_has_left_its_anchor_stops_the_arm_for_the_user():
-    run = run_in(SchemeState.MONITOR)
-    assert run.step(observation=Observation.WITHHELD) is SchemeState.REACT
-    assert run.supervisor.cause is SchemeEvent.CONTRADICTED
-    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.STOPPED
-
-
-def test_a_late_host_that_was_to_change_the_payload_holds_the_arm_first():
-    run = run_in(SchemeState.MONITOR)
-    assert run.step(LATE, request=Request.PAYLOAD) is SchemeState.REACT
-
-
-def test_an_acknowledged_stop_goes_on():
-    assert run_in(SchemeState.STOPPED).step(request=Request.ACKNOWLEDGE) is SchemeState.MONITOR
-
-
-def test_an_acknowledgement_waits_until_nothing_pushes():
-    run = run_in(SchemeState.STOPPED)
-    assert run.step(request=Request.ACKNOWLEDGE, observation=CONTACT) is SchemeState.STOPPED
-    assert run.step(observation=CONTACT, cycles=300) is SchemeState.STOPPED
-    assert run.step() is SchemeState.MONITOR
-
-
-@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.REACT])
-def test_an_acknowledgement_before_the_stop_does_not_release_it(state):
-    run = run_in(state)
-    run.step(request=Request.ACKNOWLEDGE)
-    run.to(SchemeState.STOPPED)
-    assert run.step(cycles=100) is SchemeState.STOPPED
-
-
-def test_what_is_known_of_a_stopped_arm_can_be_taken_back_even_while_something_seems_to_push():
-    run = run_in(SchemeState.STOPPED)
-    assert run.step(request=Request.RELEARN, observation=CONTACT) is SchemeState.STOPPED
-    assert run.step(observation=CONTACT | Observation.AT_REST, cycles=REST_CYCLES - 1) is SchemeState.STOPPED
-    assert run.step(observation=CONTACT | Observation.AT_REST) is SchemeState.ADAPT
-    assert run.supervisor.cause is SchemeEvent.REVOKED
+@pytest.mark.parametrize(("settings", "state", "steps"), TOLD)
+def test_a_story(settings, state, steps):
+    told, _, cause = steps.partition(" is ")
+    run = Run(settings).to(SchemeState[state]).play(told)
+    if cause:
+        cause, _, rest = cause.partition(",")
+        assert SchemeEvent(run.m.cause).name == cause
+        if rest:
+            run.play(rest)
 
 
 @pytest.mark.parametrize("state", [state for state in SchemeState if state is not SchemeState.STOPPED])
 def test_only_a_stopped_arm_is_learnt_anew(state):
-    run, plain = run_in(state), run_in(state)
-    resting = {"observation": Observation.AT_REST, "cycles": 2 * REST_CYCLES}
-    run.step(request=Request.RELEARN)
-    plain.step()
-    assert run.step(**resting) is plain.step(**resting)
-    assert run.supervisor.cause is not SchemeEvent.REVOKED
+    asked, plain = run_in(state).play("relearn, rest*100"), run_in(state).play("good, rest*100")
+    assert asked.state is plain.state
+    assert asked.m.cause != SchemeEvent.REVOKED
 
 
-def doubted():
+@pytest.mark.parametrize(
+    ("steps", "cause"),
+    [
+        ("good*1000 = STOPPED, acknowledge = ADAPT", SchemeEvent.REVOKED),
+        ("payload_changed, rest*50 = ADAPT", SchemeEvent.PAYLOAD_CHANGED),
+        ("acknowledge = ADAPT, adapted, collision, rest*50 = STOPPED, payload_changed, rest*100 = STOPPED", None),
+    ],
+    ids=["it holds until the user says how to go on", "a payload needs no announcement", "it ends with its stop"],
+)
+def test_a_doubted_arm(steps, cause):
     run = run_in(SchemeState.MONITOR)
-    assert run.supervisor.doubt() is SchemeState.STOPPED
-    return run
+    supervisor.doubt(run.m)
+    assert run.state is SchemeState.STOPPED
+    run.play(steps)
+    assert cause is None or run.m.cause == cause
 
 
-def test_a_doubted_arm_holds_until_the_user_says_how_to_go_on():
-    assert doubted().step(cycles=1000) is SchemeState.STOPPED
-    run = doubted()
-    assert run.step(request=Request.ACKNOWLEDGE) is SchemeState.ADAPT
-    assert run.supervisor.cause is SchemeEvent.REVOKED
-
-
-def test_a_payload_that_contacts_looked_like_needs_no_announcement():
-    run = doubted()
-    run.step(request=Request.PAYLOAD_CHANGED)
-    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.ADAPT
-    assert run.supervisor.cause is SchemeEvent.PAYLOAD_CHANGED
-
-
-def test_in_a_stop_that_nothing_doubts_a_changed_payload_means_nothing():
-    run = run_in(SchemeState.STOPPED)
-    run.step(request=Request.PAYLOAD_CHANGED)
-    assert run.step(observation=Observation.AT_REST, cycles=2 * REST_CYCLES) is SchemeState.STOPPED
-
-
-def test_the_doubt_ends_with_its_stop():
-    run = doubted()
-    run.step(request=Request.ACKNOWLEDGE)
-    run.to(SchemeState.STOPPED)
-    run.step(request=Request.PAYLOAD_CHANGED)
-    assert run.step(observation=Observation.AT_REST, cycles=2 * REST_CYCLES) is SchemeState.STOPPED
-
-
-def test_an_acknowledgement_is_good_for_one_stop():
-    run = run_in(SchemeState.STOPPED)
-    run.step(request=Request.ACKNOWLEDGE)
-    run.to(SchemeState.STOPPED)
-    assert run.step(cycles=100) is SchemeState.STOPPED
-
-
-@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.STOPPED])
-def test_a_payload_is_announced_to_an_arm_that_monitors_or_is_stopped(state):
-    assert run_in(state).step(request=Request.PAYLOAD) is SchemeState.PAYLOAD
-
-
-def test_a_payload_announced_during_the_test_of_the_fit_waits_for_its_end():
-    run = run_in(SchemeState.CERTIFY)
-    run.step(request=Request.PAYLOAD)
-    run.step(observation=Observation.REFUTED)
-    run.step(observation=Observation.FITTED)
-    assert run.step(observation=Observation.CERTIFIED) is SchemeState.MONITOR
-    assert run.step() is SchemeState.PAYLOAD
-
-
-def test_a_payload_announced_during_adaptation_waits_for_its_end():
-    run = run_in(SchemeState.ADAPT)
-    assert run.step(request=Request.PAYLOAD) is SchemeState.ADAPT
-    assert run.step(observation=Observation.ADAPTED) is SchemeState.MONITOR
-    assert run.step() is SchemeState.PAYLOAD
-
-
-def stopped_after_payload_in(state):
-    run = run_in(state)
-    run.step(request=Request.PAYLOAD, observation=COLLISION)
-    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.STOPPED
-    return run
-
-
-ANNOUNCED_IN = [SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR, SchemeState.REACT]
-
-
-@pytest.mark.parametrize("state", ANNOUNCED_IN)
-def test_a_payload_announced_before_a_stop_does_not_release_it(state):
-    assert stopped_after_payload_in(state).step(cycles=300) is SchemeState.STOPPED
-
-
-@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.REACT])
-def test_a_payload_announced_before_a_stop_is_served_once_that_is_acknowledged(state):
-    run = stopped_after_payload_in(state)
-    assert run.step(request=Request.ACKNOWLEDGE) is SchemeState.MONITOR
-    assert run.step() is SchemeState.PAYLOAD
-
-
-@pytest.mark.parametrize("state", ANNOUNCED_IN)
-def test_a_payload_announced_before_a_stop_is_served_once_it_is_announced_again(state):
-    assert stopped_after_payload_in(state).step(request=Request.PAYLOAD) is SchemeState.PAYLOAD
-
-
-def test_a_payload_announced_in_one_stop_does_not_release_another():
-    run = run_in(SchemeState.STOPPED)
-    run.step(request=Request.PAYLOAD)
-    run.step(observation=COLLISION)
-    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.STOPPED
-    assert run.step(cycles=300) is SchemeState.STOPPED
-
-
-def test_a_changed_payload_waits_until_the_arm_rests():
-    run = run_in(SchemeState.PAYLOAD)
-    run.step(cycles=10)
-    assert run.step(request=Request.PAYLOAD_CHANGED) is SchemeState.PAYLOAD
-    assert run.step(observation=Observation.AT_REST, cycles=49) is SchemeState.PAYLOAD
-    assert run.step(observation=Observation.AT_REST) is SchemeState.ADAPT
-
-
-@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.STOPPED])
-def test_a_changed_payload_that_was_not_announced_is_ignored(state):
-    assert run_in(state).step(request=Request.PAYLOAD_CHANGED, observation=Observation.AT_REST, cycles=200) is state
-
-
-@pytest.mark.parametrize("state", [SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.STOPPED, SchemeState.PAYLOAD])
-def test_the_end_of_the_run_is_left_to_the_control_layer(state):
-    assert run_in(state).step(request=Request.FINISH, cycles=10) is state
+def test_the_joints_of_an_observation_are_beyond_its_flags():
+    assert transitions.WITHHELD < 1 << CONTACT_SHIFT

@@ -1,5 +1,7 @@
 """The floor of the thresholds: the factor against its formula and against noise, and which residuals count."""
 
+import re
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -8,7 +10,7 @@ from test_certified_kernel import COUNT, RECOVER, Kernel
 
 from adacd_hil.scheme.detect import margin, sensitivity
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.supervisor.transitions import Observation
+from adacd_hil.scheme.supervisor import transitions
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
@@ -64,7 +66,7 @@ def test_the_floor_is_the_largest_residual_times_the_formula_s_factor(seen_s):
 
 
 def test_the_factor_falls_from_its_bound_to_one_after_an_hour():
-    factors = [margin._factor(4.0 / np.pi, seen_s) for seen_s in (0.0, 1.0, 60.0, 600.0, HOUR_S, 1e6)]
+    factors = [margin.tail_factor(4.0 / np.pi, seen_s) for seen_s in (0.0, 1.0, 60.0, 600.0, HOUR_S, 1e6)]
     assert factors[:2] == [margin.LARGEST] * 2
     assert np.all(np.diff(factors[1:5]) < 0.0)
     assert factors[4:] == [1.0, 1.0]
@@ -80,7 +82,7 @@ def test_the_largest_filtered_noise_of_an_hour_is_below_what_a_short_time_lets_e
     fall = np.exp(-cutoff * PERIOD_S)
     noise = np.abs(scipy.signal.lfilter([1.0 - fall], [1.0, -fall], white))
     seen = noise.reshape(-1, round(seen_s / PERIOD_S)).max(1).mean()
-    assert noise.max() < margin._factor(cutoff / np.pi, seen_s) * seen < 1.25 * noise.max()
+    assert noise.max() < margin.tail_factor(cutoff / np.pi, seen_s) * seen < 1.25 * noise.max()
 
 
 def test_a_residual_counts_when_its_block_and_the_one_after_it_are_over():
@@ -191,7 +193,7 @@ def steady(mode, samples=1000):
 def go_on(kernel, mode, samples, push_Nm):
     mode = certified_kernel.WATCH | getattr(certified_kernel, mode)
     found = [kernel.step([0.0, 0.0], [0.5, -0.5], [-push_Nm, -push_Nm], mode) for _ in range(samples)]
-    return np.array(found) & Observation.CONTACT != 0
+    return np.array(found) & transitions.CONTACT != 0
 
 
 def test_what_of_a_touch_was_seen_before_it_was_flagged_raises_no_threshold():
@@ -208,6 +210,20 @@ def test_what_of_a_touch_was_seen_before_it_was_flagged_raises_no_threshold():
     go_on(kernel, "REFINE", RECOVER + 3 * BLOCK, 0.005)
     assert kernel.m.models.recovering_cycles == 0.0
     np.testing.assert_allclose(kernel.m.margin.peak, before, rtol=0.06)
+
+
+def test_a_margin_that_shrinks_is_named_against_what_it_was_once_the_watch_had_settled():
+    watch = margin.MarginWatch(2, memory_blocks=5.0)
+    for _ in range(10):
+        watch.add_block(np.array([0.4, 0.4]))
+        assert watch.warning == ""
+    watch.add_block(np.array([np.inf, 0.4]))  # not finite: ignored
+    for _ in range(10):
+        watch.add_block(np.array([0.4, 0.9]))
+    assert re.fullmatch(r"joint 2: margin \d\.\d x, was 2\.5 x", watch.warning)
+    watch.forget()
+    assert watch.warning == ""
+    assert np.isinf(watch.margin).all()
 
 
 def test_the_largest_share_is_that_of_the_threshold_in_force():

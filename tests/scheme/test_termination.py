@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from adacd_hil.scheme.identify.termination import add_information, eigenvalue_range, has_moved, is_quiet, widen
+from adacd_hil.scheme.memory import Motion
+from adacd_hil.structured import zeros_of
 
 
 @pytest.mark.parametrize(
@@ -42,8 +44,10 @@ MOVED = {"q_low": (-0.5, -0.5), "q_high": (0.5, 0.5), "dq_low": (-1.0, -1.0), "d
     ],
 )
 def test_the_arm_has_moved_when_each_joint_went_far_and_both_ways(changed, expected):
-    ranges = {name: np.array(value) for name, value in (MOVED | changed).items()}
-    assert has_moved(**ranges, travel_rad=0.5, velocity_rad_s=0.2) == expected
+    motion = zeros_of(Motion, {"n": 2, "p": 1})[0]
+    for name, value in (MOVED | changed).items():
+        motion[name] = value
+    assert has_moved(motion, 0.5, 0.2) == expected
 
 
 def test_a_range_widens_to_what_was_seen():

@@ -24,12 +24,11 @@ from adacd_hil.records import (
     Vector,
 )
 from adacd_hil.scheme.contact import course
-from adacd_hil.scheme.contact.contact_report import RecalledContact, put_row, report_of
+from adacd_hil.scheme.contact.contact_report import new_rows, put_row, recalled_report
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.kernel.cycle import DECISION, decide, follow_contact, new_course
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
-from adacd_hil.scheme.supervisor.supervisor import Supervisor
-from adacd_hil.scheme.supervisor.transitions import Observation
+from adacd_hil.scheme.supervisor import transitions
 from adacd_hil.settings.configuration import Settings, load_settings, merge
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.sensing import DriveMode
@@ -89,9 +88,9 @@ class Rig:
         self._course_constants, self._course_memory = new_course(settings)
         self._course_memory["is_model_valid"] = 1
         self._contact = self._course_memory["contact"][0]
-        self._evidence = RecalledContact(settings, self._contact)
+        self._rows = new_rows(settings)
         certified = dataclasses.replace(settings, scheme="certified")
-        course.fill_constants(certified, self._evidence.due_cycles, self._course_constants["contact"][0])
+        course.fill_constants(certified, self._course_constants["contact"][0])
         self._sample, self._decision = np.zeros(1, SAMPLE), np.zeros(1, DECISION)
         self._q_d, self._dq_d, self._ddq_d = np.zeros(2), np.zeros(2), np.zeros(2)
         self._tau_d, self._tau_c = np.zeros(2), np.zeros(2)
@@ -99,7 +98,6 @@ class Rig:
         self._controller, self._floating = Controller(settings), Floating(settings)
         self._controller.feed_forward(self._theta)
         self._gate = Gate(settings.arm, settings.bus.period_s)
-        self._supervisor = Supervisor(self._course_memory["supervisor"])
         self._cycle = 0
         self._state = SchemeState.INIT
         self._stopped_cycles = 0
@@ -107,10 +105,14 @@ class Rig:
         arm = self._arm(self._body.sample())
         self._torques = [arm.tau_J] * 3
         self._q_d[:] = arm.q
-        rest = int(Observation.AT_REST | Observation.UNLOADED)
-        while self._supervisor.state is not SchemeState.MONITOR:
-            is_late = self._supervisor.state is SchemeState.ADAPT
-            self._decide(arm, Request.NONE, rest | (int(Observation.ADAPTED) if is_late else 0))
+        rest = transitions.AT_REST | transitions.UNLOADED
+        while self._supervised is not SchemeState.MONITOR:
+            is_late = self._supervised is SchemeState.ADAPT
+            self._decide(arm, Request.NONE, rest | (transitions.ADAPTED if is_late else 0))
+
+    @property
+    def _supervised(self) -> SchemeState:
+        return SchemeState(self._course_memory[0].supervisor.state)
 
     def _decide(self, arm: ArmState, request: Request, observation: int) -> None:
         fill_sample(self._sample, arm, request)
@@ -119,13 +121,14 @@ class Rig:
     def _follow_contact(self) -> ContactReport | None:
         """Take the contact on; return its report that is due."""
         block, contact = self._block[0], self._contact
-        rows, kept = self._evidence.rows, int(contact["kept_rows"])
-        put_row(rows, kept, block["q"], block["tau_ext_wide_hat"], SIGMA_NM, block["threshold"])
+        put_row(
+            self._rows, int(contact["kept_rows"]), block["q"], block["tau_ext_wide_hat"], SIGMA_NM, block["threshold"]
+        )
         contact["kept_rows"] += 1
         torques = block["tau_ext_hat"], block["tau_ext_wide_hat"]
         of_run = self._course_constants[0], self._course_memory[0]
         is_due = follow_contact(*of_run, self._sample[0], self._decision[0], *torques)
-        return report_of(self._evidence, contact, self._cycle) if is_due else None
+        return recalled_report(self.settings, contact, self._rows, self._cycle) if is_due else None
 
     def _theta_of(self) -> Vector:
         truth = np.zeros(TRUTH_LAYOUT.size)
@@ -145,12 +148,12 @@ class Rig:
         delayed = (1.0 - LAG_SHARE) * self._torques[1] + LAG_SHARE * self._torques[2]
         block["q"][:], block["dq"][:], block["tau_J"][:] = arm.q, arm.dq, delayed
         observation = paper_kernel.step(self._constants, self._memory, self._block, 1, 1, paper_kernel.ARMED)
-        observation &= ~int(Observation.COLLISION)
+        observation &= ~transitions.COLLISION
         if np.any(np.abs(block["tau_ext_hat"]) > self._collision_Nm):
-            observation |= int(Observation.COLLISION)
+            observation |= transitions.COLLISION
         is_outside = np.any(np.abs(arm.q) > self.settings.arm.position_limit_rad)
-        if observation & int(Observation.OVER_LIMIT) and not is_outside:
-            observation = observation & ~int(Observation.OVER_LIMIT) | int(Observation.OVER_SPEED)
+        if observation & transitions.OVER_LIMIT and not is_outside:
+            observation = observation & ~transitions.OVER_LIMIT | transitions.OVER_SPEED
         return observation
 
     def step(self) -> Sample:
@@ -166,7 +169,7 @@ class Rig:
         self._decide(arm, request, observation)
         tau_ext_hat = self._block[0]["tau_ext_hat"].copy()
         contact = self._follow_contact()
-        decision, state = self._decision[0], self._supervisor.state
+        decision, state = self._decision[0], self._supervised
         output = SchemeOutput(
             self._cycle, state, previous, FaultReason(decision["fault"]), int(decision["contact_joints"]), True,
             self._theta, self._theta, tau_ext_hat, contact, self._values.copy(), Reaction(decision["reaction"]),

@@ -21,7 +21,7 @@ _MONITOR = int(SchemeState.MONITOR)
 
 
 class PlayedRecord(NamedTuple):
-    """What n samples have come to: state (n,) by `SchemeState`, bits of `Observation` (n,), y and h (n, channels, 2).
+    """What n samples have come to: state (n,), observation (n,), y and h (n, channels, 2).
 
     theta (n, p): the model in use. numbers: what the kernel worked on, as the last sample left it.
     """
@@ -82,10 +82,11 @@ def step_record(
             certified_kernel.begin_adaptation(constants, memory, is_payload, k == payload_at)
             now = _ADAPT
         begins_in -= 1
-        block[0]["q"][:] = q[k]
-        block[0]["dq"][:] = dq[k]
-        block[0]["tau_J"][:] = tau_J[k]
-        block[0]["period_s"][0] = 0.0
+        out = block[0]
+        out.q[:] = q[k]
+        out.dq[:] = dq[k]
+        out.tau_J[:] = tau_J[k]
+        out.period_s = 0.0
         mode = certified_kernel.WATCH
         if begins_in < 0 and now == _ADAPT:
             mode |= certified_kernel.LEARN

@@ -196,12 +196,12 @@ def watch(
     delays: list[float] = []
     touches: int | None = None
     for stretch, detection in zip(recording.stretches, detections, strict=True):
-        samples = np.array([contact.sample for contact in detection.contacts], np.int64)
+        samples = np.array([sample for sample, _, _ in detection.contacts], np.int64)
         about = _owners(stretch, samples, recording, settings)
-        for contact, place in zip(detection.contacts, about.tolist(), strict=True):
+        for (sample, link, direction), place in zip(detection.contacts, about.tolist(), strict=True):
             is_true = None if stretch.is_touched is None else place >= 0
-            start_s = stretch.start_s + contact.sample * recording.period_s
-            spells.append(Spell(start_s, contact.link + 1, contact.direction, is_true))
+            start_s = stretch.start_s + sample * recording.period_s
+            spells.append(Spell(start_s, link + 1, direction, is_true))
         if stretch.is_touched is not None:
             touches = (touches or 0) + len(stretch.touches)
             places, firsts = np.unique(about, return_index=True)

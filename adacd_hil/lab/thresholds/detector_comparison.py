@@ -164,7 +164,7 @@ def _ratios(
         z = statistics.z[start : start + before + after].copy()
         z[before:] += torque_Nm * step_shape(after, phase_s, period_s)[:, None]
         held_Nm = statistics.held_Nm[start : start + before + after]
-        shown = detectors.DetectorBank(statistics.settings, statistics.weights, period_s).take(z, held_Nm)
+        shown = detectors.DetectorBank(statistics.settings, statistics.weights, period_s).take_stream(z, held_Nm)
         for place, (name, calibrated) in enumerate(found.items()):
             rows = list(statistics.settings.detectors[name])
             over = (shown[before:, rows] / calibrated.thresholds).max(axis=1)

@@ -126,10 +126,10 @@ def _peaks(
             z, held_Nm = (np.concatenate(pair) for pair in zip(rest, new, strict=True))
             end = place + len(z) // block
             whole = (end - place) * block
-            peaks[place:end] = bank.take(z[:whole], held_Nm[:whole], block)
+            peaks[place:end] = bank.take_stream(z[:whole], held_Nm[:whole], block)
             rest, place = (z[whole:], held_Nm[whole:]), end
             milestones.reach(place * block)
-    peaks[place:] = bank.take(*rest, block)
+    peaks[place:] = bank.take_stream(*rest, block)
     peaks[~np.logical_and.reduceat(free, np.arange(0, len(free), block))] = np.nan
     return peaks
 

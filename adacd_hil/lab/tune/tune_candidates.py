@@ -241,7 +241,7 @@ def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:
             first = max(window.first - before, 0)
             rows = slice(first - begin, window.last + 1 - begin)
             bank = detectors.DetectorBank(statistics.settings, statistics.weights, log.motion.period_s)
-            shown = bank.take(held[0][rows], held[1][rows])
+            shown = bank.take_stream(held[0][rows], held[1][rows])
             since_s = (log.t_ns[window.first : window.last + 1] - log.t_ns[window.first]) * 1e-9
             yield Touched(since_s, shown[window.first - first :], window.is_chosen_on)
         waiting = [window for window in waiting if window.last >= end]

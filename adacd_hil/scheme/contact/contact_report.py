@@ -19,12 +19,12 @@ A hand that grasps a moving arm stops it and then guides it; the kind follows fr
 has stopped. A clamped body is a hit if it springs back, a push if it stays under load: transient and quasi-static
 contact of ISO/TS 15066.
 
-**The paper's scheme** (`IntegratedContact`). Link 2 if joint 2 is over its threshold at any time until the isolation
+**The paper's scheme** (`integrated_report`). Link 2 if joint 2 is over its threshold at any time until the isolation
 window ends, else link 1. At the alarm the answer is often too early: joint 1 has the longer arm and crosses first. The
 report is given at once and becomes final when the window ends.
 """
 
-from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 
@@ -36,8 +36,6 @@ from adacd_hil.scheme.detect.external_torque import ONSET_FRACTION
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import KIND_S
 
-LINK_S = 0.01
-"""Time from detection until the link is decided."""
 BEFORE_S = 0.08
 """How far before its detection the beginning of a contact is sought; a push of 0.2 Nm/s crosses 0.02 Nm in it."""
 CERTAIN = 4.0
@@ -103,134 +101,94 @@ def _peak(tau: Vector, sigma: float) -> float:
     return float(np.sign(best) * max(abs(best) - bias, 0.0))
 
 
-class ContactEvidence(ABC):
-    """A scheme's data on a contact that it reports; values that the scheme doesn't estimate stay empty."""
-
-    due_cycles: tuple[int, ...]
-    """Cycles from detection to each report: the first report at once, the final one last."""
-
-    def compile(self) -> None:
-        """Run each compiled function once, so that it is compiled."""
-
-    @abstractmethod
-    def report(self, detected: int, elapsed: int, direction: tuple[int, int], is_final: bool) -> ContactReport:
-        """Report a contact. detected: cycle of its detection; elapsed: cycles since then."""
-
-
-def report_of(evidence: ContactEvidence, m: CourseMemory, cycle: int) -> ContactReport:
-    """Return the report that is due in this cycle, and record its link in the contact's course."""
-    direction = int(m.direction[0]), int(m.direction[1])
-    detected = int(m.detected_cycle)
-    report = evidence.report(detected, cycle - detected, direction, not m.is_open)
-    m.link = report.link
-    return report._replace(
-        level=ContactLevel(m.level), reaction=Reaction(m.reaction), is_two_sided=bool(m.is_two_sided)
+def _report(m: CourseMemory, link: int, direction: tuple[int, int], **evidence: Any) -> ContactReport:
+    """Return a report of the contact's course with a scheme's evidence, and record its link in the course."""
+    m.link = link
+    return ContactReport(
+        cycle=int(m.detected_cycle),
+        link=link,
+        direction=direction,
+        is_final=not m.is_open,
+        level=ContactLevel(m.level),
+        reaction=Reaction(m.reaction),
+        is_two_sided=bool(m.is_two_sided),
+        **evidence,
     )
 
 
-class IntegratedContact(ContactEvidence):
-    """The paper's evidence: its kernel's integrals since the contact began, at detection and when the window ends.
+def integrated_report(m: CourseMemory, y: Vector, integral: Vector, peak: Vector, a_rad_s: float) -> ContactReport:
+    """Report a contact of the paper's scheme; its impulse is y / a + integral of y.
 
-    tau_ext_hat, integral, peak: of the kernel (2,), views.
+    y, integral, peak (2,): filtered external torque, its integral and its peak since the contact began.
     """
-
-    def __init__(self, settings: Settings, tau_ext_hat: Vector, integral: Vector, peak: Vector) -> None:
-        self.due_cycles = (0, round(settings.detector.isolation_window_s / settings.bus.period_s))
-        self._tau_ext = tau_ext_hat
-        self._integral, self._peak = integral, peak
-        self._a_rad_s = settings.filter.a_rad_s
-
-    def report(
-        self,
-        detected: int,
-        elapsed: int,  # noqa: ARG002
-        direction: tuple[int, int],
-        is_final: bool,
-    ) -> ContactReport:
-        """Report the contact; its impulse is y / a + integral of y."""
-        return ContactReport(
-            cycle=detected,
-            link=2 if direction[1] else 1,
-            direction=direction,
-            tau_ext_peak=_pair(self._peak),
-            impulse=_pair(self._integral + self._tau_ext / self._a_rad_s),
-            is_final=is_final,
-        )
+    direction = int(m.direction[0]), int(m.direction[1])
+    link = 2 if direction[1] else 1
+    return _report(m, link, direction, tau_ext_peak=_pair(peak), impulse=_pair(integral + y / a_rad_s))
 
 
-class RecalledContact(ContactEvidence):
-    """The certified scheme's evidence: the last samples, at detection, and when the link and the kind are decided."""
+def new_rows(settings: Settings) -> Vector:
+    """Return the memory of the last cycles, empty, for `recalled_report`."""
+    period_s = settings.bus.period_s
+    return np.zeros((2 * (round(BEFORE_S / period_s) + 2 * round(KIND_S / period_s)), _COLUMNS))
 
-    def __init__(self, settings: Settings, m: CourseMemory) -> None:
-        period_s = settings.bus.period_s
-        window_cycles = round(KIND_S / period_s)
-        self.due_cycles = (0, round(LINK_S / period_s), window_cycles)
-        self._m = m
-        self._period_s = period_s
-        self._length_m = settings.arm.link_length_m
-        self._before_cycles = round(BEFORE_S / period_s)
-        self.rows = np.zeros((2 * (self._before_cycles + 2 * window_cycles), _COLUMNS))
-        self._since = 0
 
-    def compile(self) -> None:
-        """Run each compiled function, for one row and for several: numpy takes one row's columns as contiguous."""
-        every = np.ones((8, _COLUMNS))
-        for count in (1, 2):
-            rows = last_rows(every, count, count)
-            tau, sigma = rows[:, TAU], rows[-1, SIGMA]
-            localisation.on_link2(tau, rows[:, Q2], sigma, self._length_m)
-            classify(tau, sigma, self._period_s)
-            _peak(tau[:, 0], sigma[0])
+def compile_recalled(settings: Settings) -> None:
+    """Run each compiled function of `recalled_report`, for one row and for several.
 
-    def _begin(self) -> None:
-        """Find how many cycles ago the contact detected in this cycle began."""
-        rows = last_rows(self.rows, int(self._m.kept_rows), self._before_cycles)
-        below = np.all(np.abs(rows[:, TAU]) <= np.maximum(ONSET_FRACTION * rows[:, THRESHOLD], rows[:, SIGMA]), axis=1)
-        self._since = rows.shape[0] - int(np.flatnonzero(below)[-1]) - 1 if np.any(below) else rows.shape[0]
+    numpy takes one row's columns as contiguous.
+    """
+    every = np.ones((8, _COLUMNS))
+    for count in (1, 2):
+        rows = last_rows(every, count, count)
+        tau, sigma = rows[:, TAU], rows[-1, SIGMA]
+        localisation.on_link2(tau, rows[:, Q2], sigma, settings.arm.link_length_m)
+        classify(tau, sigma, settings.bus.period_s)
+        _peak(tau[:, 0], sigma[0])
 
-    def report(self, detected: int, elapsed: int, direction: tuple[int, int], is_final: bool) -> ContactReport:
-        """Report the contact from the samples since it began."""
-        if elapsed == 0:
-            self._begin()
-        rows = last_rows(self.rows, int(self._m.kept_rows), max(elapsed + self._since, 1))
-        tau, sigma, threshold = rows[:, TAU], rows[-1, SIGMA], rows[-1, THRESHOLD]
-        peaks = np.array([_peak(tau[:, i], sigma[i]) for i in range(JOINTS)])
-        impulse = self._period_s * np.sum(tau, axis=0)
-        peak_sigma = np.hypot(sigma, PEAK_SHARE * peaks)
-        noise = self._period_s * sigma * np.sqrt(CORRELATED_SAMPLES * rows.shape[0])
-        impulse_sigma = np.hypot(noise, IMPULSE_SHARE * impulse)
-        link = self._link(rows)
-        if link == 2:
-            place = localisation.on_link2(tau, rows[:, Q2], sigma, self._length_m)
-            blind = localisation.blind_angle(place.force_N, place.lever_m, float(threshold[1]))
-        else:
-            place = localisation.on_link1(float(peaks[0]), float(sigma[0]), self._length_m[0])
-            blind = localisation.blind_angle_of_link1(
-                float(peaks[0]), float(rows[-1, Q2]), self._length_m, float(threshold[1])
-            )
-        return ContactReport(
-            cycle=detected,
-            link=link,
-            direction=(direction[0], direction[1] if link == 2 else 0),
-            tau_ext_peak=_pair(peaks),
-            impulse=_pair(impulse),
-            is_final=is_final,
-            kind=classify(tau, sigma, self._period_s) if is_final else ContactKind.UNKNOWN,
-            location=place.location,
-            tau_ext_peak_sigma=_pair(peak_sigma),
-            impulse_sigma=_pair(impulse_sigma),
-            force_N=place.force_N,
-            force_sigma=place.force_sigma,
-            lever_m=place.lever_m,
-            lever_sigma=place.lever_sigma,
-            blind_rad=blind,
-        )
 
-    def _link(self, rows: Vector) -> int:
-        """Return the touched link, 1 or 2, from the torque of joint 2."""
-        mean = np.abs(np.mean(rows[:, TAU], axis=0))
-        sigma = float(rows[-1, SIGMA][1]) * np.sqrt(CORRELATED_SAMPLES / rows.shape[0])
-        return 2 if mean[1] > CERTAIN * sigma + CROSS_SHARE * mean[0] else 1
+def _early_rows(rows: Vector) -> int:
+    """Return how many of the last rows belong to the contact that is detected in this cycle."""
+    below = np.all(np.abs(rows[:, TAU]) <= np.maximum(ONSET_FRACTION * rows[:, THRESHOLD], rows[:, SIGMA]), axis=1)
+    return len(rows) - int(np.flatnonzero(below)[-1]) - 1 if np.any(below) else len(rows)
+
+
+def recalled_report(settings: Settings, m: CourseMemory, every_row: Vector, cycle: int) -> ContactReport:
+    """Report a contact of the certified scheme in this cycle, from the samples since it began."""
+    period_s, length_m = settings.bus.period_s, settings.arm.link_length_m
+    elapsed, kept = cycle - int(m.detected_cycle), int(m.kept_rows)
+    if elapsed == 0:
+        m.early_rows = _early_rows(last_rows(every_row, kept, round(BEFORE_S / period_s)))
+    rows = last_rows(every_row, kept, max(elapsed + int(m.early_rows), 1))
+    tau, sigma, threshold = rows[:, TAU], rows[-1, SIGMA], rows[-1, THRESHOLD]
+    peaks = np.array([_peak(tau[:, i], sigma[i]) for i in range(JOINTS)])
+    impulse = period_s * np.sum(tau, axis=0)
+    noise = period_s * sigma * np.sqrt(CORRELATED_SAMPLES * rows.shape[0])
+    link = _link(rows)
+    if link == 2:
+        place = localisation.on_link2(tau, rows[:, Q2], sigma, length_m)
+        blind = localisation.blind_angle(place.force_N, place.lever_m, float(threshold[1]))
+    else:
+        place = localisation.on_link1(float(peaks[0]), float(sigma[0]), length_m[0])
+        blind = localisation.blind_angle_of_link1(float(peaks[0]), float(rows[-1, Q2]), length_m, float(threshold[1]))
+    return _report(
+        m,
+        link,
+        (int(m.direction[0]), int(m.direction[1]) if link == 2 else 0),
+        tau_ext_peak=_pair(peaks),
+        impulse=_pair(impulse),
+        kind=ContactKind.UNKNOWN if m.is_open else classify(tau, sigma, period_s),
+        tau_ext_peak_sigma=_pair(np.hypot(sigma, PEAK_SHARE * peaks)),
+        impulse_sigma=_pair(np.hypot(noise, IMPULSE_SHARE * impulse)),
+        blind_rad=blind,
+        **place._asdict(),
+    )
+
+
+def _link(rows: Vector) -> int:
+    """Return the touched link, 1 or 2, from the torque of joint 2."""
+    mean = np.abs(np.mean(rows[:, TAU], axis=0))
+    sigma = float(rows[-1, SIGMA][1]) * np.sqrt(CORRELATED_SAMPLES / rows.shape[0])
+    return 2 if mean[1] > CERTAIN * sigma + CROSS_SHARE * mean[0] else 1
 
 
 def _pair(values: Vector) -> tuple[float, float]:

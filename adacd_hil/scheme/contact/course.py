@@ -22,12 +22,15 @@ from adacd_hil.records import JOINTS, ContactLevel, Reaction, SchemeState, Vecto
 from adacd_hil.scheme.supervisor.supervisor import IS_REACTING, SupervisorMemory
 from adacd_hil.scheme.supervisor.transitions import COLLISION, CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.scheme_settings import KIND_S
 from adacd_hil.structured import PerJoint
 
 TURNED_CYCLES = 5
 """How many samples in a row the torque must be turned: the trace of a blow in the estimate is shorter."""
 BLIND_S = 0.02
 """Time after the start of a withdrawal during which it is not judged: the estimate still rings from the blow."""
+LINK_S = 0.01
+"""Time from detection until the link is decided."""
 _NEVER = 1 << 60
 _CONTACT, _COLLISION = (int(level) for level in ContactLevel)
 """As plain numbers, which compiled code can compare with others."""
@@ -53,7 +56,8 @@ class CourseMemory:
 
     link: touched link, 0 for none. is_open: a report has been made that is not final yet. level: the highest of this
     contact. cause_link: link for which the reaction was chosen. kept_rows: rows written so far in the history for
-    reports. way: direction of a withdrawal, a unit vector; zeros without one.
+    reports. early_rows: those of the contact before its detection. way: direction of a withdrawal, a unit vector; zeros
+    without one.
     """
 
     is_reacting: int
@@ -69,19 +73,23 @@ class CourseMemory:
     cycles: int
     turned_cycles: int
     kept_rows: int
+    early_rows: int
     way: PerJoint
 
 
-def fill_constants(settings: Settings, due_cycles: tuple[int, ...], k: CourseConstants) -> None:
+def fill_constants(settings: Settings, k: CourseConstants) -> None:
     """Fill the constants for the scheme of the settings."""
     wish, is_paper = settings.reaction, settings.scheme == "paper"
+    window_s = settings.detector.isolation_window_s
     chosen = (("withdraw",) * JOINTS,) * len(ContactLevel) if is_paper else (wish.contact, wish.collision)
     k.reactions[:] = [[Reaction[name.upper()] for name in names] for names in chosen]
     k.two_sided = Reaction[wish.two_sided.upper()]
     k.is_kept = is_paper
     k.blind_cycles = _NEVER if is_paper else round(BLIND_S / settings.bus.period_s)
-    k.due_cycles[:] = due_cycles[-1]
-    k.due_cycles[: len(due_cycles)] = due_cycles
+    k.due_cycles[:] = [
+        round(due_s / settings.bus.period_s)
+        for due_s in ((0.0, window_s, window_s) if is_paper else (0.0, LINK_S, KIND_S))
+    ]
     k.collision_Nm[:] = settings.detector.collision_Nm
 
 

@@ -60,8 +60,7 @@ def registered(reserved: Collection[str]) -> Mapping[str, Registered]:
             for entry in sorted(importlib.metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
                 _load(entry, reserved)
         except DetectorError:
-            _LOADED.clear()
-            _remove_loaded()
+            forget_loaded()
             raise
     return _REGISTERED
 
@@ -74,8 +73,9 @@ def _load(entry: importlib.metadata.EntryPoint, reserved: Collection[str]) -> No
         raise DetectorError(f"detector {entry.name} of {package} can't be used: {describe_error(error)}") from error
 
 
-def _remove_loaded() -> None:
-    """Remove the detectors of an entry point, so that the next look-up reports the error again."""
+def forget_loaded() -> None:
+    """Remove the detectors of entry points, so that the next look-up loads them again."""
+    _LOADED.clear()
     for name in [name for name, found in _REGISTERED.items() if found.origin]:
         del _REGISTERED[name]
 

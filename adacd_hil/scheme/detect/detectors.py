@@ -316,7 +316,7 @@ class DetectorBank:
         self._channels = len(settings.channels)
         self._registered = [found.make(period_s) for found in settings.registered.values()]
 
-    def take(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
+    def take_stream(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
         """Process N samples (N, n); return the largest statistic of each block, (ceil(N / block_samples), channels, n).
 
         One sample per block keeps everything; a stream goes on at a block's end.

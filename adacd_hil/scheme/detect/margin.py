@@ -78,7 +78,7 @@ class MarginWatch:
         self.reference: Vector | None = None
         """Margin per joint (n,) when the watch had settled; None until then."""
 
-    def add(self, ratio: Vector) -> None:
+    def add_block(self, ratio: Vector) -> None:
         """Add the largest ratio of each joint (n,) in one contact-free block; a value that isn't finite is ignored."""
         if not np.isfinite(ratio).all():
             return
@@ -89,7 +89,7 @@ class MarginWatch:
         if self._blocks == self._settled:
             self.reference = self.margin
 
-    def restart(self) -> None:
+    def forget(self) -> None:
         """Forget everything: the model or the thresholds have changed."""
         self._blocks = 0
         self.reference = None
@@ -159,6 +159,7 @@ def discard_tail(m: Memory) -> None:
 @compiled
 def follow_tail(k: Constants, m: Memory) -> None:
     """Process one sample without contact."""
+    own = m.margin
     filters = m.filters.r.shape[0]
     for c in range(m.filters.y.shape[0]):
         still = m.sensitivity.still_smooth[c] if c < filters else m.sensitivity.still[filter_bank.filter_of(c, filters)]
@@ -166,23 +167,23 @@ def follow_tail(k: Constants, m: Memory) -> None:
             if still[i] < sensitivity.MOVING:
                 seen = min(abs(m.filters.y[c, i]), m.sensitivity.h_model[c, i])
                 sign = 0 if m.filters.y[c, i] < 0.0 else 1
-                m.margin.peak_now[sign, c, i] = max(m.margin.peak_now[sign, c, i], seen)
-    m.margin.block_used += 1.0
-    if m.margin.block_used < k.margin.block_cycles:
+                own.peak_now[sign, c, i] = max(own.peak_now[sign, c, i], seen)
+    own.block_used += 1.0
+    if own.block_used < k.margin.block_cycles:
         return
-    block_s = m.margin.block_used * k.period_s
-    m.margin.block_used = 0.0
-    if np.max(m.margin.peak_last) > 0.0:
-        m.margin.tail_s += block_s
+    block_s = own.block_used * k.period_s
+    own.block_used = 0.0
+    if np.max(own.peak_last) > 0.0:
+        own.tail_s += block_s
     for c in range(m.filters.y.shape[0]):
-        factor = _factor(k.margin.excursions_Hz[c], 0.5 * m.margin.tail_s)
+        factor = tail_factor(k.margin.excursions_Hz[c], 0.5 * own.tail_s)
         for i in range(m.filters.y.shape[1]):
             for sign in range(2):
-                kept = m.margin.peak[sign, c, i] * (1.0 - block_s / FORGOTTEN_S)
-                m.margin.peak[sign, c, i] = max(kept, m.margin.peak_last[sign, c, i])
-                m.margin.peak_last[sign, c, i] = m.margin.peak_now[sign, c, i]
-                m.margin.peak_now[sign, c, i] = 0.0
-            m.margin.tail_Nm[c, i] = factor * min(m.margin.peak[0, c, i], m.margin.peak[1, c, i])
+                kept = own.peak[sign, c, i] * (1.0 - block_s / FORGOTTEN_S)
+                own.peak[sign, c, i] = max(kept, own.peak_last[sign, c, i])
+                own.peak_last[sign, c, i] = own.peak_now[sign, c, i]
+                own.peak_now[sign, c, i] = 0.0
+            own.tail_Nm[c, i] = factor * min(own.peak[0, c, i], own.peak[1, c, i])
 
 
 def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> float:
@@ -204,7 +205,7 @@ def largest_share(m: Memory) -> float:
 
 
 @compiled
-def _factor(excursions_Hz: float, seen_s: float) -> float:
+def tail_factor(excursions_Hz: float, seen_s: float) -> float:
     """Return m(T)."""
     share = math.log(excursions_Hz / RATE_HZ) / math.log(max(excursions_Hz * max(seen_s, 1.0), 1.01))
     return float(min(np.sqrt(max(share, 1.0)), LARGEST))
@@ -214,7 +215,7 @@ WITHIN_S = 0.1
 """The slowest filter is at 0.63 of a step by then, without its smoothing."""
 LESS = 2.0
 """How many times the certificate's smallest push is allowed without a warning."""
-STRAIN_SAID, ROUGH_SAID = 1.5, 4.0
+STRAIN_NAMED, ROUGH_NAMED = 1.5, 4.0
 """From these values on, strain, and the square of the velocity's noise, are named as causes of a raised threshold."""
 LOWEST_NM, WIDTH, BINS = 1e-3, 0.02, 512
 """Thresholds are counted in bins that are 2 % wide, from 1 mNm to 28 Nm."""
@@ -239,44 +240,45 @@ def smallest_push(y: Vector, h: Vector, shown: Vector, joint: int) -> float:
 @compiled
 def begin_sight(m: Memory) -> None:
     """Begin a test: empty the counts of thresholds and the worst values."""
-    m.margin.seen[:] = 0.0
-    m.margin.seen_worst_Nm[:] = 0.0
-    m.margin.seen_push_Nm[:] = 0.0
-    m.margin.sum_push_Nm[:] = 0.0
-    m.margin.sum_cycles[:] = 0.0
-    m.margin.dim_s[:] = 0.0
+    own = m.margin
+    own.seen[:] = 0.0
+    own.seen_worst_Nm[:] = 0.0
+    own.seen_push_Nm[:] = 0.0
+    own.sum_push_Nm[:] = 0.0
+    own.sum_cycles[:] = 0.0
+    own.dim_s[:] = 0.0
 
 
 @compiled
 def follow_test(k: Constants, m: Memory) -> None:
     """Process one sample of a test, without contact."""
-    for i in range(m.margin.dim_s.shape[0]):
+    own = m.margin
+    for i in range(own.dim_s.shape[0]):
         h = m.sensitivity.wide_threshold[i]
         place = int(math.log(max(h / LOWEST_NM, 1.0)) / WIDTH)
-        m.margin.seen[min(place, BINS - 1), i] += 1.0
-        m.margin.seen_worst_Nm[i] = max(m.margin.seen_worst_Nm[i], h)
-        m.margin.seen_push_Nm[i] = max(
-            m.margin.seen_push_Nm[i], smallest_push(m.filters.y, m.sensitivity.h, k.margin.shown, i)
-        )
+        own.seen[min(place, BINS - 1), i] += 1.0
+        own.seen_worst_Nm[i] = max(own.seen_worst_Nm[i], h)
+        own.seen_push_Nm[i] = max(own.seen_push_Nm[i], smallest_push(m.filters.y, m.sensitivity.h, k.margin.shown, i))
 
 
 @compiled
 def follow_sight(k: Constants, m: Memory) -> bool:
     """Process one sample of monitoring, without contact; return whether a joint has been blind for too long."""
+    own = m.margin
     is_blind = False
-    for i in range(m.margin.dim_s.shape[0]):
+    for i in range(own.dim_s.shape[0]):
         if m.sensitivity.still[filter_bank.LEARNT, i] >= MOVING:
             continue
-        m.margin.sum_push_Nm[i] += smallest_push(m.filters.y, m.sensitivity.h, k.margin.shown, i)
-        m.margin.sum_cycles[i] += 1.0
-        if m.margin.sum_cycles[i] < k.margin.mean_cycles:
+        own.sum_push_Nm[i] += smallest_push(m.filters.y, m.sensitivity.h, k.margin.shown, i)
+        own.sum_cycles[i] += 1.0
+        if own.sum_cycles[i] < k.margin.mean_cycles:
             continue
-        m.margin.mean_push_Nm[i] = m.margin.sum_push_Nm[i] / m.margin.sum_cycles[i]
-        is_dim = not m.margin.mean_push_Nm[i] <= LESS * m.margin.seen_push_Nm[i]
-        m.margin.dim_s[i] = m.margin.dim_s[i] + MEAN_S if is_dim else 0.0
-        m.margin.sum_push_Nm[i] = 0.0
-        m.margin.sum_cycles[i] = 0.0
-        is_blind = is_blind or m.margin.dim_s[i] >= BLIND_S
+        own.mean_push_Nm[i] = own.sum_push_Nm[i] / own.sum_cycles[i]
+        is_dim = not own.mean_push_Nm[i] <= LESS * own.seen_push_Nm[i]
+        own.dim_s[i] = own.dim_s[i] + MEAN_S if is_dim else 0.0
+        own.sum_push_Nm[i] = 0.0
+        own.sum_cycles[i] = 0.0
+        is_blind = is_blind or own.dim_s[i] >= BLIND_S
     return is_blind
 
 
@@ -300,12 +302,13 @@ def describe_push(m: Memory) -> str:
 
 def describe_dim(m: Memory) -> list[str]:
     """Return the joints with less sight than in the test, and since when, a line each."""
+    own = m.margin
     return [
-        f"joint {i + 1} sees less than was certified: for {m.margin.dim_s[i]:g} s of motion it has found pushes from "
-        f"{m.margin.mean_push_Nm[i]:.2f} Nm on within {1e3 * WITHIN_S:g} ms, in the test from "
-        f"{m.margin.seen_push_Nm[i]:.2f} Nm on at worst; {_why_dim(m, i)}"
+        f"joint {i + 1} sees less than was certified: for {own.dim_s[i]:g} s of motion it has found pushes from "
+        f"{own.mean_push_Nm[i]:.2f} Nm on within {1e3 * WITHIN_S:g} ms, in the test from "
+        f"{own.seen_push_Nm[i]:.2f} Nm on at worst; {_why_dim(m, i)}"
         for i in range(JOINTS)
-        if m.margin.dim_s[i] > 0.0
+        if own.dim_s[i] > 0.0
     ]
 
 
@@ -313,9 +316,9 @@ def _why_dim(m: Memory, joint: int) -> str:
     """Return the main cause of a joint's raised thresholds as text."""
     if np.any(m.margin.tail_Nm[:, joint] > m.sensitivity.h_model[:, joint]):
         return "residuals of both signs have come near the thresholds: the arm moves otherwise than its model"
-    if m.sensitivity.strain[joint] > STRAIN_SAID:
+    if m.sensitivity.strain[joint] > STRAIN_NAMED:
         return f"contacts right after going on have raised its thresholds {m.sensitivity.strain[joint]:.1f} times"
-    if m.sensitivity.velocity_roughness[joint] > ROUGH_SAID:
+    if m.sensitivity.velocity_roughness[joint] > ROUGH_NAMED:
         return (
             f"its velocity has {math.sqrt(m.sensitivity.velocity_roughness[joint]):.1f} times the noise of the settings"
         )

@@ -110,43 +110,36 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> NoiseConst
 
 
 @compiled
-def follow_standstill(
-    dq: Vector,
-    before: Vector,
-    still_rad_s: float,
-    decay: Vector,
-    smoothing: float,
-    still: Vector,
-    still_smooth: Vector,
-    low_speed: Vector,
-) -> None:
+def follow_standstill(k: Constants, m: Memory, dq: Vector) -> None:
     """Filter with DC gain 1, into `still` (C, n) from 0 to 1, each joint's indicator of possible standstill; smooth it.
 
     `low_speed` (C, n): the same for a joint that moves slowly or not at all, not smoothed.
 
-    before (n,): dq one sample ago. A joint that turns round between two samples has stood still, and by its lag
+    A joint that turns round between two samples has stood still, and by its lag
     friction may turn a sample or two before the measured velocity does.
     """
-    for c in range(still.shape[0]):
+    own = m.sensitivity
+    for c in range(own.still.shape[0]):
         for i in range(dq.shape[0]):
-            has_turned = dq[i] * before[i] < 0.0
-            target = 1.0 if abs(dq[i]) < still_rad_s or has_turned else 0.0
-            still[c, i] = target + decay[c] * (still[c, i] - target)
-            still_smooth[c, i] = still[c, i] + smoothing * (still_smooth[c, i] - still[c, i])
+            has_turned = dq[i] * own.dq_old[i] < 0.0
+            target = 1.0 if abs(dq[i]) < k.still_rad_s or has_turned else 0.0
+            own.still[c, i] = target + k.decay[c] * (own.still[c, i] - target)
+            own.still_smooth[c, i] = own.still[c, i] + k.smoothing * (own.still_smooth[c, i] - own.still[c, i])
             target = 1.0 if abs(dq[i]) < LOW_SPEED_RAD_S or has_turned else 0.0
-            low_speed[c, i] = target + decay[c] * (low_speed[c, i] - target)
+            own.low_speed[c, i] = target + k.decay[c] * (own.low_speed[c, i] - target)
 
 
 @compiled
 def measure_noise(k: Constants, m: Memory, tau_J: Vector) -> None:
     """Add one sample at rest to `roughness` (n,): variance of the torque over that of the settings, at least 1."""
-    m.sensitivity.rest_samples += 1.0
+    own = m.sensitivity
+    own.rest_samples += 1.0
     for i in range(tau_J.shape[0]):
-        if m.sensitivity.rest_samples > 1.0:
-            m.sensitivity.rest_square[i] += 0.5 * (tau_J[i] - m.sensitivity.rest_tau[i]) ** 2
-            variance = m.sensitivity.rest_square[i] / (m.sensitivity.rest_samples - 1.0)
-            m.sensitivity.roughness[i] = max(variance / max(k.torque_noise_Nm**2, 1e-12), 1.0)
-        m.sensitivity.rest_tau[i] = tau_J[i]
+        if own.rest_samples > 1.0:
+            own.rest_square[i] += 0.5 * (tau_J[i] - own.rest_tau[i]) ** 2
+            variance = own.rest_square[i] / (own.rest_samples - 1.0)
+            own.roughness[i] = max(variance / max(k.torque_noise_Nm**2, 1e-12), 1.0)
+        own.rest_tau[i] = tau_J[i]
 
 
 @compiled
@@ -156,19 +149,18 @@ def follow_torque_step(k: Constants, m: Memory, tau_J: Vector) -> None:
     A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most. Until
     enough changes were seen L is 0: the first ones may be a push.
     """
+    own = m.sensitivity
     for i in range(tau_J.shape[0]):
         change = abs(tau_J[i] - m.gaps.last[2, i])  # nan for the first sample
         if not change > 0.0:
             continue
-        m.sensitivity.torque_changes[i] += 1.0
-        m.sensitivity.torque_change_Nm[i] = (
-            change if m.sensitivity.torque_changes[i] == 1.0 else min(change, m.sensitivity.torque_change_Nm[i])
-        )
-        step_Nm = min(m.sensitivity.torque_change_Nm[i], LARGEST_STEP_NM)
-        if m.sensitivity.torque_changes[i] >= CHANGES and step_Nm != m.sensitivity.torque_step_Nm[i]:
-            m.sensitivity.torque_step_Nm[i] = step_Nm
-            variance = k.torque_noise_Nm**2 * m.sensitivity.roughness[i]
-            m.sensitivity.torque_pull_Nm[i] = PULL * step_Nm / np.pi * math.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
+        own.torque_changes[i] += 1.0
+        own.torque_change_Nm[i] = change if own.torque_changes[i] == 1.0 else min(change, own.torque_change_Nm[i])
+        step_Nm = min(own.torque_change_Nm[i], LARGEST_STEP_NM)
+        if own.torque_changes[i] >= CHANGES and step_Nm != own.torque_step_Nm[i]:
+            own.torque_step_Nm[i] = step_Nm
+            variance = k.torque_noise_Nm**2 * own.roughness[i]
+            own.torque_pull_Nm[i] = PULL * step_Nm / np.pi * math.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
 
 
 @compiled
@@ -181,20 +173,21 @@ def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) 
 
     The roughness decays soon, except for the part that `keep_velocity_noise` keeps.
     """
+    own = m.sensitivity
     floor = (SECOND_DIFFERENCE * k.noise.velocity_noise_rad_s) ** 2
     for i in range(dq.shape[0]):
-        ddq = dq[i] - m.sensitivity.dq_old[i]
+        ddq = dq[i] - own.dq_old[i]
         if is_steady and floor > 0.0:
-            square = (ddq - m.sensitivity.ddq_old[i]) ** 2 / floor
-            square = min(square, JUMP**2 * m.sensitivity.roughness_now[i])
+            square = (ddq - own.ddq_old[i]) ** 2 / floor
+            square = min(square, JUMP**2 * own.roughness_now[i])
             now = max(
-                m.sensitivity.roughness_now[i] + k.noise.roughness_share * (square - m.sensitivity.roughness_now[i]),
+                own.roughness_now[i] + k.noise.roughness_share * (square - own.roughness_now[i]),
                 1.0,
             )
-            m.sensitivity.roughness_now[i] = now
-            m.sensitivity.velocity_roughness[i] = max(now, m.sensitivity.roughness_kept[i])
-        m.sensitivity.ddq_old[i] = ddq
-        m.sensitivity.dq_old[i] = dq[i]
+            own.roughness_now[i] = now
+            own.velocity_roughness[i] = max(now, own.roughness_kept[i])
+        own.ddq_old[i] = ddq
+        own.dq_old[i] = dq[i]
 
 
 @compiled
@@ -203,11 +196,12 @@ def keep_velocity_noise(k: Constants, m: Memory) -> None:
 
     At rest an encoder without counts shows no noise, but shows it again with the first count.
     """
-    for i in range(m.sensitivity.roughness_kept.shape[0]):
-        now, kept = m.sensitivity.roughness_now[i], m.sensitivity.roughness_kept[i]
-        if abs(m.sensitivity.dq_old[i]) > regressor.SLOW_RAD_S:
+    own = m.sensitivity
+    for i in range(own.roughness_kept.shape[0]):
+        now, kept = own.roughness_now[i], own.roughness_kept[i]
+        if abs(own.dq_old[i]) > regressor.SLOW_RAD_S:
             kept -= k.noise.roughness_loss * (kept - now)
-        m.sensitivity.roughness_kept[i] = max(kept, now)
+        own.roughness_kept[i] = max(kept, now)
 
 
 @compiled
@@ -217,10 +211,11 @@ def strain(m: Memory, largest: float) -> None:
     A contact while learning may be the model's failure. One contact may be a hand; repeated ones come from an error
     that no parameter explains, such as backlash. Then the arm is armed with higher thresholds rather than never.
     """
-    for i in range(m.sensitivity.strain.shape[0]):
+    own = m.sensitivity
+    for i in range(own.strain.shape[0]):
         for c in range(m.filters.y.shape[0]):
-            if not (abs(m.filters.y[c, i]) <= m.sensitivity.h[c, i]):
-                m.sensitivity.strain[i] = min(STRAIN * m.sensitivity.strain[i], max(largest, m.sensitivity.strain[i]))
+            if not (abs(m.filters.y[c, i]) <= own.h[c, i]):
+                own.strain[i] = min(STRAIN * own.strain[i], max(largest, own.strain[i]))
                 break
 
 
@@ -230,14 +225,15 @@ def relax(k: Constants, m: Memory) -> None:
 
     It decays while the residual is well below its threshold.
     """
-    for i in range(m.sensitivity.strain.shape[0]):
+    own = m.sensitivity
+    for i in range(own.strain.shape[0]):
         share = 0.0
         for c in range(m.filters.y.shape[0]):
-            share = max(share, abs(m.filters.y[c, i]) / m.sensitivity.h[c, i])
-        m.sensitivity.peak_share[i] = max(m.sensitivity.peak_share[i], share)
-        m.sensitivity.used[i] = max(share, m.sensitivity.used[i] * (1.0 - k.noise.strain_share))
-        if m.sensitivity.used[i] < RELAXED:
-            m.sensitivity.strain[i] = max(m.sensitivity.strain[i] * (1.0 - k.noise.strain_share), 1.0)
+            share = max(share, abs(m.filters.y[c, i]) / own.h[c, i])
+        own.peak_share[i] = max(own.peak_share[i], share)
+        own.used[i] = max(share, own.used[i] * (1.0 - k.noise.strain_share))
+        if own.used[i] < RELAXED:
+            own.strain[i] = max(own.strain[i] * (1.0 - k.noise.strain_share), 1.0)
 
 
 @compiled
@@ -248,24 +244,23 @@ def follow_unit(k: Constants, m: Memory, fit: int, share: float, is_monitored: b
     error. is_monitored: the unit is the smaller one of both signs; else it is that of all residuals, and both signs
     begin with it.
     """
-    for i in range(m.sensitivity.unit.shape[0]):
+    own = m.sensitivity
+    for i in range(own.unit.shape[0]):
         w = m.filters.W_f[fit, i]
-        believed = k.residual_Nm**2 + m.sensitivity.held[fit, i] ** 2
+        believed = k.residual_Nm**2 + own.held[fit, i] ** 2
         for j in range(w.shape[0]):
             believed += w[j] * linalg.dot(m.models.P[j], w)
         if not np.isfinite(believed):
             continue
         square = UNIT_PEAK * m.filters.r[fit, i] ** 2 / believed
         if not is_monitored:
-            m.sensitivity.unit[i] = _approach(m.sensitivity.unit[i], square, share)
-            m.sensitivity.unit_by_sign[:, i] = m.sensitivity.unit[i]
+            own.unit[i] = _approach(own.unit[i], square, share)
+            own.unit_by_sign[:, i] = own.unit[i]
             continue
         for sign in range(2):
             has_sign = m.filters.r[fit, i] > 0.0 if sign else m.filters.r[fit, i] < 0.0
-            m.sensitivity.unit_by_sign[sign, i] = _approach(
-                m.sensitivity.unit_by_sign[sign, i], 2.0 * square if has_sign else 0.0, share
-            )
-        m.sensitivity.unit[i] = np.min(m.sensitivity.unit_by_sign[:, i])
+            own.unit_by_sign[sign, i] = _approach(own.unit_by_sign[sign, i], 2.0 * square if has_sign else 0.0, share)
+        own.unit[i] = np.min(own.unit_by_sign[:, i])
 
 
 @compiled
@@ -278,19 +273,20 @@ def _approach(unit: float, square: float, share: float) -> float:
 @compiled
 def fill_thresholds(k: Constants, m: Memory, h: Vector) -> None:
     """Fill h (2 C - 1, n) from the constants `k` and the state `m` of the kernel."""
+    own = m.sensitivity
     filters = m.filters.r.shape[0]
     for i in range(h.shape[1]):
         momentum = momentum_noise(m, i)
-        hold = m.sensitivity.hold[i]
+        hold = own.hold[i]
         for c in range(filters):
-            g = k.model_sigmas * np.sqrt(_doubt(k, m, m.filters.W_f[c, i], m.sensitivity.unit[i]))
-            m.sensitivity.doubt[c, i] = g + k.smoothing * (m.sensitivity.doubt[c, i] - g)
-            slow = LOW_SPEED_SHARE * m.sensitivity.low_speed[c, i]
-            held = hold * max(m.sensitivity.still_smooth[c, i], slow)
-            h[c, i] = _threshold(k, m, c, i, momentum, m.sensitivity.doubt[c, i]) + held
+            g = k.model_sigmas * np.sqrt(_doubt(k, m, m.filters.W_f[c, i], own.unit[i]))
+            own.doubt[c, i] = g + k.smoothing * (own.doubt[c, i] - g)
+            slow = LOW_SPEED_SHARE * own.low_speed[c, i]
+            held = hold * max(own.still_smooth[c, i], slow)
+            h[c, i] = _threshold(k, m, c, i, momentum, own.doubt[c, i]) + held
             if c > 0:
                 bare = filters + c - 1
-                h[bare, i] = _threshold(k, m, bare, i, momentum, g) + hold * max(m.sensitivity.still[c, i], slow)
+                h[bare, i] = _threshold(k, m, bare, i, momentum, g) + hold * max(own.still[c, i], slow)
 
 
 @compiled
@@ -308,10 +304,11 @@ def follow_friction(k: Constants, m: Memory, tau_J: Vector) -> None:
 
     Friction at rest is not noise that averages out: for a joint that mostly rested it is inf, so that it is not learnt.
     """
-    for i in range(m.sensitivity.hold.shape[0]):
-        m.sensitivity.hold[i] = k.standstill_share * _static_friction(k, m, i, tau_J[i])
-        for c in range(m.sensitivity.held.shape[0]):
-            m.sensitivity.held[c, i] = held_Nm(m, i, m.sensitivity.still[c, i])
+    own = m.sensitivity
+    for i in range(own.hold.shape[0]):
+        own.hold[i] = k.standstill_share * _static_friction(k, m, i, tau_J[i])
+        for c in range(own.held.shape[0]):
+            own.held[c, i] = held_Nm(m, i, own.still[c, i])
 
 
 @compiled
@@ -339,16 +336,12 @@ def _static_friction(k: Constants, m: Memory, joint: int, load_Nm: float) -> flo
 @compiled
 def _threshold(k: Constants, m: Memory, channel: int, joint: int, momentum: float, g: float) -> float:
     """Return a channel's threshold without the part for standstill, and store its value without the floor."""
-    lost = m.sensitivity.lost[filter_bank.filter_of(channel, m.sensitivity.lost.shape[0]), joint]
-    noise = (
-        k.noise.torque_variance[channel] * m.sensitivity.roughness[joint]
-        + k.noise.velocity_variance[channel] * momentum
-    )
-    noise += k.noise.torque_gain[channel] * m.sensitivity.torque_step_Nm[joint] ** 2 / 12.0 + lost
-    m.sensitivity.h_model[channel, joint] = (
-        m.sensitivity.strain[joint] * np.sqrt(noise + g * g) + m.sensitivity.torque_pull_Nm[joint]
-    )
-    return float(max(m.sensitivity.h_model[channel, joint], m.margin.tail_Nm[channel, joint]))
+    own = m.sensitivity
+    lost = own.lost[filter_bank.filter_of(channel, own.lost.shape[0]), joint]
+    noise = k.noise.torque_variance[channel] * own.roughness[joint] + k.noise.velocity_variance[channel] * momentum
+    noise += k.noise.torque_gain[channel] * own.torque_step_Nm[joint] ** 2 / 12.0 + lost
+    own.h_model[channel, joint] = own.strain[joint] * np.sqrt(noise + g * g) + own.torque_pull_Nm[joint]
+    return float(max(own.h_model[channel, joint], m.margin.tail_Nm[channel, joint]))
 
 
 @compiled
@@ -359,15 +352,16 @@ def fill_wide(k: Constants, m: Memory, c: int) -> None:
     velocity's change over five samples. The slow filters detect a slow push first: the threshold is the least of all
     channels'.
     """
+    own = m.sensitivity
     samples = float(external_torque.WIDE_SAMPLES)
     span_s = samples * k.period_s
     for i in range(m.filters.r.shape[1]):
         momentum = momentum_noise(m, i)
-        noise = k.torque_noise_Nm**2 * m.sensitivity.roughness[i] / samples
+        noise = k.torque_noise_Nm**2 * own.roughness[i] / samples
         velocity = 2.0 * (k.noise.velocity_std_rad_s / span_s) ** 2 * momentum
-        doubt = m.sensitivity.doubt[c, i] / k.model_sigmas
-        m.sensitivity.wide_sigma[i] = np.sqrt(noise + velocity + doubt * doubt)
-        m.sensitivity.wide_threshold[i] = np.min(m.sensitivity.h[:, i])
+        doubt = own.doubt[c, i] / k.model_sigmas
+        own.wide_sigma[i] = np.sqrt(noise + velocity + doubt * doubt)
+        own.wide_threshold[i] = np.min(own.h[:, i])
 
 
 @compiled

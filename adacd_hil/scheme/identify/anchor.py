@@ -90,10 +90,11 @@ def _or_unknown(values: tuple[float, ...] | None) -> Vector:
 
 def begin(k: Constants, m: Memory) -> None:
     """Fill the anchors before the first sample: the tare, and the last certificate."""
-    m.anchor.anchor_std[:] = np.inf
-    m.anchor.anchor_std[TARE] = k.anchor.zero_std_Nm
-    m.anchor.anchor_Nm[LAST] = k.anchor.last_zero_Nm - k.anchor.zero_Nm
-    m.anchor.anchor_std[LAST] = k.anchor.last_zero_std_Nm
+    own = m.anchor
+    own.anchor_std[:] = np.inf
+    own.anchor_std[TARE] = k.anchor.zero_std_Nm
+    own.anchor_Nm[LAST] = k.anchor.last_zero_Nm - k.anchor.zero_Nm
+    own.anchor_std[LAST] = k.anchor.last_zero_std_Nm
 
 
 @compiled
@@ -102,15 +103,16 @@ def measure(k: Constants, m: Memory, tau_J: Vector, is_resting: bool) -> None:
 
     It is a mean over about the last `rest_cycles` samples, so a person who leaned before and has gone is forgotten.
     """
-    m.anchor.rest_count = min(m.anchor.rest_count + 1.0, k.anchor.rest_cycles) if is_resting else 0.0
-    evidence.date(m, 0, KINDS, 0.0)
+    own = m.anchor
+    own.rest_count = min(own.rest_count + 1.0, k.anchor.rest_cycles) if is_resting else 0.0
+    evidence.set_age(m, 0, KINDS, 0.0)
     for i in range(tau_J.shape[0]):
         if not is_resting:
-            m.anchor.anchor_std[REST, i] = np.inf
+            own.anchor_std[REST, i] = np.inf
             continue
-        m.anchor.anchor_Nm[REST, i] += (tau_J[i] - m.anchor.anchor_Nm[REST, i]) / m.anchor.rest_count
+        own.anchor_Nm[REST, i] += (tau_J[i] - own.anchor_Nm[REST, i]) / own.rest_count
         if k.anchor.holding_Nm[i] != np.inf:
-            m.anchor.anchor_std[REST, i] = np.sqrt(_rest_variance(k, m, i))
+            own.anchor_std[REST, i] = np.sqrt(_rest_variance(k, m, i))
 
 
 @compiled
@@ -125,16 +127,17 @@ def is_rest_refused(k: Constants, m: Memory) -> bool:
 
     Judges a complete reading only: the supervisor counts as many cycles, so no arm goes on without one.
     """
-    if m.anchor.rest_count < k.anchor.rest_cycles:
+    own = m.anchor
+    if own.rest_count < k.anchor.rest_cycles:
         return False
     is_refused = False
-    for i in range(m.anchor.anchor_Nm.shape[1]):
-        q, std, slack = OFFSETS + i, m.anchor.anchor_std[TARE, i], k.anchor.holding_Nm[i]
+    for i in range(own.anchor_Nm.shape[1]):
+        q, std, slack = OFFSETS + i, own.anchor_std[TARE, i], k.anchor.holding_Nm[i]
         variance = std**2 if np.isfinite(std + slack) else np.inf
         for kind in range(KINDS):
-            evidence.pass_over(m, kind, q)
-        evidence.put_fitted(m, q, m.anchor.anchor_Nm[REST, i], _rest_variance(k, m, i))
-        evidence.say(m, TARE, q, m.anchor.anchor_Nm[TARE, i], variance, 0.0, slack)
+            evidence.skip_row(m, kind, q)
+        evidence.put_fitted(m, q, own.anchor_Nm[REST, i], _rest_variance(k, m, i))
+        evidence.set_row(m, TARE, q, own.anchor_Nm[TARE, i], variance, 0.0, slack)
         excess = abs(evidence.weigh(k, m, TARE, q))
         is_refused = is_refused or not excess <= 1.0
     return is_refused
@@ -152,7 +155,7 @@ def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
             if kind == LAST and np.min(m.evidence.limit[:LAST, q]) <= k.beta_Nm:
                 variance = np.inf
             slack = k.anchor.holding_Nm[i] if kind == REST else 0.0
-            evidence.say(m, kind, q, m.anchor.anchor_Nm[kind, i], variance, 0.0, slack)
+            evidence.set_row(m, kind, q, m.anchor.anchor_Nm[kind, i], variance, 0.0, slack)
             excess = abs(evidence.weigh(k, m, kind, q))
             is_within = is_within and excess <= 1.0
     return bool(is_within)
@@ -161,7 +164,7 @@ def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
 @compiled
 def _variance(k: Constants, m: Memory, kind: int, joint: int) -> float:
     """Return sigma_a² + b² t."""
-    return float(m.anchor.anchor_std[kind, joint] ** 2 + k.anchor.zero_drift_Nm2_s * m.evidence.said_age_s[kind])
+    return float(m.anchor.anchor_std[kind, joint] ** 2 + k.anchor.zero_drift_Nm2_s * m.evidence.age_s[kind])
 
 
 @compiled
@@ -191,7 +194,7 @@ def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
     m.anchor.anchor_std[:] = np.inf
     m.anchor.anchor_Nm[ACCEPTED] = offset_Nm
     m.anchor.anchor_std[ACCEPTED] = std_Nm
-    evidence.date(m, 0, KINDS, 0.0)
+    evidence.set_age(m, 0, KINDS, 0.0)
 
 
 def accept_reading(m: Memory) -> None:

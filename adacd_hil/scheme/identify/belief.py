@@ -16,7 +16,7 @@ g by sigma_m² g g', and a little in each inertia, as a payload is not a point m
 little, the column is mostly noise, and an estimate from it shrinks towards zero, the more the longer it goes on. So
 lags are learnt on the excitation, and *held* after it (`hold_lags`).
 
-**Hold-back.** A sample waits in a ring for one round of the ring. `discard` empties it.
+**Hold-back.** A sample waits in a ring until `waiting` others have followed. `discard` empties it.
 
 Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R, ring_still (h, n).
 
@@ -50,17 +50,18 @@ _SETTLED = 1e-9
 @compiled
 def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
     """Begin to learn, and use the belief as the model: the prior, or the certified arm with a payload."""
-    m.models.is_payload = 1.0 if is_payload else 0.0
+    own = m.models
+    own.is_payload = 1.0 if is_payload else 0.0
     if is_payload:
-        m.models.belief[:] = m.models.certified
-        m.models.P_belief[:] = m.models.P_certified
-        add_payload(k.payload_direction, k.payload_std_kg, k.payload_rest_std, m.models.P_belief)
+        own.belief[:] = own.certified
+        own.P_belief[:] = own.P_certified
+        add_payload(k.payload_direction, k.payload_std_kg, k.payload_rest_std, own.P_belief)
     else:
-        begin(k.prior, k.prior_std, m.models.belief, m.models.P_belief)
+        begin(k.prior, k.prior_std, own.belief, own.P_belief)
     _use(m)
     discard(m)
-    m.models.are_lags_held = 0.0
-    m.models.recovering_cycles = 0.0
+    own.are_lags_held = 0.0
+    own.recovering_cycles = 0.0
 
 
 @compiled
@@ -83,14 +84,16 @@ def certify(k: Constants, m: Memory) -> None:
 
 @compiled
 def _certify(m: Memory) -> None:
-    m.models.certified[:] = m.models.theta
-    m.models.P_certified[:] = m.models.P
+    own = m.models
+    own.certified[:] = own.theta
+    own.P_certified[:] = own.P
 
 
 @compiled
 def _use(m: Memory) -> None:
-    m.models.theta[:] = m.models.belief
-    m.models.P[:] = m.models.P_belief
+    own = m.models
+    own.theta[:] = own.belief
+    own.P[:] = own.P_belief
 
 
 @compiled
@@ -157,13 +160,14 @@ def learn(k: Constants, m: Memory) -> bool:
 
     The sample that has waited long enough, if there is one, corrects the belief.
     """
+    own = m.models
     W, tau_J, still = m.filters.W_learnt, m.filters.tau_learnt, m.sensitivity.still_smooth[filter_bank.LEARNT]
-    m.models.since_learnt += 1.0
-    if m.models.since_learnt < k.learn_every:
+    own.since_learnt += 1.0
+    if own.since_learnt < k.learn_every:
         return False
-    m.models.since_learnt = 0.0
+    own.since_learnt = 0.0
     place = int(m.ring.next)
-    has_waited = m.ring.used == m.ring.tau.shape[0]
+    has_waited = m.ring.used == k.waiting
     if has_waited:
         for i in range(tau_J.shape[0]):
             R = m.ring.R[place, i]
@@ -171,7 +175,7 @@ def learn(k: Constants, m: Memory) -> bool:
             if np.inf == R:
                 continue
             missing_torque.add(k, m, place, i)
-            epsilon, s = estimator.correct(w, tau, R, True, m.models.belief, m.models.P_belief, m.models.v, m.models.K)
+            epsilon, s = estimator.correct(w, tau, R, True, own.belief, own.P_belief, own.v, own.K)
             fit_check.add_residual(m, epsilon * epsilon / (s - R + R / k.correlated))
     else:
         m.ring.used += 1.0
@@ -180,11 +184,11 @@ def learn(k: Constants, m: Memory) -> bool:
     for i in range(still.shape[0]):
         m.ring.still[place, i] = still[i] if abs(m.sensitivity.dq_old[i]) > regressor.SLOW_RAD_S else 1.0
     m.ring.tau[place] = tau_J
-    if m.models.are_lags_held != 0.0:
+    if own.are_lags_held != 0.0:
         _take_out_lags(k, m, place)
     for i in range(tau_J.shape[0]):
         m.ring.R[place, i] = k.correlated * (k.residual_Nm**2 + sensitivity.held_Nm(m, i, still[i]) ** 2)
-    m.ring.next = (place + 1) % m.ring.tau.shape[0]
+    m.ring.next = (place + 1) % k.waiting
     return bool(has_waited)
 
 
@@ -213,8 +217,9 @@ def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
 
 @compiled
 def discard(m: Memory) -> None:
-    """Discard the waiting samples."""
+    """Discard the waiting samples; the next one comes first in the ring."""
     m.ring.used = 0.0
+    m.ring.next = 0.0
     m.models.since_learnt = 0.0
 
 
@@ -246,35 +251,37 @@ def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
 @compiled
 def restart_candidate(m: Memory) -> None:
     """Begin the next test with the present belief."""
-    m.models.candidate_cycles = 0.0
-    m.models.candidate_square = 0.0
-    m.models.frozen_square = 0.0
-    m.models.candidate_worst = 0.0
-    m.models.candidate[:] = m.models.belief
-    m.models.P_candidate[:] = m.models.P_belief
+    own = m.models
+    own.candidate_cycles = 0.0
+    own.candidate_square = 0.0
+    own.frozen_square = 0.0
+    own.candidate_worst = 0.0
+    own.candidate[:] = own.belief
+    own.P_candidate[:] = own.P_belief
 
 
 @compiled
 def test_candidate(k: Constants, m: Memory) -> bool:
     """Add one sample to the test; return whether an anchor alone excludes a candidate that passes it."""
-    m.models.candidate_cycles += 1.0
+    own = m.models
+    own.candidate_cycles += 1.0
     for c in range(m.filters.W_f.shape[0]):
         for i in range(m.filters.W_f.shape[1]):
-            residual = linalg.misfit(m.filters.W_f[c, i], m.models.candidate, m.filters.tau_f[c, i])
+            residual = linalg.misfit(m.filters.W_f[c, i], own.candidate, m.filters.tau_f[c, i])
             if c == filter_bank.SLOW and m.sensitivity.still[c, i] < sensitivity.MOVING:
-                m.models.candidate_square += residual * residual
-                m.models.frozen_square += m.filters.r[c, i] ** 2
+                own.candidate_square += residual * residual
+                own.frozen_square += m.filters.r[c, i] ** 2
             bare = max(m.filters.r.shape[0] + c - 1, 0) if c > 0 else 0
-            m.models.candidate_worst = max(m.models.candidate_worst, abs(residual) / m.sensitivity.h[bare, i])
-    if m.models.candidate_cycles < k.refine_cycles:
+            own.candidate_worst = max(own.candidate_worst, abs(residual) / m.sensitivity.h[bare, i])
+    if own.candidate_cycles < k.refine_cycles:
         return False
-    is_better = m.models.candidate_square < m.models.frozen_square and m.models.candidate_worst < 1.0
-    is_fit = is_better and is_positive_definite(m.models.candidate)
-    is_anchored = is_fit and anchor.is_within(k, m, m.models.candidate, m.models.P_candidate)
+    is_better = own.candidate_square < own.frozen_square and own.candidate_worst < 1.0
+    is_fit = is_better and is_positive_definite(own.candidate)
+    is_anchored = is_fit and anchor.is_within(k, m, own.candidate, own.P_candidate)
     if is_anchored:
-        m.models.theta[:] = m.models.candidate
-        m.models.P[:] = m.models.P_candidate
+        own.theta[:] = own.candidate
+        own.P[:] = own.P_candidate
         _certify(m)
-        m.models.promotions += 1.0
+        own.promotions += 1.0
     restart_candidate(m)
     return bool(is_fit and not is_anchored)

@@ -20,11 +20,13 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import anchor, earlier, evidence, fit_check, missing_torque
 from adacd_hil.scheme.identify.evidence import FRICTIONS, INERTIAS, LAST, OFFSETS, SPEEDS_RAD_S, VISCOUS
-from adacd_hil.scheme.memory import Constants, LastConstants, Memory
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.settings.configuration import Settings
 
-NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, BLIND = range(8)
-"""Contradictions for which a certificate is withheld or taken back: values of the kernel's `withheld_by`."""
+NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, BLIND, READING = range(9)
+"""Contradictions for which a certificate is withheld or taken back: values of the kernel's `withheld_by`.
+
+READING: before the first motion, between the reading at rest and the tare."""
 FLOOR_NM, FLOOR_KGM2, FLOOR_NM_S = 0.02, 0.006, 0.02
 """Differences of friction, inertia, viscous friction below these are ignored."""
 
@@ -52,8 +54,8 @@ class Certificate(NamedTuple):
         return f"<Certificate{' with a payload' if self.is_payload else ''}: a1, a2, a3 = {inertia} kg m²>"
 
 
-def constants_of(settings: Settings) -> LastConstants:
-    """Return value, variance and slack (Q,): the last certificate's value per quantity; inf: unknown.
+def last_of(settings: Settings) -> tuple[Vector, Vector, Vector]:
+    """Return value, variance and slack (Q,) of the last certificate per quantity, inf for the variance if unknown.
 
     A viscous friction is computed from two frictions. Their deviations count as independent, which overestimates its
     own.
@@ -72,26 +74,22 @@ def constants_of(settings: Settings) -> LastConstants:
         variance = quantities**2 @ np.square((*history.friction_std_Nm, *history.inertia_std_kgm2))
         variance += np.square(share * last)
         variance[OFFSETS:VISCOUS] = np.inf
-    return LastConstants(
-        value=last,
-        variance=variance,
-        slack=np.repeat((FLOOR_NM, FLOOR_KGM2, 0.0, FLOOR_NM_S), counts),
-    )
+    return last, variance, np.repeat((FLOOR_NM, FLOOR_KGM2, 0.0, FLOOR_NM_S), counts)
 
 
-def begin(k: Constants, m: Memory) -> None:
+def begin(settings: Settings, m: Memory) -> None:
     """Load the last certificate as a source of evidence, if there is one."""
-    evidence.say_all(m, LAST, k.last.value, k.last.variance, k.last.slack)
+    evidence.set_source(m, LAST, *last_of(settings))
 
 
 def forget(m: Memory) -> None:
     """Stop the comparison with the last certificate: the user confirms that the arm is free of contact."""
-    evidence.retract(m, LAST)
+    evidence.empty_source(m, LAST)
 
 
 def is_compared(m: Memory) -> bool:
     """Return whether the last certificate is compared with the fit: not with a payload that was announced."""
-    return bool(m.evidence.said_variance[LAST, 0] != np.inf and not m.models.is_payload)
+    return bool(m.evidence.variance[LAST, 0] != np.inf and not m.models.is_payload)
 
 
 @compiled
@@ -142,9 +140,9 @@ def describe_more(m: Memory, date_utc: str) -> list[str]:
     ]
 
 
-def certificate_of(k: Constants, theta: Vector, P: Vector, is_payload: bool, text: str) -> Certificate:
-    """Return the certificate of a certified model. theta (p,), P (p, p): with the offsets; text: its event."""
-    base, first = int(k.first_offset), FRICTIONS
+def certificate_of(k: Constants, m: Memory, text: str) -> Certificate:
+    """Return the certificate of the model in use, which has just been certified. text: of its event."""
+    base, first, theta, P = int(k.first_offset), FRICTIONS, m.models.theta, m.models.P
     rows = k.evidence.columns[:OFFSETS]
     values = rows @ theta
     std = np.sqrt([row @ P @ row for row in rows])
@@ -157,6 +155,6 @@ def certificate_of(k: Constants, theta: Vector, P: Vector, is_payload: bool, tex
         inertia_std_kgm2=tuple(std[first:].tolist()),
         offset_Nm=tuple((k.anchor.zero_Nm + theta[offsets]).tolist()),
         offset_std_Nm=tuple(np.sqrt(np.diag(P)[offsets]).tolist()),
-        is_payload=is_payload,
+        is_payload=bool(m.models.is_payload),
         text=text,
     )

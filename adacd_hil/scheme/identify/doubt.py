@@ -21,7 +21,13 @@ than at RARELY_PER_H by ODDS. Three in 6.8 min are.
 An arm that meets the next contact AT_REST_S after going on would never move far enough to show its cause: the
 thresholds of the joints in contact double, to MOST_STRAIN times at most, and fall back as in `sensitivity`.
 
-Shapes: c (h, p), sums (h,), of the share of standstill (h, n) and (n,).
+Both are rows of one table: v = (w of each of the h causes, s of each of the n joints, 0 but for the row's), and
+
+    L = Σ v v'/R,   b = Σ v r/R
+
+with R the number of periods that a sample stands for, inverted.
+
+Shapes: c (h, p), v, b (h + n,), L (h + n, h + n), the lower half.
 """
 
 from collections import deque
@@ -34,10 +40,9 @@ from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect import sensitivity
-from adacd_hil.scheme.memory import Constants, DoubtConstants, Memory
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.structured import Structured
 
 WITHIN_S = 60.0
 """How far back the end of a contact may lie."""
@@ -75,55 +80,40 @@ LOAD = 0
 """Index of a payload among the causes."""
 _FRICTIONS = (("Coulomb friction", "Nm"), ("viscous friction", "Nm s/rad"))
 CAUSES = 1 + len(_FRICTIONS) * JOINTS
-TOLD_NOTHING = 0.6
+STANDING = 0.6
 """Smallest share of standstill in a filter's memory for which a sample of the joint is not used as evidence."""
 
 
-def constants_of(settings: Settings, count: int) -> DoubtConstants:
-    """Return `causes` (h, p): a payload of 1 kg, then by joint Coulomb and viscous friction."""
+def causes_of(settings: Settings, count: int) -> Vector:
+    """Return c (h, p): a payload of 1 kg, then by joint Coulomb and viscous friction."""
     unit = np.eye(count)
     first = PARAMETER_NAMES.index("F_c1"), PARAMETER_NAMES.index("F_v1")
     rows = [regressor.payload_direction(settings.arm.link_length_m, count, settings.gravity_m_s2)]
     rows += [unit[place + i] for i in range(JOINTS) for place in first]
-    return DoubtConstants(np.array(rows))
+    return np.array(rows)
 
 
 @compiled
-def react(memory: Structured, is_touched: bool, is_soon: bool) -> None:
-    """Record that the arm reacts.
-
-    is_touched: to a touch; otherwise no samples are weighed. is_soon: right after going on, so the thresholds double.
-    """
-    m = memory[0]
-    if not is_touched:
-        _clear(m)
-    elif is_soon:
-        sensitivity.strain(m, MOST_STRAIN)
-
-
-@compiled
-def _clear(m: Memory) -> None:
-    m.doubt.cause_rw[:] = 0.0
-    m.doubt.cause_ww[:] = 0.0
-    m.doubt.cause_ws[:] = 0.0
-    m.doubt.load_ww[:] = 0.0
-    m.doubt.contact_rs[:] = 0.0
-    m.doubt.contact_ss[:] = 0.0
-    m.doubt.contact_rr = 0.0
-    m.doubt.contact_rows = 0.0
-    m.doubt.contact_peak = 0.0
+def clear(m: Memory) -> None:
+    """Forget the sums of a contact."""
+    own = m.doubt
+    own.L[:] = 0.0
+    own.b[:] = 0.0
+    own.load_ww[:] = 0.0
+    own.rr = 0.0
+    own.rows = 0.0
+    own.peak = 0.0
 
 
 @compiled
-def begin(k: Constants, m: Memory, least_peak: float) -> None:
-    """Begin a contact, with the samples that were held back. least_peak: lower bound of its peak."""
-    _clear(m)
-    m.doubt.contact_peak = least_peak
+def begin(k: Constants, m: Memory) -> None:
+    """Begin a contact, with the samples that were held back."""
+    clear(m)
     _follow_peak(m)
     for s in range(int(m.ring.used)):
         for i in range(m.ring.tau.shape[1]):
-            if m.ring.still[s, i] < TOLD_NOTHING:
-                _add(k, m, i, m.ring.W[s, i], m.ring.tau[s, i], m.ring.still[s, i], k.learn_every)
+            if m.ring.still[s, i] < STANDING:
+                _add(k, m, i, m.ring.W[s, i], m.ring.tau[s, i], m.ring.still[s, i], 1.0 / k.learn_every)
 
 
 @compiled
@@ -131,43 +121,31 @@ def weigh(k: Constants, m: Memory) -> None:
     """Add one sample of a contact to the sums; at rest, friction explains any torque of the joint."""
     _follow_peak(m)
     for i in range(m.filters.tau_f.shape[1]):
-        if (
-            m.sensitivity.still_smooth[filter_bank.LEARNT, i] < TOLD_NOTHING
-            and abs(m.sensitivity.dq_old[i]) > regressor.SLOW_RAD_S
-        ):
-            _add(
-                k,
-                m,
-                i,
-                m.filters.W_learnt[i],
-                m.filters.tau_learnt[i],
-                m.sensitivity.still_smooth[filter_bank.LEARNT, i],
-                1.0,
-            )
+        still = m.sensitivity.still_smooth[filter_bank.LEARNT, i]
+        if still < STANDING and abs(m.sensitivity.dq_old[i]) > regressor.SLOW_RAD_S:
+            _add(k, m, i, m.filters.W_learnt[i], m.filters.tau_learnt[i], still, 1.0)
 
 
 @compiled
 def _follow_peak(m: Memory) -> None:
     for c in range(m.filters.y.shape[0]):
         for i in range(m.filters.y.shape[1]):
-            m.doubt.contact_peak = max(m.doubt.contact_peak, abs(m.filters.y[c, i]) / m.sensitivity.h[c, i])
+            m.doubt.peak = max(m.doubt.peak, abs(m.filters.y[c, i]) / m.sensitivity.h[c, i])
 
 
 @compiled
-def _add(k: Constants, m: Memory, i: int, w: Vector, tau: float, still: float, weight: float) -> None:
+def _add(k: Constants, m: Memory, i: int, w: Vector, tau: float, still: float, R: float) -> None:
     """Add one row w (p,) of joint i to the sums."""
+    own = m.doubt
     r = linalg.misfit(w, m.models.theta, tau)
-    m.doubt.contact_rr += weight * r * r
-    m.doubt.contact_rows += weight
-    m.doubt.contact_rs[i] += weight * r * still
-    m.doubt.contact_ss[i] += weight * still * still
-    for h in range(m.doubt.cause_rw.shape[0]):
-        left = -linalg.dot(w, k.doubt.causes[h])
-        m.doubt.cause_rw[h] += weight * r * left
-        m.doubt.cause_ww[h] += weight * left * left
-        m.doubt.cause_ws[h, i] += weight * left * still
-        if h == LOAD:
-            m.doubt.load_ww[0 if left < 0.0 else 1] += weight * left * left
+    own.rr += r * r / R
+    own.rows += 1.0 / R
+    own.row[:] = 0.0
+    for h in range(CAUSES):
+        own.row[h] = -linalg.dot(w, k.causes[h])
+    own.row[CAUSES + i] = still
+    linalg.add_row(own.row, r, R, own.L, own.b)
+    own.load_ww[0 if own.row[LOAD] < 0.0 else 1] += own.row[LOAD] ** 2 / R
 
 
 class CommonCause(NamedTuple):
@@ -196,8 +174,8 @@ class _Weighed(NamedTuple):
 class Doubt:
     """Remembers the contacts of a certificate, and finds the cause that explains the last ones, if there is one."""
 
-    def __init__(self, settings: Settings, constants: Structured, memory: Structured) -> None:
-        self._constants, self._memory = constants[0], memory
+    def __init__(self, settings: Settings, k: Constants, m: Memory) -> None:
+        self._k, self._m = k, m
         self._correlated = 2.0 / (settings.certified.cutoffs_rad_s[filter_bank.LEARNT] * settings.bus.period_s)
         self._period_s = settings.bus.period_s
         self._contacts: deque[_Weighed] = deque(maxlen=MANY)
@@ -205,10 +183,6 @@ class Doubt:
         self._waited_s = 0.0
         self._log_odds, self._weak = 0.0, 0
         self._contradiction: CommonCause | None = None
-
-    def compile(self) -> None:
-        """Call each compiled function once, on a copy, so that no later call compiles."""
-        react(self._memory.copy(), True, True)
 
     def forget(self) -> None:
         """Forget all contacts: a new certificate begins."""
@@ -219,7 +193,7 @@ class Doubt:
         """Record that the arm monitors from this cycle on."""
         self._monitored_s = cycle * self._period_s
 
-    def begin(self, cycle: int, is_touched: bool, contradiction: CommonCause | None = None) -> None:
+    def begin_contact(self, cycle: int, is_touched: bool, contradiction: CommonCause | None = None) -> None:
         """Record that the arm reacts: to a touch, or to another cause such as a late host.
 
         contradiction: the contradiction of the certificate, if the arm reacts to that.
@@ -229,14 +203,17 @@ class Doubt:
         likelier = (OFTEN_PER_H - RARELY_PER_H) / 3600.0 * self._waited_s
         self._log_odds = max(self._log_odds - likelier, 0.0)
         self._weak = self._weak if self._log_odds > 0.0 else 0
-        react(self._memory, is_touched, self._waited_s < AT_REST_S)
+        if not is_touched:
+            clear(self._m)
+        elif self._waited_s < AT_REST_S:
+            sensitivity.strain(self._m, MOST_STRAIN)
 
-    def end(self, cycle: int) -> CommonCause | None:
+    def end_contact(self, cycle: int) -> CommonCause | None:
         """Record that the contact has ended; return the common cause of the last ones, or None."""
         if self._contradiction is not None:
             return self._contradiction
         now_s = cycle * self._period_s
-        last = _weighed(self._memory[0], self._waited_s, now_s)
+        last = _weighed(self._m, self._waited_s, now_s)
         self._contacts.append(last)
         if 0.0 < last.peak < WEAK and last.waited_s >= AT_REST_S:
             self._log_odds += np.log(OFTEN_PER_H / RARELY_PER_H)
@@ -315,9 +292,9 @@ class Doubt:
 
     def _can_be(self, h: int, size: float) -> bool:
         """Return whether an arm may have so much more of a friction than the model: friction is never negative."""
-        cause = self._constants.doubt.causes[h]
-        total = float(cause @ self._memory[0].models.theta) + size
-        return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._constants.prior_std)
+        cause = self._k.causes[h]
+        total = float(cause @ self._m.models.theta) + size
+        return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._k.prior_std)
 
     def _common(self, contacts: list[_Weighed], h: int, spread: float) -> float | None:
         """Return the size of cause h that explains each of the contacts, or None."""
@@ -344,13 +321,13 @@ class Doubt:
 
 def _weighed(m: Memory, waited_s: float, now_s: float) -> _Weighed:
     """Return a contact's sums, less the torque of each joint at rest, and less the residual of a good model."""
-    ss = np.maximum(m.doubt.contact_ss, 1e-12)
-    rs, ws = m.doubt.contact_rs, m.doubt.cause_ws
-    rw = m.doubt.cause_rw - ws @ (rs / ss)
-    ww = np.maximum(m.doubt.cause_ww - (ws * ws) @ (1.0 / ss), 0.0)
-    rr = float(m.doubt.contact_rr - np.sum(rs * rs / ss))
-    rr = max(rr - RESIDUAL_NM**2 * float(m.doubt.contact_rows), LEAST_SHARE * rr)
-    return _Weighed(rw, ww, rr, m.doubt.load_ww.copy(), float(m.doubt.contact_peak), waited_s, now_s)
+    own, squares = m.doubt, m.doubt.L.diagonal()
+    ss, rs, ws = np.maximum(squares[CAUSES:], 1e-12), own.b[CAUSES:], own.L[CAUSES:, :CAUSES].T
+    rw = own.b[:CAUSES] - ws @ (rs / ss)
+    ww = np.maximum(squares[:CAUSES] - (ws * ws) @ (1.0 / ss), 0.0)
+    rr = float(own.rr - np.sum(rs * rs / ss))
+    rr = max(rr - RESIDUAL_NM**2 * float(own.rows), LEAST_SHARE * rr)
+    return _Weighed(rw, ww, rr, own.load_ww.copy(), float(own.peak), waited_s, now_s)
 
 
 def _explained(contacts: list[_Weighed], h: int) -> float:

@@ -28,7 +28,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import anchor, evidence, fit_check
 from adacd_hil.scheme.identify.evidence import FRICTIONS, INERTIAS, KEPT, OFFSETS, REFUSED, VISCOUS
-from adacd_hil.scheme.memory import Constants, EarlierConstants, Memory
+from adacd_hil.scheme.memory import Constants, Memory
 
 YOUNG_STEPS = 1
 """Number of first beliefs that are not kept: a hand may have been there all that time, without a trace."""
@@ -44,14 +44,10 @@ INERTIA_SHARE = 0.03
 """Differences below these, and below this share of an inertia, are ignored."""
 
 
-def constants_of() -> EarlierConstants:
-    """Return `kept_floor`, `kept_share` (VISCOUS,): ignored differences; inf for a2, which any touch of the arm bends.
-
-    A mass shows in a1 and a3.
-    """
-    floors = [FRICTION_NM] * FRICTIONS + [INERTIA_KGM2, np.inf, INERTIA_KGM2] + [OFFSET_NM] * JOINTS
-    shares = np.repeat((0.0, INERTIA_SHARE, 0.0), (FRICTIONS, INERTIAS, JOINTS))
-    return EarlierConstants(kept_floor=np.array(floors), kept_share=shares)
+_KEPT_FLOOR = np.array([FRICTION_NM] * FRICTIONS + [INERTIA_KGM2, np.inf, INERTIA_KGM2] + [OFFSET_NM] * JOINTS)
+_KEPT_SHARE = np.repeat((0.0, INERTIA_SHARE, 0.0), (FRICTIONS, INERTIAS, JOINTS))
+"""Ignored differences by quantity (VISCOUS,), Nm or kg m², and as a share of the value; inf for a2, which any touch of
+the arm bends. A mass shows in a1 and a3."""
 
 
 @compiled
@@ -65,14 +61,14 @@ def forget(m: Memory) -> None:
 @compiled
 def _drop(m: Memory) -> None:
     m.earlier.kept_count = 0.0
-    for s in range(KEPT, m.evidence.said.shape[0]):
-        evidence.retract(m, s)
+    for s in range(KEPT, m.evidence.value.shape[0]):
+        evidence.empty_source(m, s)
 
 
 @compiled
 def is_keeping(m: Memory) -> bool:
     """Return whether beliefs are kept."""
-    return bool(np.any(m.evidence.said_variance[KEPT:, 0] != np.inf))
+    return bool(np.any(m.evidence.variance[KEPT:, 0] != np.inf))
 
 
 @compiled
@@ -87,7 +83,7 @@ def keep(k: Constants, m: Memory) -> None:
     changed = fit_check.last_step_before_contradiction(k, m)
     keep_steps(k, m, int(m.fit_check.steps_used) - 1 if changed == fit_check.NONE else changed)
     if changed == fit_check.NONE:
-        _keep(
+        keep_belief(
             k,
             m,
             m.models.belief,
@@ -109,20 +105,21 @@ def keep_steps(k: Constants, m: Memory, last: int) -> None:
         s = number % steps
         age_s = fit_check.STEP_S * (m.fit_check.steps_used - 1.0 - number)
         unit = fit_check.unit_of(m.fit_check.steps_square[s], m.fit_check.steps_rows[s])
-        _keep(k, m, m.fit_check.steps_theta[s], m.fit_check.steps_P[s], unit, age_s)
+        keep_belief(k, m, m.fit_check.steps_theta[s], m.fit_check.steps_P[s], unit, age_s)
 
 
 @compiled
-def _keep(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, age_s: float) -> None:
+def keep_belief(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, age_s: float) -> None:
+    """Keep one belief; unit: of its residuals, age_s: since when."""
     s = KEPT + int(m.earlier.kept_count)
-    if not _say(k, m, s, theta, P, unit):
-        evidence.retract(m, s)
-    evidence.date(m, s, s + 1, age_s)
+    if not _fill_source(k, m, s, theta, P, unit):
+        evidence.empty_source(m, s)
+    evidence.set_age(m, s, s + 1, age_s)
     m.earlier.kept_count += 1.0
 
 
 @compiled
-def _say(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit: float) -> bool:
+def _fill_source(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit: float) -> bool:
     """Fill a source's rows from a belief; return whether all its frictions are at least about 0.
 
     A person who pushes the arm on makes friction look negative: a negative one counts as 0.
@@ -130,10 +127,10 @@ def _say(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit: float)
     has_friction = True
     for q in range(VISCOUS):
         value, variance = evidence.of_belief(k, q, theta, P, unit)
-        least = -max(k.earlier.kept_floor[q], evidence.BELIEF_SIGMAS * np.sqrt(variance))
+        least = -max(_KEPT_FLOOR[q], evidence.BELIEF_SIGMAS * np.sqrt(variance))
         has_friction = has_friction and (q >= FRICTIONS or not value < least)
         value = max(value, 0.0) if q < OFFSETS else value
-        evidence.say(m, s, q, value, variance, max(k.earlier.kept_floor[q], k.earlier.kept_share[q] * abs(value)), 0.0)
+        evidence.set_row(m, s, q, value, variance, max(_KEPT_FLOOR[q], _KEPT_SHARE[q] * abs(value)), 0.0)
     return has_friction
 
 
@@ -148,10 +145,10 @@ def is_no_more(k: Constants, m: Memory) -> bool:
         for q in range(VISCOUS):
             evidence.weigh(k, m, s, q)
         if _is_leant_on(k, m, s):
-            evidence.retract(m, s)
+            evidence.empty_source(m, s)
         for q in range(VISCOUS):
             if q >= OFFSETS and not anchor.is_open(k, m, q - OFFSETS):
-                evidence.pass_over(m, s, q)
+                evidence.skip_row(m, s, q)
             is_no_more = is_no_more and abs(evidence.excess(m, s, q)) <= 1.0
     if not is_keeping(m):
         m.earlier.kept_count = 0.0
@@ -170,7 +167,7 @@ def _is_leant_on(k: Constants, m: Memory, s: int) -> bool:
     for i in range(m.anchor.anchor_Nm.shape[1]):
         q = OFFSETS + i
         is_another = abs(evidence.excess(m, s, q)) > 1.0
-        if is_another and (not anchor.is_open(k, m, i) or anchor.is_excluded(m, i, m.evidence.said[s, q])):
+        if is_another and (not anchor.is_open(k, m, i) or anchor.is_excluded(m, i, m.evidence.value[s, q])):
             return True
     return False
 
@@ -178,9 +175,10 @@ def _is_leant_on(k: Constants, m: Memory, s: int) -> bool:
 @compiled
 def _lapses(k: Constants, m: Memory) -> bool:
     """Return whether enough fits in a row have been refused for the same excess of the same size; record this one."""
+    own = m.earlier
     is_little, is_less, is_same, friction_Nm, else_Nm = True, True, True, 0.0, 0.0
     for q in range(VISCOUS):
-        s = evidence.foremost(m, KEPT, KEPT + int(m.earlier.kept_count), q)
+        s = evidence.foremost(m, KEPT, KEPT + int(own.kept_count), q)
         excess = evidence.excess(m, s, q)
         is_little = is_little and abs(excess) <= (LITTLE if excess > 0.0 or q >= FRICTIONS else 1.0)
         is_less = is_less and excess <= 1.0 and (q < OFFSETS or excess >= -1.0)
@@ -189,8 +187,8 @@ def _lapses(k: Constants, m: Memory) -> bool:
             friction_Nm = max(friction_Nm, change_Nm)
         else:
             else_Nm += change_Nm
-        is_same = is_same and (m.earlier.refused_fits == 0.0 or abs(evidence.weigh(k, m, REFUSED, q)) <= 1.0)
-    _say(
+        is_same = is_same and (own.refused_fits == 0.0 or abs(evidence.weigh(k, m, REFUSED, q)) <= 1.0)
+    _fill_source(
         k,
         m,
         REFUSED,
@@ -198,10 +196,10 @@ def _lapses(k: Constants, m: Memory) -> bool:
         m.models.P_belief,
         fit_check.unit_of(m.fit_check.fit_square, m.fit_check.fit_rows),
     )
-    m.earlier.refused_fits = m.earlier.refused_fits + 1.0 if is_same else 1.0
+    own.refused_fits = own.refused_fits + 1.0 if is_same else 1.0
     if is_little and friction_Nm + else_Nm <= LITTLE_NM:
-        return bool(m.earlier.refused_fits >= LITTLE_FITS)
-    return bool(is_less and m.earlier.refused_fits >= LESS_FITS)
+        return bool(own.refused_fits >= LITTLE_FITS)
+    return bool(is_less and own.refused_fits >= LESS_FITS)
 
 
 def describe_more(m: Memory) -> list[str]:
@@ -218,7 +216,7 @@ def _changed(m: Memory, s: int, q: int, what: str, unit: str) -> str:
     change, limit, age_s = (
         float(m.evidence.difference[s, q]),
         float(m.evidence.limit[s, q]),
-        float(m.evidence.said_age_s[s]),
+        float(m.evidence.age_s[s]),
     )
     is_helped = q < FRICTIONS and change < 0.0
     why = "a hand helps the motion, or one that dragged has let go"

@@ -16,7 +16,7 @@ Two questions are not rows, since their column is not known beforehand: whether 
 detects, and which touches all rows miss.
 
 Shapes: Q quantities, S sources, p parameters; columns (Q, p), columns_prior, torque_Nm (Q,); sigmas (S,), less_counts
-(S, Q); said, said_variance, said_floor, said_slack, difference, limit (S, Q); said_age_s (S,); fitted, fitted_variance
+(S, Q); value, variance, floor, slack, difference, limit (S, Q); age_s (S,); fitted, fitted_variance
 (Q,).
 """
 
@@ -85,47 +85,48 @@ def _accelerations(settings: Settings) -> tuple[float, ...]:
 
 def begin(m: Memory) -> None:
     """Empty all sources."""
-    m.evidence.said_variance[:] = np.inf
+    m.evidence.variance[:] = np.inf
     m.evidence.limit[:] = np.inf
 
 
-def say_all(m: Memory, s: int, said: Vector, variance: Vector, slack: Vector) -> None:
-    """Fill all rows of a source, values `said` (Q,), without a floor."""
-    m.evidence.said[s], m.evidence.said_variance[s], m.evidence.said_slack[s] = said, variance, slack
+def set_source(m: Memory, s: int, value: Vector, variance: Vector, slack: Vector) -> None:
+    """Fill all rows of a source, `value` (Q,), without a floor."""
+    m.evidence.value[s], m.evidence.variance[s], m.evidence.slack[s] = value, variance, slack
 
 
 @compiled
 def follow(m: Memory, period_s: float) -> None:
     """Add one period to the age of each source."""
-    for s in range(m.evidence.said_age_s.shape[0]):
-        m.evidence.said_age_s[s] += period_s
+    for s in range(m.evidence.age_s.shape[0]):
+        m.evidence.age_s[s] += period_s
 
 
 @compiled
-def date(m: Memory, first: int, last: int, age_s: float) -> None:
+def set_age(m: Memory, first: int, last: int, age_s: float) -> None:
     """Set the age of the knowledge of the sources first .. last - 1."""
-    m.evidence.said_age_s[first:last] = age_s
+    m.evidence.age_s[first:last] = age_s
 
 
 @compiled
-def say(m: Memory, s: int, q: int, value: float, variance: float, floor: float, slack: float) -> None:
+def set_row(m: Memory, s: int, q: int, value: float, variance: float, floor: float, slack: float) -> None:
     """Fill a row: the value of quantity q by source s, its variance, floor and slack."""
-    m.evidence.said[s, q] = value
-    m.evidence.said_variance[s, q] = variance
-    m.evidence.said_floor[s, q] = floor
-    m.evidence.said_slack[s, q] = slack
+    own = m.evidence
+    own.value[s, q] = value
+    own.variance[s, q] = variance
+    own.floor[s, q] = floor
+    own.slack[s, q] = slack
 
 
 @compiled
-def retract(m: Memory, s: int) -> None:
+def empty_source(m: Memory, s: int) -> None:
     """Empty the rows of a source."""
-    m.evidence.said_variance[s] = np.inf
+    m.evidence.variance[s] = np.inf
     m.evidence.difference[s] = 0.0
     m.evidence.limit[s] = np.inf
 
 
 @compiled
-def pass_over(m: Memory, s: int, q: int) -> None:
+def skip_row(m: Memory, s: int, q: int) -> None:
     """Skip a row in this comparison."""
     m.evidence.difference[s, q] = 0.0
     m.evidence.limit[s, q] = np.inf
@@ -165,13 +166,14 @@ def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
 
     Negative: less. 0 if less doesn't count, or the source has no value.
     """
-    difference = m.evidence.fitted[q] - m.evidence.said[s, q]
-    if m.evidence.said_variance[s, q] == np.inf or (difference < 0.0 and k.evidence.less_counts[s, q] == 0.0):
+    own = m.evidence
+    difference = own.fitted[q] - own.value[s, q]
+    if own.variance[s, q] == np.inf or (difference < 0.0 and k.evidence.less_counts[s, q] == 0.0):
         difference = 0.0 if np.isfinite(difference) else difference
-    std = np.sqrt(m.evidence.said_variance[s, q] + m.evidence.fitted_variance[q])
-    m.evidence.difference[s, q] = difference
-    m.evidence.limit[s, q] = m.evidence.said_slack[s, q] + max(m.evidence.said_floor[s, q], k.evidence.sigmas[s] * std)
-    return float(difference / m.evidence.limit[s, q])
+    std = np.sqrt(own.variance[s, q] + own.fitted_variance[q])
+    own.difference[s, q] = difference
+    own.limit[s, q] = own.slack[s, q] + max(own.floor[s, q], k.evidence.sigmas[s] * std)
+    return float(difference / own.limit[s, q])
 
 
 @compiled

@@ -32,7 +32,7 @@ from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect.external_torque import LARGEST_UNIT
-from adacd_hil.scheme.memory import Constants, FitCheckConstants, Memory
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model.regressor import A5
 from adacd_hil.settings.configuration import Settings
 
@@ -66,22 +66,22 @@ SMALLEST_UNIT = 0.1
 """Least unit of the variances; the other bound is that of `sensitivity`."""
 
 
-def constants_of(settings: Settings) -> FitCheckConstants:
-    """Return `step_samples`: learnt samples from one step to the next."""
-    learn_s = settings.bus.period_s * settings.certified.learn_every
-    return FitCheckConstants(step_samples=max(round(STEP_S / learn_s), 1))
+def step_samples_of(settings: Settings) -> int:
+    """Return the number of learnt samples from one step to the next."""
+    return max(round(STEP_S / (settings.bus.period_s * settings.certified.learn_every)), 1)
 
 
 @compiled
 def begin(m: Memory) -> None:
     """Begin a fit: forget steps, samples and residuals."""
-    m.fit_check.steps_used = 0.0
-    m.fit_check.fit_square = 0.0
-    m.fit_check.fit_rows = 0.0
-    m.fit_check.fit_samples = 0.0
-    m.fit_check.samples_kept = 0.0
-    m.fit_check.samples_every = FIRST_EVERY
-    m.fit_check.samples_left_out = 0.0
+    own = m.fit_check
+    own.steps_used = 0.0
+    own.fit_square = 0.0
+    own.fit_rows = 0.0
+    own.fit_samples = 0.0
+    own.samples_kept = 0.0
+    own.samples_every = FIRST_EVERY
+    own.samples_left_out = 0.0
 
 
 @compiled
@@ -94,34 +94,36 @@ def add_residual(m: Memory, square: float) -> None:
 @compiled
 def follow(k: Constants, m: Memory, W_f: Vector, tau_f: Vector) -> None:
     """Record that the fit has learnt a sample, W_f (n, p), tau_f (n,) of the filter by which it is tested."""
+    own = m.fit_check
     _keep_sample(m, W_f, tau_f)
-    m.fit_check.fit_samples += 1.0
-    if m.fit_check.fit_samples % k.fit_check.step_samples != 0.0:
+    own.fit_samples += 1.0
+    if own.fit_samples % k.step_samples != 0.0:
         return
-    s = int(m.fit_check.steps_used) % m.fit_check.steps_rows.shape[0]
-    m.fit_check.steps_theta[s] = m.models.belief
-    m.fit_check.steps_P[s] = m.models.P_belief
-    m.fit_check.steps_square[s] = m.fit_check.fit_square
-    m.fit_check.steps_rows[s] = m.fit_check.fit_rows
-    m.fit_check.steps_used += 1.0
+    s = int(own.steps_used) % own.steps_rows.shape[0]
+    own.steps_theta[s] = m.models.belief
+    own.steps_P[s] = m.models.P_belief
+    own.steps_square[s] = own.fit_square
+    own.steps_rows[s] = own.fit_rows
+    own.steps_used += 1.0
 
 
 @compiled
 def _keep_sample(m: Memory, W_f: Vector, tau_f: Vector) -> None:
-    m.fit_check.samples_left_out += 1.0
-    if m.fit_check.samples_left_out < m.fit_check.samples_every:
+    own = m.fit_check
+    own.samples_left_out += 1.0
+    if own.samples_left_out < own.samples_every:
         return
-    m.fit_check.samples_left_out = 0.0
-    kept, room = int(m.fit_check.samples_kept), m.fit_check.samples_tau.shape[0]
+    own.samples_left_out = 0.0
+    kept, room = int(own.samples_kept), own.samples_tau.shape[0]
     if kept == room:
         kept = room // 2
         for s in range(kept):
-            m.fit_check.samples_W[s] = m.fit_check.samples_W[2 * s]
-            m.fit_check.samples_tau[s] = m.fit_check.samples_tau[2 * s]
-        m.fit_check.samples_every *= 2.0
-    m.fit_check.samples_W[kept] = W_f
-    m.fit_check.samples_tau[kept] = tau_f
-    m.fit_check.samples_kept = kept + 1.0
+            own.samples_W[s] = own.samples_W[2 * s]
+            own.samples_tau[s] = own.samples_tau[2 * s]
+        own.samples_every *= 2.0
+    own.samples_W[kept] = W_f
+    own.samples_tau[kept] = tau_f
+    own.samples_kept = kept + 1.0
 
 
 @compiled
@@ -133,24 +135,21 @@ def unit_of(square: float, rows: float) -> float:
 @compiled
 def late_square(m: Memory) -> float:
     """Return u of the fit's later half, so that a touch of its beginning doesn't count; 1 for a short fit."""
-    used = int(m.fit_check.steps_used)
+    own = m.fit_check
+    used = int(own.steps_used)
     if used < 2:
         return 1.0
-    steps = m.fit_check.steps_rows.shape[0]
+    steps = own.steps_rows.shape[0]
     s = max(used // 2 - 1, used - steps) % steps
-    return float(
-        (m.fit_check.fit_square - m.fit_check.steps_square[s])
-        / max(m.fit_check.fit_rows - m.fit_check.steps_rows[s], 1.0)
-    )
+    return float((own.fit_square - own.steps_square[s]) / max(own.fit_rows - own.steps_rows[s], 1.0))
 
 
 @compiled
 def _better_square(m: Memory, s: int) -> float:
     """Return u of the residuals up to step s, or of those after it, the smaller."""
-    early = m.fit_check.steps_square[s] / max(m.fit_check.steps_rows[s], 1.0)
-    late = (m.fit_check.fit_square - m.fit_check.steps_square[s]) / max(
-        m.fit_check.fit_rows - m.fit_check.steps_rows[s], 1.0
-    )
+    own = m.fit_check
+    early = own.steps_square[s] / max(own.steps_rows[s], 1.0)
+    late = (own.fit_square - own.steps_square[s]) / max(own.fit_rows - own.steps_rows[s], 1.0)
     return float(min(early, late))
 
 
@@ -160,12 +159,13 @@ def last_step_before_change(k: Constants, m: Memory) -> int:
 
     If only the fit's later samples contradict it, that is the last step of all. -1: all steps are too young.
     """
-    used, oldest = int(m.fit_check.steps_used), max(int(m.fit_check.steps_used) - m.fit_check.steps_rows.shape[0], 0)
+    own = m.fit_check
+    used, oldest = int(own.steps_used), max(int(own.steps_used) - own.steps_rows.shape[0], 0)
     changed = last_step_before_contradiction(k, m)
     if changed != NONE or m.models.is_payload != 0.0:
         return changed
     for number in range(oldest, used):
-        if not later_share(k, m, number % m.fit_check.steps_rows.shape[0]) <= 1.0:
+        if not later_share(k, m, number % own.steps_rows.shape[0]) <= 1.0:
             return used - 1
     return NONE
 
@@ -175,7 +175,7 @@ def last_step_before_contradiction(k: Constants, m: Memory) -> int:
     """Return the number of the last step before the fit changed, or a sample stands out; NONE without either."""
     changed = last_unsteady_step(m)
     first = first_unexplained(m)
-    return changed if changed != NONE or first < 0 else int(first // k.fit_check.step_samples) - 1
+    return changed if changed != NONE or first < 0 else int(first // k.step_samples) - 1
 
 
 @compiled
@@ -223,15 +223,16 @@ def changed_share(m: Memory, s: int) -> float:
 @compiled
 def later_share(k: Constants, m: Memory, s: int) -> float:
     """Return the torque between the fit and the model of the samples after step s, as a share of its limit."""
+    own = m.fit_check
     if not find_later(m, s):
         return np.inf
     limit_Nm = LATER_NM + RMS_SHARE * better_rms(m)
     limit_Nm += LEARNT_SHARE * k.residual_Nm * np.sqrt(_better_square(m, s))
-    has_gravity, unit, largest = int(k.first_offset) > A5, unit_of(m.fit_check.fit_square, m.fit_check.fit_rows), 0.0
-    for sample in range(int(m.fit_check.samples_kept)):
-        for i in range(m.fit_check.samples_tau.shape[1]):
-            w, allowed_Nm = m.fit_check.samples_W[sample, i], limit_Nm
-            torque = abs(linalg.dot(w, m.fit_check.later))
+    has_gravity, unit, largest = int(k.first_offset) > A5, unit_of(own.fit_square, own.fit_rows), 0.0
+    for sample in range(int(own.samples_kept)):
+        for i in range(own.samples_tau.shape[1]):
+            w, allowed_Nm = own.samples_W[sample, i], limit_Nm
+            torque = abs(linalg.dot(w, own.later))
             if has_gravity and torque > limit_Nm:
                 allowed_Nm += np.sqrt(unit * _later_variance(m, s, w))
             largest = max(largest, torque / allowed_Nm)
@@ -255,10 +256,11 @@ def distance(m: Memory, s: int) -> float:
     In units of the square roots of P_0's diagonal. Leaves the Cholesky factor in `factor`, and in `apart` the vector
     whose square the distance is.
     """
-    P_0, P, L, x = m.fit_check.steps_P[s], m.models.P_belief, m.fit_check.factor, m.fit_check.apart
+    own = m.fit_check
+    P_0, P, L, x = own.steps_P[s], m.models.P_belief, own.factor, own.apart
     for j in range(x.shape[0]):
         scale = np.sqrt(P_0[j, j])
-        x[j] = (m.models.belief[j] - m.fit_check.steps_theta[s, j]) / scale
+        x[j] = (m.models.belief[j] - own.steps_theta[s, j]) / scale
         for n in range(j + 1):
             L[j, n] = ((1.0 + REGULAR) * P_0[j, n] - P[j, n]) / (scale * np.sqrt(P_0[n, n]))
     if not linalg.factor(L, 0.0):
@@ -270,14 +272,15 @@ def distance(m: Memory, s: int) -> float:
 @compiled
 def find_later(m: Memory, s: int) -> bool:
     """Fill `later` (p,): the model of the samples after step s less that of the fit; False if it is undefined."""
+    own = m.fit_check
     if not distance(m, s) < np.inf:
         return False
-    x, P_0 = m.fit_check.apart, m.fit_check.steps_P[s]
-    linalg.solve_upper(m.fit_check.factor, x)
+    x, P_0 = own.apart, own.steps_P[s]
+    linalg.solve_upper(own.factor, x)
     for j in range(x.shape[0]):
         x[j] /= np.sqrt(P_0[j, j])
     for j in range(x.shape[0]):
-        m.fit_check.later[j] = linalg.dot(m.models.P_belief[j], x)
+        own.later[j] = linalg.dot(m.models.P_belief[j], x)
     return True
 
 

@@ -17,10 +17,10 @@ deg and a cable of 0.1 Nm came to a gain of 20 and more on a motion that shows t
 An adaptation is checked as a whole, when it refuses a fit. While the arm monitors, the check for a torque by place runs
 over the first 2 s of learnt samples, the next 4, 8, 16 s and then each 16 s. Longer stretches are not used: the drift
 of a sensor over a minute looks like such a torque. One stretch is not enough there, since on one way many effects
-depend on the place: its result must explain SAID_SHARE of the squares that the basic model leaves in a later one.
+depend on the place: its result must explain AGREED_SHARE of the squares that the basic model leaves in a later one.
 
 Shapes: p parameters, n joints, t = PLACE_TERMS, f = p + n t; L (n, f, f): by the joint of the row, lower half;
-b, basic, full, row, scale (f,); M (f, f); said (n t,): coefficients of the last stretch
+b, basic, full, row, scale (f,); M (f, f); last_found (n t,): coefficients of the last stretch
 that came to a torque by place, else all 0; rms_Nm (n,): the last torque found, 0 without one.
 """
 
@@ -40,7 +40,7 @@ EXPECTED_NM = 0.06
 """Standard deviation of a coefficient, of an arm that has a cable."""
 GAIN, SHARE, LEAST_NM = 8.0, 0.6, 0.01
 """Thresholds for one stretch."""
-SAID_SHARE = 0.4
+AGREED_SHARE = 0.4
 LEAST_BACK = 0.2
 """Share of a joint's samples in its less frequent direction: on a way in one direction a torque by speed or by time
 also depends on the place."""
@@ -100,41 +100,38 @@ def keep(m: Memory, slot: int) -> None:
 def clear(k: Constants, m: Memory) -> None:
     """Begin anew: with another arm, such as one with another payload, or with a certificate."""
     _clear_sums(m)
-    m.missing_torque.said[:] = 0.0
+    m.missing_torque.last_found[:] = 0.0
     m.missing_torque.rms_Nm[:] = 0.0
     m.missing_torque.wanted = k.missing_torque.first
 
 
 @compiled
 def _clear_sums(m: Memory) -> None:
-    m.missing_torque.L[:] = 0.0
-    m.missing_torque.b[:] = 0.0
-    m.missing_torque.yy = 0.0
-    m.missing_torque.weight[:] = 0.0
-    m.missing_torque.ways[:] = 0.0
-    m.missing_torque.samples = 0.0
+    own = m.missing_torque
+    own.L[:] = 0.0
+    own.b[:] = 0.0
+    own.yy = 0.0
+    own.weight[:] = 0.0
+    own.ways[:] = 0.0
+    own.samples = 0.0
 
 
 @compiled
 def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
     """Add the row of a joint, learnt now from a slot of the ring, to the sums; skip a joint that moves slowly."""
+    own = m.missing_torque
     if m.ring.still[slot, joint] > STILL:
         return
-    v, count = m.missing_torque.row, m.models.belief.shape[0]
+    v, count = own.row, m.models.belief.shape[0]
     R = m.ring.R[slot, joint] + k.correlated * _rough_variance(k, m, joint)
     v[:] = 0.0
     v[:count] = m.ring.W[slot, joint]
-    v[count + PLACE_TERMS * joint : count + PLACE_TERMS * (joint + 1)] = m.missing_torque.ring_X[slot, joint]
+    v[count + PLACE_TERMS * joint : count + PLACE_TERMS * (joint + 1)] = own.ring_X[slot, joint]
     r = -linalg.misfit(v, k.prior, m.ring.tau[slot, joint])
-    L, b = m.missing_torque.L[joint], m.missing_torque.b
-    for j in range(v.shape[0]):
-        if v[j] != 0.0:
-            b[j] += v[j] * r / R
-            for n in range(j + 1):
-                L[j, n] += v[j] * v[n] / R
-    m.missing_torque.ways[joint, 1 if v[int(k.first_coulomb) + joint] > 0.0 else 0] += 1.0
-    m.missing_torque.yy += r * r / R
-    m.missing_torque.weight[joint] += 1.0 / R
+    linalg.add_row(v, r, R, own.L[joint], own.b)
+    own.ways[joint, 1 if v[int(k.first_coulomb) + joint] > 0.0 else 0] += 1.0
+    own.yy += r * r / R
+    own.weight[joint] += 1.0 / R
 
 
 @compiled
@@ -155,15 +152,16 @@ def is_found_in_time(k: Constants, m: Memory) -> bool:
 
     Return whether two stretches agree, when a check is due.
     """
-    m.missing_torque.samples += 1.0
-    if m.missing_torque.samples < m.missing_torque.wanted:
+    own = m.missing_torque
+    own.samples += 1.0
+    if own.samples < own.wanted:
         return False
-    is_said = is_found(k, m)
-    said = m.missing_torque.full[m.models.belief.shape[0] :].copy()
-    is_agreed = _is_said_again(k, m)
-    if is_said:
-        m.missing_torque.said[:] = said
-    m.missing_torque.wanted = min(2.0 * m.missing_torque.wanted, k.missing_torque.longest)
+    is_lacking = is_found(k, m)
+    found = own.full[m.models.belief.shape[0] :].copy()
+    is_agreed = _is_found_again(k, m)
+    if is_lacking:
+        own.last_found[:] = found
+    own.wanted = min(2.0 * own.wanted, k.missing_torque.longest)
     _clear_sums(m)
     return is_agreed
 
@@ -171,17 +169,18 @@ def is_found_in_time(k: Constants, m: Memory) -> bool:
 @compiled
 def is_found(k: Constants, m: Memory) -> bool:
     """Return whether the place explains the model's residual over all samples; fill `rms_Nm` (n,)."""
-    m.missing_torque.rms_Nm[:] = 0.0
+    own = m.missing_torque
+    own.rms_Nm[:] = 0.0
     if k.position_torque_Nm != 0.0:
         return False
-    basic, full = m.missing_torque.basic, m.missing_torque.full
-    without = _log_evidence(m, m.missing_torque.b, _scale_of(k, m, False), basic)
-    gain = _log_evidence(m, m.missing_torque.b, _scale_of(k, m, True), full) - without
-    if not (gain > GAIN and _squares_left(m, full) < (1.0 - SHARE) * _squares_left(m, basic)):
+    basic, full = own.basic, own.full
+    without = log_evidence(m, own.b, scale_of(k, m, False), basic)
+    gain = log_evidence(m, own.b, scale_of(k, m, True), full) - without
+    if not (gain > GAIN and squares_left(m, full) < (1.0 - SHARE) * squares_left(m, basic)):
         return False
     largest = 0.0
-    for i in range(m.missing_torque.rms_Nm.shape[0]):
-        ways = m.missing_torque.ways[i]
+    for i in range(own.rms_Nm.shape[0]):
+        ways = own.ways[i]
         if np.min(ways) >= LEAST_BACK * np.sum(ways):
             largest = max(largest, _rms_Nm(m, i))
     if largest > LEAST_NM:
@@ -190,7 +189,7 @@ def is_found(k: Constants, m: Memory) -> bool:
 
 
 @compiled
-def _scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
+def scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
     """Return the prior's deviations (f,) of the model, and of the columns by place or 0 for them."""
     scale, count = m.missing_torque.scale, m.models.belief.shape[0]
     scale[:] = k.missing_torque.prior_std
@@ -200,28 +199,24 @@ def _scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
 
 
 @compiled
-def _is_said_again(k: Constants, m: Memory) -> bool:
+def _is_found_again(k: Constants, m: Memory) -> bool:
     """Return whether an earlier stretch's torque explains this one, of which `basic` is the model."""
-    m.missing_torque.rms_Nm[:] = 0.0
-    said, count, basic, full = (
-        m.missing_torque.said,
-        m.models.belief.shape[0],
-        m.missing_torque.basic,
-        m.missing_torque.full,
-    )
-    if k.position_torque_Nm != 0.0 or not np.any(said != 0.0):
+    own = m.missing_torque
+    own.rms_Nm[:] = 0.0
+    last_found, count, basic, full = own.last_found, m.models.belief.shape[0], own.basic, own.full
+    if k.position_torque_Nm != 0.0 or not np.any(last_found != 0.0):
         return False
-    b = m.missing_torque.row
-    b[:] = m.missing_torque.b
-    for i in range(m.missing_torque.L.shape[0]):
+    b = own.row
+    b[:] = own.b
+    for i in range(own.L.shape[0]):
         for j in range(count):
-            for n in range(said.shape[0]):
-                b[j] -= m.missing_torque.L[i, count + n, j] * said[n]
-    _log_evidence(m, b, _scale_of(k, m, False), full)
-    full[count : count + said.shape[0]] = said
-    left = _squares_left(m, basic)
-    explained = left - _squares_left(m, full)
-    is_agreed = 0.5 * explained > GAIN and explained > SAID_SHARE * left
+            for n in range(last_found.shape[0]):
+                b[j] -= own.L[i, count + n, j] * last_found[n]
+    log_evidence(m, b, scale_of(k, m, False), full)
+    full[count : count + last_found.shape[0]] = last_found
+    left = squares_left(m, basic)
+    explained = left - squares_left(m, full)
+    is_agreed = 0.5 * explained > GAIN and explained > AGREED_SHARE * left
     if is_agreed:
         _fill_missing(m)
     return bool(is_agreed)
@@ -236,15 +231,16 @@ def _fill_missing(m: Memory) -> None:
 @compiled
 def _rms_Nm(m: Memory, joint: int) -> float:
     """Return the rms difference of the two models on a joint's samples, Nm."""
-    apart = m.missing_torque.row
+    own = m.missing_torque
+    apart = own.row
     for j in range(apart.shape[0]):
-        apart[j] = m.missing_torque.full[j] - m.missing_torque.basic[j]
-    square = linalg.quadratic(m.missing_torque.L[joint], apart)
-    return float(np.sqrt(square / max(m.missing_torque.weight[joint], 1e-12)))
+        apart[j] = own.full[j] - own.basic[j]
+    square = linalg.quadratic(own.L[joint], apart)
+    return float(np.sqrt(square / max(own.weight[joint], 1e-12)))
 
 
 @compiled
-def _log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
+def log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
     """Return the log evidence of the columns with a deviation s (f,) above 0, less a common constant; fill x (f,)."""
     M, count, log_det = m.missing_torque.M, s.shape[0], 0.0
     for j in range(count):
@@ -266,11 +262,12 @@ def _log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
 
 
 @compiled
-def _squares_left(m: Memory, x: Vector) -> float:
+def squares_left(m: Memory, x: Vector) -> float:
     """Return Σ (r - v x)² / R."""
-    total = m.missing_torque.yy - 2.0 * linalg.dot(x, m.missing_torque.b)
-    for i in range(m.missing_torque.L.shape[0]):
-        total += linalg.quadratic(m.missing_torque.L[i], x)
+    own = m.missing_torque
+    total = own.yy - 2.0 * linalg.dot(x, own.b)
+    for i in range(own.L.shape[0]):
+        total += linalg.quadratic(own.L[i], x)
     return float(max(total, 0.0))
 
 

@@ -207,22 +207,16 @@ class FilteredTorque:
 
 
 @dataclass(frozen=True)
-class OfflineContact:
-    """One contact; joints and links are counted from 0."""
-
-    sample: int  # of detection
-    link: int
-    first_joint: int  # the one that crossed first
-    direction: tuple[int, ...]  # (n,), sign of tau_ext_hat of each joint when it crossed, 0 if it did not
-
-
-@dataclass(frozen=True)
 class OfflineDetection:
-    """External torque and threshold of each sample and joint (k, n), Nm, and the contacts in order."""
+    """External torque and threshold of each sample and joint (k, n), Nm, and the contacts in order.
+
+    A contact: the sample of its detection; its link, from 0; the sign (n,) of tau_ext_hat of each joint when it
+    crossed its threshold, 0 if it did not.
+    """
 
     tau_ext_hat: Vector
     threshold: Vector
-    contacts: tuple[OfflineContact, ...]
+    contacts: tuple[tuple[int, int, tuple[int, ...]], ...]
 
 
 def identify(model: ArmModel, record: Record, before: ModelEstimate, settings: OfflineSettings) -> ModelEstimate:
@@ -231,7 +225,7 @@ def identify(model: ArmModel, record: Record, before: ModelEstimate, settings: O
     for has_velocity_noise in (False, True) if settings.velocity_noise_rad_s else (True,):
         theta, P = before.theta.copy(), before.P.copy()
         weighed = settings if has_velocity_noise else replace(settings, velocity_noise_rad_s=0.0)
-        _fit_trace(model, record, ModelEstimate(theta, P), weighed, theta_M, is_learning=True)
+        _trace(model, record, ModelEstimate(theta, P), weighed, theta_M, is_learning=True)
         theta_M = theta
     return ModelEstimate(theta, P)
 
@@ -258,7 +252,7 @@ def parameter_deviation(
     scores = np.zeros((_PARTS, estimate.theta.size))
     squares, at = np.zeros(model.joints), 0
     for record in records:
-        trace = _fit_trace(
+        trace = _trace(
             model, record, estimate, settings, estimate.theta, scores=scores, at=at, length=-(-count // _PARTS)
         )
         squares += np.sum(trace.tau_ext_hat**2, axis=0)
@@ -279,7 +273,7 @@ def parameter_deviation(
 
 def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredTorque:
     """Return torque and residual of a record as the fit sees them. Raises as `identify`."""
-    trace = _fit_trace(model, record, estimate, settings, estimate.theta)
+    trace = _trace(model, record, estimate, settings, estimate.theta)
     return FilteredTorque(trace.tau_f, -trace.tau_ext_hat, trace.unit)
 
 
@@ -287,10 +281,10 @@ def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tupl
     """Return the samples of a fit: regressor (m, n, p) and torque (m, n), filtered. Raises as `identify`."""
     count = len(record.q) // settings.fit_every
     shape = (count, model.joints, len(model.parameter_names))
-    rows = _Rows(np.zeros(shape), np.zeros(shape[:2]))
+    rows = np.zeros(shape), np.zeros(shape[:2])
     zero = ModelEstimate(np.zeros(shape[2]), np.zeros((0, 0)))
-    _fit_trace(model, record, zero, settings, zero.theta, rows=rows)
-    return rows.W, rows.tau
+    _trace(model, record, zero, settings, zero.theta, rows=rows)
+    return rows
 
 
 def mass_terms(model: ArmModel, q: Vector, dq: Vector) -> Vector:
@@ -310,7 +304,7 @@ def filtered_noise_Nm(settings: OfflineSettings) -> Vector:
 
 def certify(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> OfflineCertificate:
     """Test a frozen estimate on a record of free motion that `identify` has not seen. Raises as `identify`."""
-    trace = _detection_trace(model, record, estimate, settings)
+    trace = _trace(model, record, estimate, settings)
     residual = np.abs(trace.tau_ext_hat)
     mean_square = np.mean(residual**2, axis=0)
     lack = np.sqrt(np.maximum(mean_square - np.mean(trace.deviation**2, axis=0), 0.0))
@@ -329,14 +323,14 @@ def detect(
     lack_Nm: Vector | None = None,
 ) -> OfflineDetection:
     """Find the contacts in a record. lack_Nm (n,): of `certify`, zero if not given. Raises as `identify`."""
-    trace = _detection_trace(model, record, estimate, settings)
+    trace = _trace(model, record, estimate, settings)
     threshold = _threshold(trace, settings, np.zeros(model.joints) if lack_Nm is None else lack_Nm)
     window = round(settings.isolation_s / settings.period_s)
-    return OfflineDetection(trace.tau_ext_hat, threshold, _contacts(trace.tau_ext_hat, threshold, window))
+    return OfflineDetection(trace.tau_ext_hat, threshold, find_contacts(trace.tau_ext_hat, threshold, window))
 
 
-def _contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[OfflineContact, ...]:
-    """Split the samples over the threshold into contacts.
+def find_contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[tuple[int, int, tuple[int, ...]], ...]:
+    """Split the samples over the threshold into contacts, as in `OfflineDetection`.
 
     A contact ends when every joint has stayed within `ONSET_FRACTION` of its threshold for a whole window, so a push
     that sways around the threshold is one.
@@ -355,8 +349,7 @@ def _contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[Offl
         for joint in joints:
             value = tau_ext_hat[crossings[joint], joint]
             direction[joint] = int(value > 0.0) - int(value < 0.0)
-        first = int(joints[np.argmin(crossings[joints])])
-        contacts.append(OfflineContact(int(begin), int(joints[-1]), first, tuple(direction)))
+        contacts.append((int(begin), int(joints[-1]), tuple(direction)))
     return tuple(contacts)
 
 
@@ -407,13 +400,6 @@ def _new_memory(joints: int, count: int) -> _Memory:
     return _Memory(*(np.zeros(shape) for shape in (*(columns,) * 8, *(joint,) * 9, *(columns,) * 2, *(parameter,) * 2)))
 
 
-class _Rows(NamedTuple):
-    """The samples of a fit, if the caller wants them: (m, n, p) and (m, n), m = 0 if not."""
-
-    W: Vector
-    tau: Vector
-
-
 class _NoiseGains(NamedTuple):
     """The filters' gains for white noise of 1: its standard deviation, and the cost of its correlation in a fit."""
 
@@ -446,39 +432,21 @@ def _noise_gains(cutoff_rad_s: float, settings: OfflineSettings, is_smoothed: bo
     return _NoiseGains(gains[0], gains[1], R)
 
 
-def _detection_trace(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> _Trace:
-    """Run a record through the filter of detection, the estimate frozen."""
-    return _trace(model, record, estimate, settings, settings.detection_cutoff_rad_s, estimate.theta)
-
-
-def _fit_trace(
-    model: ArmModel,
-    record: Record,
-    estimate: ModelEstimate,
-    settings: OfflineSettings,
-    theta_M: Vector,
-    **options: bool | int | Vector | _Rows,
-) -> _Trace:
-    """Run a record through the smoothed filter of the fit; options: of `_trace`."""
-    cutoff_rad_s = settings.fit_cutoff_rad_s
-    return _trace(model, record, estimate, settings, cutoff_rad_s, theta_M, is_smoothed=True, **options)  # type: ignore[arg-type]
-
-
 def _trace(
     model: ArmModel,
     record: Record,
     estimate: ModelEstimate,
     settings: OfflineSettings,
-    cutoff_rad_s: float,
-    theta_M: Vector,
-    is_smoothed: bool = False,
+    theta_M: Vector | None = None,
     is_learning: bool = False,
     scores: Vector | None = None,
     at: int = 0,
     length: int = 1,
-    rows: _Rows | None = None,
+    rows: tuple[Vector, Vector] | None = None,
 ) -> _Trace:
-    """Run a record through the filter; theta and P, contiguous then, are corrected in place if it learns.
+    """Run a record through the smoothed filter of the fit, or without theta_M through the one of detection.
+
+    If it learns, theta and P, contiguous then, are corrected in place.
 
     theta_M (p,): of the mass matrix that carries the velocity's noise. scores (B, p): gets the sums of
     `parameter_deviation`, `length` samples a part; at: samples that were before this record.
@@ -489,6 +457,8 @@ def _trace(
         raise ValueError(
             f"the arm has {n} joints, the record {record.q.shape[1]}, noise_Nm {len(settings.noise_Nm)} values"
         )
+    is_smoothed = theta_M is not None
+    cutoff_rad_s = settings.fit_cutoff_rad_s if is_smoothed else settings.detection_cutoff_rad_s
     hold = filter_bank.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
     gains = _noise_gains(cutoff_rad_s, settings, is_smoothed)
     memory = _new_memory(n, estimate.theta.size)
@@ -512,7 +482,7 @@ def _trace(
         settings.fit_every,
         settings.standstill_rad_s,
         is_learning,
-        np.ascontiguousarray(theta_M),
+        np.ascontiguousarray(estimate.theta if theta_M is None else theta_M),
         np.ascontiguousarray(estimate.theta),
         np.ascontiguousarray(estimate.P),
         chain.new_scratch(model.chain),
@@ -521,7 +491,7 @@ def _trace(
         np.zeros((0, 0)) if scores is None else scores,
         at,
         length,
-        _Rows(np.zeros((0, 0, 0)), np.zeros((0, 0))) if rows is None else rows,
+        (np.zeros((0, 0, 0)), np.zeros((0, 0))) if rows is None else rows,
     )
     return trace
 
@@ -553,7 +523,7 @@ def _run(
     scores: Vector,
     at: int,
     length: int,
-    rows: _Rows,
+    rows: tuple[Vector, Vector],
 ) -> None:
     """Filter a record, estimate the external torque of each sample, and correct theta and P if it learns.
 
@@ -590,9 +560,9 @@ def _run(
             trace.tau_f[k, i] = m.tau[i]
         if k % fit_every == fit_every - 1:
             _weigh(noise_Nm, R, passed_rad_s2, m)
-            if rows.W.shape[0] > 0:
-                rows.W[k // fit_every] = m.W
-                rows.tau[k // fit_every] = m.tau
+            if rows[0].shape[0] > 0:
+                rows[0][k // fit_every] = m.W
+                rows[1][k // fit_every] = m.tau
             if scores.shape[0] > 0:
                 _add_score(theta, m, scores[(at + k) // length])
             if is_learning:

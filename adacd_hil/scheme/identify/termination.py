@@ -71,14 +71,12 @@ def widen(value: Vector, low: Vector, high: Vector) -> None:
 
 
 @compiled
-def has_moved(
-    q_low: Vector, q_high: Vector, dq_low: Vector, dq_high: Vector, travel_rad: float, velocity_rad_s: float
-) -> bool:
+def has_moved(motion: Motion, travel_rad: float, velocity_rad_s: float) -> bool:
     """Return whether each joint has travelled, and moved in both directions, as far and as fast as required."""
-    for i in range(q_low.shape[0]):
-        if not (q_high[i] - q_low[i] >= travel_rad):
+    for i in range(motion.q_low.shape[0]):
+        if not (motion.q_high[i] - motion.q_low[i] >= travel_rad):
             return False
-        if not (dq_high[i] >= velocity_rad_s and dq_low[i] <= -velocity_rad_s):
+        if not (motion.dq_high[i] >= velocity_rad_s and motion.dq_low[i] <= -velocity_rad_s):
             return False
     return True
 
@@ -188,13 +186,14 @@ def test(k: Constants, m: Memory, dq: Vector, tau_ext_hat: Vector) -> int:
 
     Samples of a joint at rest prove no model and are skipped.
     """
+    own = m.motion
     m.fit.tested += 1.0
-    widen(dq, m.motion.dq_low, m.motion.dq_high)
+    widen(dq, own.dq_low, own.dq_high)
     has_moved = True
     for i in range(dq.shape[0]):
         if not (abs(tau_ext_hat[i]) <= m.fit.test_limit_Nm):
             return -1
-        fastest = max(m.motion.dq_high[i], -m.motion.dq_low[i])
+        fastest = max(own.dq_high[i], -own.dq_low[i])
         has_moved = has_moved and fastest >= k.velocity_rad_s
     is_long = m.fit.tested >= k.test_cycles[int(m.models.is_payload)]
     return 1 if is_long and has_moved else 0
@@ -208,8 +207,9 @@ TEST_SHARE = 6.0
 @compiled
 def is_complete(k: Constants, m: Memory) -> bool:
     """Return whether the evidence for a fit is complete, from the constants `k` and the state `m` of the kernel."""
+    own = m.motion
     is_payload = m.models.is_payload != 0.0
-    if m.motion.samples < k.fit_cycles[1 if is_payload else 0]:
+    if own.samples < k.fit_cycles[1 if is_payload else 0]:
         return False
     for j in range(m.models.belief.shape[0]):
         if not (m.models.P_belief[j, j] <= k.enough_std[j] ** 2):
@@ -218,9 +218,7 @@ def is_complete(k: Constants, m: Memory) -> bool:
         return True
     if not (m.fit.excitation >= k.excitation_Nm2s and m.fit.condition <= k.condition):
         return False
-    return bool(
-        has_moved(m.motion.q_low, m.motion.q_high, m.motion.dq_low, m.motion.dq_high, k.travel_rad, k.velocity_rad_s)
-    )
+    return has_moved(own, k.travel_rad, k.velocity_rad_s)
 
 
 @compiled
@@ -238,12 +236,13 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
 
     `k`, `m`: as for `is_complete`.
     """
+    own = m.motion
     lines = []
-    joints = m.motion.q_low.shape[0]
+    joints = own.q_low.shape[0]
     travel, speed = float(np.degrees(k.travel_rad)), float(np.degrees(k.velocity_rad_s))
     enough_samples = k.fit_cycles[int(m.models.is_payload)]
-    if m.motion.samples < enough_samples:
-        lines.append(f"{m.motion.samples:.0f} samples in a row are undisturbed, {enough_samples:.0f} needed")
+    if own.samples < enough_samples:
+        lines.append(f"{own.samples:.0f} samples in a row are undisturbed, {enough_samples:.0f} needed")
     if m.models.is_payload == 0.0:
         if not m.fit.excitation >= k.excitation_Nm2s:
             lines.append(
@@ -257,10 +256,10 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
                 "(estimator.gravity of an arm that hardly feels it)"
             )
         for i in range(joints):
-            travelled = max(float(np.degrees(m.motion.q_high[i] - m.motion.q_low[i])), 0.0)
+            travelled = max(float(np.degrees(own.q_high[i] - own.q_low[i])), 0.0)
             if not travelled >= travel:
                 lines.append(f"joint {i + 1} has travelled {travelled:.1f} deg of {travel:g}: move it further")
-            fastest, slowest = float(np.degrees(m.motion.dq_high[i])), float(np.degrees(m.motion.dq_low[i]))
+            fastest, slowest = float(np.degrees(own.dq_high[i])), float(np.degrees(own.dq_low[i]))
             if not (fastest >= speed and slowest <= -speed):
                 lines.append(
                     f"joint {i + 1} has moved at {min(slowest, 0.0):.1f} to {max(fastest, 0.0):.1f} deg/s, "

@@ -15,12 +15,10 @@ is armed the belief goes on learning; its mean replaces the frozen model after a
 Constants, memory and block: `certified_memory`.
 """
 
-from typing import Any
-
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.records import CertifiedBlock, Vector
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import (
     anchor,
@@ -113,18 +111,18 @@ def begin_refinement(constants: Structured, memory: Structured) -> None:
 
 @compiled
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
-    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of `Observation`.
+    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`transitions`).
 
     is_complete: 1 for a fresh sample. steps: periods since the fresh sample before it. mode: bits MEASURE to WEIGH.
     """
     k, m, out = constants[0], memory[0], block[0]
-    observation = observe(k, out, steps, OVER_SPEED)
+    observation = observe(k.limits, k.period_s, block, steps, OVER_SPEED)
     is_fresh = is_complete != 0 and observation & NOT_A_NUMBER == 0
     if is_fresh:
-        evidence.follow(m, out["period_s"][0])
+        evidence.follow(m, out.period_s)
         if mode & MEASURE:
-            sensitivity.measure_noise(k, m, out["tau_J"])
-            anchor.measure(k, m, out["tau_J"], observation & AT_REST != 0)
+            sensitivity.measure_noise(k, m, out.tau_J)
+            anchor.measure(k, m, out.tau_J, observation & AT_REST != 0)
         if _filter(k, m, out, steps):
             observation &= ~UNSEEN
         if not (np.all(np.isfinite(m.filters.r)) and np.all(np.isfinite(m.models.theta))):
@@ -132,13 +130,13 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     elif is_complete != 0:
         m.gaps.has_gap = 1.0
     if mode & MEASURE and anchor.is_rest_refused(k, m):
-        certificate.withhold(m, certificate.ANCHOR)
+        certificate.withhold(m, certificate.READING)
         observation |= WITHHELD
     if mode & WATCH:
         observation |= _watch(k, m, out, is_fresh)
     else:
-        out["threshold"][:] = np.inf
-        out["threshold_bank"][:] = np.inf
+        out.threshold[:] = np.inf
+        out.threshold_bank[:] = np.inf
         sensitivity.lift(m)
     if mode & WEIGH and not observation & UNSEEN:
         doubt.weigh(k, m)
@@ -149,37 +147,37 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 
 
 @compiled
-def _filter(k: Constants, m: Memory, out: Any, steps: int) -> bool:
+def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
     """Advance the bank to this sample and estimate the external torque from each filter.
 
     Return whether the filters took the sample in; after a gap they only resume.
     """
     nominal_s: float = k.period_s
-    period_s: float = out["period_s"][0]
+    period_s: float = out.period_s
     is_seen = m.gaps.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
     each_s = period_s / steps if is_seen else period_s
     if is_seen:
         filter_bank.choose_rates(k, m, each_s)
         for between in range(1, steps):
-            put_between(m.gaps.last, out["q"], out["dq"], out["tau_J"], between / steps, m.gaps.between)
+            put_between(m.gaps.last, out.q, out.dq, out.tau_J, between / steps, m.gaps.between)
             m.gaps.is_steady = 0.0
             q, dq, tau_J = m.gaps.between[0], m.gaps.between[1], m.gaps.between[2]
-            _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
-    sensitivity.follow_lost(k, m, out["dq"], max(steps, 1), period_s, is_seen)
-    sensitivity.follow_torque_step(k, m, out["tau_J"])
-    if not is_seen and np.max(np.abs(out["dq"])) > regressor.SLOW_RAD_S:
+            _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out.tau_ext_wide_hat)
+    sensitivity.follow_lost(k, m, out.dq, max(steps, 1), period_s, is_seen)
+    sensitivity.follow_torque_step(k, m, out.tau_J)
+    if not is_seen and np.max(np.abs(out.dq)) > regressor.SLOW_RAD_S:
         belief.pause(m, k.settle_cycles)
     m.gaps.is_steady = 1.0 if is_seen and steps == 1 else 0.0
-    q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays like those above, so that this is compiled once
-    _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
+    q, dq, tau_J = out.q[:], out.dq[:], out.tau_J[:]  # arrays like those above, so that this is compiled once
+    _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out.tau_ext_wide_hat)
     m.gaps.has_gap = 0.0
-    keep_sample(out["q"], out["dq"], out["tau_J"], m.gaps.last)
-    out["tau_f"][:] = m.filters.tau_f[filter_bank.SLOW]
-    external_torque.predict(m.filters.W_f[filter_bank.SLOW], k.theta_cad, out["tau_f_cad"])
-    for i in range(out["q"].shape[0]):
-        out["tau_ext_hat"][i] = m.filters.r[filter_bank.SLOW, i]
-        out["tau_f_hat"][i] = m.filters.r[filter_bank.SLOW, i] + out["tau_f"][i]
-        out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
+    keep_sample(out.q, out.dq, out.tau_J, m.gaps.last)
+    out.tau_f[:] = m.filters.tau_f[filter_bank.SLOW]
+    external_torque.predict(m.filters.W_f[filter_bank.SLOW], k.theta_cad, out.tau_f_cad)
+    for i in range(out.q.shape[0]):
+        out.tau_ext_hat[i] = m.filters.r[filter_bank.SLOW, i]
+        out.tau_f_hat[i] = m.filters.r[filter_bank.SLOW, i] + out.tau_f[i]
+        out.tau_ext_hat_cad[i] = out.tau_f_cad[i] - out.tau_f[i]
     return bool(is_seen)
 
 
@@ -205,17 +203,7 @@ def _take_sample(
     filter_bank.smooth_learnt(k.smoothing, m.filters.W_f, m.filters.tau_f, m.filters.W_learnt, m.filters.tau_learnt)
     filter_bank.estimate_external(m.filters.tau_f, m.filters.W_f, m.models.theta, m.filters.r)
     filter_bank.smooth(k.smoothing, m.filters.r, m.filters.y)
-    still_rad_s, decay, smoothing = k.still_rad_s, k.decay, k.smoothing
-    sensitivity.follow_standstill(
-        dq,
-        m.sensitivity.dq_old,
-        still_rad_s,
-        decay,
-        smoothing,
-        m.sensitivity.still,
-        m.sensitivity.still_smooth,
-        m.sensitivity.low_speed,
-    )
+    sensitivity.follow_standstill(k, m, dq)
     sensitivity.follow_velocity_noise(k, m, dq, m.gaps.is_steady != 0.0)
     sensitivity.follow_friction(k, m, tau_J)
     external_torque.undo_filter(
@@ -224,11 +212,11 @@ def _take_sample(
 
 
 @compiled
-def _watch(k: Constants, m: Memory, out: Any, is_fresh: bool) -> int:
+def _watch(k: Constants, m: Memory, out: CertifiedBlock, is_fresh: bool) -> int:
     """Compare with the thresholds; return CONTACT, COLLISION and the joints over their threshold, or 0."""
     if is_fresh:
         sensitivity.fill_thresholds(k, m, m.sensitivity.h)
-        out["threshold"][:] = m.sensitivity.h[filter_bank.SLOW]
+        out.threshold[:] = m.sensitivity.h[filter_bank.SLOW]
         sensitivity.fill_wide(k, m, filter_bank.WIDE)
     joints = sensitivity.joints_over(m.filters.y, m.sensitivity.h)
     if not joints:
@@ -242,24 +230,24 @@ def _watch(k: Constants, m: Memory, out: Any, is_fresh: bool) -> int:
 
 
 @compiled
-def improve(k: Constants, m: Memory, out: Any, is_touched: bool, mode: int) -> int:
-    """Learn, test or refine with this sample; return the result as bits of `Observation`."""
+def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode: int) -> int:
+    """Learn, test or refine with this sample; return the result as bits of an observation."""
     was_free = m.models.recovering_cycles == 0.0
     is_free = belief.is_free(k, m, is_touched)
     if is_touched and was_free and mode & (LEARN | TEST):
         sensitivity.strain(m, sensitivity.LARGEST_STRAIN)
         earlier.keep(k, m)
     if is_touched and mode & REFINE:
-        doubt.begin(k, m, 0.0)
+        doubt.begin(k, m)
     _follow_noise(k, m, is_free, mode)
     if mode & TEST:
-        return _test(k, m, out["dq"])
+        return _test(k, m, out.dq)
     if mode & REFINE:
         return _refine(k, m) if is_free else 0
     W_f, tau_f = m.filters.W_f[filter_bank.SLOW], m.filters.tau_f[filter_bank.SLOW]
     if is_free and belief.learn_and_use(k, m):
         fit_check.follow(k, m, W_f, tau_f)
-    is_complete = is_free and termination.follow(k, m, out["q"], out["dq"], W_f)
+    is_complete = is_free and termination.follow(k, m, out.q, out.dq, W_f)
     if not (is_complete and regressor.is_positive_definite(m.models.belief)):
         return 0
     certificate.withhold(m, certificate.contradicted_by(k, m))
@@ -280,7 +268,7 @@ def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
 
 @compiled
 def _test(k: Constants, m: Memory, dq: Vector) -> int:
-    """Add this sample to the test of the frozen model; return the test's result as bits of `Observation`."""
+    """Add this sample to the test of the frozen model; return its result as bits of an observation."""
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_test_share, False)
     margin.follow_test(k, m)
     result = termination.test(k, m, dq, m.filters.r[filter_bank.SLOW])
@@ -310,21 +298,21 @@ def _refine(k: Constants, m: Memory) -> int:
 
 
 @compiled
-def _fill_model(k: Constants, m: Memory, out: Any) -> None:
+def _fill_model(k: Constants, m: Memory, out: CertifiedBlock) -> None:
     """Fill the block's fields of the model and the bank."""
     base, joints = int(k.first_offset), m.filters.y.shape[1]
     for j in range(m.models.theta.shape[0]):
         if j < base:
-            out["theta_hat"][j] = m.models.theta[j]
+            out.theta_hat[j] = m.models.theta[j]
         else:
-            out["theta_further"][j - base] = m.models.theta[j]
-        out["theta_std"][j] = np.sqrt(max(m.models.P[j, j], 0.0))
+            out.theta_further[j - base] = m.models.theta[j]
+        out.theta_std[j] = np.sqrt(max(m.models.P[j, j], 0.0))
     for c in range(m.filters.y.shape[0]):
         for i in range(joints):
-            out["tau_ext_bank"][c * joints + i] = m.filters.y[c, i]
-            if out["threshold"][i] != np.inf:
-                out["threshold_bank"][c * joints + i] = m.sensitivity.h[c, i]
-    out["excitation"][0] = m.fit.excitation
-    out["condition"][0] = m.fit.condition
-    out["promotions"][0] = m.models.promotions
-    out["quiet_s"][0] = m.fit.tested * k.period_s
+            out.tau_ext_bank[c * joints + i] = m.filters.y[c, i]
+            if out.threshold[i] != np.inf:
+                out.threshold_bank[c * joints + i] = m.sensitivity.h[c, i]
+    out.excitation = m.fit.excitation
+    out.condition = m.fit.condition
+    out.promotions = m.models.promotions
+    out.quiet_s = m.fit.tested * k.period_s

@@ -8,19 +8,18 @@ import math
 
 import numpy as np
 
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector, certified_layout
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, POSITION_TERMS, CertifiedBlock, Vector, block_sizes
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import (
     anchor,
     belief,
     certificate,
     doubt,
-    earlier,
     evidence,
     fit_check,
     missing_torque,
 )
-from adacd_hil.scheme.kernel.kernel_samples import Numbers, block_dtype, limits_of
+from adacd_hil.scheme.kernel.kernel_samples import Numbers, limits_of
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.configuration import Settings
@@ -30,6 +29,9 @@ from adacd_hil.structured import Structured, packed, zeros_of
 SETTLED = 3.0
 """After a gap a moving arm waits so many time constants of the learnt filter before it learns again: the filter
 restarts with a measured velocity, which lags, and takes this long to forget that error."""
+
+LEAST_PLACES = 32
+"""Least number of places in the ring: enough at 0.5 ms and longer periods, so that these share their machine code."""
 
 
 def parameter_names(settings: Settings) -> tuple[str, ...]:
@@ -136,7 +138,6 @@ def constants_of(settings: Settings) -> Structured:
             first_position=_first_of(POSITION_TERMS[0], names),
             position_torque_Nm=settings.arm.position_torque_Nm,
             width_rad_s=certified.coulomb_width_rad_s,
-            stribeck_rad_s=certified.stribeck_rad_s,
             terms=np.array([FRICTION_TERMS.index(term) for term in certified.friction_terms]),
             dahl_rad=np.array(certified.dahl_rad),
             theta_cad=theta_cad,
@@ -148,46 +149,51 @@ def constants_of(settings: Settings) -> Structured:
             payload_direction=regressor.payload_direction(
                 settings.arm.link_length_m, len(names), settings.gravity_m_s2
             ),
-            payload_std_kg=certified.payload_std_kg,
             payload_rest_std=_payload_rest_std_of(settings, len(names)),
             correlated=max(correlated, 1.0),
-            residual_Nm=certified.residual_Nm,
-            learn_every=certified.learn_every,
             recover_cycles=round(certified.recover_s / period_s),
             settle_cycles=round(SETTLED / (cutoff[filter_bank.LEARNT] * period_s)),
             fit_cycles=np.array([round(fit_s / period_s) for fit_s in certified.fit_s]),
             test_cycles=np.array([round(test_s / period_s) for test_s in certified.test_s]),
-            beta_Nm=certified.beta_Nm,
             refine_cycles=round(certified.refine_s / period_s),
-            excitation_Nm2s=certified.excitation_Nm2s,
-            condition=certified.condition,
             scale=_by_kind((inertia, viscous, coulomb, gravity, coulomb, 0.005, coulomb), names)[: base + 2 * JOINTS],
             travel_rad=np.radians(settings.termination.travel_deg),
             velocity_rad_s=np.radians(settings.termination.velocity_deg_s),
             smoothing=math.exp(-certified.smoothing_rad_s * period_s),
             noise=sensitivity.noise_constants(certified, period_s),
             anchor=anchor.constants_of(settings),
-            doubt=doubt.constants_of(settings, len(names)),
+            causes=doubt.causes_of(settings, len(names)),
             evidence=evidence.constants_of(settings, prior_std),
-            fit_check=fit_check.constants_of(settings),
-            earlier=earlier.constants_of(),
-            last=certificate.constants_of(settings),
+            step_samples=fit_check.step_samples_of(settings),
+            waiting=_waiting_of(settings),
             margin=margin.constants_of(settings),
             missing_torque=missing_torque.constants_of(settings, prior_std),
+            collision_Nm=np.array(settings.detector.collision_Nm),
+            limits=limits_of(settings),
+            residual_Nm=certified.residual_Nm,
+            learn_every=certified.learn_every,
+            beta_Nm=certified.beta_Nm,
+            excitation_Nm2s=certified.excitation_Nm2s,
+            condition=certified.condition,
             model_sigmas=certified.model_sigmas,
             torque_noise_Nm=certified.torque_noise_Nm,
             noise_sigmas=certified.noise_sigmas,
             still_rad_s=certified.still_rad_s,
             standstill_share=certified.standstill_share,
-            collision_Nm=np.array(settings.detector.collision_Nm),
-            limits=limits_of(settings),
+            payload_std_kg=certified.payload_std_kg,
+            stribeck_rad_s=certified.stribeck_rad_s,
         )
     )
 
 
+def _waiting_of(settings: Settings) -> int:
+    """Return the number of learnt samples that wait for so long as the settings say."""
+    learn_s = settings.bus.period_s * settings.certified.learn_every
+    return max(round(settings.certified.hold_back_s / learn_s), 1)
+
+
 def sizes_of(settings: Settings) -> dict[str, int]:
     """Return the sizes named in the records of `Memory`."""
-    learn_s = settings.bus.period_s * settings.certified.learn_every
     count = len(parameter_names(settings))
     return {
         "n": JOINTS,
@@ -198,13 +204,13 @@ def sizes_of(settings: Settings) -> dict[str, int]:
         "filters": settings.filter_count,
         "channels": settings.channel_count,
         "wide": external_torque.WIDE_SAMPLES + 1,
-        "waiting": max(round(settings.certified.hold_back_s / learn_s), 1),
+        "places_in_ring": max(LEAST_PLACES, _waiting_of(settings)),
         "kinds": anchor.KINDS,
         "sources": evidence.SOURCES,
         "quantities": evidence.QUANTITIES,
         "steps": fit_check.STEPS,
         "room": fit_check.ROOM,
-        "causes": doubt.CAUSES,
+        "causes_n": doubt.CAUSES + JOINTS,
         "bins": margin.BINS,
     }
 
@@ -223,7 +229,7 @@ def new_memory(settings: Settings) -> Structured:
     evidence.begin(m)
     anchor.begin(k, m)
     missing_torque.clear(k, m)
-    certificate.begin(k, m)
+    certificate.begin(settings, m)
     return memory
 
 
@@ -231,8 +237,7 @@ def new_block(settings: Settings) -> Structured:
     """Return a block before the first sample: zeros, and infinite thresholds."""
     base = len(settings.estimator.parameter_names)
     further = len(parameter_names(settings)) - base
-    layout = certified_layout(base, further, settings.channel_count)
-    block = np.zeros(1, block_dtype(layout))
+    block = zeros_of(CertifiedBlock, block_sizes(base, further, settings.channel_count))
     for name in ("threshold", "threshold_bank", "paper_threshold"):
         block[name] = np.inf
     return block

@@ -19,7 +19,7 @@ from adacd_hil.records import JOINTS, ContactLevel, Request, SchemeState, Vector
 from adacd_hil.scheme.contact import contact_report, course
 from adacd_hil.scheme.contact.course import CourseConstants, CourseMemory
 from adacd_hil.scheme.kernel import certified_kernel, paper_kernel
-from adacd_hil.scheme.kernel.kernel_samples import Interval, interval_s, put_sample
+from adacd_hil.scheme.kernel.kernel_samples import put_sample
 from adacd_hil.scheme.memory import Sample
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.supervisor import supervisor
@@ -41,7 +41,7 @@ BEFORE_CONTACT = LEFT | REFUSED | TOOK_OVER | ACCEPTED
 
 
 class Decision:
-    """The result of a cycle. observation: bits of `Observation`."""
+    """The result of a cycle. observation: bits of an observation (`transitions`)."""
 
     state: Annotated[int, np.uint8]
     previous_state: Annotated[int, np.uint8]
@@ -65,12 +65,15 @@ class RunConstants:
 class RunMemory:
     """Memory common to both schemes.
 
+    is_measured: intervals of samples are measured; sampled_ns: time of the last fresh one, is_sampled: there was one.
     is_model_valid: the model may be fed forward. is_refusing: a refusal is pending that the user may accept.
     """
 
     supervisor: SupervisorMemory
     contact: CourseMemory
-    interval: Interval
+    is_measured: int
+    is_sampled: int
+    sampled_ns: int
     is_model_valid: int
     is_refusing: int
 
@@ -95,13 +98,26 @@ _PAPER_MODE[[SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED]] = pap
 
 
 def new_course(settings: Settings) -> tuple[Structured, Structured]:
-    """Return constants and memory (1,) before the first cycle; the policy fills in the times of the reports."""
+    """Return constants and memory (1,) before the first cycle."""
     constants, memory = zeros_of(RunConstants, _SIZES), zeros_of(RunMemory, _SIZES)
-    supervisor.fill_constants(settings, constants["supervisor"][0])
-    supervisor.begin(memory["supervisor"][0])
-    course.begin(memory["contact"][0])
-    memory["interval"]["is_measured"] = settings.realtime.sample_period == "measured"
+    k: RunConstants = constants[0]
+    m: RunMemory = memory[0]
+    supervisor.fill_constants(settings, k.supervisor)
+    course.fill_constants(settings, k.contact)
+    supervisor.begin(m.supervisor)
+    course.begin(m.contact)
+    m.is_measured = settings.realtime.sample_period == "measured"
     return constants, memory
+
+
+@compiled
+def interval_s(m: RunMemory, sample: Sample) -> float:
+    """Return the time since the last fresh sample, s; 0 for the first sample, a missing one, and if not measured."""
+    if m.is_measured == 0 or sample.is_complete == 0:
+        return 0.0
+    period_s = (sample.sampled_ns - m.sampled_ns) * 1e-9 if m.is_sampled != 0 else 0.0
+    m.is_sampled, m.sampled_ns = 1, sample.sampled_ns
+    return period_s
 
 
 @compiled
@@ -127,7 +143,7 @@ def certified_cycle(
     `contact_report.put_row`.
     """
     sample, decision, run = samples[place], decisions[place], course_memory[0]
-    period_s = interval_s(run.interval, sample)
+    period_s = interval_s(run, sample)
     mode = _CERTIFIED_MODE[run.supervisor.state]
     if run.supervisor.state == SchemeState.REACT and run.supervisor.origin == SchemeState.MONITOR:
         mode |= certified_kernel.WEIGH
@@ -163,14 +179,14 @@ def end_certified(
     contact_report.put_row(
         rows,
         contact.kept_rows,
-        out["q"],
-        out["tau_ext_wide_hat"],
+        out.q,
+        out.tau_ext_wide_hat,
         m.sensitivity.wide_sigma,
         m.sensitivity.wide_threshold,
     )
     contact.kept_rows += 1
     asked = follow_contact(
-        course_constants[0], run, samples[place], decision, m.filters.y[filter_bank.WIDE], out["tau_ext_wide_hat"]
+        course_constants[0], run, samples[place], decision, m.filters.y[filter_bank.WIDE], out.tau_ext_wide_hat
     )
     is_disturbed = IS_REACTING[state] and _IS_LEARNING[run.supervisor.origin]
     is_reported = is_disturbed and contact.is_open == 0
@@ -204,7 +220,7 @@ def paper_cycle(
 ) -> int:
     """Run one cycle of the paper's scheme; arguments and result as for `certified_cycle`."""
     sample, decision, run = samples[place], decisions[place], course_memory[0]
-    period_s = interval_s(run.interval, sample)
+    period_s = interval_s(run, sample)
     mode = _PAPER_MODE[run.supervisor.state]
     if run.contact.is_open != 0:
         mode |= paper_kernel.REPORTING
@@ -228,7 +244,7 @@ def end_paper(
     course_memory: Structured,
 ) -> int:
     """End a cycle of the paper's scheme in the state reached; return bits of further tasks for Python."""
-    tau_ext_hat = block[0]["tau_ext_hat"]
+    tau_ext_hat = block[0].tau_ext_hat
     return follow_contact(
         course_constants[0], course_memory[0], samples[place], decisions[place], tau_ext_hat, tau_ext_hat
     )

@@ -7,17 +7,17 @@ q, dq, tau_J and the measured period_s into the block; a period_s of 0 was not m
 Shapes: n joints; q, dq, tau_J (n,); last, between (3, n).
 """
 
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, ArmBatch, ArmState, Layout, Vector
+from adacd_hil.records import JOINTS, ArmBatch, ArmState, SchemeBlock, Vector
 from adacd_hil.scheme.memory import Limits, Sample
 from adacd_hil.scheme.supervisor.transitions import AT_REST, NOT_A_NUMBER, OVER_LIMIT, UNLOADED, UNSEEN
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.structured import Structured, described, float_fields
+from adacd_hil.structured import Structured, described
 
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.5, 1.5
 """Shortest and longest interval of two samples that follow each other, over the nominal period."""
@@ -33,14 +33,6 @@ class Numbers(NamedTuple):
 
 
 SAMPLE = described(Sample, {"n": JOINTS})
-
-
-class Interval:
-    """State of the interval's measurement: whether intervals are measured, and the time of the last fresh sample."""
-
-    is_measured: int
-    is_known: int
-    sampled_ns: int
 
 
 def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
@@ -64,29 +56,14 @@ def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
 
 
 @compiled
-def interval_s(m: Interval, sample: Sample) -> float:
-    """Return the time since the last fresh sample, s; 0 for the first sample, a missing one, and if not measured."""
-    if m.is_measured == 0 or sample.is_complete == 0:
-        return 0.0
-    period_s = (sample.sampled_ns - m.sampled_ns) * 1e-9 if m.is_known != 0 else 0.0
-    m.is_known, m.sampled_ns = 1, sample.sampled_ns
-    return period_s
-
-
-@compiled
 def put_sample(block: Structured, sample: Sample, period_s: float) -> None:
     """Write a sample into the block, the input of a kernel's next step."""
-    out = block[0]
-    for i in range(out["q"].shape[0]):
-        out["q"][i] = sample.q[i]
-        out["dq"][i] = sample.dq[i]
-        out["tau_J"][i] = sample.tau_J[i]
-    out["period_s"][0] = period_s
-
-
-def block_dtype(layout: Layout) -> np.dtype[np.void]:
-    """Return a block's structured type; its bytes are those of the float64 block."""
-    return float_fields({field.name: (field.size,) for field in layout.fields})
+    out: SchemeBlock = block[0]
+    for i in range(out.q.shape[0]):
+        out.q[i] = sample.q[i]
+        out.dq[i] = sample.dq[i]
+        out.tau_J[i] = sample.tau_J[i]
+    out.period_s = period_s
 
 
 def limits_of(settings: Settings) -> Limits:
@@ -99,38 +76,27 @@ def limits_of(settings: Settings) -> Limits:
     )
 
 
-class Judging(Protocol):
-    """Constants of either scheme that the checks of measurements need."""
-
-    @property
-    def period_s(self) -> float:
-        """Nominal period, s."""
-
-    @property
-    def limits(self) -> Limits:
-        """Limits for checks of measurements."""
-
-
 @compiled
-def observe(k: Judging, out: Any, steps: int, too_fast: int) -> int:
+def observe(limits: Limits, nominal_s: float, block: Structured, steps: int, too_fast: int) -> int:
     """Return the findings of the measurements alone, and UNSEEN; fill period_s with the nominal one if not measured.
 
     steps: periods since the fresh sample before it. too_fast: the bit of a joint beyond its velocity limit.
     """
-    if out["period_s"][0] == 0.0:
-        out["period_s"][0] = max(steps, 1) * k.period_s
+    out: SchemeBlock = block[0]
+    if out.period_s == 0.0:
+        out.period_s = max(steps, 1) * nominal_s
     observation = AT_REST | UNLOADED | UNSEEN
-    for i in range(out["q"].shape[0]):
-        q, dq, tau_J = out["q"][i], out["dq"][i], out["tau_J"][i]
+    for i in range(out.q.shape[0]):
+        q, dq, tau_J = out.q[i], out.dq[i], out.tau_J[i]
         if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):
             observation |= NOT_A_NUMBER
-        if not (abs(q) <= k.limits.position_limit_rad[i]):
+        if not (abs(q) <= limits.position_limit_rad[i]):
             observation |= OVER_LIMIT
-        if not (abs(dq) <= k.limits.velocity_limit_rad_s[i]):
+        if not (abs(dq) <= limits.velocity_limit_rad_s[i]):
             observation |= too_fast
-        if not (abs(dq) < k.limits.rest_velocity_rad_s):
+        if not (abs(dq) < limits.rest_velocity_rad_s):
             observation &= ~AT_REST
-        if not (abs(tau_J) < k.limits.rest_torque_Nm):
+        if not (abs(tau_J) < limits.rest_torque_Nm):
             observation &= ~UNLOADED
     return observation
 

@@ -16,17 +16,16 @@ the quantities that count. T of eq. (15) is counted in cycles, whose grid keeps 
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector, scheme_layout
+from adacd_hil.records import JOINTS, CertifiedBlock, SchemeBlock, Vector, block_sizes
 from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.identify import estimator, termination
 from adacd_hil.scheme.kernel.kernel_samples import (
     Numbers,
-    block_dtype,
     is_filled,
     keep_sample,
     limits_of,
@@ -151,7 +150,7 @@ def new_memory(parameter_count: int) -> Structured:
 
 def new_block(parameter_count: int) -> Structured:
     """Return a block before the first sample: zeros, and infinite thresholds."""
-    block = np.zeros(1, block_dtype(scheme_layout(parameter_count)))
+    block = zeros_of(SchemeBlock, block_sizes(parameter_count))
     block["threshold"] = np.inf
     return block
 
@@ -172,25 +171,25 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     c, m, out = constants[0], memory[0], block[0]
     m.has_gap = 1.0
     m.W_f[:] = 0.0
-    out["tau_f"][:] = 0.0
+    out.tau_f[:] = 0.0
     external_torque.forget(m.wide)
     m.mode = LEARN  # used by a step beside; in charge, the mode follows from the state
     estimator.reset_gain(c.P0, m.P)
     termination.begin(m.motion)
     m.quiet_cycles = 0.0
-    out["quiet_s"][0] = 0.0
-    out["excitation"][0] = 0.0
+    out.quiet_s = 0.0
+    out.excitation = 0.0
 
 
 @compiled
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
-    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of `Observation`.
+    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`transitions`).
 
     is_complete: 1 for a fresh sample. steps: periods since the fresh sample before it. mode: LEARN, ARMED, REPORTING.
     """
     c, m, out = constants[0], memory[0], block[0]
     period_s = c.period_s
-    observation = observe(c, out, steps, OVER_LIMIT)
+    observation = observe(c.limits, c.period_s, block, steps, OVER_LIMIT)
     is_fresh = is_complete != 0 and observation & NOT_A_NUMBER == 0
     if is_fresh:
         is_seen, period_s = _filter(c, m, out, steps)
@@ -198,20 +197,20 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
             observation &= ~UNSEEN
         if mode & LEARN:
             observation |= _learn(c, m, out, period_s)
-        if not (np.all(np.isfinite(out["tau_ext_hat"])) and np.all(np.isfinite(out["theta_hat"]))):
+        if not (np.all(np.isfinite(out.tau_ext_hat)) and np.all(np.isfinite(out.theta_hat))):
             observation |= NOT_A_NUMBER
     elif is_complete != 0:
         m.has_gap = 1.0
     if mode & ARMED:
         return observation | _watch(c, m, out, period_s, is_fresh, mode & REPORTING != 0)
-    out["threshold"][:] = np.inf
+    out.threshold[:] = np.inf
     m.integral[:] = 0.0
     m.peak[:] = 0.0
     return observation
 
 
 @compiled
-def _filter(c: PaperConstants, m: PaperMemory, out: Any, steps: int) -> tuple[bool, float]:
+def _filter(c: PaperConstants, m: PaperMemory, out: SchemeBlock, steps: int) -> tuple[bool, float]:
     """Advance the filters to this sample and estimate the external torque with both models.
 
     Return whether they took the sample in, and the time that it covers: the measured interval, after a gap the nominal
@@ -219,8 +218,8 @@ def _filter(c: PaperConstants, m: PaperMemory, out: Any, steps: int) -> tuple[bo
     """
     a, b = c.a_rad_s, c.b_rad_s
     nominal_s: float = c.period_s
-    period_s: float = out["period_s"][0]
-    q, dq, tau_J = out["q"][:], out["dq"][:], out["tau_J"][:]  # arrays like those of `between`: all is compiled once
+    period_s: float = out.period_s
+    q, dq, tau_J = out.q[:], out.dq[:], out.tau_J[:]  # arrays like those of `between`: all is compiled once
     is_seen = m.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
     if is_seen:
         step_s = period_s / steps
@@ -228,10 +227,10 @@ def _filter(c: PaperConstants, m: PaperMemory, out: Any, steps: int) -> tuple[bo
         if step_s != nominal_s:
             hold = filter_bank.first_order_hold(a, b, step_s)
         for k in range(1, steps):
-            put_between(m.last, out["q"], out["dq"], out["tau_J"], k / steps, m.between)
-            _advance(c, m, m.between[0], m.between[1], m.between[2], hold, out["tau_f"])
+            put_between(m.last, out.q, out.dq, out.tau_J, k / steps, m.between)
+            _advance(c, m, m.between[0], m.between[1], m.between[2], hold, out.tau_f)
             _compare(c, m, m.between[1], hold.decay, out)
-        _advance(c, m, q, dq, tau_J, hold, out["tau_f"])
+        _advance(c, m, q, dq, tau_J, hold, out.tau_f)
         _compare(c, m, dq, hold.decay, out)
     else:
         period_s = nominal_s
@@ -240,7 +239,7 @@ def _filter(c: PaperConstants, m: PaperMemory, out: Any, steps: int) -> tuple[bo
         filter_bank.resume(a, b, m.Y_p, m.Y_h, tau_J, m.input_old, m.tau_old, m.S, m.W_f)
         m.has_gap = 0.0
         _compare(c, m, dq, c.decay, out)
-    keep_sample(out["q"], out["dq"], out["tau_J"], m.last)
+    keep_sample(out.q, out.dq, out.tau_J, m.last)
     return is_seen, period_s
 
 
@@ -263,57 +262,57 @@ def _advance(
 
 
 @compiled
-def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: Any) -> None:
+def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: SchemeBlock) -> None:
     """Compare the filtered torque with both predictions."""
     external_torque.follow_standstill(dq, c.standstill_rad_s, decay, m.standstill)
-    external_torque.predict(m.W_f, out["theta_hat"], out["tau_f_hat"])
-    external_torque.predict(m.W_f, c.theta_cad, out["tau_f_cad"])
-    external_torque.estimate_external(out["tau_f"], out["tau_f_hat"], c.dc_gain, out["tau_ext_hat"])
-    external_torque.estimate_external(out["tau_f"], out["tau_f_cad"], c.dc_gain, out["tau_ext_hat_cad"])
-    external_torque.undo_filter(out["tau_ext_hat"], c.decay, m.wide.history, out["tau_ext_wide_hat"])
+    external_torque.predict(m.W_f, out.theta_hat, out.tau_f_hat)
+    external_torque.predict(m.W_f, c.theta_cad, out.tau_f_cad)
+    external_torque.estimate_external(out.tau_f, out.tau_f_hat, c.dc_gain, out.tau_ext_hat)
+    external_torque.estimate_external(out.tau_f, out.tau_f_cad, c.dc_gain, out.tau_ext_hat_cad)
+    external_torque.undo_filter(out.tau_ext_hat, c.decay, m.wide.history, out.tau_ext_wide_hat)
 
 
 @compiled
-def _learn(c: PaperConstants, m: PaperMemory, out: Any, period_s: float) -> int:
+def _learn(c: PaperConstants, m: PaperMemory, out: SchemeBlock, period_s: float) -> int:
     """Test the estimate of this sample by eq. (15), then correct it; return ADAPTED if the adaptation is over."""
-    if termination.gather(m.motion, out["q"], out["dq"], m.W_f, period_s):
-        out["excitation"][0] = termination.eigenvalue_range(m.motion.information, c.scale, m.motion.scratch)[0]
-    m.quiet_cycles = m.quiet_cycles + 1.0 if termination.is_quiet(out["tau_ext_hat"], c.beta_Nm) else 0.0
-    out["quiet_s"][0] = m.quiet_cycles * c.period_s
+    if termination.gather(m.motion, out.q, out.dq, m.W_f, period_s):
+        out.excitation = termination.eigenvalue_range(m.motion.information, c.scale, m.motion.scratch)[0]
+    m.quiet_cycles = m.quiet_cycles + 1.0 if termination.is_quiet(out.tau_ext_hat, c.beta_Nm) else 0.0
+    out.quiet_s = m.quiet_cycles * c.period_s
     is_over = (
         m.quiet_cycles >= c.hold_cycles
-        and out["excitation"][0] >= c.excitation_Nm2s
-        and termination.has_moved(
-            m.motion.q_low, m.motion.q_high, m.motion.dq_low, m.motion.dq_high, c.travel_rad, c.velocity_rad_s
-        )
+        and out.excitation >= c.excitation_Nm2s
+        and termination.has_moved(m.motion, c.travel_rad, c.velocity_rad_s)
     )
     R = 1.0 / period_s
-    estimator.update(m.W_f, out["tau_f"], R, c.is_least_squares != 0.0, out["theta_hat"], m.P, m.v, m.K)
+    estimator.update(m.W_f, out.tau_f, R, c.is_least_squares != 0.0, out.theta_hat, m.P, m.v, m.K)
     return ADAPTED if is_over else 0
 
 
 @compiled
-def _watch(c: PaperConstants, m: PaperMemory, out: Any, period_s: float, is_fresh: bool, is_reporting: bool) -> int:
+def _watch(
+    c: PaperConstants, m: PaperMemory, out: SchemeBlock, period_s: float, is_fresh: bool, is_reporting: bool
+) -> int:
     """Compare with the thresholds; return the joints over their threshold, and COLLISION if one is a collision."""
-    F_c = out["theta_hat"][regressor.F_C1 : regressor.F_C2 + 1]
-    external_torque.fill_threshold(c.threshold_Nm, m.standstill, F_c, out["threshold"])
+    F_c = out.theta_hat[regressor.F_C1 : regressor.F_C2 + 1]
+    external_torque.fill_threshold(c.threshold_Nm, m.standstill, F_c, out.threshold)
     if is_fresh:
         external_torque.follow_contact(
-            out["tau_ext_hat"],
-            out["tau_ext_wide_hat"],
-            out["threshold"],
+            out.tau_ext_hat,
+            out.tau_ext_wide_hat,
+            out.threshold,
             period_s,
             is_reporting,
             m.integral,
             m.peak,
         )
-    joints = external_torque.joints_over(out["tau_ext_hat"], out["threshold"])
+    joints = external_torque.joints_over(out.tau_ext_hat, out.threshold)
     return ANY_CONTACT | joints << CONTACT_SHIFT if joints else 0
 
 
 @compiled
 def step_beside(
-    constants: Structured, memory: Structured, block: Structured, sample: Sample, period_s: float, main: Any
+    constants: Structured, memory: Structured, block: Structured, sample: Sample, period_s: float, main: CertifiedBlock
 ) -> None:
     """Process a sample beside the scheme in charge, and write the results into that scheme's block.
 
@@ -324,9 +323,9 @@ def step_beside(
     observation = step(constants, memory, block, sample.is_complete, sample.steps, int(m.mode))
     if observation & ADAPTED:
         m.mode = ARMED
-    main["paper_is_armed"][0] = 1.0 if m.mode == ARMED else 0.0
+    main.paper_is_armed = 1.0 if m.mode == ARMED else 0.0
     for i in range(JOINTS):
-        main["paper_tau_ext_hat"][i] = own["tau_ext_hat"][i]
-        main["paper_threshold"][i] = own["threshold"][i]
-    for j in range(own["theta_hat"].size):
-        main["paper_theta_hat"][j] = own["theta_hat"][j]
+        main.paper_tau_ext_hat[i] = own.tau_ext_hat[i]
+        main.paper_threshold[i] = own.threshold[i]
+    for j in range(own.theta_hat.size):
+        main.paper_theta_hat[j] = own.theta_hat[j]

@@ -158,10 +158,11 @@ def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> floa
 @compiled
 def forget(m: Memory) -> None:
     """Forget the filtered torque and motion."""
-    m.filters.W_f[:] = 0.0
-    m.filters.tau_f[:] = 0.0
-    m.filters.W_learnt[:] = 0.0
-    m.filters.tau_learnt[:] = 0.0
+    own = m.filters
+    own.W_f[:] = 0.0
+    own.tau_f[:] = 0.0
+    own.W_learnt[:] = 0.0
+    own.tau_learnt[:] = 0.0
 
 
 @compiled
@@ -170,9 +171,10 @@ def rest(m: Memory) -> None:
 
     From 0, that torque would be a step: the columns of the lag would have its derivative.
     """
-    for c in range(m.filters.tau_f.shape[0]):
-        m.filters.W_f[c] = m.regressor.Y_h
-        m.filters.tau_f[c] = m.filters.tau_old[c]
+    own = m.filters
+    for c in range(own.tau_f.shape[0]):
+        own.W_f[c] = m.regressor.Y_h
+        own.tau_f[c] = own.tau_old[c]
 
 
 @compiled
@@ -200,18 +202,19 @@ def take_sample(k: Constants, m: Memory, tau_J: Vector, is_seen: bool) -> None:
 
     `rates` (3, C) of `m`: the filters' coefficients for the period, see `FirstOrderHold`.
     """
-    rates = m.filters.rates
+    own = m.filters
+    rates = own.rates
     for c in range(k.cutoff.shape[0]):
         a, tau_old, input_old, S, W_f = (
             k.cutoff[c],
-            m.filters.tau_old[c],
-            m.filters.input_old[c],
-            m.filters.S[c],
-            m.filters.W_f[c],
+            own.tau_old[c],
+            own.input_old[c],
+            own.S[c],
+            own.W_f[c],
         )
         if is_seen:
             hold = FirstOrderHold(rates[0, c], rates[1, c], rates[2, c])
-            advance_torque(hold, tau_old, tau_J, m.filters.tau_f[c])
+            advance_torque(hold, tau_old, tau_J, own.tau_f[c])
             advance_regressor(hold, a, a, m.regressor.Y_p, m.regressor.Y_h, input_old, S, W_f)
         else:
             resume(a, a, m.regressor.Y_p, m.regressor.Y_h, tau_J, input_old, tau_old, S, W_f)

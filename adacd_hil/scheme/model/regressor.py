@@ -67,39 +67,29 @@ def fill_momentum(q: Vector, dq: Vector, Y_p: Vector) -> None:
 def fill_remainder(q: Vector, dq: Vector, level_rad: float, Y_h: Vector) -> None:
     """Fill Y_h (2, p) of -C' dq + g + F_v dq + F_c sgn(dq). Entries that are always zero are left as they are."""
     Y_h[1, A2] = np.sin(q[1]) * dq[0] * (dq[0] + dq[1])  # (-Mdot + C) dq = -C' dq
-    Y_h[0, F_V1] = dq[0]
-    Y_h[1, F_V2] = dq[1]
-    Y_h[0, F_C1] = np.sign(dq[0])
-    Y_h[1, F_C2] = np.sign(dq[1])
-    if Y_h.shape[1] > A5:
-        Y_h[0, A4] = np.cos(q[0] - level_rad)
-        Y_h[0, A5] = Y_h[1, A5] = np.cos(q[0] + q[1] - level_rad)
+    _fill_friction_and_gravity(q, dq, level_rad, Y_h)
+
+
+@compiled
+def _fill_friction_and_gravity(q: Vector, dq: Vector, level_rad: float, W: Vector) -> None:
+    W[0, F_V1] = dq[0]
+    W[1, F_V2] = dq[1]
+    W[0, F_C1] = np.sign(dq[0])
+    W[1, F_C2] = np.sign(dq[1])
+    if W.shape[1] > A5:
+        W[0, A4] = np.cos(q[0] - level_rad)
+        W[0, A5] = W[1, A5] = np.cos(q[0] + q[1] - level_rad)
 
 
 @compiled
 def regressor(q: Vector, dq: Vector, ddq: Vector, parameter_count: int, level_rad: float) -> Vector:
     """Return W (2, p) of eq. (17)."""
     W = np.zeros((JOINTS, parameter_count))
-    c2 = np.cos(q[1])
+    fill_momentum(q, ddq, W)  # M ddq
     s2 = np.sin(q[1])
-    # M ddq
-    W[0, A1] = ddq[0]
-    W[0, A2] = c2 * (2.0 * ddq[0] + ddq[1])
-    W[0, A3] = ddq[1]
-    W[1, A2] = c2 * ddq[0]
-    W[1, A3] = ddq[0] + ddq[1]
-    # C dq
-    W[0, A2] += -s2 * dq[1] * dq[0] - s2 * (dq[0] + dq[1]) * dq[1]
+    W[0, A2] += -s2 * dq[1] * dq[0] - s2 * (dq[0] + dq[1]) * dq[1]  # C dq
     W[1, A2] += s2 * dq[0] * dq[0]
-    # friction
-    W[0, F_V1] = dq[0]
-    W[1, F_V2] = dq[1]
-    W[0, F_C1] = np.sign(dq[0])
-    W[1, F_C2] = np.sign(dq[1])
-    # gravity
-    if parameter_count > A5:
-        W[0, A4] = np.cos(q[0] - level_rad)
-        W[0, A5] = W[1, A5] = np.cos(q[0] + q[1] - level_rad)
+    _fill_friction_and_gravity(q, dq, level_rad, W)
     return W
 
 
@@ -221,19 +211,20 @@ def put_position_columns(X: Vector, first_column: int, Y_h: Vector) -> None:
 @compiled
 def fill(k: Constants, m: Memory, q: Vector, dq: Vector, tau_J: Vector, period_s: float) -> None:
     """Fill Y_p, Y_h (n, p), offsets and further friction included, X, and M (n, n) of the model in use."""
+    own = m.regressor
     base, first_coulomb, count = int(k.first_offset), int(k.first_coulomb), q.shape[0]
-    bend_bristles(dq, period_s, k.still_rad_s, k.dahl_rad, m.regressor.bent)
-    fill_momentum(q, dq, m.regressor.Y_p[:, :base])
-    fill_remainder(q, dq, k.level_rad, m.regressor.Y_h[:, :base])
+    bend_bristles(dq, period_s, k.still_rad_s, k.dahl_rad, own.bent)
+    fill_momentum(q, dq, own.Y_p[:, :base])
+    fill_remainder(q, dq, k.level_rad, own.Y_h[:, :base])
     for i in range(count):
-        m.regressor.Y_h[i, first_coulomb + i] = smooth_sign(dq[i], k.still_rad_s, k.width_rad_s)
-        m.regressor.Y_h[i, base + i] = 1.0
+        own.Y_h[i, first_coulomb + i] = smooth_sign(dq[i], k.still_rad_s, k.width_rad_s)
+        own.Y_h[i, base + i] = 1.0
     speeds = k.still_rad_s, k.width_rad_s, k.stribeck_rad_s
-    fill_terms(dq, tau_J, k.terms, speeds, m.regressor.bent, base + 2 * count, m.regressor.Y_h)
-    fill_position(q, m.regressor.X)
+    fill_terms(dq, tau_J, k.terms, speeds, own.bent, base + 2 * count, own.Y_h)
+    fill_position(q, own.X)
     if k.position_torque_Nm != 0.0:
-        put_position_columns(m.regressor.X, int(k.first_position), m.regressor.Y_h)
-    fill_mass_matrix(q, m.models.theta, m.regressor.M)
+        put_position_columns(own.X, int(k.first_position), own.Y_h)
+    fill_mass_matrix(q, m.models.theta, own.M)
 
 
 def payload_direction(link_length_m: tuple[float, float], count: int, gravity_m_s2: float) -> Vector:

@@ -1,6 +1,5 @@
 """Messages about the certified scheme's certificates, and the user's replies to them."""
 
-from enum import Enum, unique
 from typing import NamedTuple
 
 import numpy as np
@@ -10,14 +9,14 @@ from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.identify import anchor, certificate, earlier, missing_torque
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import CommonCause
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model.regressor import A5
-from adacd_hil.structured import Structured
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A drag or a mass held from before the first motion is learnt as these: one run alone cannot separate them."""
 BY_WORD = "friction and inertia: by this run and the user's word, against "
 BY_FITS_THAT_AGREE = "friction and inertia: by fits of this run that agree, other than it had learnt before a touch"
-SAID_EACH = 5
+REPORT_EACH = 5
 """A lasting cause is reported once in so many refused fits, about each 7 s."""
 _THE_RUN = "what the run had learnt before"
 _TAKEN_BACK = "the certificate that was taken back"
@@ -30,66 +29,56 @@ _BEGINS_ANEW = "no certificate, learning begins anew"
 _POSITION_REMEDY = "if it is the arm's, `arm.position_torque_Nm` lets the model have it, from the next start on"
 
 
-@unique
-class _Cause(Enum):
-    """Contradictions: the name of the event, the consequence, and the user's remedy."""
-
-    READING = "anchor", "the drives stay off", "`accept` does without the tare"
-    ANCHOR = "anchor", _BEGINS_ANEW, "`accept` takes it for the sensor's zero"
-    CHANGED = "touch", _BEGINS_ANEW, "nobody may touch an arm that learns"
-    MORE = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"
-    BY_PLACE = "position", _BEGINS_ANEW, _POSITION_REMEDY
-    TOO_MUCH_BY_PLACE = "position", _BEGINS_ANEW, "who holds the arm shall let go, or that bound is too small"
-    MORE_THAN_LAST = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm, which has changed"
-    BLIND = "sight", _BEGINS_ANEW, "`relearn` learns the arm anew"
-
-
-_CAUSES = {
-    certificate.ANCHOR: _Cause.ANCHOR,
-    certificate.CHANGED: _Cause.CHANGED,
-    certificate.MORE: _Cause.MORE,
-    certificate.MORE_THAN_LAST: _Cause.MORE_THAN_LAST,
-    certificate.BY_PLACE: _Cause.BY_PLACE,
-    certificate.TOO_MUCH_BY_PLACE: _Cause.TOO_MUCH_BY_PLACE,
-    certificate.BLIND: _Cause.BLIND,
+_CONTRADICTIONS = {
+    certificate.READING: ("anchor", "the drives stay off", "`accept` does without the tare"),
+    certificate.ANCHOR: ("anchor", _BEGINS_ANEW, "`accept` takes it for the sensor's zero"),
+    certificate.CHANGED: ("touch", _BEGINS_ANEW, "nobody may touch an arm that learns"),
+    certificate.MORE: ("touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"),
+    certificate.BY_PLACE: ("position", _BEGINS_ANEW, _POSITION_REMEDY),
+    certificate.TOO_MUCH_BY_PLACE: (
+        "position",
+        _BEGINS_ANEW,
+        "who holds the arm shall let go, or that bound is too small",
+    ),
+    certificate.MORE_THAN_LAST: (
+        "touch",
+        _BEGINS_ANEW,
+        "`accept` says that nobody touches the arm, which has changed",
+    ),
+    certificate.BLIND: ("sight", _BEGINS_ANEW, "`relearn` learns the arm anew"),
 }
+"""By contradiction: name of the event, consequence, remedy."""
 
 
 class _Refusal(NamedTuple):
-    """A refusal: its text; torques (n,) that were judged, their standard deviations. times: refusals in a row."""
+    """A refusal: its contradiction and text; torques (n,) that were judged, their standard deviations.
 
-    cause: _Cause
+    times: refusals in a row.
+    """
+
+    cause: int
     torque_Nm: Vector
     std_Nm: Vector
     lines: list[str]
     times: int
 
 
-class _Certified(NamedTuple):
-    """The certified model (p,), its covariance (p, p), whether it has a payload, and the text of the certificate."""
-
-    theta: Vector
-    P: Vector
-    is_payload: bool
-    text: str
-
-
 class CertificateWatch:
-    """Reports the kernel's findings, and passes on the user's acceptance. last_utc: the last certificate's date."""
+    """Reports the kernel's findings, and accepts a refused fit for the user. last_utc: the last certificate's date."""
 
-    def __init__(self, constants: Structured, memory: Structured, last_utc: str) -> None:
-        self._constants, self._memory = constants[0], memory[0]
+    def __init__(self, k: Constants, m: Memory, last_utc: str) -> None:
+        self._k, self._m = k, m
         self._last = f"the certificate of {last_utc}"
         self._last_utc = last_utc
         self._refusal: _Refusal | None = None
         self._vouched_against = ""
-        self._certified: list[_Certified] = []
+        self._certificates: list[Certificate] = []
         self._is_standing = False
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
         """All certificates that were not taken back, in order."""
-        return tuple(certificate.certificate_of(self._constants, *certified) for certified in self._certified)
+        return tuple(self._certificates)
 
     @property
     def is_refusing(self) -> bool:
@@ -104,51 +93,47 @@ class CertificateWatch:
             return None
         self._refusal = None
         known_by, self._vouched_against = self._known_by(), ""
-        k, m = self._constants, self._memory
+        k, m = self._k, self._m
         level = "info" if anchor.is_anchored(k, m) else "warning"
         by_place = anchor.describe_place(k, m)
         text = f"{anchor.describe(k, m)}; {margin.describe_sight(m)}; {known_by}{by_place}"
         self._is_standing = True
-        self._certified.append(_Certified(m.models.theta.copy(), m.models.P.copy(), bool(m.models.is_payload), text))
+        self._certificates.append(certificate.certificate_of(k, m, text))
         return BriefedEvent.of(Event(level, "certificate", text), self._certified_in_brief(known_by))
 
     def _certified_in_brief(self, known_by: str) -> str:
         """Return the text of a certificate's promises and of its limits."""
-        told = [margin.describe_push(self._memory)]
-        joints = " and ".join(f"joint {i + 1}" for i in anchor.open_joints(self._constants, self._memory))
+        texts = [margin.describe_push(self._m)]
+        joints = " and ".join(f"joint {i + 1}" for i in anchor.open_joints(self._k, self._m))
         if joints:
-            told.insert(0, f"warning: who has leaned on {joints} since before the start is learnt as a torque offset")
-        return "; ".join([*told, *[known_by] * known_by.startswith((BY_WORD, BY_FITS_THAT_AGREE))])
+            texts.insert(0, f"warning: a lean on {joints} from before the start counts as a torque offset")
+        return "; ".join([*texts, *[known_by] * known_by.startswith((BY_WORD, BY_FITS_THAT_AGREE))])
 
     def _known_by(self) -> str:
         if self._vouched_against:
             return BY_WORD + self._vouched_against
-        if self._memory.earlier.has_lapsed:
+        if self._m.earlier.has_lapsed:
             return BY_FITS_THAT_AGREE
-        is_compared = certificate.is_compared(self._memory)
+        is_compared = certificate.is_compared(self._m)
         return f"friction and inertia: within what {self._last} allows" if is_compared else THIS_RUN_ONLY
 
-    def refuse(self, is_reading: bool) -> Event | None:
+    def refuse(self) -> Event | None:
         """Record, before its traces are gone, that the reading at rest or a fit is refused.
 
         Return the event to report.
         """
-        before = self._refusal
-        cause = _Cause.READING if is_reading else _CAUSES[int(self._memory.certificate.withheld_by)]
-        offsets = slice(int(self._constants.first_offset), int(self._constants.first_offset) + JOINTS)
-        self._refusal = _Refusal(
-            cause,
-            anchor.judged_Nm(self._memory),
-            np.sqrt(np.diag(self._memory.models.P_belief)[offsets]),
-            self._describe(cause),
-            1 if before is None else before.times + 1,
-        )
-        is_said = before is not None and before.cause is cause
-        if is_said and (is_reading or self._refusal.times % SAID_EACH != 0):
+        before, m, cause = self._refusal, self._m, int(self._m.certificate.withheld_by)
+        offsets = slice(int(self._k.first_offset), int(self._k.first_offset) + JOINTS)
+        std_Nm = np.sqrt(np.diag(m.models.P_belief)[offsets])
+        times = 1 if before is None else before.times + 1
+        lines = self._describe(cause)
+        self._refusal = _Refusal(cause, anchor.judged_Nm(m), std_Nm, lines, times)
+        is_known = before is not None and before.cause == cause
+        if is_known and (cause == certificate.READING or times % REPORT_EACH != 0):
             return None
-        name, what, remedy = cause.value
-        again = [f"the {self._refusal.times}th fit in a row that is refused"] * is_said
-        return Event("warning", name, "; ".join((*self._refusal.lines, *again, what, remedy)))
+        name, consequence, remedy = _CONTRADICTIONS[cause]
+        again = [f"the {times}th fit in a row that is refused"] * is_known
+        return Event("warning", name, "; ".join((*lines, *again, consequence, remedy)))
 
     def doubt(self, verdict: CommonCause) -> Event:
         """Return the event that contacts have taken the certificate back, with the reason."""
@@ -158,14 +143,14 @@ class CertificateWatch:
 
     def revoke(self) -> Event:
         """Record, before the kept evidence is forgotten, that the user takes the certificate back; return the event."""
-        if earlier.is_keeping(self._memory):
+        if earlier.is_keeping(self._m):
             self._vouched_against = _THE_RUN
         self._take_back()
         return Event("warning", "revoked", "at the user's word the arm is learnt anew")
 
     def _take_back(self) -> None:
         if self._is_standing:
-            self._certified.pop()
+            self._certificates.pop()
             self._vouched_against = _TAKEN_BACK
         self._is_standing = False
 
@@ -183,27 +168,24 @@ class CertificateWatch:
 
     def contradiction(self) -> CommonCause:
         """Return the contradiction of the certificate while the arm monitors: offset, torque by place, blindness."""
-        cause = _CAUSES[int(self._memory.certificate.withheld_by)]
-        return CommonCause("; ".join(self._describe(cause)), is_payload=False)
+        return CommonCause("; ".join(self._describe(int(self._m.certificate.withheld_by))), is_payload=False)
 
-    def _describe(self, cause: _Cause) -> list[str]:
-        k, m = self._constants, self._memory
+    def _describe(self, cause: int) -> list[str]:
+        k, m = self._k, self._m
         match cause:
-            case _Cause.READING:
-                lines = anchor.describe_refused(m, is_reading=True)
-            case _Cause.ANCHOR:
-                lines = anchor.describe_refused(m, is_reading=False)
-            case _Cause.CHANGED:
+            case certificate.READING | certificate.ANCHOR:
+                lines = anchor.describe_refused(m, is_reading=cause == certificate.READING)
+            case certificate.CHANGED:
                 lines = [_CHANGED + (_OR_MOUNTING if k.first_offset > A5 else "")]
-            case _Cause.MORE:
+            case certificate.MORE:
                 lines = earlier.describe_more(m)
-            case _Cause.BY_PLACE:
+            case certificate.BY_PLACE:
                 lines = missing_torque.describe(m)
-            case _Cause.TOO_MUCH_BY_PLACE:
+            case certificate.TOO_MUCH_BY_PLACE:
                 lines = anchor.describe_place_refused(k, m)
-            case _Cause.MORE_THAN_LAST:
+            case certificate.MORE_THAN_LAST:
                 lines = certificate.describe_more(m, self._last_utc)
-            case _Cause.BLIND:
+            case _:
                 lines = margin.describe_dim(m)
         return lines
 
@@ -214,26 +196,26 @@ class CertificateWatch:
             return Event("warning", "anchor", "nothing to accept: no certificate is withheld")
         torque = ", ".join(f"{value:.3f}" for value in refusal.torque_Nm)
         match refusal.cause:
-            case _Cause.READING:
-                anchor.accept_reading(self._memory)
-                what = f"the user accepts {torque} Nm at rest: the tare is not used"
-            case _Cause.ANCHOR:
-                anchor.accept(self._memory, refusal.torque_Nm, refusal.std_Nm)
-                what = f"the user accepts {torque} Nm as the zero of the sensors"
-            case _Cause.MORE_THAN_LAST:
-                certificate.forget(self._memory)
+            case certificate.READING:
+                anchor.accept_reading(self._m)
+                text = f"the user accepts {torque} Nm at rest: the tare is not used"
+            case certificate.ANCHOR:
+                anchor.accept(self._m, refusal.torque_Nm, refusal.std_Nm)
+                text = f"the user accepts {torque} Nm as the zero of the sensors"
+            case certificate.MORE_THAN_LAST:
+                certificate.forget(self._m)
                 self._vouched_against = self._last
-                what = f"the user says that nobody touches the arm: {self._last} is not compared"
+                text = f"the user says that nobody touches the arm: {self._last} is not compared"
             case _:
-                earlier.forget(self._memory)
+                earlier.forget(self._m)
                 self._vouched_against = _THE_RUN
-                what = "the user says that nobody touches the arm: what was learnt before is not compared"
-        return Event("warning", refusal.cause.value[0], what)
+                text = "the user says that nobody touches the arm: what was learnt before is not compared"
+        return Event("warning", _CONTRADICTIONS[refusal.cause][0], text)
 
     def describe(self) -> list[str]:
         """Return the present refusal, a line per cause; empty without a refusal."""
         if self._refusal is None:
             return []
-        is_reading = self._refusal.cause is _Cause.READING
+        is_reading = self._refusal.cause == certificate.READING
         withheld = [] if is_reading else [f"certificates withheld: {self._refusal.times}"]
-        return [*self._refusal.lines, *withheld, self._refusal.cause.value[2]]
+        return [*self._refusal.lines, *withheld, _CONTRADICTIONS[self._refusal.cause][2]]

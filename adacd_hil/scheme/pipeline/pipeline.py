@@ -1,8 +1,8 @@
 """The scheme: one ArmState in, one SchemeOutput out. No clock, no input or output; the same live and in replay.
 
 A cycle: the present state selects the kernel's tasks, the kernel's findings move the supervisor, and the new state has
-its actions: an adaptation begins or ends, a contact's report begins or becomes final. A policy holds the actions that
-differ between the schemes: `PaperPolicy`, `CertifiedPolicy`.
+its actions: an adaptation begins or ends, a contact's report begins or becomes final. The actions
+that differ between the schemes are methods of `PaperPipeline` and `CertifiedPipeline`; `new_pipeline` chooses one.
 
 The cycle is compiled (`kernel.cycle`), the same live and in a replay. A few cycles have tasks for Python. `_attend`
 runs them in the same cycle, before the decision is issued.
@@ -11,6 +11,8 @@ runs them in the same cycle, before the decision is issued.
 still taken in time. It is 0 where it is unknown or not to be used.
 """
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -31,12 +33,12 @@ from adacd_hil.records import (
     certified_layout,
     scheme_layout,
 )
+from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.identify.certificate import Certificate
-from adacd_hil.scheme.kernel.cycle import BEFORE_CONTACT, DECISION
+from adacd_hil.scheme.kernel.cycle import BEFORE_CONTACT, DECISION, REPORT, RunMemory, new_course
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, Numbers, fill_sample, samples_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics
-from adacd_hil.scheme.pipeline.certified_policy import CertifiedPolicy
-from adacd_hil.scheme.pipeline.scheme_policy import PaperPolicy, SchemePolicy
+from adacd_hil.scheme.supervisor import supervisor
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured
 
@@ -93,62 +95,88 @@ def arm_at(arms: ArmBatch, row: int) -> ArmState:
     )
 
 
-class Pipeline:
-    """Adaptation and contact detection for one run, by the scheme selected in the settings."""
+class Pipeline(ABC):
+    """Adaptation and contact detection for one run: the compiled cycle, and a scheme's rare tasks in Python.
 
-    def __init__(self, settings: Settings) -> None:
-        self._policy: SchemePolicy = (
-            CertifiedPolicy(settings) if settings.scheme == "certified" else PaperPolicy(settings)
-        )
+    numbers: the kernel's arrays. tau_ext_hat (2,): external torque that is reported in each cycle, Nm, a view.
+    theta_ff: model from the last finished adaptation, for the feedforward; zeros before the first.
+    """
+
+    tau_ext_hat: Vector
+    compiled_functions: tuple[object, ...]
+    """The largest compiled functions that `compile_cycle` runs."""
+    _cycle: Callable[..., int]
+    _end: Callable[..., int]
+    _run: Callable[..., tuple[int, int]]
+    _cycle_arrays: tuple[Vector | Structured, ...]
+    """Arrays of the compiled cycle, in its order."""
+    _end_arrays: tuple[Vector | Structured, ...]
+
+    def __init__(self, settings: Settings, numbers: Numbers) -> None:
+        self.numbers = numbers
+        self.theta_ff = np.zeros(len(settings.estimator.parameter_names))
+        self._course_constants, self._course_memory = new_course(settings)
+        self._course: RunMemory = self._course_memory[0]
         self._theta_hat = layout_of(settings).slices["theta_hat"]
         self._sample, self._decision = np.zeros(1, SAMPLE), np.zeros(1, DECISION)
-        self._block = np.zeros((1, self.numbers.values.size))
+        self._block = np.zeros((1, numbers.values.size))
 
     @property
-    def numbers(self) -> Numbers:
-        """The kernel's arrays, for studies that inspect them."""
-        return self._policy.numbers
+    def state(self) -> SchemeState:
+        """The scheme's present state."""
+        return SchemeState(self._course.supervisor.state)
 
-    def compile(self) -> None:
+    def compile_cycle(self) -> None:
         """Run each compiled function of the cycle once, on copies, so that no later call compiles."""
-        inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._policy.theta_ff, 0.0)
-        self._policy.compile()
-
-    @property
-    def compiled_functions(self) -> tuple[object, ...]:
-        """The largest compiled functions that `compile` runs."""
-        return self._policy.compiled_functions
+        inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self.theta_ff, 0.0)
+        supervisor.doubt(self._course_memory["supervisor"].copy()[0])
+        course.goes_on(self._course.contact)
+        samples, decisions, blocks = np.zeros(1, SAMPLE), np.zeros(1, DECISION), np.zeros_like(self._block)
+        self._cycle(samples, decisions, blocks, 0, *(array.copy() for array in self._cycle_arrays))
+        self._end(samples, decisions, 0, *(array.copy() for array in self._end_arrays))
 
     def compile_longest(self) -> None:
-        """Compile the second half of `compile`'s work: for another process, at the same time."""
-        self._policy.compile_longest()
+        """Compile the second half of `compile_cycle`'s work, for another process at the same time.
+
+        Skip if the whole takes only a moment.
+        """
+
+    @abstractmethod
+    def _follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
+        """Run the first actions of a new state, and the last ones of the state before, after the supervisor's step."""
+
+    @abstractmethod
+    def _report(self, cycle: int) -> ContactReport:
+        """Return the contact's report that is due in this cycle."""
+
+    def _attend(self, asked: int, cycle: int) -> None:
+        """Run the tasks at the end of a cycle."""
 
     def describe_missing(self) -> list[str]:
         """Return the conditions that an adaptation still waits for, a line each.
 
         Empty for the paper's scheme, which waits for eq. (15).
         """
-        return self._policy.describe_missing()
+        return []
 
     def describe_withheld(self) -> list[str]:
         """Return the contradictions of a certificate that is withheld, a line each."""
-        return self._policy.describe_withheld()
+        return []
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
         """The certificates of the run that were not taken back, in order; empty for the paper's scheme."""
-        return self._policy.certificates
+        return ()
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call: a margin that has shrunk, a certificate."""
-        return self._policy.take_events()
+        return []
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Process one cycle and return its output."""
-        policy = self._policy
         fill_sample(self._sample, arm, request)
-        asked = policy.cycle(self._sample, self._decision, self._block)
-        contact = self._attend(asked, self._sample, self._decision, 0) if asked else None
+        asked = self._cycle(self._sample, self._decision, self._block, 0, *self._cycle_arrays)
+        contact = self._finish(asked, self._sample, self._decision, 0) if asked else None
         state, previous_state, fault, reaction, contact_joints, _, is_model_valid = self._decision.item()
         block = self._block[0].copy()
         return SchemeOutput(
@@ -159,8 +187,8 @@ class Pipeline:
             contact_joints=contact_joints,
             is_model_valid=bool(is_model_valid),
             theta_hat=block[self._theta_hat],
-            theta_ff=policy.theta_ff,
-            tau_ext_hat=policy.tau_ext_hat.copy(),
+            theta_ff=self.theta_ff,
+            tau_ext_hat=self.tau_ext_hat.copy(),
             contact=contact,
             block=block,
             reaction=_REACTIONS[reaction],
@@ -172,12 +200,12 @@ class Pipeline:
         samples, decisions = samples_of(arms, requests), np.zeros(count, DECISION)
         blocks = np.empty((count, self.numbers.values.size))
         contacts: dict[int, ContactReport] = {}
-        place, asked = self._policy.run(samples, decisions, blocks, 0)
+        place, asked = self._run(samples, decisions, blocks, 0, self._cycle_arrays)
         while place < count:
-            contact = self._attend(asked, samples, decisions, place)
+            contact = self._finish(asked, samples, decisions, place)
             if contact is not None:
                 contacts[place] = contact
-            place, asked = self._policy.run(samples, decisions, blocks, place + 1)
+            place, asked = self._run(samples, decisions, blocks, place + 1, self._cycle_arrays)
         columns = {
             name: np.ascontiguousarray(decisions[name]) for name in DECISION.names or () if name != "observation"
         }
@@ -189,11 +217,13 @@ class Pipeline:
             contact_places=np.array(list(contacts), dtype=np.int64),
         )
 
-    def _attend(self, asked: int, samples: Structured, decisions: Structured, place: int) -> ContactReport | None:
+    def _finish(self, asked: int, samples: Structured, decisions: Structured, place: int) -> ContactReport | None:
         """Run the tasks that a cycle has for Python, and end it; return the contact's report that is due, or None."""
-        policy, cycle = self._policy, int(samples["cycle"][place])
+        cycle = int(samples["cycle"][place])
         if asked & BEFORE_CONTACT:
             previous, observation = SchemeState(decisions["previous_state"][place]), decisions["observation"][place]
-            policy.follow(asked, previous, cycle, int(observation))
-            asked = policy.end(samples, decisions, place)
-        return policy.attend(asked, cycle)
+            self._follow(asked, previous, cycle, int(observation))
+            asked = self._end(samples, decisions, place, *self._end_arrays)
+        report = self._report(cycle) if asked & REPORT else None
+        self._attend(asked, cycle)
+        return report

@@ -47,7 +47,6 @@ from adacd_hil.scheme.supervisor.transitions import (
     next_state,
 )
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.structured import Structured
 
 REST_HOLD_S = 0.05
 """The arm counts as at rest once |dq| has stayed below the rest velocity this long. At the reversal of a withdrawal
@@ -130,9 +129,9 @@ class SupervisorMemory:
 
     origin: state to which REACT or STOPPED returns: the state before, or ADAPT after a broken test. cause: the event by
     which the state was entered. is_latched: the user must acknowledge the cause of REACT or STOPPED. is_doubted: the
-    model is wrong. pending: bits of the requests that wait. is_weight_told: the user has announced the payload's weight
-    since REACT began. is_told_here: the user has announced a new payload in this state. periods, cycles: counts up to
-    now.
+    model is wrong. pending: bits of the requests that wait. is_weight_announced: the user has announced the payload's
+    weight since REACT began. is_announced_here: the user has announced a new payload in this state. periods, cycles:
+    counts up to now.
     """
 
     state: int
@@ -142,8 +141,8 @@ class SupervisorMemory:
     is_latched: int
     is_doubted: int
     pending: int
-    is_weight_told: int
-    is_told_here: int
+    is_weight_announced: int
+    is_announced_here: int
     phase_periods: int
     learning_periods: int
     commissioned_cycles: int
@@ -183,8 +182,8 @@ def supervise(
 ) -> None:
     """Process one cycle and change to the new state.
 
-    observation: bits of `Observation`. is_reporting: a contact's report is not final yet. goes_on: the reaction in
-    force lets the arm move on, so that a contact clears without rest.
+    observation: its bits, see `transitions`. is_reporting: a contact's report is not final yet. goes_on: the reaction
+    in force lets the arm move on, so that a contact clears without rest.
     """
     _count(m, arm, observation)
     if arm.request != Request.NONE:
@@ -227,9 +226,9 @@ def _take(m: SupervisorMemory, request: int) -> None:
     if _keeps(m, request, m.state):
         m.pending |= 1 << request
         if request == Request.PAYLOAD:
-            m.is_told_here = 1
+            m.is_announced_here = 1
         if request == Request.PAYLOAD_CHANGED and IS_REACTING[m.state]:
-            m.is_weight_told = 1
+            m.is_weight_announced = 1
 
 
 @compiled
@@ -249,24 +248,24 @@ def _is_pending(m: SupervisorMemory, request: int) -> bool:
 def _has_grown(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> bool:
     """Return whether a contact that would clear itself now needs an acknowledgement."""
     is_over = observation & COLLISION != 0 or arm.is_late != 0 or m.phase_periods >= k.patience_cycles
-    return bool(is_over or _is_told_of_payload(k, m))
+    return bool(is_over or _is_payload_announced(k, m))
 
 
 @compiled
 def _is_announced(m: SupervisorMemory) -> bool:
     """Return whether a change of payload is due in MONITOR or STOPPED; it ends a stop only if announced in it."""
     is_awaited = _is_pending(m, Request.PAYLOAD) and m.state == SchemeState.MONITOR
-    return bool(m.is_told_here != 0 or is_awaited)
+    return bool(m.is_announced_here != 0 or is_awaited)
 
 
 @compiled
-def _is_told_of_payload(k: SupervisorConstants, m: SupervisorMemory) -> bool:
+def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
     """Return whether the user has attributed the contact to the payload: to its weight, where gravity acts.
 
     The weight counts only if announced since the contact began: an earlier announcement cannot exclude a person's
     touch.
     """
-    is_weight = k.has_gravity != 0 and m.origin == SchemeState.PAYLOAD and m.is_weight_told != 0
+    is_weight = k.has_gravity != 0 and m.origin == SchemeState.PAYLOAD and m.is_weight_announced != 0
     return bool((m.is_doubted != 0 or is_weight) and _is_pending(m, Request.PAYLOAD_CHANGED))
 
 
@@ -278,14 +277,14 @@ def _enter(m: SupervisorMemory, state: int, event: int) -> None:
     if state == SchemeState.REACT:
         m.origin = SchemeState.ADAPT if m.state == SchemeState.CERTIFY else m.state
         m.is_latched = event != SchemeEvent.CONTACT
-        m.is_weight_told = 0
+        m.is_weight_announced = 0
     elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED, SchemeEvent.REVOKED):
         m.learning_periods = 0
     m.cause = event
     if state != SchemeState.STOPPED:
         m.is_doubted = 0
     m.state = state
-    m.is_told_here = 0
+    m.is_announced_here = 0
     m.phase_periods = 0
     m.commissioned_cycles = 0
     for request in range(_IS_KEPT.shape[0]):
@@ -355,7 +354,7 @@ def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observat
     """Return the event by which the user's request ends STOPPED in this cycle, or 0."""
     event: int = SchemeEvent.NONE
     is_late = arm.is_late != 0
-    if _is_told_of_payload(k, m):
+    if _is_payload_announced(k, m):
         if is_still and not is_late:
             event = SchemeEvent.PAYLOAD_CHANGED
     elif _is_pending(m, Request.RELEARN):
@@ -452,33 +451,6 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
     return fault
 
 
-class Supervisor:
-    """The state machine as the rest of the scheme sees it. memory: (1,) of `SupervisorMemory`."""
-
-    def __init__(self, memory: Structured) -> None:
-        self._m = memory[0]
-
-    @property
-    def state(self) -> SchemeState:
-        """The scheme's present state."""
-        return SchemeState(self._m.state)
-
-    @property
-    def origin(self) -> SchemeState:
-        """State to which the arm returns after REACT or STOPPED."""
-        return SchemeState(self._m.origin)
-
-    @property
-    def cause(self) -> SchemeEvent:
-        """The event by which this state was entered."""
-        return SchemeEvent(self._m.cause)
-
-    def doubt(self) -> SchemeState:
-        """Hold the arm because the model is wrong; return the new state."""
-        doubt(self._m)
-        return self.state
-
-
 class KeptRequest:
     """The end of the run, or a stop to change the payload, kept until it is served. One object per attempt.
 
@@ -489,7 +461,7 @@ class KeptRequest:
         self.request = carried
         self._carried = carried
 
-    def take(self) -> Request:
+    def take_carried(self) -> Request:
         """Return the request left over from the attempt before, once; then NONE."""
         carried, self._carried = self._carried, Request.NONE
         return carried

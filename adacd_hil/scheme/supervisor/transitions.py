@@ -9,7 +9,7 @@ Each kernel sets only the bits that it knows: the paper's kernel never certifies
 A pair that is not in the table leaves the state as it is. `adacd_hil.scheme.supervisor.supervisor` raises the events.
 """
 
-from enum import Enum, IntEnum, IntFlag
+from enum import IntEnum
 from types import MappingProxyType
 
 import numpy as np
@@ -45,13 +45,11 @@ class SchemeEvent(IntEnum):
     CONTRADICTED = 20  # later evidence contradicts the certificate: an anchor, or a torque by place
 
 
-class Back(Enum):
-    """A place in the table that depends on the past."""
+STAYS = -1
+TO_ORIGIN = -2
+"""Next state: the state from which REACT was entered."""
 
-    TO_ORIGIN = "the state from which REACT was entered"
-
-
-TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]] = MappingProxyType(
+TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, int]] = MappingProxyType(
     {
         # Gathers no data yet. Out: the first complete cycle; too late is a fault.
         SchemeState.INIT: {
@@ -103,14 +101,14 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
         SchemeState.REACT: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.AT_REST: SchemeState.STOPPED,
-            SchemeEvent.CLEARED: Back.TO_ORIGIN,
+            SchemeEvent.CLEARED: TO_ORIGIN,
         },
         # Holds its place. Out: acknowledged while no joint is pushed; the announcement of a payload change; a payload
         # that looked like contacts, or whose weight looks like one; the certificate taken back, even while a push seems
         # to last.
         SchemeState.STOPPED: {
             SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.ACKNOWLEDGED: Back.TO_ORIGIN,
+            SchemeEvent.ACKNOWLEDGED: TO_ORIGIN,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
             SchemeEvent.PAYLOAD_CHANGED: SchemeState.ADAPT,
             SchemeEvent.REVOKED: SchemeState.ADAPT,
@@ -128,15 +126,12 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
 )
 
 
-STAYS, TO_ORIGIN = -1, -2
-
-
 def _numbered() -> NDArray[np.int64]:
     """Return the table as numbers (states, events): the next state, STAYS or TO_ORIGIN."""
     table = np.full((len(SchemeState), len(SchemeEvent)), STAYS)
     for state, row in TRANSITIONS.items():
         for event, following in row.items():
-            table[state, event] = TO_ORIGIN if following is Back.TO_ORIGIN else int(following)
+            table[state, event] = following
     return table
 
 
@@ -165,39 +160,18 @@ CONTACT_SHIFT = 16
 """Index of an observation's first bit for a joint over its lower threshold; one bit per joint."""
 
 
-class Observation(IntFlag):
-    """One cycle's findings. Numbers are not logged."""
-
-    NONE = 0
-    NOT_A_NUMBER = 1  # a measurement is not finite
-    OVER_LIMIT = 2  # beyond the arm's limits: |q|, or |dq| where OVER_SPEED is not a bit of its own
-    AT_REST = 4  # every |dq| below the rest velocity
-    UNLOADED = 8  # every |tau_J| below the rest torque
-    ADAPTED = 16  # eq. (15) holds with the evidence for it
-    CONTACT = 32  # a joint is over its lower threshold
-    FITTED = 64  # the evidence for the estimate is complete; it is to be tested
-    CERTIFIED = 128  # the frozen model has passed its test
-    REFUTED = 256  # the frozen model has failed its test
-    COLLISION = 512  # a joint is over its upper threshold
-    OVER_SPEED = 1024  # |dq| beyond the arm's limit, which a blow may do for a moment
-    UNSEEN = 2048  # the filters took no new sample in: the residual is an old one
-    WITHHELD = 4096  # an anchor, a touch or a torque by place excludes the model to be certified, or the certified one
-
-
-(
-    NOT_A_NUMBER,
-    OVER_LIMIT,
-    AT_REST,
-    UNLOADED,
-    ADAPTED,
-    CONTACT,
-    FITTED,
-    CERTIFIED,
-    REFUTED,
-    COLLISION,
-    OVER_SPEED,
-    UNSEEN,
-    WITHHELD,
-) = (int(bit) for bit in Observation)
-"""The same bits as plain numbers, which compiled code can read."""
+# Bits of an observation, the findings of one cycle. Numbers are not logged.
+NOT_A_NUMBER = 1  # a measurement is not finite
+OVER_LIMIT = 2  # beyond the arm's limits: |q|, or |dq| where OVER_SPEED is not a bit of its own
+AT_REST = 4  # every |dq| below the rest velocity
+UNLOADED = 8  # every |tau_J| below the rest torque
+ADAPTED = 16  # eq. (15) holds with the evidence for it
+CONTACT = 32  # a joint is over its lower threshold
+FITTED = 64  # the evidence for the estimate is complete; it is to be tested
+CERTIFIED = 128  # the frozen model has passed its test
+REFUTED = 256  # the frozen model has failed its test
+COLLISION = 512  # a joint is over its upper threshold
+OVER_SPEED = 1024  # |dq| beyond the arm's limit, which a blow may do for a moment
+UNSEEN = 2048  # the filters took no new sample in: the residual is an old one
+WITHHELD = 4096  # an anchor, a touch or a torque by place excludes the model to be certified, or the certified one
 ANY_CONTACT = CONTACT | COLLISION

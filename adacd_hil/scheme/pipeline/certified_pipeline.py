@@ -8,13 +8,12 @@ import numpy as np
 
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, Event, SchemeState
 from adacd_hil.scheme.contact import course
-from adacd_hil.scheme.contact.contact_report import RecalledContact
+from adacd_hil.scheme.contact.contact_report import compile_recalled, new_rows, recalled_report
 from adacd_hil.scheme.detect import margin, sensitivity
 from adacd_hil.scheme.detect.margin import MarginWatch
-from adacd_hil.scheme.identify import anchor, belief, certificate, earlier, termination
+from adacd_hil.scheme.identify import anchor, certificate, doubt, earlier, termination
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import Doubt
-from adacd_hil.scheme.identify.doubt import begin as begin_doubt
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory, paper_kernel
 from adacd_hil.scheme.kernel.cycle import (
     ACCEPTED,
@@ -29,7 +28,8 @@ from adacd_hil.scheme.kernel.cycle import (
 )
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.pipeline.certificate_watch import CertificateWatch
-from adacd_hil.scheme.pipeline.scheme_policy import SchemePolicy
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.supervisor import supervisor
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, SchemeEvent
 from adacd_hil.settings.configuration import Settings
 
@@ -37,31 +37,29 @@ FORGOTTEN_S = 1.0
 """Time from a stop to the check whether the arm at rest is pushed: the slowest filter has forgotten 40 Nm by then."""
 
 
-class CertifiedPolicy(SchemePolicy):
+class CertifiedPipeline(Pipeline):
     """Adaptation with a certificate. A certified model stays valid while another payload is learnt on top of it."""
 
     _cycle, _end, _run = staticmethod(certified_cycle), staticmethod(end_certified), staticmethod(run_certified)
 
     def __init__(self, settings: Settings) -> None:
-        super().__init__(settings)
-        self.numbers = certified_memory.numbers_of(settings)
-        self._m = m = self.numbers.memory[0]
+        super().__init__(settings, certified_memory.numbers_of(settings))
+        self._settings = settings
+        self._k, self._m = self.numbers.constants[0], self.numbers.memory[0]
         self._names = certified_memory.parameter_names(settings)
-        self.tau_ext_hat = m.filters.y[filter_bank.WIDE]  # for the reactions: fast, and smooth
-        self.evidence = evidence = RecalledContact(settings, self._contact)
-        course.fill_constants(settings, evidence.due_cycles, self._course_constants["contact"][0])
+        self.tau_ext_hat = self._m.filters.y[filter_bank.WIDE]  # for the reactions: fast, and smooth
         self._paper = paper_kernel.numbers_of(settings)[:3]
-        shared = self._course_constants, self._course_memory, evidence.rows
+        self._rows = new_rows(settings)
+        shared = self._course_constants, self._course_memory, self._rows
         self._cycle_arrays = *self.numbers, *self._paper, *shared
         self._end_arrays = *self.numbers[:3], *shared
-        self.theta_ff = np.zeros(len(settings.estimator.parameter_names))
         self._is_payload = False
         self._margin = MarginWatch(JOINTS)
         self._push_cycles = round(FORGOTTEN_S / settings.bus.period_s)
         self._warned: set[str] = set()
         self._events: list[Event] = []
-        self._watch = CertificateWatch(self.numbers.constants, self.numbers.memory, settings.history.date_utc)
-        self._doubt = Doubt(settings, self.numbers.constants, self.numbers.memory)
+        self._watch = CertificateWatch(self._k, self._m, settings.history.date_utc)
+        self._doubt = Doubt(settings, self._k, self._m)
 
     compiled_functions = (
         certified_kernel.begin_adaptation,
@@ -71,22 +69,23 @@ class CertifiedPolicy(SchemePolicy):
         certified_cycle,
     )
 
-    def compile(self) -> None:
+    def compile_cycle(self) -> None:
         """Run each compiled function of the cycle once, on copies."""
         constants, memory = self.numbers.constants, self.numbers.memory.copy()
+        k, m = constants[0], memory[0]
         certified_kernel.begin_adaptation(constants, memory, False, True)
         certified_kernel.begin_test(constants, memory)
         certified_kernel.begin_refinement(constants, memory)
-        earlier.is_keeping(memory[0])
-        earlier.forget(memory[0])
-        certificate.forget(memory[0])
-        anchor.accept(memory[0], np.zeros(JOINTS), np.ones(JOINTS))
-        belief.pause(memory[0], constants[0].recover_cycles)
-        begin_doubt(constants[0], memory[0], 0.0)
-        anchor.tightest(constants[0], memory[0], 0)
-        self._doubt.compile()
+        earlier.is_keeping(m)
+        earlier.forget(m)
+        certificate.forget(m)
+        anchor.accept(m, np.zeros(JOINTS), np.ones(JOINTS))
+        anchor.tightest(k, m, 0)
+        doubt.begin(k, m)
+        sensitivity.strain(m, doubt.MOST_STRAIN)
+        compile_recalled(self._settings)
         paper_kernel.begin_adaptation(*(array.copy() for array in self._paper))
-        super().compile()
+        super().compile_cycle()
 
     def compile_longest(self) -> None:
         """Compile the learning from a sample, half of a step's compile time, and the paper's scheme."""
@@ -97,9 +96,7 @@ class CertifiedPolicy(SchemePolicy):
 
     def describe_missing(self) -> list[str]:
         """Return the conditions that an adaptation still waits for, a line each."""
-        constants, memory, _, _ = self.numbers
-        missing = termination.describe_missing(constants[0], memory[0], self._names, PARAMETER_UNITS)
-        return [*self._watch.describe(), *missing]
+        return [*self._watch.describe(), *termination.describe_missing(self._k, self._m, self._names, PARAMETER_UNITS)]
 
     def describe_withheld(self) -> list[str]:
         """Return the contradictions of a certificate that is withheld, a line each."""
@@ -115,41 +112,42 @@ class CertifiedPolicy(SchemePolicy):
         events, self._events = self._events, []
         return events
 
-    def follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
+    def _follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
         """Process the kernel's findings, and run the first actions of a new state."""
-        state = self.supervisor.state
+        state = self.state
         if asked & ACCEPTED:
             self._events.append(self._watch.accept())
         if asked & REFUSED:
-            self._say(self._watch.refuse(is_reading=previous is SchemeState.COMMISSION))
+            self._add_event(self._watch.refuse())
         if state is not previous:
             state = self._weigh(state, previous, cycle, observation >> CONTACT_SHIFT != 0)
-            self._say(self._watch.enter(previous, state))
+            self._add_event(self._watch.enter(previous, state))
             self._enter(state, previous)
         elif asked & REFUSED and state is SchemeState.ADAPT:
             self._learn_anew(is_first=False)
         if asked & TOOK_OVER:
             self._feed_forward()
-        self._course_memory["is_refusing"] = self._watch.is_refusing
+        self._course.is_refusing = self._watch.is_refusing
 
-    def attend(self, asked: int, cycle: int) -> ContactReport | None:
-        """Report the contact; forget the samples of a touch, judge the margin, and report a push on the arm at rest."""
-        contact = super().attend(asked, cycle)
+    def _report(self, cycle: int) -> ContactReport:
+        return recalled_report(self._settings, self._course.contact, self._rows, cycle)
+
+    def _attend(self, asked: int, cycle: int) -> None:  # noqa: ARG002
+        """Forget the samples of a touch, judge the margin, and report a push on the arm at rest."""
         if asked & FORGET:
             self._learn_anew(is_first=False)
         if asked & SECOND:
             self._judge_margin()
         if asked & PUSHED:
             self._events.append(self._watch.push(self._m.filters.y[filter_bank.SLOW]))
-        return contact
 
-    def _say(self, event: Event | None) -> None:
+    def _add_event(self, event: Event | None) -> None:
         if event is not None:
             self._events.append(event)
 
     def _judge_margin(self) -> None:
         """Judge the residuals' margin to thresholds in a second of monitoring, and the smallest detectable contact."""
-        self._margin.add(sensitivity.take_peak_shares(self._m))
+        self._margin.add_block(sensitivity.take_peak_shares(self._m))
         dim = "; ".join(margin.describe_dim(self._m))
         for name, warning in (("margin", self._margin.warning), ("sight", dim)):
             if warning and name not in self._warned:
@@ -162,16 +160,17 @@ class CertifiedPolicy(SchemePolicy):
         Return the next state, STOPPED if the model is doubted.
         """
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
-            is_contradicted = self.supervisor.cause is SchemeEvent.CONTRADICTED
-            self._doubt.begin(cycle, is_touched, self._watch.contradiction() if is_contradicted else None)
+            is_contradicted = self._course.supervisor.cause == SchemeEvent.CONTRADICTED
+            self._doubt.begin_contact(cycle, is_touched, self._watch.contradiction() if is_contradicted else None)
         is_over = previous is SchemeState.REACT and state in (SchemeState.MONITOR, SchemeState.STOPPED)
-        if is_over and self.supervisor.origin is SchemeState.MONITOR:
-            verdict = self._doubt.end(cycle)
-            if verdict is not None and not course.goes_on(self._contact):
+        if is_over and self._course.supervisor.origin == SchemeState.MONITOR:
+            verdict = self._doubt.end_contact(cycle)
+            if verdict is not None and not course.goes_on(self._course.contact):
                 self._events.append(self._watch.doubt(verdict))
-                return self.supervisor.doubt()
+                supervisor.doubt(self._course.supervisor)
+                return self.state
             again = self._doubt.describe_again()
-            self._say(Event("info", "touch", again) if again else None)
+            self._add_event(Event("info", "touch", again) if again else None)
             if is_touched and state is SchemeState.STOPPED:
                 self._m.watch.until_push_cycles = self._push_cycles
         if state is SchemeState.MONITOR:
@@ -183,22 +182,22 @@ class CertifiedPolicy(SchemePolicy):
         if state is SchemeState.ADAPT:
             self._begin_adaptation(previous)
         elif state is SchemeState.CERTIFY:
-            certified_kernel.begin_test(self.numbers.constants, self.numbers.memory)
+            certified_kernel.begin_test(*self.numbers[:2])
         elif state is SchemeState.MONITOR and previous is SchemeState.CERTIFY:
-            certified_kernel.begin_refinement(self.numbers.constants, self.numbers.memory)
-            self._margin.restart()
+            certified_kernel.begin_refinement(*self.numbers[:2])
+            self._margin.forget()
             self._warned.clear()
             self._doubt.forget()
-            self.is_model_valid = True
+            self._course.is_model_valid = True
             self._feed_forward()
 
     def _begin_adaptation(self, previous: SchemeState) -> None:
         """Begin to learn anew: a payload on top of the certified arm; if that has failed, the whole arm."""
-        cause = self.supervisor.cause
-        if cause is SchemeEvent.REVOKED:
+        cause = self._course.supervisor.cause
+        if cause == SchemeEvent.REVOKED:
             self._revoke()
         elif cause in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
-            self._is_payload = self.is_model_valid
+            self._is_payload = bool(self._course.is_model_valid)
             paper_kernel.begin_adaptation(*self._paper)
         elif previous is SchemeState.CERTIFY:
             self._is_payload = False
@@ -212,14 +211,14 @@ class CertifiedPolicy(SchemePolicy):
         contact's beginning. Or the arm is free of contact now, and the adaptation had learnt an earlier one. Then the
         arm goes on only with a model that claims no knowledge.
         """
-        certified_kernel.begin_adaptation(self.numbers.constants, self.numbers.memory, self._is_payload, is_first)
+        certified_kernel.begin_adaptation(*self.numbers[:2], self._is_payload, is_first)
 
     def _revoke(self) -> None:
         """Take back the certificate: forget the arm's model and stop the feedforward."""
-        self._is_payload = self.is_model_valid = False
+        self._is_payload = self._course.is_model_valid = False
         self.theta_ff = np.zeros(self.theta_ff.size)
         self._events.append(self._watch.revoke())
-        earlier.forget(self.numbers.memory[0])
+        earlier.forget(self._m)
         paper_kernel.begin_adaptation(*self._paper)
 
     def _feed_forward(self) -> None:

@@ -1,0 +1,55 @@
+"""The paper's scheme: without a certificate; an adaptation waits for a single condition, eq. (15).
+
+The paper's `theta_hat` is the live estimate, after this cycle's correction; tau_f_hat of the same block was predicted
+before it.
+"""
+
+import numpy as np
+
+from adacd_hil.records import ContactReport, SchemeState
+from adacd_hil.scheme.contact.contact_report import integrated_report
+from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.kernel.cycle import end_paper, paper_cycle, run_paper
+from adacd_hil.scheme.model.regressor import is_positive_definite
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.supervisor.transitions import SchemeEvent
+from adacd_hil.settings.configuration import Settings
+
+
+class PaperPipeline(Pipeline):
+    """Pipeline of the paper's scheme.
+
+    A model is valid once an adaptation has finished with a mass matrix that is positive definite everywhere. It stays
+    so during later adaptations.
+    """
+
+    _cycle, _end, _run = staticmethod(paper_cycle), staticmethod(end_paper), staticmethod(run_paper)
+    compiled_functions = (paper_kernel.begin_adaptation, paper_cycle)
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings, paper_kernel.numbers_of(settings))
+        self._m: paper_kernel.PaperMemory = self.numbers.memory[0]
+        self._a_rad_s = settings.filter.a_rad_s
+        self.tau_ext_hat = self.numbers.block[0].tau_ext_hat
+        self._cycle_arrays = *self.numbers, self._course_constants, self._course_memory
+        self._end_arrays = self.numbers.block, self._course_constants, self._course_memory
+
+    def compile_cycle(self) -> None:
+        """Run every compiled function of the cycle once, on copies."""
+        paper_kernel.begin_adaptation(*(array.copy() for array in self.numbers[:3]))
+        super().compile_cycle()
+
+    def _report(self, cycle: int) -> ContactReport:  # noqa: ARG002
+        return integrated_report(self._course.contact, self.tau_ext_hat, self._m.integral, self._m.peak, self._a_rad_s)
+
+    def _follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:  # noqa: ARG002
+        """Begin an adaptation, or take over its result."""
+        state = self.state
+        if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:
+            self.theta_ff = self.numbers.block[0].theta_hat.copy()
+            self._course.is_model_valid = is_positive_definite(self.theta_ff)
+        elif state is SchemeState.ADAPT and previous is not state:
+            if self._course.supervisor.cause == SchemeEvent.REVOKED:
+                self.theta_ff = np.zeros(self.theta_ff.size)
+                self._course.is_model_valid = False
+            paper_kernel.begin_adaptation(*self.numbers[:3])
