@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all test-realtime check compiled-certified compiled-paper vcan docs bench clean
+.PHONY: help install demo test test-all test-realtime check compiled-certified compiled-paper vcan docs wheel bench clean
 
 help:
 	@echo "make install   the locked packages and this one, in .venv"
@@ -17,6 +17,7 @@ help:
 	@echo "make test-all   all checks and all tests"
 	@echo "make test-realtime   SocketCAN tests that need a machine which doesn't stall: 1 kHz contacts, two arms"
 	@echo "make check  format, lint, types, direction of imports"
+	@echo "make wheel  the package with its machine code, for this Python and architecture, in dist"
 	@echo "make docs   the documentation's site, in docs/_site"
 	@echo "make bench  codec, step, plant, log hand-off; the cycle over vcan beside a C yardstick and a straightforward loop"
 
@@ -90,9 +91,12 @@ docs: $(VENV)/.dev
 	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going docs docs/_site
 	@echo "docs/_site/index.html"
 
+wheel: $(VENV)/.run
+	tools/wheel
+
 bench: $(VENV)/.run
 	$(BIN)/python tools/bench.py
 
 clean:
-	rm -rf $(VENV) docs/_site .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) dist docs/_site .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find adacd_hil firmware_sim tests tools -name __pycache__ -prune -exec rm -r {} +

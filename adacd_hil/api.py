@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 _LIBRARY = "adacd_hil.lab.library"
-_PLACES = {
+PLACES = {
     "Arm": (f"{_LIBRARY}.array_detection", "OfflineArm"),
     "ArrayContact": (f"{_LIBRARY}.array_detection", "ArrayContact"),
     "ArrayError": (f"{_LIBRARY}.array_detection", "ArrayError"),
@@ -61,11 +61,11 @@ _PLACES = {
 
 def __getattr__(name: str) -> object:
     """Import a name at its first use: some modules compile functions, some import plot libraries."""
-    if name not in _PLACES:
+    if name not in PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; there are {', '.join(__all__)}")
     from importlib import import_module
 
-    module, attribute = _PLACES[name]
+    module, attribute = PLACES[name]
     return getattr(import_module(module), attribute)
 
 

@@ -4,7 +4,9 @@ The on-disk cache is keyed by the text of every module with compiled functions a
 numba alone looks only at the file of the function itself; it would use old code of an edited callee, and the old value
 of an edited constant.
 
-A function that one process is compiling is not compiled by another at the same time (`_SharedCache`).
+A function that one process is compiling is not compiled by another at the same time (`_SharedCache`). The code is for
+every processor of the architecture, so that a wheel can bring it along (`tools/wheel`). It is as fast as code for this
+machine's processor, and gives the same bits.
 """
 
 import contextlib
@@ -24,7 +26,13 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    UserProvidedCacheLocator,
+    _CacheLocator,
+)
 
 from adacd_hil.compile_progress import CompileCount, full_name, functions_below
 
@@ -123,8 +131,12 @@ def _is_own(status: os.stat_result) -> bool:
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
 
-_FOLDER = cache_folder(source_digest())
+_DIGEST = source_digest()
+_FOLDER = cache_folder(_DIGEST)
+SHIPPED = Path(__file__).resolve().parent / "machine_code"
+"""Folder that a wheel brings along: below it, by digest of the sources, the compiled code of `tools/wheel`."""
 numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
+numba.config.CPU_NAME, numba.config.CPU_FEATURES = "generic", ""  # type: ignore[attr-defined]
 
 
 _POLL_S = 0.02
@@ -186,12 +198,71 @@ def _name_of_layout(record: numba.types.Record) -> tuple[str, tuple[str]]:
 numba.types.Record.mangling_args = property(_name_of_layout)  # type: ignore[method-assign, assignment]
 
 
+class _Locator(_CacheLocator):
+    """Places the code of our functions by module and line, wherever the sources lie; their state names the folder."""
+
+    def __init__(self, function: Any) -> None:
+        self._module, self._line = function.__module__, str(function.__code__.co_firstlineno)
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> "_Locator | None":
+        """Make the locator of a function of the two packages; None for others' functions."""
+        is_ours = any(Path(py_file).resolve().is_relative_to(_ROOT / package) for package in _PACKAGES)
+        return cls(py_func) if is_ours else None
+
+    def get_cache_path(self) -> str:
+        """Return the folder for the code of this function's module."""
+        return str(_FOLDER / self._module)
+
+    def get_source_stamp(self) -> str:
+        """Return the state of the sources."""
+        return _DIGEST
+
+    def get_disambiguator(self) -> str:
+        """Return the line, which tells functions of one name apart."""
+        return self._line
+
+
+class _Implementation(CompileResultCacheImpl):
+    _locator_classes = (_Locator, UserProvidedCacheLocator)  # type: ignore[assignment]
+
+
+class _CacheFile(IndexDataCacheFile):
+    """One function's code in the user's cache; code that is missing there comes from the wheel."""
+
+    def __init__(self, path: str, base: str, stamp: object) -> None:
+        super().__init__(path, base, stamp)  # type: ignore[no-untyped-call]
+        shipped = SHIPPED / _DIGEST / Path(path).relative_to(_FOLDER)
+        self._shipped = IndexDataCacheFile(str(shipped), base, stamp)  # type: ignore[no-untyped-call]
+
+    def load(self, key: Any) -> Any:
+        """Load the code for a key; None: there is none."""
+        found = super().load(key)  # type: ignore[no-untyped-call]
+        return self._shipped.load(key) if found is None else found  # type: ignore[no-untyped-call]
+
+    def version(self) -> int | None:
+        """Return a number that changes whenever any process saves code of this function; None: there is no code."""
+        for path in (self._index_path, self._shipped._index_path):
+            with contextlib.suppress(OSError):
+                return Path(path).stat().st_mtime_ns
+        return None
+
+
 class _SharedCache(FunctionCache):
     """numba's cache on disk, for processes that compile at the same time.
 
     numba chooses a file's name by the index that it has read before: of two processes that compile a function for
     different types both take the same name, and the index then gives the code of one for the types of the other.
     """
+
+    _impl_class = _Implementation
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        locator = self._impl.locator
+        self._cache_file: _CacheFile = _CacheFile(
+            locator.get_cache_path(), self._impl.filename_base, locator.get_source_stamp()
+        )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the code compiled for these types; None: this process has to compile it, then save it."""
@@ -212,11 +283,8 @@ class _SharedCache(FunctionCache):
             _claims.release(self._claim(sig))
 
     def version(self) -> int | None:
-        """Return a number that changes whenever any process saves code of this function; None: no code is saved."""
-        try:
-            return Path(self._cache_file._index_path).stat().st_mtime_ns
-        except OSError:
-            return None
+        """Return the version of the code on the disk, see `_CacheFile.version`."""
+        return self._cache_file.version()
 
     def _claim(self, sig: Any) -> str:
         return f"{full_name(self._py_func)} {sig}"
@@ -237,7 +305,7 @@ def _compiled(function: Function, **options: bool) -> Function:
     made = numba.njit(fastmath=False, error_model="numpy", no_cfunc_wrapper=True, **options)  # type: ignore[call-overload]
     dispatcher: Any = made(function)
     if dispatcher is not function:  # as it is where NUMBA_DISABLE_JIT is set
-        dispatcher._cache = _SharedCache(function)  # type: ignore[no-untyped-call]
+        dispatcher._cache = _SharedCache(function)
     return cast(Function, dispatcher)
 
 

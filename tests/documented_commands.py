@@ -27,8 +27,9 @@ from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.device.profile import ProfileSettings, load_profile
 from adacd_hil.given_path import WrittenPath
 from adacd_hil.lab.offline.recording_map import read_map
-from adacd_hil.settings.configuration import Settings, apply_settings, load_settings, parse_changes, parse_variations
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError, find_problems, parse
+from adacd_hil.settings.setting_keys import apply_settings, parse_changes, parse_variations
 from adacd_hil.wire.codec import CodecError, load_codec
 from firmware_sim.cli.emulator_main import cli as emulator_cli
 from firmware_sim.cli.scenario_list import check as check_scenario

@@ -190,5 +190,5 @@ def run_realtime(
         fault = rig.run().fault.name
     except (BusError, DeviceError) as failure:
         error = str(failure)
-        rig.recorder.cycle(rig.clock.now_ns(), [], rig.tap.take())
+        rig.recorder.cycle(rig.clock.now_ns(), [], rig.tap.take_passed())
     return rig.outcome(fault, error, rig.read())

@@ -90,7 +90,13 @@ def describe_geared_arm(folder: Path) -> list[str]:
 
 _ROW = "[[contacts]]\nat_s = {:.1f}\nlink = {}\npoint_m = {}\nangle_deg = {}\nforce_N = 20.0\nduration_s = 0.1\n"
 _TOUCHES = ((1, 0.3, 90.0), (1, 0.3, -90.0), (2, 0.2, 90.0), (2, 0.2, -90.0)) * 2
-EIGHT_TOUCHES = "lasts_s = 12.8\nstart_deg = [-30.0, -60.0]\n" + "".join(
-    _ROW.format(2.4 + 1.3 * number, *touch) for number, touch in enumerate(_TOUCHES)
-)
-"""A scenario: once the model is certified, a touch every 1.3 s, each as short as a knock."""
+
+
+def touches(count: int) -> str:
+    """Write a scenario: once the model is certified, a touch every 1.3 s, each as short as a knock."""
+    rows = "".join(_ROW.format(2.4 + 1.3 * number, *touch) for number, touch in enumerate(_TOUCHES[:count]))
+    return f"lasts_s = {2.4 + 1.3 * count:.1f}\nstart_deg = [-30.0, -60.0]\n{rows}"
+
+
+LINKS = [touch[0] for touch in _TOUCHES]
+"""The link of each touch."""

@@ -44,27 +44,26 @@ def fixed_pdos() -> EdsVariant:
 
 
 KINDS = {
-    "no SYNC period": EdsVariant().without("1006"),
-    "neither SYNC period nor counter": EdsVariant().without("1006", "1019"),
-    "no rated torque": EdsVariant().without("6076"),
-    "no event timers": EdsVariant().without(*every(5, *SENT)),
-    "no deadline of commands": EdsVariant().without(*every(5, *RECEIVED)),
-    "error code and mode in no frame": EdsVariant().with_value(0, "603F", "6061", key="PDOMapping"),
-    "no mode at all": EdsVariant().without("6060", "6061"),
-    "identifiers that can't be written": EdsVariant()
+    "the least that an EDS may have": EdsVariant().without(
+        *("1006", "1014", "1015", "1016", "1019", "6060", "6061", "6076"), *every(5, *SENT), *every(5, *RECEIVED)
+    ),
+    "a counter without a period, mode and error code in no frame, 2000 increments": EdsVariant()
+    .without("1006")
+    .with_value(0, "603F", "6061", key="PDOMapping")
+    .with_value(2000, "608Fsub1")
+    .with_value(1, "6091sub1"),
+    "identifiers that can't be written, velocity in rpm": EdsVariant()
     .with_value("ro", *every(1, "1400", "1800", "1801"), key="AccessType")
     .with_value("$NODEID+0x200", "1400sub1")
     .with_value("$NODEID+0x180", "1800sub1")
-    .with_value("$NODEID+0x280", "1801sub1"),
-    "room for two objects in a frame": EdsVariant().without(
-        *(f"{record}sub{sub}" for record in ("1600", "1A00", "1A01") for sub in range(3, 9))
-    ),
-    "2000 increments from the factory": EdsVariant().with_value(2000, "608Fsub1").with_value(1, "6091sub1"),
+    .with_value("$NODEID+0x280", "1801sub1")
+    .with_object("60A9", RPM),
+    "room for two objects in a frame, rated torque in millionths": EdsVariant()
+    .without(*(f"{record}sub{sub}" for record in ("1600", "1A00", "1A01") for sub in range(3, 9)))
+    .with_value(380_000, "6076")
+    .with_value(30, "6091sub1"),
     "one increment from the factory": EdsVariant().with_value(1, "608Fsub1", "6091sub1"),
-    "velocity in rpm": EdsVariant().with_object("60A9", RPM),
-    "rated torque in millionths": EdsVariant().with_value(380_000, "6076").with_value(30, "6091sub1"),
     "fixed mapping with the mode in it": fixed_pdos(),
-    "no emergency, no heartbeat consumer": EdsVariant().without("1014", "1015", "1016"),
 }
 
 
@@ -86,20 +85,21 @@ def test_a_drive_from_its_eds_is_rehearsed(tmp_path: Path, kind: str) -> None:
     assert rehearse(tmp_path)[0] == ExitCode.OK
 
 
-@pytest.mark.parametrize(
-    ("name", "head", "encoding"),
-    [
+def test_an_eds_of_any_encoding_is_read_to_the_same_profile(tmp_path: Path) -> None:
+    text = EdsVariant().write(tmp_path / "plain.eds").read_text()
+    profiles = set()
+    for name, head, encoding in (
         ("drive.eds", "; Gr\u00f6\u00dfe in \u00b5Nm\r\n", "latin-1"),
         ("drive.eds", "", "utf-8-sig"),
         ("DRIVE.EDS", "", "ascii"),
-    ],
-)
-def test_an_eds_of_any_encoding_is_rehearsed(tmp_path: Path, name: str, head: str, encoding: str) -> None:
-    text = EdsVariant().write(tmp_path / "plain.eds").read_text()
-    (tmp_path / name).write_text(head + text, encoding=encoding)
-    written = init(tmp_path, "--eds", str(tmp_path / name))
-    assert written.exit_code == 0, written.stderr
-    assert rehearse(tmp_path)[0] == ExitCode.OK
+    ):
+        folder = tmp_path / encoding
+        folder.mkdir()
+        (folder / name).write_text(head + text, encoding=encoding)
+        written = init(folder, "--eds", str(folder / name))
+        assert written.exit_code == 0, written.stderr
+        profiles.add((folder / "my-arm-drive.toml").read_text().replace(name, ""))
+    assert len(profiles) == 1
 
 
 def test_a_drive_whose_eds_names_no_profile_is_told_to_be_one(tmp_path: Path) -> None:
@@ -121,8 +121,7 @@ def test_what_an_eds_omits_is_made_up_and_said(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("gears", [(), ("--gear", "50", "30")])
-@pytest.mark.parametrize("name", ["maxon-epos4", "zeroerr-erob"])
+@pytest.mark.parametrize(("name", "gears"), [("maxon-epos4", ("--gear", "50", "30")), ("zeroerr-erob", ())])
 def test_a_shipped_profile_is_rehearsed(tmp_path: Path, name: str, gears: tuple[str, ...]) -> None:
     written = init(tmp_path, "--drive", name, name, *gears)
     assert written.exit_code == 0, written.stderr
@@ -185,11 +184,8 @@ def test_the_torque_of_a_geared_arm_is_the_joint_s(geared: Path, tmp_path: Path)
     ("gear", "joint", "least", "most"),
     [
         ((1.2, 1.0), 1, 1.15, 1.25),
-        ((1.0, 1.2), 2, 1.15, 1.25),
         ((1.0 / 1.2, 1.0), 1, 0.79, 0.87),
-        ((26.0, 1.0), 1, 15.0, 35.0),
         ((1.0, 26.0), 2, 15.0, 35.0),
-        ((1.0 / 26.0, 1.0), 1, 0.02, 0.06),
         ((1.0, 1.0 / 26.0), 2, 0.02, 0.06),
     ],
 )

@@ -1,6 +1,7 @@
 """What a user installs: the wheel holds every file that the code reads, the licences, and the types."""
 
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -19,14 +20,18 @@ DATA = sorted(
 )
 
 
+def _build(folder: Path, **variables: str) -> Path:
+    built = subprocess.run(
+        [sys.executable, "-c", BUILD, str(folder)],
+        cwd=ROOT, env={**os.environ, **variables}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return folder / built.stdout.strip()
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wheel of this source tree."""
-    folder = tmp_path_factory.mktemp("wheel")
-    built = subprocess.run(
-        [sys.executable, "-c", BUILD, str(folder)], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return folder / built.stdout.strip()
+    return _build(tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +43,43 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _run(installed: Path, code: str) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(installed)}
+def _run(installed: Path, code: str, **variables: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(installed), **variables}
     ran = subprocess.run(
         [sys.executable, "-c", code], cwd=installed, env=environment, capture_output=True, text=True, check=True
     )
     return ran.stdout
+
+
+MEASURE_A_FRAME = "from adacd_hil.wire.frame_time import exact_frame; exact_frame(0x181, bytes(8))"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"), reason="nothing is compiled")
+def test_machine_code_of_a_wheel_is_used_where_it_is_installed_and_compiled_no_more(tmp_path: Path) -> None:
+    compiled, own = tmp_path / "compiled", tmp_path / "own"
+    _run(ROOT, MEASURE_A_FRAME, NUMBA_CACHE_DIR=str(compiled))
+    assert list(compiled.rglob("*.nbc"))
+    installed = tmp_path / "installed"
+    with zipfile.ZipFile(_build(tmp_path, ADACD_HIL_MACHINE_CODE=str(compiled))) as archive:
+        archive.extractall(installed)
+    _run(installed, MEASURE_A_FRAME, NUMBA_CACHE_DIR=str(own))
+    assert list(own.rglob("*.nbc")) == []
+    changed = installed / "adacd_hil" / "wire" / "frame_time.py"
+    changed.write_text(changed.read_text() + "\n# other code\n")
+    _run(installed, MEASURE_A_FRAME, NUMBA_CACHE_DIR=str(own))
+    assert list(own.rglob("*.nbc"))
+
+
+def test_a_wheel_with_machine_code_is_for_this_python_and_this_architecture(tmp_path: Path) -> None:
+    (tmp_path / "code").mkdir()
+    tags = _build(tmp_path, ADACD_HIL_MACHINE_CODE=str(tmp_path / "code")).stem.split("-")[2:]
+    assert tags[0] == f"cp{sys.version_info[0]}{sys.version_info[1]}"
+    assert tags[2].endswith(platform.machine())
+
+
+def test_a_wheel_without_machine_code_is_for_every_python(wheel: Path) -> None:
+    assert wheel.stem.split("-")[2:] == ["py3", "none", "any"]
 
 
 def test_the_wheel_holds_every_file_of_the_packages(wheel: Path) -> None:

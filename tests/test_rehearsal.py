@@ -3,16 +3,19 @@
 import dataclasses
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from own_arm import describe_arm
+from own_arm import LINKS, describe_arm, describe_geared_arm, touches
 
 from adacd_hil.cli.embedded_run import resolve
 from adacd_hil.cli.main import cli
 from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.profile import load_profile
+from adacd_hil.lab.report.run_reading import read_run
+from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError
@@ -53,6 +56,27 @@ def rehearse(folder: Path, name: str, *words: str) -> tuple[int, str]:
         [sys.executable, "-c", HOST, *command], cwd=folder, capture_output=True, text=True, check=False
     )
     return ran.returncode, ran.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("describe", [describe_arm, describe_geared_arm])
+def test_an_arm_of_init_is_certified_and_all_its_touches_are_found(
+    describe: Callable[[Path], list[str]], tmp_path: Path
+) -> None:
+    written = CliRunner().invoke(cli, ["init", *describe(tmp_path)])
+    assert written.exit_code == 0, written.output
+    (tmp_path / "touches.toml").write_text(touches(len(LINKS)))
+    words = ["--config", "my-arm.toml", "--scenario", "touches.toml", "--out", "played"]
+    ran = subprocess.run(
+        [sys.executable, "-c", HOST, "demo", *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "model certified" in ran.stderr
+    run, gathered, _ = read_run(tmp_path / "played" / "run.mcap", tmp_path / "played" / "truth.mcap")
+    judged = evaluate(run, gathered)
+    assert (len(judged.contacts), judged.missed, judged.false_alarms) == (len(LINKS), 0, 0)
+    assert [contact.link_detected for contact in judged.contacts] == LINKS
+    assert all(contact.direction_ok for contact in judged.contacts)
 
 
 def test_an_own_arm_is_composed_and_what_is_assumed_of_it_is_said(folder: Path) -> None:

@@ -10,8 +10,9 @@ import pytest
 
 from adacd_hil import remedies
 from adacd_hil.remedies import install_command, nearest_name
-from adacd_hil.settings.configuration import Settings, apply_settings, load_settings
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse
+from adacd_hil.settings.setting_keys import apply_settings
 
 KEYS = ("a_rad_s", "b_rad_s", "threshold_Nm", "torque_limit_Nm", "torque_rate_limit_Nm_s", "Kp", "Kd", "condition")
 DOTTED = ("filter.a_rad_s", "detector.threshold_Nm", "certified.condition", "certified.noise_sigmas")

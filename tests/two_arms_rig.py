@@ -111,7 +111,7 @@ class FirstHost:
         self.cycle += 1
         state = self._exchange.read(Tick(self.cycle, self._clock.now_ns(), 1, 0))
         self.states.append(state)
-        self.arm.write(ArmCommand(PUSH_NM if state.is_enabled else np.zeros(2), True, False))
+        self.arm.send_command(ArmCommand(PUSH_NM if state.is_enabled else np.zeros(2), True, False))
         if self.cycle % 50 == 0:
             self.master.send_heartbeat()
 

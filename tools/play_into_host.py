@@ -92,7 +92,7 @@ def start_in_phase(bus: SocketCanBus, command: list[str]) -> "subprocess.Popen[b
 def decisions(log: RunLog) -> tuple[list[str], list[tuple[int, tuple[int, int]]]]:
     """List the transitions, and link and direction of each final contact report."""
     transitions = [e.event.message for e in log.events if e.event.name == "supervisor"]
-    contacts = [(c.report.link, tuple(map(int, c.report.direction))) for c in log.contacts if c.report.is_final]
+    contacts = [(each.link, tuple(map(int, each.direction))) for _, each in log.contacts if each.is_final]
     return transitions, contacts
 
 

@@ -8,7 +8,7 @@ Exit status: 0 printed, 2 wrong usage.
 import argparse
 import sys
 
-from adacd_hil.settings.configuration import keys_of, sections
+from adacd_hil.settings.setting_keys import keys_of, sections
 
 HEAD = (
     "# Settings\n\n"

@@ -45,7 +45,7 @@ def complete_truth(_ctx: Context, _param: Parameter, incomplete: str) -> list[Co
 
 def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:
     """Complete sections and keys; for an option KEY=VALUE keys with `=`, and the choices of a key."""
-    from adacd_hil.settings.configuration import known_keys, sections
+    from adacd_hil.settings.setting_keys import known_keys, sections
 
     known = {key: row for key, row in known_keys().items() if not row.is_in_row}
     if param.param_type_name == "argument":

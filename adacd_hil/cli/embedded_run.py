@@ -78,22 +78,6 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
     return Cast(dataclasses.replace(settings, arm=arm, operator=operator), scenario, contract, tuple(assumed))
 
 
-class _TrueTouch:
-    """Time since which the emulated person touches the arm: for the progress lines only, the host doesn't use it."""
-
-    def __init__(self, truth: TruthLog) -> None:
-        self.since_ns: int | None = None
-        self._truth = truth
-
-    def write(self, cycle: int, t_ns: int, block: Vector) -> None:
-        """Log the truth of one cycle, and update `since_ns`."""
-        if block[_TOUCHED_LINK] == 0.0:
-            self.since_ns = None
-        elif self.since_ns is None:
-            self.since_ns = t_ns
-        self._truth.write(cycle, t_ns, block)
-
-
 def run_embedded(
     cast: Cast,
     clock_name: str,
@@ -117,10 +101,16 @@ def run_embedded(
     host = {CONFIG_DIGEST_KEY: config_digest(to_toml(settings))}
     with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", metadata=host, scenario=scenario) as truth:
         try:
-            touch = _TrueTouch(truth)
+            touched_ns: int | None = None  # since when somebody touches the arm, for the progress lines alone
+
+            def write_truth(cycle: int, t_ns: int, block: Vector) -> None:
+                nonlocal touched_ns
+                touched_ns = None if block[_TOUCHED_LINK] == 0.0 else touched_ns or t_ns
+                truth.write(cycle, t_ns, block)
+
             with compiling_cycle(settings, Body.compiled_functions):
                 bench = Bench(
-                    scenario, codec, embedded.deliver, contract=contract, on_truth=touch.write, on_event=truth.event
+                    scenario, codec, embedded.deliver, contract=contract, on_truth=write_truth, on_event=truth.event
                 )
                 Pipeline(settings).compile()
             embedded.attach(bench.on_frame)
@@ -137,7 +127,7 @@ def run_embedded(
                 progress=progress,
                 live=live,
                 on_started=on_started,
-                touched_ns=lambda: touch.since_ns,
+                touched_ns=lambda: touched_ns,
             )
             with on_interrupt(session.interrupt):
                 summary = session.run()

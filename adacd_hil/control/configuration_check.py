@@ -5,24 +5,14 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import PurePath
 from typing import NamedTuple
 
-from adacd_hil.control.host_checks import Check, CheckOutcome, ok, warning
 from adacd_hil.control.motions import motion_problems
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
-from adacd_hil.settings.configuration import (
-    ConfigurationLayer,
-    KnownKey,
-    Settings,
-    configuration_layers,
-    explain_unknown,
-    in_words,
-    known_keys,
-    resolved_table,
-    value_of,
-)
+from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
 from adacd_hil.settings.schema import ConfigError, find_problems, parse
+from adacd_hil.settings.setting_keys import explain_unknown, known_keys, value_of
 from adacd_hil.settings.toml_files import builtin_names
-from adacd_hil.wire.budget import check_budget
+from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.codec import Codec, CodecError
 
 Pair = tuple[float, float]
@@ -61,47 +51,12 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
         codec = load_contract(settings)
     except (ConfigError, CodecError) as error:
         return ConfigurationFindings([str(error)], [], None)
-    late = list(_budget_warnings(codec, settings))
+    excess = describe_excess(codec, settings)
+    late = [excess] if excess else []
     guesses = [*settings.assumed, *profile_guesses(settings)]
     assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in guesses)}"] if guesses else []
-    warnings = [*_oddities(settings), *_narrow(codec, settings), *assumed, *_layer_warnings(layers), *late]
+    warnings = [*oddities(settings), *_narrow(codec, settings), *assumed, *_layer_warnings(layers), *late]
     return ConfigurationFindings([], warnings, settings, bool(late))
-
-
-def configuration_checks(settings: Settings) -> list[Check[Settings]]:
-    """Return doctor's checks of a configuration: its likely mistakes, and one check for each guessed value."""
-    known = known_keys()
-    guesses = [key for key in settings.assumed if key in known]
-    return [
-        Check("settings", _check_oddities),
-        *(Check(f"`{key}`", _asking_for(known[key])) for key in guesses),
-        *(Check(f"`{key}`", _asking_for_profile(value)) for key, value in profile_guesses(settings).items()),
-    ]
-
-
-def _check_oddities(settings: Settings) -> CheckOutcome:
-    odd = _oddities(settings)
-    if odd:
-        return warning("; ".join(odd), "correct the configuration; `adacd-hil config check` looks at it without a bus")
-    return ok(f"configuration {settings.name}")
-
-
-def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
-    def ask(settings: Settings) -> CheckOutcome:
-        value = value_of(settings, known.key)
-        text = "nothing is given" if value is None else f"{in_words(value)} is a guess"
-        remedy = f"measure it or look it up, write it, and take `{known.key}` off `assumed`"
-        return warning(f"{text}: {known.meaning}", remedy)
-
-    return ask
-
-
-def _asking_for_profile(value: float) -> Callable[[Settings], CheckOutcome]:
-    def ask(_: Settings) -> CheckOutcome:
-        remedy = "look it up or measure it, write it into that profile, and take the key off its `assumed`"
-        return warning(f"{value:.10g} is a guess", remedy)
-
-    return ask
 
 
 def profile_guesses(settings: Settings) -> dict[str, float]:
@@ -116,7 +71,8 @@ def profile_guesses(settings: Settings) -> dict[str, float]:
     return found
 
 
-def _oddities(settings: Settings) -> list[str]:
+def oddities(settings: Settings) -> list[str]:
+    """Return the likely mistakes that the settings alone show, a line each."""
     return [line for look in _LOOKS for line in look(settings)]
 
 
@@ -216,13 +172,6 @@ def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
                 f"{message.name} carries ±{most_Nm:.3g} Nm, `arm.rated_torque_Nm[{joint}]` = {rated_Nm:g} Nm: is "
                 f"`torque_Nm` of {settings.devices.sensor[joint]} right?"
             )
-
-
-def _budget_warnings(codec: Codec, settings: Settings) -> Iterator[str]:
-    if b'"Trigger"' in codec.text:
-        budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
-        if not budget.is_fit:
-            yield f"contract {codec.path.stem}: {budget.line}"
 
 
 def _pair(values: Sequence[float]) -> str:

@@ -29,7 +29,7 @@ class Controller:
         self._theta = self._old = self._new = none
         self._cycles_left = 0
 
-    def compile(self) -> None:
+    def compile_law(self) -> None:
         """Call the compiled part once, so that it doesn't compile in the cycle."""
         zeros = np.zeros(JOINTS)
         fill_torque(

@@ -21,7 +21,7 @@ from adacd_hil.control.pacing import Pacer
 from adacd_hil.control.reference import MOTION, Reference
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import DataShares, DataWatch
-from adacd_hil.device.arm_watch import ArmWatch, Recurrence
+from adacd_hil.device.arm_watch import ArmWatch, EventSource, Recurrence
 from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.device.network import Master
 from adacd_hil.log.recording.recorder import Recorder
@@ -113,7 +113,7 @@ class Cycle:
         self._checks = SelfChecks(settings, arm, master.parameters, self._q_d, self._first_motion)
         self._faults = FaultReport(settings, arm, self._watch, self._pipeline, self._checks, master)
         self._escalation = StopEscalation(arm, master)
-        self._sources = (
+        self._sources: tuple[EventSource, ...] = (
             self._master,
             arm.strangers,
             self._data,
@@ -122,7 +122,6 @@ class Cycle:
             self._exchange.events,
             self._first_motion,
             self._reference,
-            self._pipeline,
         )
         self._state = SchemeState.INIT
         self._first_cycle = -1  # before the first
@@ -150,9 +149,9 @@ class Cycle:
     def compile(self) -> None:
         """Compile everything the loop calls; to be done before the drives are enabled."""
         self._pipeline.compile()
-        self._reference.compile()
-        self._controller.compile()
-        self._first_motion.compile()
+        self._reference.compile_motion()
+        self._controller.compile_law()
+        self._first_motion.compile_readings()
 
     def interrupt(self) -> None:
         """Ask the loop to park the arm and end; a second time, to end at once with a quick stop."""
@@ -166,14 +165,14 @@ class Cycle:
         output = None
         self._pacer.resume()
         while not self._is_over(output):
-            turn = self._exchange.turn()
-            arm = self._watch.judge(turn.arm)
+            tick, arm = self._exchange.turn()
+            arm = self._watch.judge(arm)
             request = self._checks.judge(arm, self._state) or self._request(arm.cycle)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
             self._follow(arm, output)
             command, flags = self._limit(arm, output, self._exchange.leave())
-            record = self._exchange.end(turn, command, recorder.waiting_bytes)
+            record = self._exchange.end(tick, arm, command, recorder.waiting_bytes)
             self._data.note(arm)
             self._faults.note(self._state, arm)
             self._first_motion.note(arm, self._state, self._tau_c)
@@ -187,7 +186,7 @@ class Cycle:
                 else f"not parked within {FINISH_S:g} s"
             )
             text = f"{why}: the drives are disabled where the arm is"
-            recorder.event(turn.tick.t_ns, Event("warning", "run", text))
+            recorder.event(tick.t_ns, Event("warning", "run", text))
             self._progress(text)
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(
@@ -271,12 +270,12 @@ class Cycle:
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
             self._narration.contact(t_ns, output.contact)
-        recorder.cycle(t_ns, messages, self._bus.take())
-        for source in self._sources:
-            for event in source.take_events():
-                recorder.event(t_ns, event)
-                if event.name in CERTIFICATE_EVENTS or event.name == MOTION or is_shown(event):
-                    self._narration.event(t_ns, event.operator_text)
+        recorder.cycle(t_ns, messages, self._bus.take_passed())
+        events = [event for source in self._sources if source.events for event in source.take_events()]
+        for event in (*events, *self._pipeline.take_events()):
+            recorder.event(t_ns, event)
+            if event.name in CERTIFICATE_EVENTS or event.name == MOTION or is_shown(event):
+                self._narration.event(t_ns, event.operator_text)
         if output.state is not self._state:
             event = self._transition(output, arm)
             recorder.event(t_ns, event)
@@ -286,14 +285,14 @@ class Cycle:
     def _transition(self, output: SchemeOutput, arm: ArmState) -> Event:
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is SchemeState.REACT and output.contact is None:
-            late = f"{FaultReason.DEADLINE.name}; {self._watch.deadline.describe()}"
+            late = f"{FaultReason.DEADLINE.name}; {self._watch.deadline.describe_misses()}"
             why = late if arm.is_late else "what was learnt since contradicts the certificate"
             return Event("warning", "supervisor", f"{text}: {why}")
         if output.state is SchemeState.COMMISSION and output.previous_state is SchemeState.ENABLE:
             return Event("warning", "supervisor", f"{text}: the arm moves before all its drives are enabled")
         if output.state is not SchemeState.FAULT:
             return Event("info", "supervisor", text)
-        details = "; ".join([output.fault.name, *self._faults.describe(output.fault)])
+        details = "; ".join([output.fault.name, *self._faults.list_causes(output.fault)])
         return Event("error", "supervisor", f"{text}: {details}")
 
     def _follow_state(self, state: SchemeState, cycle: int) -> None:
@@ -324,7 +323,7 @@ class Cycle:
         command = ArmCommand(self._tau_c, enable=False, quick_stop=quick_stop)
         for _ in range(DISABLE_CYCLES):
             tick, _ = self._exchange.turn()
-            self._arm.write(command)
-            recorder.cycle(tick.t_ns, [], self._bus.take())
+            self._arm.send_command(command)
+            recorder.cycle(tick.t_ns, [], self._bus.take_passed())
         checks = pack_frame_checks(self._arm.frame_checks())
-        recorder.cycle(tick.t_ns, [(ChannelId.FRAME_CHECKS, checks)], self._bus.take())
+        recorder.cycle(tick.t_ns, [(ChannelId.FRAME_CHECKS, checks)], self._bus.take_passed())

@@ -243,7 +243,7 @@ class DeviceReadings:
         self._shares, self._solutions = np.ones(readings), np.zeros((readings, unknowns))
         self._refuted = 0  # rounds in a row in which the configuration was refuted
 
-    def compile(self) -> None:
+    def compile_readings(self) -> None:
         """Compile the functions that `add_means` calls."""
         zero = np.zeros(JOINTS)
         add_block(self._rows, zero, zero, zero, zero, zero, self._level_rad, self._count, self._normals.copy())
@@ -297,7 +297,7 @@ class DeviceReadings:
         self._solve(())
         return 0 < self._blocks < _SUSPECT_BLOCKS or not is_positive_definite(self._solutions[0])
 
-    def describe(self, left: Sequence[Reading]) -> str:
+    def name_causes(self, left: Sequence[Reading]) -> str:
         """Describe the remaining causes, their unexplained shares, and the remedies; "" without a cause.
 
         If even the best reading explains little, the cause is not among the readings, or there are several.

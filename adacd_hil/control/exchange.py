@@ -3,8 +3,6 @@
 If another host sends SYNC, this host receives it. A cycle is `turn`, its own decision, `leave`, `end`.
 """
 
-from typing import NamedTuple
-
 from adacd_hil.clock import Clock
 from adacd_hil.control.pacing import MOST_FRAMES, Pacer, Tick
 from adacd_hil.device.arm import FEEDBACK_SHARE, Arm
@@ -16,13 +14,6 @@ from adacd_hil.wire.bus import NOTHING_QUEUED, Frame, SilenceError, Tap
 from adacd_hil.wire.error_frames import TroubleKind, decode_error
 
 QUEUES_S = 0.01
-
-
-class Turn(NamedTuple):
-    """How a cycle began, and the arm's state in it."""
-
-    tick: Tick
-    arm: ArmState
 
 
 class Exchange:
@@ -53,10 +44,10 @@ class Exchange:
         self._commands_late = 0
         self._said_lost = bus.frames_lost
 
-    def turn(self) -> Turn:
+    def turn(self) -> tuple[Tick, ArmState]:
         """Wait for the next cycle and read the arm, see `read`; the cycle ends by `end`."""
         tick = self._pacer.next()
-        return Turn(tick, self.read(tick))
+        return tick, self.read(tick)
 
     def read(self, tick: Tick) -> ArmState:
         """Begin with SYNC and take in the devices' samples of it.
@@ -142,19 +133,19 @@ class Exchange:
         self._bus.held_ns = leaving_ns = self._pacer.spend(self.feedback_ns)
         return leaving_ns
 
-    def end(self, turn: Turn, command: ArmCommand, log_queue_bytes: int = 0) -> CycleRecord:
+    def end(self, tick: Tick, arm: ArmState, command: ArmCommand, log_queue_bytes: int = 0) -> CycleRecord:
         """Hand the commands to the bus, and a heartbeat when it is due; return the record of the cycle.
 
         `log_queue_bytes`: bytes that wait for the log's writer. Raises BusError.
         """
-        self._arm.write(command)
-        record = self._record(turn, log_queue_bytes)
+        self._arm.send_command(command)
+        record = self._record(tick, arm, log_queue_bytes)
         if self._heartbeats.is_due(record.cycle):
             self._master.send_heartbeat()
         return record
 
-    def _record(self, turn: Turn, log_queue_bytes: int) -> CycleRecord:
-        tick, arm, command_ns = *turn, self._clock.now_ns()
+    def _record(self, tick: Tick, arm: ArmState, log_queue_bytes: int) -> CycleRecord:
+        command_ns = self._clock.now_ns()
         frames_lost = self._bus.frames_lost
         if frames_lost != self._said_lost and self.events.is_due("lost", command_ns):
             count, self._said_lost = frames_lost - self._said_lost, frames_lost
@@ -186,6 +177,6 @@ def say_trouble(events: RateLimitedEvents, frame: Frame) -> None:
 
     A controller without an acknowledging node signals thousands a second; every frame is in the log anyway.
     """
-    trouble = decode_error(frame)
-    level = "info" if trouble.kind is TroubleKind.ERROR_ACTIVE else "warning"
-    events.say(frame.t_ns, trouble.kind, Event(level, "bus", trouble.text))
+    kind, text = decode_error(frame)
+    level = "info" if kind is TroubleKind.ERROR_ACTIVE else "warning"
+    events.say(frame.t_ns, kind, Event(level, "bus", text))

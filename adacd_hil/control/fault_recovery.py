@@ -13,14 +13,13 @@ enabled at the present position with zero torque first.
 import math
 from collections import Counter
 from collections.abc import Callable
-from typing import NamedTuple
 
 from adacd_hil.clock import Clock
 from adacd_hil.control.first_motion import FirstMotion
 from adacd_hil.control.operator import FaultAnswer, Operator
 from adacd_hil.control.pacing import MOST_FRAMES
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_disabled, describe_excess, describe_faults, describe_gaps
 from adacd_hil.device.arm_watch import ArmWatch, RateLimitedEvents
 from adacd_hil.device.device_setup import ParameterWatch
 from adacd_hil.device.drive import Cia402State, Drive
@@ -144,19 +143,18 @@ class FaultReport:
         master: Master,
     ) -> None:
         self._commission = CommissionReport(settings, arm)
-        report = ArmReport(arm)
-        self._report, self._watch, self._checks, self._master = report, watch, checks, master
+        self._arm, self._watch, self._checks, self._master = arm, watch, checks, master
         self._causes: dict[FaultReason, tuple[Callable[[], list[str]], ...]] = {
-            FaultReason.DATA_AGE: (report.describe_gaps,),
-            FaultReason.BLIND: (report.describe_gaps,),
-            FaultReason.LIMIT: (report.describe_excess,),
-            FaultReason.DEADLINE: (lambda: [watch.deadline.describe()],),
+            FaultReason.DATA_AGE: (lambda: describe_gaps(arm),),
+            FaultReason.BLIND: (lambda: describe_gaps(arm),),
+            FaultReason.LIMIT: (lambda: describe_excess(arm),),
+            FaultReason.DEADLINE: (lambda: [watch.deadline.describe_misses()],),
             FaultReason.COMMISSION_TIMEOUT: (
                 pipeline.describe_withheld,
-                self._commission.describe,
-                report.describe_excess,
+                self._commission.list_unrest,
+                lambda: describe_excess(arm),
             ),
-            FaultReason.ENABLE_TIMEOUT: (report.describe_disabled,),
+            FaultReason.ENABLE_TIMEOUT: (lambda: describe_disabled(arm),),
             FaultReason.ADAPT_TIMEOUT: (pipeline.describe_missing,),
         }
 
@@ -164,13 +162,13 @@ class FaultReport:
         """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
         self._commission.count_cycle(state, arm)
 
-    def describe(self, fault: FaultReason) -> list[str]:
+    def list_causes(self, fault: FaultReason) -> list[str]:
         """Describe the causes of a fault, one line each: first those of its reason."""
         return [
             *([self._checks.line] if fault is self._checks.reason else ()),
             *self._checks.suspicions(fault),
             *(line for describe in self._causes.get(fault, ()) for line in describe()),
-            *self._report.describe_faults(),
+            *describe_faults(self._arm),
             *self._watch.lost,
             *self._master.describe_emergencies(),
         ]
@@ -179,38 +177,25 @@ class FaultReport:
 _STATES = (SchemeState.INIT, SchemeState.COMMISSION)
 
 
-class _RestBound(NamedTuple):
-    """Upper bound for every joint of an arm at rest. `says`: text for a joint beyond it."""
-
-    says: str
-    setting: str
-    bound: float
-    unit: str
-
-
-class _Unrest(NamedTuple):
-    """A joint over a bound."""
-
-    joint: int
-    over: _RestBound
-
-
 class CommissionReport:
     """Counts the reasons why an arm stays in INIT or COMMISSION, by cycles."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         self._arm = arm
-        speed, torque = settings.safety.rest_velocity_rad_s, settings.safety.rest_torque_Nm
-        self._speed = _RestBound("moves: |dq|", "safety.rest_velocity_rad_s", speed, "rad/s")
-        self._torque = _RestBound("is loaded: |tau_J|", "safety.rest_torque_Nm", torque, "Nm")
+        torque = settings.safety.rest_torque_Nm
+        self._bounds = (
+            ("moves: |dq|", "safety.rest_velocity_rad_s", settings.safety.rest_velocity_rad_s, "rad/s"),
+            ("is loaded: |tau_J|", "safety.rest_torque_Nm", torque, "Nm"),
+        )
+        """Upper bounds for every joint of an arm at rest: text for a joint beyond it, setting, value, unit."""
         tilt_deg, hangs_deg = settings.mounting_deg
         self._weight = f"correct the mounting, arm.mounting_deg = [{tilt_deg:g}, {hangs_deg:g}]"
         if not settings.estimator.gravity:
             self._weight = "the mounting is not flat: estimator.gravity = true and arm.mounting_deg"
         self._weight += f", and safety.rest_torque_Nm = {torque:g} Nm"
         self._cycles = 0
-        self._causes: Counter[str | _Unrest] = Counter()
-        self._worst: dict[_Unrest, float] = {}
+        self._causes: Counter[str | tuple[int, int]] = Counter()  # a joint beyond a bound: joint, place of the bound
+        self._worst: dict[tuple[int, int], float] = {}
 
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
         """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
@@ -221,27 +206,27 @@ class CommissionReport:
             self._causes.update(f"{name}: no usable frame in time" for name in self._arm.missing_names())
         if arm.fault is not FaultReason.NONE:
             self._causes[f"fault {arm.fault.name}"] += 1
-        for joint in range(JOINTS):
-            for over, value in ((self._speed, arm.dq[joint]), (self._torque, arm.tau_J[joint])):
-                if not abs(value) < over.bound:
-                    cause = _Unrest(joint, over)
-                    self._causes[cause] += 1
-                    self._worst[cause] = max(self._worst.get(cause, 0.0), abs(float(value)))
+        for place, values in enumerate((arm.dq, arm.tau_J)):
+            for joint, value in enumerate(values.tolist()):
+                if not abs(value) < self._bounds[place][2]:
+                    self._causes[joint, place] += 1
+                    self._worst[joint, place] = max(self._worst.get((joint, place), 0.0), abs(value))
 
-    def describe(self) -> list[str]:
+    def list_unrest(self) -> list[str]:
         """Name the causes, the most frequent first, one line each; empty if every cycle was good."""
         lines = [
             f"{self._text(cause)} in {count} of {self._cycles} cycles" for cause, count in self._causes.most_common()
         ]
-        if any(isinstance(cause, _Unrest) and cause.over is self._torque for cause in self._causes):
+        if any((joint, 1) in self._causes for joint in range(JOINTS)):
             lines.append(f"if that is the arm's own weight: {self._weight}")
         return lines
 
-    def _text(self, cause: str | _Unrest) -> str:
+    def _text(self, cause: str | tuple[int, int]) -> str:
         if isinstance(cause, str):
             return cause
-        says, setting, bound, unit = cause.over
-        return f"joint {cause.joint + 1} {says} up to {self._worst[cause]:.3g} {unit}, {setting} = {bound:g} {unit},"
+        joint, place = cause
+        says, setting, bound, unit = self._bounds[place]
+        return f"joint {joint + 1} {says} up to {self._worst[cause]:.3g} {unit}, {setting} = {bound:g} {unit},"
 
 
 _LOOK_NS = 10_000_000
@@ -310,7 +295,7 @@ class Recovery:
                     break
         except BusError:
             pass  # logged when it ended the run, and again if it can't be emptied
-        self._recorder.cycle(self._clock.now_ns(), [], self._tap.take())
+        self._recorder.cycle(self._clock.now_ns(), [], self._tap.take_passed())
 
     def _say(self, level: str, line: str) -> None:
         self._recorder.event(self._clock.now_ns(), Event(level, "recovery", line))

@@ -26,6 +26,7 @@ from adacd_hil.control.device_readings import RIDGE, DeviceReadings, Reading, To
 from adacd_hil.control.geometry_check import EVENT as GEOMETRY
 from adacd_hil.control.geometry_check import geometry_event
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_watch import EventSource
 from adacd_hil.records import JOINTS, ArmState, Event, SchemeState, Vector
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.supervisor.supervisor import POWERED
@@ -78,11 +79,12 @@ def is_shown(event: Event) -> bool:
     return event.name == GEOMETRY or (event.name == "first motion" and event.level == "warning")
 
 
-class FirstMotion:
+class FirstMotion(EventSource):
     """Judges the arm's first motion. `line`: the contradiction to the configuration, empty without one."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         """Start; with `safety.first_motion_error` = 0 it doesn't judge."""
+        super().__init__()
         self._arm = arm
         self._settings = settings
         self._error = settings.safety.first_motion_error
@@ -99,7 +101,6 @@ class FirstMotion:
         self._path = np.zeros((3, JOINTS))  # Σ Δq ∫ dq dt, Σ (∫ dq dt)², Σ Δq²
         self._way_rad = np.zeros(JOINTS)
         self._open = set(range(JOINTS)) if self._error > 0.0 else set[int]()
-        self._events: list[Event] = []
         self.is_certified = False
         """Whether a certificate has been compared with the lengths."""
         self.line = ""
@@ -109,15 +110,10 @@ class FirstMotion:
         """Whether a joint is still to be judged."""
         return bool(self._open or self._readings) and not self.line
 
-    def compile(self) -> None:
+    def compile_readings(self) -> None:
         """Compile the functions that `note` calls."""
         if self._readings is not None:
-            self._readings.compile()
-
-    def take_events(self) -> list[Event]:
-        """Return the events since the last call."""
-        events, self._events = self._events, []
-        return events
+            self._readings.compile_readings()
 
     def note(self, arm: ArmState, state: SchemeState, tau_c: Vector) -> None:
         """Take in a cycle; `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme before it."""
@@ -154,14 +150,14 @@ class FirstMotion:
             squares = ddq * ddq, tau_c * tau_c, tau_J * tau_J
             self._pushed += *squares, tau_c * ddq, tau_J * ddq, tau_c * block.dq, tau_c * tau_J
             if readings.judge_blocks(is_torque_known=not self._open):
-                self.line = readings.describe(self._left()) or _NO_CAUSE
+                self.line = readings.name_causes(self._left()) or _NO_CAUSE
 
     def certify(self, certificates: tuple[Certificate, ...]) -> None:
         """Compare the first certificate of the run, if any, with the configured lengths."""
         self.is_certified = True
         event = geometry_event(self._settings, certificates[0]) if certificates else None
         if event is not None:
-            self._events.append(event)
+            self.events.append(event)
 
     def suspicion(self) -> str:
         """Describe the likely causes of an arm that runs away, by its first motion; empty if nothing is likely."""
@@ -179,7 +175,7 @@ class FirstMotion:
             left = [r for r in left if r.kind in _EXCHANGES or (r.kind in kinds and r.joint == joint)]
         elif not self._readings.is_unlike_an_arm():
             return ""
-        text = self._readings.describe(left)
+        text = self._readings.name_causes(left)
         return f"perhaps {text.removeprefix('either ')}" if text else _TOO_SHORT
 
     def _left(self) -> list[Reading]:
@@ -232,7 +228,7 @@ class FirstMotion:
                 "limit, or cycles are missing: unchecked are its signs, scales of position and velocity, "
                 f"{self._scales(joint)}"
             )
-            self._events.append(Event("warning", "first motion", text))
+            self.events.append(Event("warning", "first motion", text))
         self._open.clear()
         self._readings = None
 
@@ -260,7 +256,7 @@ class FirstMotion:
         first, second = found
         if first is not None and second is not None and is_of_other(first) and is_of_other(second):
             head = "joints 1 and 2: each torque sensor measures the commanded torque of the other joint: "
-            causes = "" if self._readings is None else self._readings.describe(self._left())
+            causes = "" if self._readings is None else self._readings.name_causes(self._left())
             return head + (causes or "the drives or the sensors are exchanged")
         for joint, ratio in enumerate(found):
             if ratio is None or joint not in self._open or ratio.own_std > _SURE:
@@ -285,7 +281,7 @@ class FirstMotion:
         )
         if is_off:
             text += f"; check {self._scales(joint)}"
-        self._events.append(Event("warning" if is_off else "info", "first motion", text))
+        self.events.append(Event("warning" if is_off else "info", "first motion", text))
 
     def _scales(self, joint: int) -> str:
         gear, rated_Nm = self._arm.gear_ratios[joint], self._settings.arm.rated_torque_Nm[joint]
@@ -303,7 +299,7 @@ class FirstMotion:
                 f"devices.sensor_node[{joint}] is at this joint and measures, and {self._scales(joint)}"
             )
         if ratio.own < 0.0:
-            causes = "" if self._readings is None else self._readings.describe(self._left())
+            causes = "" if self._readings is None else self._readings.name_causes(self._left())
             either = (
                 f"either the sensor of devices.sensor_node[{joint}] or devices.drive_node[{joint}] counts the other way"
             )

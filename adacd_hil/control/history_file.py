@@ -170,17 +170,21 @@ class UsedHistory:
         std_Nm = tuple(math.sqrt(std**2 + drifted) for std in known.offset_std_Nm)
         return dataclasses.replace(settings, history=dataclasses.replace(known, offset_std_Nm=std_Nm))
 
-    def check_devices(self, identities: Sequence[Identity]) -> Event:
-        """Return an event for the log. Raises DeviceError unless the devices are those of the history."""
+    def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
+        """Return events for the log. Raises DeviceError unless the devices are those of the history."""
         if self.history is None:
-            return Event("warning", "history", self.warnings[0])
+            return [Event("warning", "history", self.warnings[0])]
         if difference := _difference(self.history.devices, identities, self.path):
             raise DeviceError(difference)
-        return Event("info", "history", f"{self.path}: {self._count()}, the last of {self.history.last.date_utc}")
+        return [Event("info", "history", f"{self.path}: {self._count()}, the last of {self.history.last.date_utc}")]
 
     def _count(self) -> str:
         count = 0 if self.history is None else len(self.history.certificates)
         return f"{count} certificate{'' if count == 1 else 's'}"
+
+    def attachments(self) -> dict[str, bytes]:
+        """Return the file's text, by its name in the log; none in a first run."""
+        return {} if self.is_first_run else {HISTORY_NAME: self.text}
 
     def metadata(self) -> dict[str, str]:
         """Describe the history for the log's metadata."""

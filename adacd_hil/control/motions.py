@@ -79,9 +79,9 @@ class Pace:
     def __init__(self, settings: Settings) -> None:
         self._period_s = settings.bus.period_s
         self._limit = np.radians(settings.reaction.acceleration_limit_deg_s2)
-        self.restart()
+        self.begin_path()
 
-    def restart(self) -> None:
+    def begin_path(self) -> None:
         """Restart at full speed, for a new path."""
         self.share, self.change = 1.0, 0.0
         """Present share, and its rate of change, 1/s."""

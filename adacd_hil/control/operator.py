@@ -1,29 +1,15 @@
-"""The user of a running arm, by script or on the console, and the progress lines of a run for the user.
+"""The user of a running arm, by script, and the progress lines of a run for the user.
 
 A request goes to the scheme in one cycle. The progress lines also show the states' names as in the log.
 """
 
-import contextlib
-import difflib
-import io
-import sys
-import threading
 from collections import deque
 from collections.abc import Callable
 from enum import Enum
-from typing import Protocol, TextIO
+from typing import Protocol
 
 from adacd_hil.records import ContactLevel, ContactReport, Reaction, Request, SchemeOutput, SchemeState
 from adacd_hil.settings.run_settings import OperatorSettings
-
-CONSOLE_WORDS = {
-    "ack": Request.ACKNOWLEDGE,
-    "payload": Request.PAYLOAD,
-    "changed": Request.PAYLOAD_CHANGED,
-    "accept": Request.ACCEPT,
-    "relearn": Request.RELEARN,
-    "finish": Request.FINISH,
-}
 
 
 class FaultAnswer(Enum):
@@ -84,74 +70,6 @@ class ScriptedOperator:
             return Request.NONE
         self._stopped_since_s = elapsed_s
         return Request.ACKNOWLEDGE
-
-
-_AWAITED = {
-    SchemeState.STOPPED: "waiting: type `ack` to go on",
-    SchemeState.PAYLOAD: "waiting: type `changed` once the payload has been changed",
-}
-_MOST_LETTERS = 40
-"""Letters of an unknown word that are repeated."""
-
-
-class ConsoleOperator:
-    """Reads words from a terminal, a line each, on a thread of its own, and passes on the requests of a script.
-
-    tell: prints a line for the user: which word a state waits for, and that a word is unknown.
-    """
-
-    def __init__(
-        self, script: ScriptedOperator, stream: TextIO = sys.stdin, tell: Callable[[str], None] = lambda _: None
-    ) -> None:
-        self._script = script
-        self._stream = stream
-        self._tell = tell
-        self._state = SchemeState.INIT
-        self._asked: deque[Request] = deque()
-        self._thread = threading.Thread(target=self._listen, name="console", daemon=True)
-        self._thread.start()
-
-    def join(self, timeout_s: float) -> None:
-        """Wait until the stream has ended, at most `timeout_s`."""
-        self._thread.join(timeout_s)
-
-    def _listen(self) -> None:
-        if isinstance(self._stream, io.TextIOWrapper):
-            self._stream.reconfigure(errors="replace")  # an invalid character must not end the thread
-        with contextlib.suppress(OSError):  # the terminal has hung up, or this process is in its background
-            for line in self._stream:
-                word = line.strip().lower()
-                if word in CONSOLE_WORDS:
-                    self._asked.append(CONSOLE_WORDS[word])
-                elif word:
-                    self._tell(_unknown(word))
-
-    def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return the user's first request, else the script's; for a faulted arm, leave it to `answer_fault`."""
-        if state is not self._state:
-            self._state = state
-            if state in _AWAITED and not self._asked:
-                self._tell(_AWAITED[state])
-        if self._asked and state is not SchemeState.FAULT:
-            return self._asked.popleft()
-        return self._script.request(elapsed_s, state)
-
-    def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Return the answer if the user has typed `ack` or `finish`; without a user the script's answer."""
-        while self._asked:
-            request = self._asked.popleft()
-            if request is Request.ACKNOWLEDGE:
-                return FaultAnswer.RECOVER
-            if request is Request.FINISH:
-                return FaultAnswer.END
-        return FaultAnswer.WAIT if self._thread.is_alive() else self._script.answer_fault(elapsed_s)
-
-
-def _unknown(word: str) -> str:
-    """Answer a word that is none of `CONSOLE_WORDS`."""
-    nearest = difflib.get_close_matches(word, CONSOLE_WORDS, n=1)
-    meant = f"; did you mean `{nearest[0]}`?" if nearest else ""
-    return f"unknown word {word[:_MOST_LETTERS]!r}{meant} (known: {', '.join(CONSOLE_WORDS)})"
 
 
 _STATES = {

@@ -20,6 +20,7 @@ from collections.abc import Callable
 import numpy as np
 
 from adacd_hil.control.motions import Admittance, Excitation, Pace, QuinticMove, corner_to_corner, motion_problems
+from adacd_hil.device.arm_watch import EventSource
 from adacd_hil.records import JOINTS, ArmState, Event, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.contact.reaction import Withdrawal
 from adacd_hil.scheme.supervisor.supervisor import LEARNING, POWERED, REACTING
@@ -55,11 +56,12 @@ Path = Callable[[float, Vector, Vector, Vector], None]
 """Fills q, dq, ddq (2,) of a planned motion at a time since its start, s."""
 
 
-class Reference:
+class Reference(EventSource):
     """The desired motion. `q_d`, `dq_d`, `ddq_d` (2,) are views of the control block that it fills."""
 
     def __init__(self, settings: Settings, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
         """Prepare the motions. Raises ConfigError if trajectory or excitation leave the arm's limits."""
+        super().__init__()
         if problems := motion_problems(settings):
             raise ConfigError("; ".join(problems))
         self._settings = settings
@@ -92,22 +94,16 @@ class Reference:
         self._contact_cycle = 0
         self._is_exciting = self._is_parking = False
         self._waited_cycles = 0
-        self._events: list[Event] = []
         self._beyond: set[int] = set()
         """Joints that brake beyond their position limit in this state; reported once."""
 
-    def compile(self) -> None:
+    def compile_motion(self) -> None:
         """Evaluate every kind of motion once, so that it doesn't compile in the cycle."""
         zeros, scratch = np.zeros(JOINTS), np.zeros((3, JOINTS))
         self._follow(0.0, *scratch)
         if self._excitation.is_on:
             self._excitation.evaluate(0.0, *scratch)
         Withdrawal(self._settings, zeros, zeros, np.ones(JOINTS)).evaluate(0.0, *scratch)
-
-    def take_events(self) -> list[Event]:
-        """Return the events since the last call."""
-        events, self._events = self._events, []
-        return events
 
     @property
     def is_floating(self) -> bool:
@@ -297,7 +293,7 @@ class Reference:
         """Report, once per state, joints that can't stop within their position limit."""
         for joint in withdrawal.beyond:
             if joint not in self._beyond:
-                self._events.append(Event("warning", MOTION, withdrawal.describe_beyond(joint)))
+                self.events.append(Event("warning", MOTION, withdrawal.describe_beyond(joint)))
         self._beyond.update(withdrawal.beyond)
 
     def _stop_from(self, q: Vector, dq: Vector) -> Withdrawal:
@@ -330,7 +326,7 @@ class Reference:
 
     def _start(self, path: Path, cycle: int) -> None:
         self._path, self._start_cycle = path, cycle
-        self._pace.restart()
+        self._pace.begin_path()
 
     def _follow(self, elapsed_s: float, q: Vector, dq: Vector, ddq: Vector) -> None:
         corner_to_corner(elapsed_s, self._amplitude, self._half_period_s, q, dq, ddq)

@@ -2,7 +2,7 @@
 
 import json
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -12,14 +12,11 @@ from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.fault_recovery import Recovery
-from adacd_hil.control.history_file import HISTORY_NAME, UsedHistory
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.pacing import Pacer, make_pacer, prepare_spin
-from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_checks
 from adacd_hil.device.canopen_bus import DeviceError
-from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.profile import enable_timeout_s, place_devices
 from adacd_hil.device.strangers import refuse_company
@@ -68,6 +65,19 @@ class LiveView(Protocol):
         """Return the server of the view for an arm; robot: its URDF."""
 
 
+class ArmFile(Protocol):
+    """A file about an arm that a run uses, such as a tare or a history."""
+
+    def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
+        """Return events for the log. Raises DeviceError unless the devices are those of the file."""
+
+    def attachments(self) -> dict[str, bytes]:
+        """Return what the log keeps of the file, by name."""
+
+    def metadata(self) -> dict[str, str]:
+        """Describe the file for the log's metadata."""
+
+
 class Attempt(NamedTuple):
     """Objects of one attempt to run the arm; a recovery makes new ones."""
 
@@ -105,8 +115,7 @@ class Session:
     interface: str
     metadata: dict[str, str] = field(default_factory=dict)
     progress: Callable[[str], None] = lambda _: None
-    tare: UsedTare | None = None
-    history: UsedHistory | None = None
+    files: Sequence[ArmFile] = ()
     live: LiveView | None = None
     on_started: Callable[[], None] = lambda: None
     touched_ns: Callable[[], int | None] = lambda: None
@@ -213,10 +222,10 @@ class Session:
         except (BusError, DeviceError) as reason:
             line = reason.line if isinstance(reason, DeviceError) else str(reason)
             ending = Ending(None, line, isinstance(reason, BusError))
-            recorder.cycle(self.clock.now_ns(), [], tap.take())
+            recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
             recorder.event(self.clock.now_ns(), Event("error", "run", ending.error))
             self.progress(ending.error)
-        for line in (*ArmReport(arm).describe_checks(), *master.describe_checks()):
+        for line in (*describe_checks(arm), *master.describe_checks()):
             recorder.event(self.clock.now_ns(), Event("info", "frame checks", line))
         for certificate in cycle.certificates:  # as numbers, to compare runs
             recorder.event(self.clock.now_ns(), Event("info", CERTIFIED_MODEL, json.dumps(certificate._asdict())))
@@ -228,13 +237,11 @@ class Session:
         self._identities = identities = tuple(master.identify())
         for identity in identities:
             recorder.event(self.clock.now_ns(), Event("info", identity.name, _describe(identity)))
-        if self.tare is not None:
-            for event in self.tare.check_sensors(identities):
+        for file in self.files:
+            for event in file.check_devices(identities):
                 recorder.event(self.clock.now_ns(), event)
-        if self.history is not None:
-            recorder.event(self.clock.now_ns(), self.history.check_devices(identities))
         master.configure()
-        recorder.cycle(self.clock.now_ns(), [], tap.take())
+        recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
         if not self._has_started:
@@ -253,7 +260,7 @@ class Session:
             master.stop()
         except BusError as error:
             recorder.event(self.clock.now_ns(), Event("error", "run", f"devices were not stopped: {error}"))
-        recorder.cycle(self.clock.now_ns(), [], tap.take())
+        recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
         self.out.mkdir(parents=True, exist_ok=True)
@@ -264,10 +271,8 @@ class Session:
             attachments[f"{device.name}.toml"] = to_toml(device.settings).encode()
         attachments["arm.dbc"] = self.codec.text
         attachments["config.toml"] = to_toml(self.settings).encode()
-        if self.tare is not None:
-            attachments[TARE_NAME] = self.tare.text
-        if self.history is not None and not self.history.is_first_run:
-            attachments[HISTORY_NAME] = self.history.text
+        for file in self.files:
+            attachments |= file.attachments()
         robot = robot_description(self.settings)
         with grant.unpinned():
             recorder = Recorder(
@@ -316,8 +321,7 @@ class Session:
             "period_us": str(settings.bus.period_us),
             "operator": "script" if isinstance(self.operator, ScriptedOperator) else "console",
             **arithmetic(),
-            **(self.tare.metadata() if self.tare is not None else {}),
-            **(self.history.metadata() if self.history is not None else {}),
+            **{key: value for file in self.files for key, value in file.metadata().items()},
             **self.metadata,
         }
 
@@ -327,6 +331,18 @@ def _describe(identity: Identity) -> str:
         f"node {identity.node_id}: vendor 0x{identity.vendor:X}, product 0x{identity.product:X}, "
         f"revision 0x{identity.revision:X}, serial {identity.serial}"
     )
+
+
+def write_contract(codec: Codec, folder: Path) -> Path:
+    """Return the file of the contract; write a composed or moved contract, which has no file, to `folder`.
+
+    Raises OSError, also when another file of that name is there.
+    """
+    if codec.path.is_file() and codec.path.read_bytes() == codec.text:
+        return codec.path
+    path = folder / codec.path.name
+    place_file(path, codec.text)
+    return path
 
 
 def git_commit() -> str:

@@ -165,13 +165,17 @@ class UsedTare:
         )
         return max(first, SMALLEST_STD_NM), max(second, SMALLEST_STD_NM)
 
-    def check_sensors(self, identities: Sequence[Identity]) -> list[Event]:
+    def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
         """Return events for the log. Raises DeviceError unless the sensors are those of the tare."""
         for sensor, identity in zip(self.tare.sensors, sensor_identities(identities), strict=True):
             if difference := sensor.difference(identity):
                 raise DeviceError(f"{difference} of tare {self.path}; tare again")
         events = [Event("info", "tare", f"{self.path} of {self.tare.date_utc}: {self.describe_offset()} Nm subtracted")]
         return events + [Event("warning", "tare", line) for line in self.warnings]
+
+    def attachments(self) -> dict[str, bytes]:
+        """Return the file's text, by its name in the log."""
+        return {TARE_NAME: self.text}
 
     def metadata(self) -> dict[str, str]:
         """Return file, date, offsets and sensors of the tare for the log's metadata."""

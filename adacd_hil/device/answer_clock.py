@@ -1,5 +1,8 @@
 """The SYNC that each cyclic frame answers, and the values that all devices sampled on one SYNC.
 
+The model compares torque with motion, so all values of a sample must be of one moment. If a device answers late, its
+sample is complete one or more cycles after it was taken. The sample is used then, with its age.
+
 A device answers every SYNC with one frame. A frame that arrives in time answers the last SYNC. A frame that arrives
 after the host's wait, or after the next SYNC, answers an earlier SYNC, and its value is as old as that SYNC. If the
 host took it for the last SYNC's answer, the model would compare torque and motion of different moments.
@@ -19,9 +22,10 @@ late; it counts as late. Second: a frame without counter that arrives at the usu
 lost frame. If the arm doesn't move, it counts as the latter; a second frame on the same SYNC shows that it was late.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
+KEPT = 16
+"""SYNCs whose values are kept: more than any device may be late."""
 USUAL_ANSWERS = 100
 """Answers from which the usual time is taken, at the beginning of an attempt, while the arm rests: 0.1 s at 1 kHz."""
 TOLERANCE_NS = 50_000
@@ -46,6 +50,7 @@ class AnswerClock:
         self._usual_count = 0
         self._is_guess = False
         self._unanswered = 0  # bit k: the SYNC k before the last answered one has no answer
+        self._kept: list[tuple[int, tuple[float, ...]]] = [(-1, ())] * KEPT
 
     def find(
         self,
@@ -64,7 +69,7 @@ class AnswerClock:
         least so far.
         """
         answered = self.answered
-        if answered is None or answered == newest - 1:
+        if answered is None:
             return newest
         if answered >= newest:
             return newest if self._is_guess and self._is_newer(offset_ns, position_error) else None
@@ -103,6 +108,15 @@ class AnswerClock:
         self._unanswered &= ~(1 << behind)
         return is_missing
 
+    def keep(self, ordinal: int, values: tuple[float, ...]) -> None:
+        """Keep the values of one SYNC."""
+        self._kept[ordinal % KEPT] = ordinal, values
+
+    def values_of(self, ordinal: int) -> tuple[float, ...] | None:
+        """Return the values of one SYNC; None if they did not come, or no longer kept."""
+        answered, values = self._kept[ordinal % KEPT]
+        return values if answered == ordinal else None
+
     def note(self, ordinal: int, newest: int, offset_ns: int, is_counted: bool) -> None:
         """Note that a frame answers the SYNC `ordinal`, as `find` returned it. `is_counted`: it has a counter."""
         before, self.answered = self.answered, ordinal
@@ -125,35 +139,10 @@ class AnswerClock:
         self._unanswered = 0
 
 
-KEPT = 16
-"""SYNCs whose values are kept: more than any device may be late."""
-
-
-class Sample(NamedTuple):
-    """Values of all devices, sampled on one SYNC. `ordinal`: which; `values`: a tuple of each device."""
-
-    ordinal: int
-    values: tuple[tuple[float, ...], ...]
-
-
-class SampleAlignment:
-    """The last values of each device by the SYNC that they answer.
-
-    The model compares torque with motion, so all values of a sample must be of one moment. If a device answers late,
-    its sample is complete one or more cycles after it was taken. The sample is used then, with its age.
-    """
-
-    def __init__(self, devices: int) -> None:
-        self._kept: list[list[tuple[int, tuple[float, ...]]]] = [[(-1, ())] * KEPT for _ in range(devices)]
-
-    def put(self, device: int, ordinal: int, values: tuple[float, ...]) -> None:
-        """Keep a device's values of one SYNC."""
-        self._kept[device][ordinal % KEPT] = ordinal, values
-
-    def newest(self, last: int, after: int) -> Sample | None:
-        """Return the newest complete sample of the SYNCs up to `last` that come behind `after`, or None."""
-        for ordinal in range(last, max(after, last - KEPT), -1):
-            answers = [kept[ordinal % KEPT] for kept in self._kept]
-            if all(answered == ordinal for answered, _ in answers):
-                return Sample(ordinal, tuple(values for _, values in answers))
-        return None
+def newest_sample(clocks: Sequence[AnswerClock], last: int, after: int) -> tuple[int, list[tuple[float, ...]]] | None:
+    """Return the newest SYNC up to `last` and behind `after` that all devices have answered, and their values."""
+    for ordinal in range(last, max(after, last - KEPT), -1):
+        values = [found for clock in clocks if (found := clock.values_of(ordinal)) is not None]
+        if len(values) == len(clocks):
+            return ordinal, values
+    return None

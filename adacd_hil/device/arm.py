@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from adacd_hil.device.answer_clock import KEPT, AnswerClock, SampleAlignment
+from adacd_hil.device.answer_clock import KEPT, AnswerClock, newest_sample
 from adacd_hil.device.arm_watch import PATIENCE_PERIODS
 from adacd_hil.device.drive import Drive, option_codes, torque_limit_permille
 from adacd_hil.device.profile import PlacedDevice, place_devices
@@ -37,7 +37,7 @@ REMEMBERED_GAPS = 0xFF
 
 
 class Arm:
-    """Both joints on one bus. Per cycle: `synchronise`, `accept` each frame, `state`, `write`."""
+    """Both joints on one bus. Per cycle: `synchronise`, `accept` each frame, `state`, `send_command`."""
 
     def __init__(self, settings: Settings, codec: Codec, bus: Bus) -> None:
         """Place the devices.
@@ -82,7 +82,6 @@ class Arm:
         self._ordinal = -1  # of the last SYNC
         self._sync_cycles, self._sync_ns = [-1] * KEPT, [0] * KEPT  # of the last SYNCs, by ordinal
         self._clocks = tuple(AnswerClock() for _ in self.devices)
-        self._alignment = SampleAlignment(len(self.devices))
         self._sampled_ordinal = self._sampled_cycle = -1  # of the last complete sample
         self.gaps = [0] * len(self.devices)  # bit k: no usable frame k cycles ago
         self._has_gaps = False
@@ -171,11 +170,9 @@ class Arm:
         device, clock, data = self.devices[place], self._clocks[place], frame.data
         offset_ns = frame.t_ns - self._sync_ns[newest % KEPT]
         step = device.end_to_end.step_of(data)
-        error = soonest_ns = None
-        if place < JOINTS and clock.answered != newest - 1:  # the motion tells how many periods lie before the frame
-            error = partial(self.drives[place].position_error, data)
-            soonest_ns = self._soonest_ns(place)
-        ordinal = None if step == 0 else clock.find(newest, offset_ns, step, error, soonest_ns)
+        ordinal: int | None = newest
+        if clock.answered != newest - 1 or step == 0:  # nearly every frame answers the SYNC after the last answered one
+            ordinal = None if step == 0 else self._find(place, newest, offset_ns, step, data)
         if ordinal is None:
             self._refuse(frame, place, step, is_second=clock.answered is not None and clock.answered >= newest)
             return
@@ -185,10 +182,10 @@ class Arm:
             self.has_all_frames = self._seen == _COMPLETE
         is_revised = clock.answered == ordinal  # the frame taken for this answer was the previous SYNC's
         if is_revised:
-            self._alignment.put(place, ordinal - 1, device.values)
+            clock.keep(ordinal - 1, device.values)
         if device.accept_cyclic(data, self._sync_cycles[ordinal % KEPT]):
             clock.note(ordinal, newest, offset_ns, device.is_protected)
-            self._alignment.put(place, ordinal, device.values)
+            clock.keep(ordinal, device.values)
             self._last_data[place] = data
             if is_present:
                 self.received |= 1 << place
@@ -196,6 +193,13 @@ class Arm:
             clock.begin_anew(newest)  # the device restarted its counter
         elif device.end_to_end.status is E2eStatus.SYNC or (not device.is_protected and is_present):
             clock.note(ordinal, newest, offset_ns, device.is_protected)
+
+    def _find(self, place: int, newest: int, offset_ns: int, step: int | None, data: bytes) -> int | None:
+        """Return the SYNC that a frame answers where earlier ones lack an answer; a drive's motion helps to decide."""
+        if place >= JOINTS:
+            return self._clocks[place].find(newest, offset_ns, step)
+        error = partial(self.drives[place].position_error, data)
+        return self._clocks[place].find(newest, offset_ns, step, error, self._soonest_ns(place))
 
     def _soonest_ns(self, place: int) -> int:
         """Return how soon a device can answer this SYNC: as the first of those whose frames are not in."""
@@ -250,10 +254,10 @@ class Arm:
         cycle = self._cycle
         if self.received == _COMPLETE:
             return self._state_of(self._ordinal, [device.values for device in self.devices], (cycle,) * 4)
-        sample = self._alignment.newest(self._ordinal, self._sampled_ordinal)
+        sample = newest_sample(self._clocks, self._ordinal, self._sampled_ordinal)
         if sample is not None:
-            sampled = self._sync_cycles[sample.ordinal % KEPT]
-            return self._state_of(sample.ordinal, sample.values, (sampled,) * 4)
+            ordinal, values = sample
+            return self._state_of(ordinal, values, (self._sync_cycles[ordinal % KEPT],) * 4)
         return self._state_of(
             None, [device.values for device in self.devices], [device.sample_cycle for device in self.devices]
         )
@@ -271,13 +275,20 @@ class Arm:
             sampled_ns = self._sync_ns[ordinal % KEPT]
             self._sampled_ordinal, self._sampled_cycle = ordinal, sampled[0]
         is_enabled = self.drives[0].is_enabled and self.drives[1].is_enabled
+        motion = np.array(
+            (
+                *(sign1 * q1 - zero1, sign2 * q2 - zero2),
+                *(sign1 * dq1, sign2 * dq2),
+                *(sign1 * tau1 - offset1, sign2 * tau2 - offset2),
+            )
+        )
         return ArmState(
             cycle=cycle,
             t_ns=self._t_ns,
             periods=self._periods,
-            q=np.array((sign1 * q1 - zero1, sign2 * q2 - zero2)),
-            dq=np.array((sign1 * dq1, sign2 * dq2)),
-            tau_J=np.array((sign1 * tau1 - offset1, sign2 * tau2 - offset2)),
+            q=motion[:2],
+            dq=motion[2:4],
+            tau_J=motion[4:],
             age_q=(cycle - sampled[0], cycle - sampled[1]),
             age_tau_J=(cycle - sampled[2], cycle - sampled[3]),
             is_enabled=is_enabled,
@@ -303,7 +314,7 @@ class Arm:
             return FaultReason.DRIVE if is_drive else FaultReason.SENSOR
         return FaultReason.FOREIGN_FRAMES if self.strangers.are_heard(self._cycle) else FaultReason.NONE
 
-    def write(self, command: ArmCommand) -> None:
+    def send_command(self, command: ArmCommand) -> None:
         """Send the commands of this cycle, to act at the next SYNC; if pipelined, keep them until then.
 
         Commands that were kept for longer than the age limit of a value are sent without torque. Raises BusError.

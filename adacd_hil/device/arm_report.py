@@ -10,12 +10,12 @@ Cycles are counted only while the drives are enabled: data from before and after
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from adacd_hil.device.arm import REMEMBERED_GAPS, Arm
+from adacd_hil.device.arm_watch import EventSource
 from adacd_hil.device.canopen_bus import name_error
 from adacd_hil.device.drive import Cia402State, Drive
-from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
+from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.records import ArmState, Event
 from adacd_hil.settings.arm_settings import DATA_WINDOW_S, SHORTEST_DATA_WINDOW
 from adacd_hil.settings.configuration import Settings
@@ -23,6 +23,11 @@ from adacd_hil.wire.e2e import E2eStatus
 
 MOST_IN_A_ROW = 2
 _REVOLUTION_DEG = 360.0
+_STATUS_WORDS = (
+    (SensorStatus.POSITIVE_OVERLOAD, "positive overload"),
+    (SensorStatus.NEGATIVE_OVERLOAD, "negative overload"),
+    (SensorStatus.NOT_VALID, "not valid"),
+)
 
 
 @dataclass(frozen=True)
@@ -42,10 +47,11 @@ class DataShares:
     excesses: tuple[str, ...]
 
 
-class DataWatch:
+class DataWatch(EventSource):
     """Follows one attempt."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
+        super().__init__()
         limits = settings.data
         self._arm = arm
         self._window_cycles = max(1, round(DATA_WINDOW_S / settings.bus.period_s))
@@ -61,7 +67,6 @@ class DataWatch:
         self._cycles = self._all_cycles = self._incomplete = self._late = 0
         self._in_a_row = self._rows = 0  # cycles without a sample; rows of them in the present window
         self._has_rows = False
-        self._events: list[Event] = []
 
     def note(self, state: ArmState) -> None:
         """Count missing frames and cycles without a sample; call it once the cycle's frames are in."""
@@ -88,7 +93,7 @@ class DataWatch:
         if not self._has_rows:
             self._has_rows = True
             text = f"no sample for the model in {MOST_IN_A_ROW} cycles in a row: so much later a contact is found"
-            self._events.append(Event("warning", "data", text))
+            self.events.append(Event("warning", "data", text))
 
     def _end_window(self) -> None:
         """Judge the cycles of a window; report shares that now exceed their limit, and those that are back below."""
@@ -102,20 +107,15 @@ class DataWatch:
             self._over ^= {name}
             level = "warning" if share > limit else "info"
             text = f"{name}: {share:.1%} of the last {self._cycles} cycles, {limit:.1%} allowed"
-            self._events.append(Event(level, "data", text))
+            self.events.append(Event(level, "data", text))
         if self._has_rows and not self._rows:
             self._has_rows = False
             text = f"a sample for the model at least every {MOST_IN_A_ROW} cycles again, for {self._cycles} cycles"
-            self._events.append(Event("info", "data", text))
+            self.events.append(Event("info", "data", text))
         self._rows = 0
         self._all_cycles += self._cycles
         self._cycles = self._incomplete = 0
         self._missing = [0] * len(self._names)
-
-    def take_events(self) -> list[Event]:
-        """Return and forget the events since the last call."""
-        events, self._events = self._events, []
-        return events
 
     def shares(self) -> DataShares:
         """Sum up the attempt."""
@@ -138,127 +138,89 @@ class DataWatch:
         )
 
 
-class SignalAge(NamedTuple):
-    """How old the value of some signals of one device is, in cycles; `limit`: the oldest that is usable."""
-
-    device: str
-    signals: str
-    age: int
-    limit: int
-
-    @property
-    def is_over(self) -> bool:
-        """Whether it is too old."""
-        return self.age > self.limit
+def describe_gaps(arm: Arm) -> list[str]:
+    """Count, per device, the last cycles without a usable frame in time, in words, one line each."""
+    present = [~arm.received >> place & 1 for place in range(len(arm.devices))]
+    gaps = [bits << 1 | now for bits, now in zip(arm.gaps, present, strict=True)]
+    cycles = REMEMBERED_GAPS.bit_length() + 1
+    return [
+        f"{device.name}: no usable frame in time in {bits.bit_count()} of the last {cycles} cycles"
+        for device, bits in zip(arm.devices, gaps, strict=True)
+        if bits
+    ]
 
 
-class ArmReport:
-    """Describes in words the faults of an arm, from the frames that it has received so far."""
+def describe_checks(arm: Arm) -> list[str]:
+    """Count the cyclic frames of each device that passed and failed their checks, in words, one line each."""
+    lines = []
+    for device in arm.devices:
+        tally = dict(device.end_to_end.tally())
+        counts = ", ".join(f"{count} {status.name}" for status, count in tally.items())
+        if not device.is_protected:
+            missing = f"{tally[E2eStatus.NO_NEW_DATA]} {E2eStatus.NO_NEW_DATA.name}"
+            counts = f"unprotected, {device.implausible_frames} implausible, {missing}"
+        lines.append(f"{device.name}: {counts}")
+    return lines
 
-    def __init__(self, arm: Arm) -> None:
-        self._arm = arm
 
-    def ages(self) -> list[SignalAge]:
-        """Return the age of every signal that the arm is run by, against its limit."""
-        cycle = self._arm.cycle
-        ages = []
-        for drive, status_limit in zip(self._arm.drives, self._arm.status_age_limits, strict=True):
-            ages.append(
-                SignalAge(drive.name, "position, velocity", cycle - drive.sample_cycle, self._arm.max_age_cycles)
-            )
-            if drive.has_status_frame and not math.isinf(status_limit):
-                ages.append(SignalAge(drive.name, "statusword", cycle - drive.status_cycle, int(status_limit)))
-        for sensor in self._arm.sensors:
-            ages.append(SignalAge(sensor.name, "torque", cycle - sensor.sample_cycle, self._arm.max_age_cycles))
-        return ages
+def describe_faults(arm: Arm) -> list[str]:
+    """Describe the fault of each device, one line each; empty without a fault.
 
-    def describe_gaps(self) -> list[str]:
-        """Count, per device, the last cycles without a usable frame in time, in words, one line each."""
-        present = [~self._arm.received >> place & 1 for place in range(len(self._arm.devices))]
-        gaps = [bits << 1 | now for bits, now in zip(self._arm.gaps, present, strict=True)]
-        cycles = REMEMBERED_GAPS.bit_length() + 1
-        return [
-            f"{device.name}: no usable frame in time in {bits.bit_count()} of the last {cycles} cycles"
-            for device, bits in zip(self._arm.devices, gaps, strict=True)
-            if bits
-        ]
+    Lines name a drive's fault with its error's name, a sensor's status, and signals older than their limit.
+    """
+    lines = []
+    for drive in arm.drives:
+        if drive.state in (Cia402State.FAULT, Cia402State.FAULT_REACTION_ACTIVE) or drive.error_code:
+            name = f": {name_error(drive.error_code)}" if drive.error_code else ""
+            lines.append(f"{drive.name}: {drive.state.name}, error code 0x{drive.error_code:04X}{name}")
+        elif arm.was_enabled:
+            lines += _describe_disabled(drive)
+    lines += arm.strangers.describe_senders(arm.cycle)
+    for sensor in arm.sensors:
+        if sensor.status:
+            words = ", ".join(text for bit, text in _STATUS_WORDS if sensor.status & bit)
+            lines.append(f"{sensor.name}: status 0x{int(sensor.status):02X}: {words}")
+    ages: list[tuple[str, int, float]] = []
+    for drive, status_limit in zip(arm.drives, arm.status_age_limits, strict=True):
+        ages.append((f"{drive.name}: position, velocity", drive.sample_cycle, arm.max_age_cycles))
+        if drive.has_status_frame:
+            ages.append((f"{drive.name}: statusword", drive.status_cycle, status_limit))
+    ages += ((f"{sensor.name}: torque", sensor.sample_cycle, arm.max_age_cycles) for sensor in arm.sensors)
+    lines += (
+        f"{signals} {arm.cycle - cycle} cycles old, {limit:g} allowed"
+        for signals, cycle, limit in ages
+        if arm.cycle - cycle > limit
+    )
+    return lines
 
-    def describe_checks(self) -> list[str]:
-        """Count the cyclic frames of each device that passed and failed their checks, in words, one line each."""
-        return [_describe_checks(device) for device in self._arm.devices]
 
-    def describe_faults(self) -> list[str]:
-        """Describe the fault of each device, one line each; empty without a fault.
+def describe_disabled(arm: Arm) -> list[str]:
+    """Name each drive that is not enabled, with its state and mode, one line each; empty when both are enabled."""
+    return [line for drive in arm.drives for line in _describe_disabled(drive)]
 
-        Lines name a drive's fault with its error's name, a sensor's status, and signals older than their limit.
-        """
-        lines = []
-        for drive in self._arm.drives:
-            if drive.state in (Cia402State.FAULT, Cia402State.FAULT_REACTION_ACTIVE) or drive.error_code:
-                name = f": {name_error(drive.error_code)}" if drive.error_code else ""
-                lines.append(f"{drive.name}: {drive.state.name}, error code 0x{drive.error_code:04X}{name}")
-            elif self._arm.was_enabled:
-                lines += _describe_disabled(drive)
-        lines += self._arm.strangers.describe(self._arm.cycle)
-        for sensor in self._arm.sensors:
-            if sensor.status:
-                lines.append(f"{sensor.name}: status 0x{int(sensor.status):02X}: {_describe_status(sensor.status)}")
-        lines.extend(
-            f"{age.device}: {age.signals} {age.age} cycles old, {age.limit} allowed"
-            for age in self.ages()
-            if age.is_over
-        )
-        return lines
 
-    def describe_disabled(self) -> list[str]:
-        """Name each drive that is not enabled, with its state and mode, one line each; empty when both are enabled."""
-        return [line for drive in self._arm.drives for line in _describe_disabled(drive)]
-
-    def describe_excess(self) -> list[str]:
-        """Name each joint that exceeds a limit of the arm, and the limit, one line each; empty without an excess."""
-        lines = []
-        for joint, (drive, sign) in enumerate(zip(self._arm.drives, self._arm.sign, strict=True)):
-            for quantity, value, bound, unit in (
-                (
-                    "position",
-                    sign * drive.values[0] - self._arm.zero_rad[joint],
-                    self._arm.limits.position_limit_deg[joint],
-                    "deg",
-                ),
-                ("velocity", sign * drive.values[1], self._arm.limits.velocity_limit_deg_s[joint], "deg/s"),
-            ):
-                value_deg = math.degrees(value)
-                if abs(value_deg) > bound:
-                    text = f"joint {joint + 1}: {quantity} {value_deg:.2f} {unit}, ±{bound:g} {unit} allowed"
-                    if quantity == "position" and abs(value_deg) > _REVOLUTION_DEG:
-                        text += (
-                            "; more than a revolution: check scale.increments_per_joint_rev, scale.gear_ratio and the "
-                            f"encoder's zero of devices.drive[{joint}]"
-                        )
-                    lines.append(text)
-        return lines
+def describe_excess(arm: Arm) -> list[str]:
+    """Name each joint that exceeds a limit of the arm, and the limit, one line each; empty without an excess."""
+    lines = []
+    for joint, (drive, sign) in enumerate(zip(arm.drives, arm.sign, strict=True)):
+        position, velocity = drive.values
+        for quantity, value, bound, unit in (
+            ("position", sign * position - arm.zero_rad[joint], arm.limits.position_limit_deg[joint], "deg"),
+            ("velocity", sign * velocity, arm.limits.velocity_limit_deg_s[joint], "deg/s"),
+        ):
+            value_deg = math.degrees(value)
+            if abs(value_deg) > bound:
+                text = f"joint {joint + 1}: {quantity} {value_deg:.2f} {unit}, ±{bound:g} {unit} allowed"
+                if quantity == "position" and abs(value_deg) > _REVOLUTION_DEG:
+                    text += (
+                        "; more than a revolution: check scale.increments_per_joint_rev, scale.gear_ratio and the "
+                        f"encoder's zero of devices.drive[{joint}]"
+                    )
+                lines.append(text)
+    return lines
 
 
 def _describe_disabled(drive: Drive) -> list[str]:
     if drive.is_enabled:
         return []
     return [f"{drive.name}: {drive.state.name}, mode {drive.mode}, OPERATION_ENABLED in mode 10 expected"]
-
-
-def _describe_checks(device: Drive | TorqueSensor) -> str:
-    tally = device.end_to_end.tally()
-    if device.is_protected:
-        return f"{device.name}: " + ", ".join(f"{count} {status.name}" for status, count in tally)
-    missing = dict(tally)[E2eStatus.NO_NEW_DATA]
-    return (
-        f"{device.name}: unprotected, {device.implausible_frames} implausible, {missing} {E2eStatus.NO_NEW_DATA.name}"
-    )
-
-
-def _describe_status(status: SensorStatus) -> str:
-    words = (
-        (SensorStatus.POSITIVE_OVERLOAD, "positive overload"),
-        (SensorStatus.NEGATIVE_OVERLOAD, "negative overload"),
-        (SensorStatus.NOT_VALID, "not valid"),
-    )
-    return ", ".join(text for bit, text in words if status & bit)

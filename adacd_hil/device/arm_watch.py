@@ -42,16 +42,26 @@ REPEAT_NS = 1_000_000_000
 """Least time between two events of one kind."""
 
 
-class RateLimitedEvents:
-    """Collects events, each kind at once, then at most once a second with the count of those between.
-
-    `take_events` gives those since the last call.
-    """
+class EventSource:
+    """Collects events in `events`; `take_events` gives those since the last call."""
 
     def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call."""
+        events = self.events.copy()
+        self.events.clear()
+        return events
+
+
+class RateLimitedEvents(EventSource):
+    """Collects events, each kind at once, then at most once a second with the count of those between."""
+
+    def __init__(self) -> None:
+        super().__init__()
         self._said_ns: dict[Hashable, int] = {}
         self._unsaid: dict[Hashable, int] = {}
-        self._events: list[Event] = []
 
     def say(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
         """Take an event of a kind at a time. `count`: how many it stands for."""
@@ -60,17 +70,12 @@ class RateLimitedEvents:
             return
         more = self._unsaid.pop(kind, 0)
         self._said_ns[kind] = t_ns
-        self._events.append(event._replace(message=f"{event.message} (and {more} before)") if more else event)
+        self.events.append(event._replace(message=f"{event.message} (and {more} before)") if more else event)
 
     def is_due(self, kind: Hashable, t_ns: int) -> bool:
         """Return whether an event of a kind would be reported at once."""
         said_ns = self._said_ns.get(kind)
         return said_ns is None or t_ns - said_ns >= REPEAT_NS
-
-    def take_events(self) -> list[Event]:
-        """Return and forget the events since the last call."""
-        events, self._events = self._events, []
-        return events
 
 
 _LOOKS = 0.1
@@ -229,6 +234,6 @@ class DeadlineWatch:
             return arm._replace(is_late=True)
         return arm._replace(fault=FaultReason.DEADLINE) if arm.fault is FaultReason.NONE else arm
 
-    def describe(self) -> str:
+    def describe_misses(self) -> str:
         """Return the number of misses of the last verdict in words; empty without one."""
         return self._verdict

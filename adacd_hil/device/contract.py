@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings, PlacedDevice, place_devices
-from adacd_hil.file_access import place_file
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -88,18 +87,6 @@ def load_contract(settings: Settings) -> Codec:
     codec = _move(load_codec(find_contract(name)), settings, devices)
     _compare(codec, composed, name)
     return codec
-
-
-def write_contract(codec: Codec, folder: Path) -> Path:
-    """Return the file of the contract; write a composed or moved contract, which has no file, to `folder`.
-
-    Raises OSError, also when another file of that name is there.
-    """
-    if codec.path.is_file() and codec.path.read_bytes() == codec.text:
-        return codec.path
-    path = folder / codec.path.name
-    place_file(path, codec.text)
-    return path
 
 
 def compose(settings: Settings, devices: list[PlacedDevice]) -> Codec:

@@ -8,7 +8,6 @@ A PDO is made invalid before anything of it is changed, the mapping is emptied b
 valid last. PDOs that the contract doesn't know are switched off: a stock device's defaults would take bus time.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, NoReturn
@@ -20,7 +19,6 @@ from adacd_hil.device.canopen_bus import (
     RefusedError,
     explained,
     find_variable,
-    read_object,
 )
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
 from adacd_hil.device.drive_units import name_velocity_unit, read_drive_units
@@ -30,7 +28,6 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import NOT_VALID, SDO_REQUEST_ID, SDO_RESPONSE_ID
-from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 
 class Slave:
@@ -63,23 +60,23 @@ class Slave:
 
     def read(self, index: int, sub: int = 0) -> int:
         """Read a number. Raises DeviceError."""
-        with explained(self.name, self.node_id, f"reading {self.describe(index, sub)}", self._answer_s):
+        with explained(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self._answer_s):
             return int(self._entry(index, sub).raw)
 
-    def write(self, index: int, sub: int, value: int) -> None:
+    def write_object(self, index: int, sub: int, value: int) -> None:
         """Write a number. Raises DeviceError."""
-        what = f"writing {self.describe(index, sub)} = {_number(value)}"
+        what = f"writing {self.name_object(index, sub)} = {_number(value)}"
         with explained(self.name, self.node_id, what, self._answer_s):
             self._entry(index, sub).raw = value
         self.known[index, sub] = value
 
     def write_checked(self, index: int, sub: int, value: int, unit: str = "") -> None:
         """Write a number and read it back. Raises DeviceError."""
-        self.write(index, sub, value)
+        self.write_object(index, sub, value)
         found = self.read(index, sub)
         if found != value:
             self.fail(
-                f"{self.describe(index, sub)} reads back {_with(found, unit)}, {_with(value, unit)} written",
+                f"{self.name_object(index, sub)} reads back {_with(found, unit)}, {_with(value, unit)} written",
                 f"the device limits or rounds it: see {ObjectName(index, sub)} in its manual",
             )
 
@@ -99,7 +96,7 @@ class Slave:
         if text := self.difference(index, sub, expected, quantity, unit):
             self.fail(text, remedy)
 
-    def describe(self, index: int, sub: int) -> str:
+    def name_object(self, index: int, sub: int) -> str:
         """Name an object as the EDS does."""
         variable = find_variable(self._node.object_dictionary, index, sub)
         return str(ObjectName(index, sub)) + ("" if variable is None else f" {variable.name}")
@@ -188,7 +185,7 @@ def _check_rated_torque(slave: Slave, settings: Settings) -> None:
             "rated torque 0x6076 = 0: the drive does not know its motor",
             "enter the motor with the maker's tool, and store it",
         )
-    unit = _torque_unit(scale)
+    unit = torque_unit(scale)
     text = f"rated torque 0x6076 = {found} {unit}, {round(expected[joint])} {unit} expected"
     if scale.joint_torque_Nm != scale.rated_torque_count_Nm:
         text += (
@@ -208,21 +205,9 @@ def _check_rated_torque(slave: Slave, settings: Settings) -> None:
     )
 
 
-def _torque_unit(scale: ScaleSettings) -> str:
+def torque_unit(scale: ScaleSettings) -> str:
+    """Name a count of 0x6076."""
     return _TORQUE_UNITS.get(scale.rated_torque_count_Nm, f"x {scale.rated_torque_count_Nm:g} Nm")
-
-
-def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
-    """Say how the rated torque of a motor becomes that of its joint, `rated_Nm`. Raises DeviceError."""
-    if not slave.has(0x6076):
-        return f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint"
-    scale = slave.device.settings.scale
-    parts = [f"{slave.read(0x6076)} {_torque_unit(scale)}"]
-    if scale.gear_ratio != 1.0:
-        parts.append(f"gear {scale.gear_ratio:g}")
-    if scale.gear_efficiency != 1.0:
-        parts.append(f"efficiency {scale.gear_efficiency:g}")
-    return f"{slave.name}: 0x6076 = {' x '.join(parts)}, {rated_Nm:.4g} Nm at the joint, 0.1 % of it a count"
 
 
 def _check_units(slave: Slave, codec: Codec) -> list[str]:
@@ -282,13 +267,13 @@ def _enter_mode(slave: Slave, codec: Codec) -> None:
     if not slave.can_write(0x6060):
         return
     try:
-        slave.write(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+        slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
     except RefusedError:
         if not (slave.can_write(0x6040) and slave.read(0x6040) & _HALT):
             raise
-        slave.write(0x6040, 0, 0)  # some drives refuse another mode under halt
+        slave.write_object(0x6040, 0, 0)  # some drives refuse another mode under halt
         slave.known.pop((0x6040, 0))
-        slave.write(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+        slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
     if not slave.has(0x6061):
         return
     for _ in range(_MODE_READS):
@@ -364,7 +349,7 @@ class _KnownObject(NamedTuple):
 
     @property
     def name(self) -> str:
-        return f"{self.slave.name} (node {self.slave.node_id}): {self.slave.describe(*self.place)}"
+        return f"{self.slave.name} (node {self.slave.node_id}): {self.slave.name_object(*self.place)}"
 
 
 class ParameterWatch(RateLimitedEvents):
@@ -493,7 +478,7 @@ def _switch_off_others(slave: Slave) -> None:
             continue
         cob_id = slave.read(index, _COB_ID)
         if not cob_id & NOT_VALID:
-            slave.write(index, _COB_ID, cob_id | NOT_VALID)
+            slave.write_object(index, _COB_ID, cob_id | NOT_VALID)
 
 
 def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
@@ -505,7 +490,7 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
     mapping = slave.device.settings.mapping
     is_all = mapping == "rewritten"
     if slave.can_write(index, _COB_ID):
-        slave.write(index, _COB_ID, cob_id | NOT_VALID)
+        slave.write_object(index, _COB_ID, cob_id | NOT_VALID)
     if is_all or (mapping != "fixed" and _mapping_difference(slave, pdo)):
         if not slave.has(mapping_index, len(entries)):
             slave.fail(
@@ -513,22 +498,34 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
                 f"{len(entries)}",
                 f"map fewer objects in [[pdo]] {pdo.message} of {slave.device.profile.name}",
             )
-        slave.write(mapping_index, 0, 0)
+        slave.write_object(mapping_index, 0, 0)
         for sub, entry in enumerate(entries, 1):
-            slave.write(mapping_index, sub, entry)
-        slave.write(mapping_index, 0, len(entries))
+            slave.write_object(mapping_index, sub, entry)
+        slave.write_object(mapping_index, 0, len(entries))
     if is_all or slave.can_write(index, _TYPE):
-        slave.write(index, _TYPE, pdo.transmission)
+        slave.write_object(index, _TYPE, pdo.transmission)
     for sub, value in ((_INHIBIT, pdo.inhibit_100us), (_EVENT_TIMER, event_timer_ms)):
         if slave.can_write(index, sub):
-            slave.write(index, sub, value)
+            slave.write_object(index, sub, value)
         elif value and not slave.has(index, sub):
             slave.fail(
                 f"{ObjectName(index, sub)} is not in the EDS, {value} wanted",
                 f"leave it out of [[pdo]] {pdo.message} in {slave.device.profile.name}",
             )
     if slave.can_write(index, _COB_ID):
-        slave.write(index, _COB_ID, cob_id)
+        slave.write_object(index, _COB_ID, cob_id)
+
+
+def pdo_differences(slave: Slave, command_deadline_ms: int) -> list[str]:
+    """Read the PDOs of a device again and describe how they differ from its profile, a line each. Raises DeviceError.
+
+    `command_deadline_ms`: as of `set_up_pdos`.
+    """
+    found = [
+        (pdo, _difference(slave, pdo, _event_timer(slave, pdo, command_deadline_ms)))
+        for pdo in slave.device.settings.pdo
+    ]
+    return [f"{slave.name}{pdo.message}: {text}" for pdo, text in found if text]
 
 
 def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
@@ -557,87 +554,3 @@ def _mapping_difference(slave: Slave, pdo: PdoSettings) -> str:
     for sub, entry in enumerate(entries, 1):
         text = text or slave.difference(mapping_index, sub, entry, "mapped object", is_hex=True)
     return text
-
-
-_RECEIVED, _SENT = 0x1400, 0x1800
-_MOST_PDOS = 8
-
-SIGNAL_OBJECTS = {
-    "position": 0x6064,
-    "velocity": 0x606C,
-    "statusword": 0x6041,
-    "mode_display": 0x6061,
-    "torque_actual": 0x6077,
-    "torque_demand": 0x6074,
-    "error_code": 0x603F,
-    "error_register": 0x1001,
-    "controlword": 0x6040,
-    "target_torque": 0x6071,
-    "torque_offset": 0x60B2,
-    "max_torque": 0x6072,
-    "mode": 0x6060,
-    "torque": 0x9130,
-    "status": 0x6150,
-}
-"""CiA 301, 402 and 404: the object behind a signal's name."""
-
-
-class MappedObject(NamedTuple):
-    """One entry of a mapping."""
-
-    object_index: int
-    subindex: int
-    bits: int
-
-    def __str__(self) -> str:
-        return f"{ObjectName(self.object_index, self.subindex)} of {self.bits} bits"
-
-
-class Pdo(NamedTuple):
-    """One PDO that is in use."""
-
-    can_id: int
-    objects: tuple[MappedObject, ...]
-
-
-def read_pdos(node: Any) -> list[Pdo]:
-    """Read all PDOs of a node that are valid, received ones first. Raises DeviceError, BusError."""
-    return [
-        pdo
-        for first in (_RECEIVED, _SENT)
-        for index in range(first, first + _MOST_PDOS)
-        if (pdo := _read_pdo(node, index)) is not None
-    ]
-
-
-def _read_pdo(node: Any, index: int) -> Pdo | None:
-    cob_id = _read_number(node, index, 1)
-    if cob_id is None or cob_id & NOT_VALID:
-        return None
-    count = _read_number(node, index + 0x200, 0) or 0
-    entries = (_read_number(node, index + 0x200, subindex) or 0 for subindex in range(1, count + 1))
-    objects = tuple(MappedObject(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in entries)
-    return Pdo(cob_id & MAX_STANDARD_ID, objects)
-
-
-def _read_number(node: Any, index: int, subindex: int) -> int | None:
-    data = read_object(node, index, subindex)
-    return None if data is None else int.from_bytes(data, "little")
-
-
-def contract_differences(device: PlacedDevice, pdos: list[Pdo]) -> list[str]:
-    """List the differences between a device's PDOs and its profile, from which the contract follows, one line each."""
-    by_id = {pdo.can_id: pdo for pdo in pdos}
-    lines = []
-    for pdo in device.settings.pdo:
-        name, can_id = f"{device.name}{pdo.message}", device.can_id(pdo)
-        found = by_id.get(can_id)
-        if found is None:
-            lines.append(f"{name}: the device has no PDO with identifier 0x{can_id:03X}")
-            continue
-        wanted = [MappedObject(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in device.mapping(pdo)]
-        for place, pair in enumerate(itertools.zip_longest(found.objects, wanted), start=1):
-            if pair[0] != pair[1]:
-                there, right = ("nothing" if entry is None else str(entry) for entry in pair)
-                lines.append(f"{name}: {there} is mapped at place {place}, {right} expected")
-    return lines

@@ -6,7 +6,7 @@ Source: CiA 402-2 / IEC 61800-7-201, clause 10.3 (state machine), clause 16 (cyc
 
 from collections import deque
 from collections.abc import Sequence
-from enum import Enum, IntEnum
+from enum import IntEnum
 from typing import NamedTuple
 
 from adacd_hil.device.cyclic_device import CyclicDevice
@@ -44,19 +44,8 @@ class Controlword(IntEnum):
     QUICK_STOP = 0x0002
     SHUTDOWN = 0x0006
     SWITCH_ON = 0x0007
-    DISABLE_OPERATION = 0x0007  # the same bits; the state tells which is meant
     ENABLE_OPERATION = 0x000F
     FAULT_RESET = 0x0080  # the rising edge of bit 7
-
-
-class Goal(Enum):
-    """State into which the host leads a drive."""
-
-    OPERATION_ENABLED = "operation enabled"
-    SWITCHED_ON = "switched on"
-    READY_TO_SWITCH_ON = "ready to switch on"
-    SWITCH_ON_DISABLED = "switch on disabled"
-    QUICK_STOP_ACTIVE = "quick stop active"
 
 
 _STATUSWORD = (  # mask, value: IEC 61800-7-201 table 30
@@ -71,62 +60,13 @@ _STATUSWORD = (  # mask, value: IEC 61800-7-201 table 30
 )
 
 
-class Cia402Transition(NamedTuple):
-    """One transition that the host commands, with the standard's number."""
-
-    number: int
-    command: Controlword
-    target: Cia402State
-
-
-_S, _C = Cia402State, Controlword
-TRANSITIONS: dict[tuple[Cia402State, Controlword], Cia402Transition] = {
-    (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): Cia402Transition(2, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
-    (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): Cia402Transition(3, _C.SWITCH_ON, _S.SWITCHED_ON),
-    # With all bits of transition 4 set the drive does 3, then 4 by itself.
-    (_S.READY_TO_SWITCH_ON, _C.ENABLE_OPERATION): Cia402Transition(3, _C.ENABLE_OPERATION, _S.SWITCHED_ON),
-    (_S.SWITCHED_ON, _C.ENABLE_OPERATION): Cia402Transition(4, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
-    (_S.OPERATION_ENABLED, _C.DISABLE_OPERATION): Cia402Transition(5, _C.DISABLE_OPERATION, _S.SWITCHED_ON),
-    (_S.SWITCHED_ON, _C.SHUTDOWN): Cia402Transition(6, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
-    (_S.READY_TO_SWITCH_ON, _C.QUICK_STOP): Cia402Transition(7, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
-    (_S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE): Cia402Transition(7, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    (_S.OPERATION_ENABLED, _C.SHUTDOWN): Cia402Transition(8, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
-    (_S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE): Cia402Transition(9, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    (_S.SWITCHED_ON, _C.QUICK_STOP): Cia402Transition(10, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
-    (_S.SWITCHED_ON, _C.DISABLE_VOLTAGE): Cia402Transition(10, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    (_S.OPERATION_ENABLED, _C.QUICK_STOP): Cia402Transition(11, _C.QUICK_STOP, _S.QUICK_STOP_ACTIVE),
-    (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): Cia402Transition(12, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    (_S.FAULT, _C.FAULT_RESET): Cia402Transition(15, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
-    # With 0x605A from 5 on; never sent by us: torque would be back at once.
-    (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): Cia402Transition(16, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+_WAY_UP = {
+    Cia402State.SWITCH_ON_DISABLED: Controlword.SHUTDOWN,  # transition 2
+    Cia402State.READY_TO_SWITCH_ON: Controlword.SWITCH_ON,  # 3
+    Cia402State.SWITCHED_ON: Controlword.ENABLE_OPERATION,  # 4
 }
-"""Effect of each command in each state, if it has one; the drive itself makes 0, 1, 12, 13, 14.
-
-IEC 61800-7-201, figure of the power drive system finite state automaton and its table of transitions.
-"""
-
-_WAYS: dict[Goal, dict[Cia402State, Controlword]] = {
-    Goal.OPERATION_ENABLED: {
-        _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,
-        _S.READY_TO_SWITCH_ON: _C.SWITCH_ON,
-        _S.SWITCHED_ON: _C.ENABLE_OPERATION,
-        _S.OPERATION_ENABLED: _C.ENABLE_OPERATION,
-    },
-    Goal.SWITCHED_ON: {
-        _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,
-        _S.READY_TO_SWITCH_ON: _C.SWITCH_ON,
-        _S.SWITCHED_ON: _C.SWITCH_ON,
-        _S.OPERATION_ENABLED: _C.DISABLE_OPERATION,
-    },
-    Goal.READY_TO_SWITCH_ON: {
-        _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,
-        _S.READY_TO_SWITCH_ON: _C.SHUTDOWN,
-        _S.SWITCHED_ON: _C.SHUTDOWN,
-        _S.OPERATION_ENABLED: _C.SHUTDOWN,
-    },
-}
-"""The next command by goal and state. States that are not listed get disable voltage; FAULT and QUICK_STOP_ACTIVE have
-rules of their own."""
+"""The next command on the way to Operation enabled, by state. States that are not listed get disable voltage; FAULT
+and QUICK_STOP_ACTIVE have rules of their own. IEC 61800-7-201, table of transitions."""
 
 _FIRST_STAYING_OPTION = 5
 """0x605A: from 5 on the drive stays in QUICK_STOP_ACTIVE; below it goes on to SWITCH_ON_DISABLED at standstill."""
@@ -145,9 +85,6 @@ class _StatusPlaces(NamedTuple):
     mode_display: int = -1
     torque_actual: int = -1
     error_code: int = -1
-    error_register: int = -1
-    torque_demand: int = -1
-    acted_commands: int = -1
 
 
 _NO_STATUS = _StatusPlaces()
@@ -200,24 +137,24 @@ class Drive(CyclicDevice):
         Raises CodecError when the contract lacks a message or signal.
         """
         name = f"Drive{joint}"
-        self.feedback_message = codec.message(f"{name}Feedback")
-        super().__init__(codec, name, self.feedback_message, "position", period_s)
-        self.command_message = codec.message(f"{name}Command")
-        self.command_id = self.command_message.can_id
-        self._sender = self.command_message.sender()
+        feedback = codec.message(f"{name}Feedback")
+        super().__init__(codec, name, feedback, "position", period_s)
+        self._command_message = codec.message(f"{name}Command")
+        self.command_id = self._command_message.can_id
+        self._sender = self._command_message.sender()
         self._quick_stop_option = quick_stop_option
         self._position_jump_rad = position_jump_rad
-        self._velocity_at = self.feedback_message.place("velocity")
-        self._feedback_status = _status_places(self.feedback_message)
+        self._velocity_at = feedback.place("velocity")
+        self._feedback_status = _status_places(feedback)
         self._status_places = _NO_STATUS if self.status_message is None else _status_places(self.status_message)
         self._command, self._controlword_at, self._torque_at = _command_template(
-            self.command_message, max_torque_permille
+            self._command_message, max_torque_permille
         )
         self.has_status_frame = self._feedback_status == _NO_STATUS
         """Whether the status comes in a frame of its own."""
         if max(self._feedback_status.statusword, self._status_places.statusword) < 0:
             raise CodecError(f"{name}: no message carries signal statusword")
-        self._last_controlword = int(Controlword.DISABLE_VOLTAGE)
+        self._last_controlword = Controlword.DISABLE_VOLTAGE
         self.recent_permille: deque[int] = deque([0], maxlen=_RECENT_COMMANDS)
         """Commanded torque of the last cycles, per mille of rated torque."""
         self.values = 0.0, 0.0  # position, rad, and velocity, rad/s
@@ -230,10 +167,7 @@ class Drive(CyclicDevice):
         self.is_enabled = False
         """Whether the drive produces the commanded torque."""
         self.torque_actual_permille = 0
-        self.torque_demand_permille = 0
         self.error_code = 0
-        self.error_register = 0
-        self.acted_commands = 0
 
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
         travel = values[self._velocity_at] * (cycles * self._period_s)
@@ -260,9 +194,9 @@ class Drive(CyclicDevice):
 
     def position_error(self, data: bytes, periods: int) -> float:
         """Return the error of a frame's position, rad, if so many periods lie between it and the last frame."""
-        if self._received is None or len(data) != self.feedback_message.length:
+        if self._received is None or len(data) != self.cyclic_length:
             return 0.0
-        values = self.feedback_message.decode_values(data)
+        values = self._message.decode_values(data)
         travel = values[self._velocity_at] * periods * self._period_s
         return abs(values[self._main_at] - self._received - travel)
 
@@ -276,48 +210,36 @@ class Drive(CyclicDevice):
         self.is_enabled = self.state is Cia402State.OPERATION_ENABLED and self.mode == MODE_CYCLIC_SYNCHRONOUS_TORQUE
         if at.torque_actual >= 0:
             self.torque_actual_permille = int(values[at.torque_actual])
-        if at.torque_demand >= 0:
-            self.torque_demand_permille = int(values[at.torque_demand])
         if at.error_code >= 0:
             self.error_code = int(values[at.error_code])
-        if at.error_register >= 0:
-            self.error_register = int(values[at.error_register])
-        if at.acted_commands >= 0:
-            self.acted_commands = int(values[at.acted_commands])
 
     def command(self, torque_permille: int, enable: bool, quick_stop: bool) -> bytes:
-        """Encode one command frame; torque is zero unless the drive is wanted and enabled."""
-        if quick_stop:
-            return self.lead(Goal.QUICK_STOP_ACTIVE)
-        return self.lead(Goal.OPERATION_ENABLED if enable else Goal.SWITCH_ON_DISABLED, torque_permille)
+        """Encode one command frame: one state nearer to Operation enabled, or disable voltage, or quick stop.
 
-    def lead(self, goal: Goal, torque_permille: int = 0) -> bytes:
-        """Encode the command frame that brings the drive one state nearer to `goal`, or holds it there.
-
-        Torque is zero unless the goal is OPERATION_ENABLED and the drive is there, in cyclic synchronous torque.
+        Torque is zero unless the drive is wanted, and enabled in cyclic synchronous torque.
         """
-        controlword = self._next_controlword(goal)
+        is_wanted = enable and not quick_stop
+        controlword = self._next_controlword() if is_wanted else Controlword.DISABLE_VOLTAGE
+        if quick_stop:
+            controlword = Controlword.QUICK_STOP
         self._last_controlword = controlword
         raw = self._command
         raw[self._controlword_at] = controlword
-        torque = torque_permille if goal is Goal.OPERATION_ENABLED and self.is_enabled else 0
+        torque = torque_permille if is_wanted and self.is_enabled else 0
         raw[self._torque_at] = torque
         self.recent_permille.append(torque)
-        return self._sender.protect(self.command_message.encode_raw(*raw))
+        return self._sender.protect(self._command_message.encode_raw(*raw))
 
-    def _next_controlword(self, goal: Goal) -> int:
-        if goal is Goal.OPERATION_ENABLED and self.state is Cia402State.OPERATION_ENABLED:  # nearly always
+    def _next_controlword(self) -> Controlword:
+        """Return the next command on the way to Operation enabled."""
+        if self.state is Cia402State.OPERATION_ENABLED:  # nearly always
             return Controlword.ENABLE_OPERATION
-        if goal is Goal.QUICK_STOP_ACTIVE:
-            return Controlword.QUICK_STOP
-        if goal is Goal.SWITCH_ON_DISABLED:
-            return Controlword.DISABLE_VOLTAGE
         if self.state is Cia402State.FAULT:  # the edge counts, so low and high alternate
-            is_high = self._last_controlword & Controlword.FAULT_RESET
+            is_high = self._last_controlword is Controlword.FAULT_RESET
             return Controlword.DISABLE_VOLTAGE if is_high else Controlword.FAULT_RESET
         if self.state is Cia402State.QUICK_STOP_ACTIVE:
             return Controlword.QUICK_STOP if self._is_quick_stopping else Controlword.DISABLE_VOLTAGE
-        return _WAYS[goal].get(self.state, Controlword.DISABLE_VOLTAGE)
+        return _WAY_UP.get(self.state, Controlword.DISABLE_VOLTAGE)
 
     @property
     def _is_quick_stopping(self) -> bool:

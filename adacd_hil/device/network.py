@@ -7,7 +7,7 @@ Source: CiA 301 (4.2), clauses 7.2.8 (NMT) and 7.5.2 (communication objects); Ci
 import functools
 from typing import Any, NamedTuple
 
-from adacd_hil.device.arm_watch import OPERATIONAL, PATIENCE_PERIODS, follow_devices
+from adacd_hil.device.arm_watch import OPERATIONAL, PATIENCE_PERIODS, EventSource, follow_devices
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, describe_emergency
 from adacd_hil.device.device_setup import (
     ParameterWatch,
@@ -44,7 +44,7 @@ class Identity(NamedTuple):
     serial: int
 
 
-class Master:
+class Master(EventSource):
     """The CANopen master of one arm."""
 
     def __init__(self, settings: Settings, codec: Codec, bus: Bus, watch_host: bool = True) -> None:
@@ -53,12 +53,12 @@ class Master:
         `watch_host`: devices shall watch the host by time: its heartbeat, and its commands where they count ms. Not in
         lockstep: cycles have no fixed duration there, and a device waits by the wall clock.
         """
+        super().__init__()
         self._watch_host = watch_host
         self._settings = settings
         self._codec = codec
         self._bus = bus
         self._canopen = CanopenBus(bus)
-        self._events: list[Event] = []
         self._emergencies: dict[str, str] = {}
         self._heartbeat_id = codec.message(HOST_HEARTBEAT).can_id
         self.slaves: list[Slave] = []
@@ -72,7 +72,7 @@ class Master:
             )
             self.nodes[device.name] = node
             self.slaves.append(Slave(device, node, self._let_pass))
-        self._heartbeats = follow_devices(devices, settings.bus.heartbeat_ms, self._events.append)
+        self._heartbeats = follow_devices(devices, settings.bus.heartbeat_ms, self.events.append)
         self.parameters = ParameterWatch(settings, bus)
         self._canopen.bystander = self._heartbeats.accept
 
@@ -83,7 +83,7 @@ class Master:
             self._emergencies[name] = text
         else:
             self._emergencies.pop(name, None)
-        self._events.append(Event("warning" if error.code >> 8 else "info", name, text))
+        self.events.append(Event("warning" if error.code >> 8 else "info", name, text))
 
     def accept(self, frame: Frame) -> None:
         """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY."""
@@ -94,12 +94,6 @@ class Master:
 
     def _let_pass(self, duration_s: float) -> None:
         self._canopen.pump(lambda _: False, duration_s)
-
-    def take_events(self) -> list[Event]:
-        """Return the events that the devices reported since the last call."""
-        events = self._events.copy()
-        self._events.clear()
-        return events
 
     def describe_checks(self) -> list[str]:
         """Return in one line how many frames fitted no CANopen service and were dropped; empty without such frames."""
@@ -199,11 +193,11 @@ class Master:
             set_up_pdos(slave, command_deadline_ms(self._settings) if self._watch_host else 0)
             if slave.device.settings.kind == "drive":
                 for remark in set_up_drive(slave, self._settings, self._codec):
-                    self._events.append(Event("warning", slave.name, remark))
+                    self.events.append(Event("warning", slave.name, remark))
             else:
                 status = set_up_sensor(slave, self._codec)
                 if status:
-                    self._events.append(Event("info", slave.name, status))
+                    self.events.append(Event("info", slave.name, status))
             for extra in slave.device.settings.setup:
                 slave.write_checked(extra.name.index, extra.name.sub, extra.value)
         self.parameters.follow(self.slaves)
@@ -220,10 +214,11 @@ class Master:
         has_period = slave.can_write(0x1006)
         if counts and slave.read(0x1019) != SYNC_OVERFLOW:
             if has_period:
-                slave.write(0x1006, 0, 0)  # CiA 301, 7.5.2.22: the overflow value can be changed at period 0 only
+                # CiA 301, 7.5.2.22: the overflow value can be changed at period 0 only
+                slave.write_object(0x1006, 0, 0)
             slave.write_checked(0x1019, 0, SYNC_OVERFLOW)
         if has_period:
-            slave.write(0x1006, 0, self._settings.bus.period_us)
+            slave.write_object(0x1006, 0, self._settings.bus.period_us)
             slave.expect(
                 0x1006,
                 0,
@@ -243,7 +238,7 @@ class Master:
         if slave.can_write(0x1017):
             slave.write_checked(0x1017, 0, period_ms, "ms")
         else:
-            self._events.append(Event("warning", slave.name, "sends no heartbeat (0x1017 is not in its EDS)"))
+            self.events.append(Event("warning", slave.name, "sends no heartbeat (0x1017 is not in its EDS)"))
         if slave.can_write(0x1016, 1) and slave.device.can("heartbeat_consumer"):
             host = self._heartbeat_id & 0x7F
             entry = host << 16 | round(PATIENCE_PERIODS * period_ms)

@@ -143,23 +143,23 @@ def _unpack(frames: NDArray[Any]) -> Iterator[tuple[bool, Frame]]:
         yield is_sent, Frame(can_id, data[start : start + length], t_ns, is_error)
 
 
+_KINDS: dict[str, Any] = {
+    "is_enabled": np.bool_,
+    "is_complete": np.bool_,
+    "is_late": np.bool_,
+    "fault": np.uint8,
+    **dict.fromkeys(("q", "dq", "tau_J"), np.float64),
+}
+"""Types of an ArmBatch's columns that are not int64."""
+_PAIRS = ("q", "dq", "tau_J", "age_q", "age_tau_J")
+
+
 def _batch_of(states: list[ArmState]) -> ArmBatch:
     """Lay the states of n cycles out as columns."""
-    count = len(states)
-    numbers = {name: np.empty(count, np.int64) for name in ("cycle", "t_ns", "periods", "steps", "sampled_ns")}
-    batch = ArmBatch(
-        **numbers,
-        q=np.empty((count, JOINTS)),
-        dq=np.empty((count, JOINTS)),
-        tau_J=np.empty((count, JOINTS)),
-        age_q=np.empty((count, JOINTS), np.int64),
-        age_tau_J=np.empty((count, JOINTS), np.int64),
-        is_enabled=np.empty(count, np.bool_),
-        is_complete=np.empty(count, np.bool_),
-        fault=np.empty(count, np.uint8),
-        is_late=np.empty(count, np.bool_),
+    columns = list(zip(*states, strict=True)) if states else [()] * len(ArmBatch._fields)
+    return ArmBatch(
+        *(
+            np.array(column, _KINDS.get(name, np.int64)).reshape(len(states), *([JOINTS] if name in _PAIRS else []))
+            for name, column in zip(ArmBatch._fields, columns, strict=True)
+        )
     )
-    columns: tuple[NDArray[Any], ...] = batch
-    for column, values in zip(columns, zip(*states, strict=True), strict=bool(states)):
-        column[:] = values
-    return batch

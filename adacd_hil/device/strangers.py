@@ -52,27 +52,19 @@ def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
     return doing
 
 
-def listen_for_hosts(bus: Bus, clock: Clock, settings: Settings, codec: Codec, duration_s: float) -> list[str]:
-    """Listen to the bus and describe the actions of another host that runs the arm, one line each. Raises BusError.
+def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
+    """Raise DeviceError when another host runs the arm: a reset would take it from that host. Raises BusError.
 
-    Requests that only read objects, and commands to nodes of other arms, are ignored.
+    Only where time passes by itself: in lockstep it does by this host's own frames. Requests that only read objects,
+    and commands to nodes of other arms, are ignored.
     """
     strangers = Strangers(settings, codec)
-    end_ns = clock.now_ns() + round(duration_s * 1e9)
+    end_ns = clock.now_ns() + round(HOSTS_LISTEN_S * 1e9)
     while (remaining_ns := end_ns - clock.now_ns()) > 0:
         frame = bus.receive(remaining_ns * 1e-9)
         if frame is not None and not frame.is_error:
             strangers.accept(frame, 0)
-    return strangers.describe(0)
-
-
-def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
-    """Raise DeviceError when another host runs the arm: a reset would take it from that host. Raises BusError.
-
-    Only where time passes by itself: in lockstep it does by this host's own frames.
-    """
-    heard = listen_for_hosts(bus, clock, settings, codec, HOSTS_LISTEN_S)
-    if heard:
+    if heard := strangers.describe_senders(0):
         raise DeviceError(f"{'; '.join(heard)} on {bus.channel}: end the other program; an arm has one host")
 
 
@@ -132,6 +124,6 @@ class Strangers(RateLimitedEvents):
         """Return whether another sender has acted on the arm of late."""
         return cycle <= self._until_cycle
 
-    def describe(self, cycle: int) -> list[str]:
+    def describe_senders(self, cycle: int) -> list[str]:
         """Describe the actions of other senders on the arm of late, one line each."""
         return [text for text, heard in self._complaints.items() if cycle <= heard + self._hold_cycles]

@@ -25,7 +25,6 @@ STATUS_BITS = 0x07
 _STATUSES = tuple(SensorStatus(bits) for bits in range(STATUS_BITS + 1))
 USABLE = tuple(status for status in _STATUSES if not status & SensorStatus.NOT_VALID)
 """Statuses with which a torque may be used; an overloaded one is a bound."""
-_OVERLOAD = SensorStatus.POSITIVE_OVERLOAD | SensorStatus.NEGATIVE_OVERLOAD
 _STATUS_IN_HEADER = {0: None, 2: (1, 4), 4: (3, 0)}
 """Byte and shift of the sender's status, by the length of the end-to-end header: none, Profile 2, Profile 5."""
 
@@ -46,7 +45,7 @@ class TorqueSensor(CyclicDevice):
         Raises CodecError when the contract lacks a message or signal.
         """
         name = f"Sensor{joint}"
-        message = self.torque_message = codec.message(f"{name}Torque")
+        message = codec.message(f"{name}Torque")
         super().__init__(codec, name, message, "torque", period_s)
         self._torque_rate_Nm_s = torque_rate_Nm_s
         self.torque_range_Nm = torque_range_Nm
@@ -90,11 +89,6 @@ class TorqueSensor(CyclicDevice):
         self._heard_bits = int(values[self._slow_status_at]) & STATUS_BITS
         self._slow_bits &= self._heard_bits
         self.status = _STATUSES[self._cyclic_bits | self._heard_bits]
-
-    @property
-    def is_overloaded(self) -> bool:
-        """Whether the torque is beyond the sensor's range: fresh, but not the torque that acts."""
-        return bool(self.status & _OVERLOAD)
 
 
 def _judge_range(torque: float, range_Nm: float) -> SensorStatus:

@@ -147,41 +147,23 @@ SIGMAS = 2.0
 
 
 class HistoryPanel(NamedTuple):
-    """One panel: values and their deviations (n, m), a curve for each of m names; nan: not known.
-
-    marks: rows at which something has changed. level: a line to compare with.
-    """
+    """One panel: values and their deviations (n, m), a curve for each of m names; nan: not known."""
 
     title: str
     names: tuple[str, ...]
     values: Vector
     std: Vector
-    marks: tuple[int, ...] = ()
-    level: float | None = None
 
 
-HISTORY_CAPTION: Final = "Bars: two deviations."
-
-
-def history_figure(
-    dates: Sequence[str],
-    panels: Sequence[HistoryPanel],
-    name: str = "history",
-    title: str = "What the arm's runs have certified",
-    caption: str = HISTORY_CAPTION,
-) -> Drawing:
+def history_figure(dates: Sequence[str], panels: Sequence[HistoryPanel]) -> Drawing:
     """Draw panels over n dates, ISO 8601, with two deviations."""
     at = np.array([date.removesuffix("Z") for date in dates], dtype="datetime64[s]")
     with style():
         figure = Figure(figsize=(7.2, 2.0 * len(panels)), layout="constrained")
         rows = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
         for axes, panel in zip(rows, panels, strict=True):
-            for row in panel.marks:
-                axes.axvline(at[row], color=COLOURS["alarm"], linewidth=0.8, linestyle="--")
-            if panel.level is not None:
-                axes.axhline(panel.level, color=COLOURS["muted"], linewidth=0.8, linestyle=":")
             for m, label in enumerate(panel.names):
-                colour = COLOURS[("joint1", "joint2", "beside")[m % 3]]
+                colour = COLOURS[("joint1", "joint2", "beside")[m]]
                 axes.errorbar(
                     at, panel.values[:, m], SIGMAS * panel.std[:, m], marker="o", ms=3, lw=1, capsize=2, color=colour,
                     label=label,
@@ -191,4 +173,4 @@ def history_figure(
             axes.margins(x=0.02)
             axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(panel.names))
         rows[-1].tick_params(axis="x", rotation=20)
-    return Drawing(name, title, caption, figure)
+    return Drawing("history", "What the arm's runs have certified", "Bars: two deviations.", figure)

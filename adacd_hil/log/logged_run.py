@@ -219,6 +219,7 @@ class Truth:
     force_N: Vector | None = None  # size of the contact force (m,)
     time_s: Vector | None = None  # of its cycles (m,), since motion start; None: between those of the run
     model_cycle: Cycles | None = None
+    model_attempt: Cycles | None = None
     attempt: Cycles | None = None  # of its cycles (m,), from 0; None: all are of one
     span: Span | None = None
     """Cycles that the emulator recorded, whichever are kept; None: all."""
@@ -289,7 +290,7 @@ class StretchOfRun(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """A run as plain arrays over n of its cycles: over all, or of a long one over those that `KeptCycles` keeps.
+    """A run as plain arrays over n of its cycles: over all, or of a long one over those that the report keeps.
 
     `truth` is None on a real arm.
     """

@@ -51,7 +51,6 @@ from adacd_hil.records import (
 __all__ = [
     "FRAME_DTYPE",
     "LONG_FRAME_DTYPE",
-    "LoggedContact",
     "LoggedEvent",
     "RunLog",
     "Series",
@@ -73,13 +72,6 @@ class LoggedEvent(NamedTuple):
 
     t_ns: int
     event: Event
-
-
-class LoggedContact(NamedTuple):
-    """A contact report and when it was made."""
-
-    t_ns: int
-    report: ContactReport
 
 
 class Series:
@@ -147,7 +139,7 @@ class RunLog:
     decoded: Mapping[str, Series]  # by DBC message
     frames: NDArray[Any]  # (n,) of FRAME_DTYPE or LONG_FRAME_DTYPE, both ways, in the order of the bus
     events: list[LoggedEvent]
-    contacts: list[LoggedContact]
+    contacts: list[tuple[int, ContactReport]]  # when each report was made, ns, and the report
     parts: int  # files that it was read from
 
     @property
@@ -288,8 +280,11 @@ def check_states(scheme: Series) -> None:
                 raise LogError(f"/scheme has {name} {value} in cycle {cycle}, which this version does not know")
 
 
-def contacts_of(series: Series) -> list[LoggedContact]:
-    """Return the reports of /contact. Raises LogError for an unknown level, kind, reaction or place."""
+def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
+    """Return when each report of /contact was made, ns, and the report.
+
+    Raises LogError for an unknown level, kind, reaction or place.
+    """
     contacts = []
     members = [member for member in CONTACT.head if member.name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
@@ -297,7 +292,7 @@ def contacts_of(series: Series) -> list[LoggedContact]:
             report = ContactReport(**{member.name: member.value_of(record[member.name].tolist()) for member in members})
         except (ValueError, OverflowError) as error:  # "77 is not a valid ContactLevel"
             raise LogError(f"/contact has a report that this version does not know: {error}") from None
-        contacts.append(LoggedContact(t_ns, report))
+        contacts.append((t_ns, report))
     return contacts
 
 

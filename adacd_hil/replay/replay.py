@@ -36,7 +36,7 @@ from adacd_hil.replay.scheme_comparison import (
     different_arithmetic,
 )
 from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch, arm_at
-from adacd_hil.score.emulator_truth import TrueContacts, contacts_beside
+from adacd_hil.score.emulator_truth import KnownContacts, contacts_beside
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
@@ -97,7 +97,7 @@ class _Player:
     def __init__(
         self,
         settings: Settings,
-        truth: TrueContacts | None,
+        truth: KnownContacts | None,
         comparison: SchemeComparison | None,
         asking: Asking | None,
         checks_arms: bool,
@@ -207,7 +207,7 @@ def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
 def replay_source(
     source: ReplaySource,
     variants: Sequence[Settings],
-    truth: TrueContacts | None = None,
+    truth: KnownContacts | None = None,
     progress: Progress = lambda _: None,
     tolerance: float | None = None,
     script_of: ScriptOf | None = None,
@@ -402,7 +402,7 @@ def _result(
         arms_compared=0 if comparison is None else comparison.arms,
         attempts=player.attempts,
         states=tuple(each for each in gatherer.transitions if each.t_ns >= first_ns),
-        contacts=tuple(each for each in gatherer.reports if each.t_ns >= first_ns),
+        contacts=tuple(each for each in gatherer.reports if each[0] >= first_ns),
         adaptations=tuple(each for each in gatherer.adaptations if each.t_ns >= first_ns),
         parameters=dict(zip(player.settings.estimator.parameter_names, gatherer.theta_hat, strict=False)),
         score=score,

@@ -9,7 +9,7 @@ import itertools
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.logged_run import Mismatch, enters_react, host_span
-from adacd_hil.log.reader import LoggedContact
-from adacd_hil.records import JOINTS, PARAMETER_UNITS, FaultReason, SchemeState, Vector
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.score.emulator_truth import HostCycles, TrueContact, TrueContacts, windows_of
-from adacd_hil.score.judge import Alarm, Score, TouchWindow, judge
+from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, placed_contacts
+from adacd_hil.score.judge import Detection, Score, TrueContact, judge
 from adacd_hil.score.margins import PushGatherer
 from adacd_hil.score.wording import NONE, found_text, why_not_found
 from adacd_hil.settings.configuration import Settings
@@ -61,9 +60,9 @@ class Sight(NamedTuple):
 class OutcomeGatherer:
     """Takes in the decisions of one replay. `truth`: the true contacts, None if unknown."""
 
-    def __init__(self, settings: Settings, truth: TrueContacts | None) -> None:
+    def __init__(self, settings: Settings, truth: KnownContacts | None) -> None:
         self.transitions: list[StateChange] = []
-        self.reports: list[LoggedContact] = []
+        self.reports: list[tuple[int, ContactReport]] = []  # with the time of each, ns
         self.adaptations: list[Adaptation] = []
         self.theta_hat: tuple[float, ...] = ()
         self.state = SchemeState.INIT
@@ -71,8 +70,8 @@ class OutcomeGatherer:
         self._truth = truth
         self._contacts: list[TrueContact] = []  # of this attempt, on the host's cycles
         self._kept: list[HostCycles] = []  # of this attempt
-        self._touches: list[TouchWindow] = []
-        self._alarms: list[tuple[int, Alarm]] = []  # with the cycle of each
+        self._placed: list[TrueContact] = []  # on the host's clock
+        self._alarms: list[tuple[int, Detection]] = []  # with the cycle of each
         self._begins: list[int] = []  # first cycle of each attempt
         slices = layout_of(settings).slices
         self._theta = slices["theta_hat"]
@@ -98,7 +97,7 @@ class OutcomeGatherer:
         over[batch.contact_places] |= np.array([r.cycle for r in batch.contacts]) == ticks.cycle[batch.contact_places]
         for row in np.flatnonzero(enters_react(batch.previous_state, batch.state) & over).tolist():
             is_armed = bool(batch.previous_state[row] == SchemeState.MONITOR)
-            self._alarms.append((int(ticks.cycle[row]), Alarm(int(ticks.t_ns[row]), is_armed)))
+            self._alarms.append((int(ticks.cycle[row]), Detection(int(ticks.t_ns[row]), is_armed)))
         for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
             self._enter(
                 StateChange(
@@ -111,7 +110,7 @@ class OutcomeGatherer:
                 batch.block[row, self._theta],
             )
         for row, report in zip(batch.contact_places.tolist(), batch.contacts, strict=True):
-            self.reports.append(LoggedContact(int(ticks.t_ns[row]), report))
+            self.reports.append((int(ticks.t_ns[row]), report))
         self.theta_hat = tuple(batch.block[-1, self._theta].tolist())
         self.state = SchemeState(batch.state[-1])
 
@@ -132,9 +131,9 @@ class OutcomeGatherer:
         if not len(block):
             return
         if self._push is not None and self._bank is not None:
-            self._push.add(*(block[:, place].reshape(len(block), -1, JOINTS) for place in self._bank))
+            self._push.add_residuals(*(block[:, place].reshape(len(block), -1, JOINTS) for place in self._bank))
         for joint, kept in enumerate(self._thresholds):
-            kept.add(block[:, self._threshold][:, joint])
+            kept.add_values(block[:, self._threshold][:, joint])
 
     @property
     def sight(self) -> Sight:
@@ -169,7 +168,7 @@ class OutcomeGatherer:
         self.end()
         self._begins += [cycle] * (attempt + 1 - len(self._begins))  # also of those that a recording lacks
         if self._truth is not None:
-            mine = (contact for contact in self._truth.contacts if contact.attempt == attempt)
+            mine = (contact for contact in self._truth[0] if contact.attempt == attempt)
             self._contacts = [contact.counted_from(cycle) for contact in mine]
         self._was_over = False
 
@@ -178,7 +177,7 @@ class OutcomeGatherer:
         self._give_up()
         if self._kept:
             host = HostCycles(*map(np.concatenate, zip(*self._kept, strict=True)))
-            self._touches += windows_of(self._contacts, host, self._settings)
+            self._placed += placed_contacts(self._contacts, host, self._settings)
             self._kept = []
 
     @property
@@ -190,10 +189,10 @@ class OutcomeGatherer:
         """Judge the alarms; None without the truth."""
         if self._truth is None:
             return None
-        span = host_span(self._truth.span, np.array(self._begins or [0]))
+        span = host_span(self._truth[1], np.array(self._begins or [0]))
         is_known = span.covers(np.array([cycle for cycle, _ in self._alarms], np.int64)).tolist()
-        alarms = [alarm._replace(is_known=known) for (_, alarm), known in zip(self._alarms, is_known, strict=True)]
-        return judge(self._touches, alarms, self._crossings)
+        alarms = [replace(alarm, is_known=known) for (_, alarm), known in zip(self._alarms, is_known, strict=True)]
+        return judge(self._placed, alarms, self._crossings)
 
 
 @dataclass(frozen=True)
@@ -203,9 +202,10 @@ class Replay:
     cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 where the settings
     are not the log's. arms_compared: cycles whose state, made of the frames, was compared with the log's. monitored_s:
     in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`.
-    parameters: of the end. score: of contacts and alarms that begin in the stretch, None where the truth is not known.
-    adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one. ending: the last change of
-    state, which may be before the stretch. attempts, sight: from the beginning of the log.
+    contacts: reports with their times, ns. parameters: of the end. score: of contacts and alarms that begin in the
+    stretch, None where the truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0
+    without one. ending: the last change of state, which may be before the stretch. attempts, sight: from the beginning
+    of the log.
     """
 
     settings: Settings
@@ -215,7 +215,7 @@ class Replay:
     arms_compared: int
     attempts: int
     states: tuple[StateChange, ...]
-    contacts: tuple[LoggedContact, ...]
+    contacts: tuple[tuple[int, ContactReport], ...]
     adaptations: tuple[Adaptation, ...]
     parameters: dict[str, float]
     score: Score | None

@@ -122,7 +122,7 @@ class Distribution:
         self._bins: NDArray[np.int64] | None = None  # of -_SIDE to _SIDE, once there are more than `exact` values
         self._range = (np.inf, -np.inf)
 
-    def add(self, values: Values) -> None:
+    def add_values(self, values: Values) -> None:
         """Take in values (k,)."""
         new = np.asarray(values, dtype=np.float64)
         new = new[~np.isnan(new)]

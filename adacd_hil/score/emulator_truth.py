@@ -10,7 +10,7 @@ The reader refuses a log of another run, as far as both logs name their scenario
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -28,11 +28,10 @@ from adacd_hil.log.logged_run import (
     host_cycles,
     host_span,
     is_interrupted,
-    whole_rounds,
 )
 from adacd_hil.log.reader import LogStream, Series
 from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
-from adacd_hil.score.judge import TouchWindow, contact_bounds, forgotten_after_s
+from adacd_hil.score.judge import TrueContact, true_contacts
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml
@@ -64,22 +63,13 @@ _HELD: Final = 30_000
 
 
 class TruthTable(NamedTuple):
-    """Kept rows of the truth (m,), on the emulator's own cycles; attempt (m,): of the run, from 0.
+    """What an emulator's log has of the truth: kept rows on the emulator's own cycles; its metadata.
 
-    model_attempt, model_cycle (k,): from when on payload and parameters are as they are. metadata: of the log; problem:
-    missing parts; is_complete: it is whole and no record was dropped on the way to it.
+    problem: missing parts; is_complete: it is whole and no record was dropped on the way to it. span: None if the
+    emulator never cycled.
     """
 
-    attempt: Cycles
-    cycle: Cycles
-    tau_ext: Vector
-    contact_link: Vector
-    contact_index: Vector
-    force_N: Vector | None
-    model_attempt: Cycles
-    model_cycle: Cycles
-    payload_kg: Vector
-    theta: Vector
+    rows: Truth
     metadata: Mapping[str, str]
     problem: str
     is_complete: bool
@@ -98,33 +88,42 @@ _MODEL: Final = ("payload", "theta")
 def read_truth(path: Path) -> TruthTable:
     """Read the contacts from the emulator's log, with the cycle after each. Raises LogError."""
     stream = LogStream(path, ("/truth",))
-    rows = _Gathering()
+    rows = _TruthRows()
     for piece in stream:
-        rows.add(piece.series["/truth"])
-    return rows.done(stream)
+        rows.add_records(piece.series["/truth"])
+    return rows.table(stream)
 
 
-class _Gathering:
-    """Takes in the records of /truth, piece by piece."""
+class _TruthRows:
+    """Keeps rows of /truth, piece by piece: of one contact in progress in bounded memory."""
 
     def __init__(self) -> None:
         self._has_force = True
         self._kept: list[NDArray[Any]] = []
         self._kept_rows = 0
-        self._contact = _OneContact(_BEGINNING[0])
         self._first: NDArray[Any] | None = None
         self._last: NDArray[Any] | None = None  # the row before
         self._models: list[tuple[NDArray[Any], ...]] = []  # attempt, cycle, payload, theta
         self._model: tuple[NDArray[Any], ...] | None = None
+        self._begin()
 
-    def add(self, truth: Series) -> None:
+    def _begin(self) -> None:
+        """Begin the next contact."""
+        self._key: tuple[int, float] | None = None  # attempt and index of the contact in progress
+        self._whole = _BEGINNING[self._kept_rows > _PLENTY]  # rows of it that are kept as they are
+        self._waiting = np.zeros(0, _ROW)
+
+    def add_records(self, truth: Series) -> None:
         """Take in a piece."""
         if not len(truth):
             return
         rows = self._rows(truth)
         self._first = rows[:1] if self._first is None else self._first
         self._add_models(truth, rows)
-        self._add_contacts(rows)
+        key = np.stack((rows["attempt"].astype(np.float64), rows["contact_index"]), axis=1)
+        edges = np.flatnonzero((key[1:] != key[:-1]).any(axis=1)) + 1
+        for start, end in pairwise([0, *edges.tolist(), len(rows)]):
+            self._add_spell(rows[start:end])
         self._last = rows[-1:]
 
     def _rows(self, truth: Series) -> NDArray[Any]:
@@ -151,116 +150,92 @@ class _Gathering:
         self._models.append((attempt[changes], rows["cycle"][changes], payload[changes], theta[changes]))
         self._model = tuple(column[-1:].copy() for column in columns)
 
-    def _add_contacts(self, rows: NDArray[Any]) -> None:
-        """Keep the rows of contacts, and the row after each contact."""
-        key = np.stack((rows["attempt"].astype(np.float64), rows["contact_index"]), axis=1)
-        edges = np.flatnonzero((key[1:] != key[:-1]).any(axis=1)) + 1
-        bounds = [0, *edges.tolist(), len(rows)]
-        for start, end in pairwise(bounds):
-            spell = rows[start:end]
-            if self._contact.is_another(spell[0]):
-                self._close(spell[:1])
-            if spell["contact_index"][0] >= 0.0:
-                self._contact.add(spell)
+    def _add_spell(self, rows: NDArray[Any]) -> None:
+        """Keep rows with or without a contact; the row after a contact unless that is the next contact's own."""
+        key = int(rows["attempt"][0]), float(rows["contact_index"][0])
+        if self._key not in (None, key):
+            self._thin()
+            self._keep(self._waiting)
+            self._keep(rows[: int(key[1] < 0.0)])
+            self._begin()
+        if key[1] < 0.0:
+            return
+        self._key = key
+        self._keep(rows[: self._whole])
+        rest = rows[self._whole :]
+        self._whole -= len(rows) - len(rest)
+        self._waiting = np.concatenate((self._waiting, rest))
+        if len(self._waiting) > _HELD:
+            self._thin()
 
-    def _close(self, after: NDArray[Any]) -> None:
-        """End the contact in progress with the row after it, unless that is the next contact's own."""
-        done = self._contact.rows()
-        if after["contact_index"][0] < 0.0:
-            done = np.concatenate((done, after))
-        self._kept.append(done)
-        self._kept_rows += len(done)
-        self._contact = _OneContact(_BEGINNING[self._kept_rows > _PLENTY])
+    def _keep(self, rows: NDArray[Any]) -> None:
+        self._kept.append(rows)
+        self._kept_rows += len(rows)
 
-    def done(self, stream: LogStream) -> TruthTable:
-        """Return the kept rows."""
-        rows = np.concatenate([np.zeros(0, _ROW), *self._kept, self._contact.rows()])
+    def _thin(self) -> None:
+        """Choose among the waiting rows but the last ones."""
+        middle, self._waiting = self._waiting[:-_ENDING], self._waiting[-_ENDING:].copy()
+        if len(middle):
+            series = (middle["tau_ext"][:, 0], middle["tau_ext"][:, 1], middle["contact_force"])
+            self._keep(middle[extreme_rows(series, np.arange(0, len(middle), _BUCKET))])
+
+    def table(self, stream: LogStream) -> TruthTable:
+        """Return the kept rows, at the end of the log."""
+        self._thin()
+        rows = np.concatenate([np.zeros(0, _ROW), *self._kept, self._waiting])
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
         models = zip(nothing, *self._models, strict=True)
         attempt, cycle, payload, theta = (np.concatenate(column) for column in models)
-        return TruthTable(
-            attempt=rows["attempt"].copy(),
+        truth = Truth(
             cycle=rows["cycle"].copy(),
             tau_ext=rows["tau_ext"].copy(),
             contact_link=rows["contact_link"].copy(),
             contact_index=rows["contact_index"].copy(),
-            force_N=rows["contact_force"].copy() if self._has_force else None,
-            model_attempt=attempt,
-            model_cycle=cycle,
             payload_kg=payload[:, 0],
             theta=theta,
-            metadata=stream.metadata,
-            problem=stream.problem,
-            is_complete=stream.is_complete,
-            span=None if self._first is None or self._last is None else (_place(self._first), _place(self._last)),
+            force_N=rows["contact_force"].copy() if self._has_force else None,
+            attempt=rows["attempt"].copy(),
+            model_cycle=cycle,
+            model_attempt=attempt,
         )
+        span = None if self._first is None or self._last is None else (_place(self._first), _place(self._last))
+        return TruthTable(truth, stream.metadata, stream.problem, stream.is_complete, span)
 
 
 def _place(row: NDArray[Any]) -> tuple[int, int]:
     return int(row["attempt"][0]), int(row["cycle"][0])
 
 
-class _OneContact:
-    """The rows of the contact in progress, in bounded memory."""
-
-    def __init__(self, beginning: int) -> None:
-        self._beginning = beginning  # rows that are kept as they are
-        self._key: tuple[int, float] | None = None
-        self._chosen: list[NDArray[Any]] = []
-        self._count = 0
-        self._waiting = np.zeros(0, _ROW)
-
-    def is_another(self, row: NDArray[Any]) -> bool:
-        """Whether there is a contact in progress that a row is not of."""
-        return self._key is not None and self._key != (int(row["attempt"]), float(row["contact_index"]))
-
-    def add(self, rows: NDArray[Any]) -> None:
-        """Take in rows of it."""
-        self._key = (int(rows["attempt"][0]), float(rows["contact_index"][0]))
-        room = max(self._beginning - self._count, 0)
-        self._chosen.append(rows[:room])
-        self._count += len(rows)
-        self._waiting = np.concatenate((self._waiting, rows[room:]))
-        if len(self._waiting) > _HELD:
-            self._choose()
-
-    def _choose(self) -> None:
-        """Choose among the waiting rows but the last ones."""
-        middle, self._waiting = self._waiting[:-_ENDING], self._waiting[-_ENDING:].copy()
-        if len(middle):
-            series = (middle["tau_ext"][:, 0], middle["tau_ext"][:, 1], middle["contact_force"])
-            self._chosen.append(middle[extreme_rows(series, np.arange(0, len(middle), _BUCKET))])
-
-    def rows(self) -> NDArray[Any]:
-        """Return the rows that are kept."""
-        self._choose()
-        return np.concatenate([*self._chosen, self._waiting])
-
-
-def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
+def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
     """Return the truth on the host's cycles; None where the emulator never cycled.
 
-    begins: first cycle of each attempt of the run; last: of the run; time_s: of the rows (m,).
-
-    The arm goes on when the host has died; cycles after the host's last one are left out.
+    begins: first cycle of each attempt of the run so far; last: of the run; time_s: of the rows (m,). Rows of later
+    attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
     """
+    rows = table.rows
+    assert rows.attempt is not None
+    assert rows.model_cycle is not None
+    assert rows.model_attempt is not None
     if not rows.model_cycle.size:
         return None
     cycle = host_cycles(rows.cycle, rows.attempt, begins)
-    of_host = cycle <= last
-    return Truth(
-        cycle=cycle[of_host],
-        tau_ext=rows.tau_ext[of_host],
-        contact_link=rows.contact_link[of_host],
-        contact_index=rows.contact_index[of_host],
-        payload_kg=rows.payload_kg,
-        theta=rows.theta,
-        force_N=None if rows.force_N is None else rows.force_N[of_host],
-        attempt=rows.attempt[of_host],
-        time_s=time_s[of_host],
-        model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins),
-        span=None if rows.span is None else host_span(rows.span, begins),
+    of_host = (cycle <= last) & (rows.attempt < len(begins))
+    known = rows.model_attempt < len(begins)
+    return replace(
+        truth_rows(replace(rows, cycle=cycle, time_s=time_s), of_host),
+        payload_kg=rows.payload_kg[known],
+        theta=rows.theta[known],
+        model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins)[known],
+        model_attempt=rows.model_attempt[known],
+        span=None if table.span is None else host_span(table.span, begins),
     )
+
+
+def truth_rows(truth: Truth, rows: NDArray[np.bool_]) -> Truth:
+    """Return some rows of a truth, with all of its payloads and parameters."""
+    names = ("cycle", "tau_ext", "contact_link", "contact_index", "force_N", "time_s", "attempt")
+    columns = {name: getattr(truth, name) for name in names}
+    return replace(truth, **{name: column[rows] for name, column in columns.items() if column is not None})
 
 
 _PLAYED = ("scenario", "seed")
@@ -312,35 +287,6 @@ def _played(truth: Path) -> dict[str, str]:
     return {key: str(value) for key, value in attached.items() if value is not None} | said
 
 
-@dataclass(frozen=True)
-class TrueContact:
-    """A true contact. onset, end: its first cycle and the first one without it. tau_ext (k, 2), cycle (k,): of both.
-
-    number: of the truth, from 1. Cycles are the emulator's, in the `attempt` of the run, from 0; `counted_from` makes
-    them the host's.
-    """
-
-    number: int
-    attempt: int
-    link: int
-    onset: int
-    end: int
-    tau_ext: Vector
-    cycle: Cycles
-
-    def counted_from(self, first_cycle: int) -> "TrueContact":
-        """Return it with the cycles of the host, for which the attempt begins with the given one."""
-        shift = int(whole_rounds(np.array(first_cycle)))
-        return replace(self, onset=self.onset + shift, end=self.end + shift, cycle=self.cycle + shift)
-
-
-class TrueContacts(NamedTuple):
-    """The true contacts of a run, in order, and of which cycles they are known."""
-
-    contacts: tuple[TrueContact, ...]
-    span: EmulatorSpan
-
-
 class HostCycles(NamedTuple):
     """Cycles of the host (k,): number, time, state of the cycle before, and threshold (k, 2)."""
 
@@ -350,8 +296,8 @@ class HostCycles(NamedTuple):
     threshold: Vector
 
 
-def windows_of(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TouchWindow]:
-    """Return those contacts, on the host's cycles, that begin before these end, as they are judged.
+def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TrueContact]:
+    """Return those contacts, with the host's cycles, that begin before these end, on the host's clock.
 
     host: has the cycles that each onset and each end lies between.
     """
@@ -363,28 +309,32 @@ def windows_of(contacts: Sequence[TrueContact], host: HostCycles, settings: Sett
     instants = [(contact.onset, contact.end) for contact in contacts]
     since_ns = np.rint(np.interp(instants, host.cycle, host.t_ns - host.t_ns[0])).astype(np.int64)
     rows = np.searchsorted(host.cycle, [contact.onset for contact in contacts]).tolist()
-    windows = []
+    placed = []
     for contact, row, (onset_ns, end_ns) in zip(contacts, rows, (since_ns + host.t_ns[0]).tolist(), strict=True):
         threshold = np.where(np.isfinite(host.threshold[row]), host.threshold[row], settings.detector.threshold_Nm)
-        after_s = forgotten_after_s(contact.tau_ext, contact.cycle, settings.bus.period_s, a_rad_s, threshold)
         before = host.before[row]
-        windows.append(
-            TouchWindow(
-                number=contact.number,
-                link=contact.link,
-                onset_ns=onset_ns,
-                forgotten_ns=end_ns + round(after_s * 1e9),
+        placed.append(
+            contact.placed(
+                (onset_ns, end_ns),
+                settings,
+                a_rad_s,
+                threshold,
                 is_armed=bool(before == SchemeState.MONITOR),
                 is_reacting=bool(is_interrupted(before)),
             )
         )
-    return windows
+    return placed
 
 
-def contacts_beside(path: Path, progress: Progress = lambda _: None) -> TrueContacts | None:
-    """Read the true contacts from the emulator's log in the same folder; None where there is none. Raises LogError.
+KnownContacts = tuple[tuple[TrueContact, ...], EmulatorSpan]
+"""The true contacts of a run, in order, and of which cycles they are known."""
 
-    The truth of another run is left out, and `progress` gets a line with the reason.
+
+def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownContacts | None:
+    """Read the true contacts from the emulator's log in the same folder, and of which cycles they are known.
+
+    None where there is none. The truth of another run is left out, and `progress` gets a line with the reason. Raises
+    LogError.
     """
     truth = path.with_name(TRUTH_NAME)
     if not truth.exists():
@@ -392,15 +342,5 @@ def contacts_beside(path: Path, progress: Progress = lambda _: None) -> TrueCont
     if problem := foreign_truth(path, truth):
         progress(f"{problem}; it is left out")
         return None
-    rows = read_truth(truth)
-    return None if rows.span is None else TrueContacts(_contacts(rows), rows.span)
-
-
-def _contacts(rows: TruthTable) -> tuple[TrueContact, ...]:
-    found = []
-    for number, (start, end) in enumerate(contact_bounds(rows.contact_index, rows.attempt), start=1):
-        stop = end + int(end < len(rows.cycle) and rows.attempt[end] == rows.attempt[start])  # the row after it
-        cycle = rows.cycle[start:stop]
-        link, tau_ext = int(rows.contact_link[start]), rows.tau_ext[start:stop]
-        found.append(TrueContact(number, int(rows.attempt[start]), link, int(cycle[0]), int(cycle[-1]), tau_ext, cycle))
-    return tuple(found)
+    table = read_truth(truth)
+    return None if table.span is None else (true_contacts(table.rows), table.span)

@@ -24,25 +24,36 @@ distribution", Biometrika 28 (1936).
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaincinv, gammaincinv
 
-from adacd_hil.log.logged_run import Cycles, Mask, Run, enters_react
+from adacd_hil.log.logged_run import Cycles, Mask, Run, Truth, enters_react, whole_rounds
 from adacd_hil.records import JOINTS, ContactReport, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
+from adacd_hil.settings.configuration import Settings
+
+Times = NDArray[np.int64]
 
 
-class Alarm(NamedTuple):
-    """An alarm. is_armed: raised by armed detection, which is in MONITOR; is_known: the truth covers that time."""
+@dataclass(frozen=True)
+class Detection:
+    """An alarm of a scheme. is_armed: raised by armed detection, in MONITOR; is_known: the truth covers that time.
+
+    row: of the run's cycles. first, last: its report at the alarm, and the newest one of the same contact; None
+    without a report.
+    """
 
     t_ns: int
     is_armed: bool
     is_known: bool = True
+    row: int = -1
+    first: ContactReport | None = None
+    last: ContactReport | None = None
 
 
 def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> NDArray[np.bool_]:
@@ -67,23 +78,41 @@ def share_bounds(found: int, count: int) -> tuple[float, float]:
     return low, high
 
 
-Times = NDArray[np.int64]
+@dataclass(frozen=True)
+class TrueContact:
+    """A true contact; then, on the clock of a run, when it explains alarms; then when it was detected.
 
+    number: of the truth, from 1. cycle (k,), tau_ext (k, 2), force_N, time_s (k,): of the truth's rows, of which the
+    first `rows` are of the contact; one more is the row after it, where the truth has that. Cycles are the
+    emulator's, in the `attempt` of the run, from 0; `counted_from` makes them the host's.
 
-class TouchWindow(NamedTuple):
-    """A true contact, and when it was detected.
-
-    forgotten_ns: until when it explains alarms. is_armed: detection was armed at its onset; is_reacting: the scheme
-    still reacted to something else then. detected_ns: None if no alarm found it.
+    onset_ns, forgotten_ns: from when until when it explains alarms. is_armed: detection was armed at its onset;
+    is_reacting: the scheme still reacted to something else then. detected_ns: None if no alarm found it.
     """
 
     number: int
     link: int
-    onset_ns: int
-    forgotten_ns: int
-    is_armed: bool
+    onset_ns: int = 0
+    forgotten_ns: int = 0
+    is_armed: bool = False
     is_reacting: bool = False
     detected_ns: int | None = None
+    attempt: int = 0
+    rows: int = 0
+    cycle: Times = field(default_factory=lambda: np.zeros(0, np.int64), compare=False, repr=False)
+    tau_ext: Vector = field(default_factory=lambda: np.zeros((0, JOINTS)), compare=False, repr=False)
+    force_N: Vector | None = field(default=None, compare=False, repr=False)
+    time_s: Vector | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def onset(self) -> int:
+        """Its first cycle."""
+        return int(self.cycle[0])
+
+    @property
+    def end(self) -> int:
+        """The first cycle without it; its last one where the truth ends with it."""
+        return int(self.cycle[-1])
 
     @property
     def delay_ms(self) -> float | None:
@@ -95,14 +124,38 @@ class TouchWindow(NamedTuple):
         """Whether detection was armed and did not find it."""
         return self.is_armed and self.detected_ns is None
 
+    def counted_from(self, first_cycle: int) -> "TrueContact":
+        """Return it with the cycles of the host, for which the attempt begins with the given one."""
+        return replace(self, cycle=self.cycle + int(whole_rounds(np.array(first_cycle))))
+
+    def placed(
+        self,
+        times_ns: tuple[int, int],
+        settings: Settings,
+        a_rad_s: float,
+        threshold: Vector,
+        is_armed: bool,
+        is_reacting: bool = False,
+    ) -> "TrueContact":
+        """Return it on the clock of a run; times_ns: of onset and end; a_rad_s, threshold (2,): the filter's."""
+        after_s = forgotten_after_s(self.tau_ext, self.cycle, settings.bus.period_s, a_rad_s, threshold)
+        onset_ns, end_ns = times_ns
+        return replace(
+            self,
+            onset_ns=onset_ns,
+            forgotten_ns=end_ns + round(after_s * 1e9),
+            is_armed=is_armed,
+            is_reacting=is_reacting,
+        )
+
 
 @dataclass(frozen=True)
 class Score:
     """True contacts in order with their detections, and false alarms; unjudged: alarms beyond the truth."""
 
-    contacts: tuple[TouchWindow, ...]
-    false_alarms: tuple[Alarm, ...]
-    unjudged: tuple[Alarm, ...] = ()
+    contacts: tuple[TrueContact, ...]
+    false_alarms: tuple[Detection, ...]
+    unjudged: tuple[Detection, ...] = ()
 
     @property
     def armed(self) -> int:
@@ -148,22 +201,22 @@ def owners(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times
     return np.asarray(np.where(at <= until[places], places, -1))
 
 
-def judge(touches: Sequence[TouchWindow], alarms: Sequence[Alarm], crossings_ns: Sequence[int] = ()) -> Score:
+def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossings_ns: Sequence[int] = ()) -> Score:
     """Judge alarms by true contacts, both in order.
 
     crossings_ns: when some threshold is first exceeded, of a scheme replayed on a motion that is not its own: while it
     still reacts, it can raise no alarm, and a crossing finds the contacts that begin meanwhile.
     """
-    onsets, until = _bounds(touches)
+    onsets, until = _bounds(contacts)
     about = owners(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
     found = _first(about, [alarm.t_ns for alarm in alarms])
     crossed = _first(owners(np.array(crossings_ns, np.int64), onsets, until).tolist(), crossings_ns)
-    for place, touch in enumerate(touches):
-        if touch.is_reacting and place in crossed:
+    for place, contact in enumerate(contacts):
+        if contact.is_reacting and place in crossed:
             found.setdefault(place, crossed[place])
     unexplained = [alarm for alarm, place in zip(alarms, about, strict=True) if place < 0]
     return Score(
-        _judged(touches, found),
+        _judged(contacts, found),
         tuple(alarm for alarm in unexplained if alarm.is_known),
         tuple(alarm for alarm in alarms if not alarm.is_known),
     )
@@ -173,35 +226,37 @@ class StreamJudge:
     """Judges a statistic that is compared with a threshold sample by sample but raises no alarm, piece by piece.
 
     The first sample over the threshold that is about a contact finds it. Samples about no contact are a false alarm;
-    a sample no more than `pause_ns` after the one before belongs to the same false alarm.
+    a sample no more than `pause_ns` after the one before belongs to the same false alarm. contacts: those that begin
+    before the end of the samples so far, and are known until then; each call may have more of them.
     """
 
-    def __init__(self, touches: Sequence[TouchWindow], pause_ns: int) -> None:
-        self._touches = touches
-        self._onsets, self._until = _bounds(touches)
+    def __init__(self, pause_ns: int) -> None:
         self._pause_ns = pause_ns
         self._found: dict[int, int] = {}
-        self._false: list[Alarm] = []
+        self._false: list[Detection] = []
         self._last_ns: int | None = None  # of the last sample that no contact explains
 
-    def add(self, t_ns: Times, is_over: NDArray[np.bool_], is_judged: NDArray[np.bool_]) -> None:
-        """Take in the next samples (n,). is_judged: where an alarm that no contact explains counts as false."""
+    def add_samples(
+        self, contacts: Sequence[TrueContact], t_ns: Times, is_over: NDArray[np.bool_], is_judged: NDArray[np.bool_]
+    ) -> None:
+        """Judge the next samples (n,). is_judged: where an alarm that no contact explains counts as false."""
         rows = np.flatnonzero(is_over)
-        about = owners(t_ns[rows], self._onsets, self._until)
+        about = owners(t_ns[rows], *_bounds(contacts))
         self._found = _first(about.tolist(), t_ns[rows].tolist()) | self._found
         false_ns = t_ns[rows[(about < 0) & is_judged[rows]]]
-        self._false += [Alarm(at, True) for at in false_ns[begins_of(false_ns, self._pause_ns, self._last_ns)].tolist()]
+        begins = begins_of(false_ns, self._pause_ns, self._last_ns)
+        self._false += [Detection(at_ns, True) for at_ns in false_ns[begins].tolist()]
         if len(false_ns):
             self._last_ns = int(false_ns[-1])
 
-    def score(self) -> Score:
+    def score(self, contacts: Sequence[TrueContact]) -> Score:
         """Judge all samples so far."""
-        return Score(_judged(self._touches, self._found), tuple(self._false))
+        return Score(_judged(contacts, self._found), tuple(self._false))
 
 
-def _bounds(touches: Sequence[TouchWindow]) -> tuple[Times, Times]:
-    onsets = np.array([touch.onset_ns for touch in touches], np.int64)
-    return onsets, explained_until(onsets, np.array([touch.forgotten_ns for touch in touches], np.int64))
+def _bounds(contacts: Sequence[TrueContact]) -> tuple[Times, Times]:
+    onsets = np.array([contact.onset_ns for contact in contacts], np.int64)
+    return onsets, explained_until(onsets, np.array([contact.forgotten_ns for contact in contacts], np.int64))
 
 
 def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
@@ -211,8 +266,8 @@ def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
     return first
 
 
-def _judged(touches: Sequence[TouchWindow], found: dict[int, int]) -> tuple[TouchWindow, ...]:
-    return tuple(touch._replace(detected_ns=found.get(place)) for place, touch in enumerate(touches))
+def _judged(contacts: Sequence[TrueContact], found: dict[int, int]) -> tuple[TrueContact, ...]:
+    return tuple(replace(contact, detected_ns=found.get(place)) for place, contact in enumerate(contacts))
 
 
 def rate_bound_per_h(alarms: int, hours: float) -> float:
@@ -263,61 +318,66 @@ def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: f
     return (1.0 + math.log(max(1.0, excess))) / a_rad_s
 
 
-class LoggedDetection(NamedTuple):
-    """An alarm of a run: its row, its time, and the report at the alarm and at the end of the window."""
-
-    row: int
-    detected_s: float
-    raised: Alarm
-    alarm: ContactReport | None
-    final: ContactReport | None
-
-
-def find_detections(run: Run) -> tuple[LoggedDetection, ...]:
+def find_detections(run: Run) -> tuple[Detection, ...]:
     """Find the alarms of a run and the reports that belong to them by their cycle."""
     rows = np.flatnonzero(enters_react(run.state[:-1], run.state[1:])) + 1
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
-    time_s = run.time_s()
     detections = []
     for row in rows.tolist():
         cycle = int(run.cycle[row])
         final = finals.get(cycle)
-        alarm = alarms.get(cycle, final)
-        if alarm is None and run.contact_joints is not None and not run.contact_joints[row]:
+        first = alarms.get(cycle, final)
+        if first is None and run.contact_joints is not None and not run.contact_joints[row]:
             continue
-        raised = Alarm(
-            int(run.t_ns[row]),
-            bool(run.state[row - 1] == SchemeState.MONITOR),
-            run.truth is None or run.truth.covers(cycle),
-        )
-        detections.append(LoggedDetection(row, float(time_s[row]), raised, alarm, final))
+        is_armed = bool(run.state[row - 1] == SchemeState.MONITOR)
+        is_known = run.truth is None or run.truth.covers(cycle)
+        detections.append(Detection(int(run.t_ns[row]), is_armed, is_known, row, first, final or first))
     return tuple(detections)
 
 
-class TruthTouch(NamedTuple):
-    """A true contact: its number, its rows [first, last] of the truth, and times since motion start."""
-
-    number: int
-    first: int
-    last: int
-    link: int
-    onset_s: float
-    end_s: float
-
-
-def true_contacts(run: Run) -> tuple[TruthTouch, ...]:
-    """Find the true contacts in the truth record; return () without one."""
-    truth = run.truth
-    if truth is None or truth.cycle.size == 0 or run.cycle.size == 0:
+def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueContact, ...]:
+    """Find the true contacts in a truth; return () without one."""
+    if truth is None:
         return ()
-    time_s, last = run.truth_time_s(), truth.cycle.size - 1
-    return tuple(
-        TruthTouch(
-            number, start, end - 1, int(truth.contact_link[start]), float(time_s[start]), float(time_s[min(end, last)])
+    found = []
+    bounds = contact_bounds(truth.contact_index, truth.attempt)
+    for number, (start, end) in enumerate(bounds, first_number):
+        has_after = end < len(truth.cycle) and (truth.attempt is None or truth.attempt[end] == truth.attempt[start])
+        rows = slice(start, end + int(has_after))
+        found.append(
+            TrueContact(
+                number=number,
+                link=int(truth.contact_link[start]),
+                attempt=0 if truth.attempt is None else int(truth.attempt[start]),
+                rows=end - start,
+                cycle=truth.cycle[rows],
+                tau_ext=truth.tau_ext[rows],
+                force_N=None if truth.force_N is None else truth.force_N[rows],
+                time_s=None if truth.time_s is None else truth.time_s[rows],
+            )
         )
-        for number, (start, end) in enumerate(contact_bounds(truth.contact_index, truth.attempt), run.first_contact)
+    return tuple(found)
+
+
+def contacts_of(run: Run) -> tuple[TrueContact, ...]:
+    """Find the true contacts of a run, on its clock, with the thresholds and the filter of its own scheme."""
+    if run.truth is None or run.cycle.size == 0:
+        return ()
+    truth = run.truth if run.truth.time_s is not None else replace(run.truth, time_s=run.time_of_s(run.truth.cycle))
+    armed = run.state == SchemeState.MONITOR
+    return tuple(
+        placed_in(run, contact, run.a_rad_s, None, armed) for contact in true_contacts(truth, run.first_contact)
     )
+
+
+def placed_in(run: Run, contact: TrueContact, a_rad_s: float, threshold: Vector | None, armed: Mask) -> TrueContact:
+    """Return a contact on the clock of a run. threshold: None: that in force; armed (n,): where detection is armed."""
+    assert contact.time_s is not None
+    ends_ns = [run.zero_ns + round(float(at_s) * 1e9) for at_s in contact.time_s[[0, -1]]]
+    row = row_at(run, float(contact.time_s[0]))
+    threshold = threshold_in(run, row) if threshold is None else threshold
+    return contact.placed((ends_ns[0], ends_ns[1]), run.settings, a_rad_s, threshold, bool(row > 0 and armed[row - 1]))
 
 
 def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
@@ -370,9 +430,8 @@ class FilterChannel:
         return filtered(response, cycle, period_s, self.smoothing_rad_s)
 
 
-def threshold_at(run: Run, time_s: float) -> Vector:
-    """Return the threshold of `tau_ext_hat` in force at a time, Nm (2,); the configured one where detection is off."""
-    row = row_at(run, time_s)
+def threshold_in(run: Run, row: int) -> Vector:
+    """Return the threshold of `tau_ext_hat` in force in a cycle, Nm (2,); the configured one where detection is off."""
     configured = np.array(run.settings.detector.threshold_Nm)
     return np.where(np.isfinite(run.threshold[row]), run.threshold[row], configured)
 
@@ -387,7 +446,7 @@ def row_at(run: Run, time_s: float) -> int:
 def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
     """Return the filters that detect at a time, with their thresholds: the paper's one, or the bank."""
     if run.certified is None:
-        return (FilterChannel(run.a_rad_s, None, threshold_at(run, time_s)),)
+        return (FilterChannel(run.a_rad_s, None, threshold_in(run, row_at(run, time_s))),)
     thresholds = run.certified.threshold[row_at(run, time_s)]
     return tuple(
         FilterChannel(cutoff, smoothing, threshold)
@@ -395,31 +454,9 @@ def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
     )
 
 
-def ideal_response(run: Run, touch: TruthTouch, channel: FilterChannel) -> Vector:
-    """Filter a contact's true torque by a channel, from its first row to the one after its last (k, 2)."""
-    truth = run.truth
-    assert truth is not None
-    rows = slice(touch.first, touch.last + 2)
-    return channel.respond(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s)
-
-
-def touch_window(run: Run, touch: TruthTouch, a_rad_s: float, threshold: Vector, armed: Mask) -> TouchWindow:
-    """Return a contact as it is judged; armed (n,): the cycles of the run in which detection is armed."""
-    truth = run.truth
-    assert truth is not None
-    rows = slice(touch.first, touch.last + 2)
-    after_s = forgotten_after_s(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s, a_rad_s, threshold)
-    row = row_at(run, touch.onset_s)
-    onset_ns, forgotten_ns = (run.zero_ns + round(at_s * 1e9) for at_s in (touch.onset_s, touch.end_s + after_s))
-    is_armed = bool(row > 0 and armed[row - 1])
-    return TouchWindow(touch.number, touch.link, onset_ns, forgotten_ns, is_armed)
-
-
-def judge_run(run: Run, touches: Sequence[TruthTouch], detections: Sequence[LoggedDetection]) -> Score:
+def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[Detection]) -> Score:
     """Judge the alarms of a run's own scheme."""
-    armed = run.state == SchemeState.MONITOR
-    windows = [touch_window(run, touch, run.a_rad_s, threshold_at(run, touch.onset_s), armed) for touch in touches]
-    return judge(windows, [detection.raised for detection in detections if not is_of_weight(run, detection.row)])
+    return judge(contacts, [detection for detection in detections if not is_of_weight(run, detection.row)])
 
 
 def is_of_weight(run: Run, row: int) -> bool:

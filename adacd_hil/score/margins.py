@@ -1,6 +1,7 @@
 """Sums over a run's cycles free of contact: residuals, margins, and the paper's scheme beside.
 
-Cycles are taken piece by piece, in order; a run in memory is one piece. A cycle is *free* unless it lies in
+Cycles come piece by piece, in order, each with an outline: a run that has all that happened so far, and a second or
+more beyond the piece. A run in memory is one piece, and its own outline. A cycle is *free* unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
 5 Nm. Without the truth, [detection - 10/a, detection + 10/a] stands for the contact. Cycles that the
 truth does not cover are not free. After the request to finish the
@@ -30,17 +31,9 @@ from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.detect import margin as detect_margin
 from adacd_hil.scheme.model.filter_bank import channels_of
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.score.judge import (
-    LoggedDetection,
-    StreamJudge,
-    TruthTouch,
-    find_detections,
-    touch_window,
-    true_contacts,
-)
+from adacd_hil.score.judge import StreamJudge, TrueContact, contacts_of, find_detections, placed_in
 from adacd_hil.score.metrics import (
     Beside,
-    BesideContact,
     CertifiedEvidence,
     ChannelMargin,
     ParameterEstimate,
@@ -69,76 +62,74 @@ def larger(largest: Vector | None, values: Vector) -> Vector | None:
 class BesideGatherer:
     """Gathers the results of the paper's scheme, piece by piece."""
 
-    def __init__(self, run: Run, sections: Sequence[Section], touches: Sequence[TruthTouch]) -> None:
-        assert run.beside is not None
-        a = run.settings.filter.a_rad_s
-        threshold = np.array(run.settings.detector.threshold_Nm)
-        time_s = run.time_s()
-        armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
-        windows = [touch_window(run, touch, a, threshold, armed) for touch in touches]
-        self._judge = StreamJudge(windows, round(SETTLING_TIME_CONSTANTS / a * 1e9))
-        self._zero_ns, self._has_truth = run.zero_ns, run.truth is not None
-        self._sections = sections
-        self._finish_cycle = run.finish_cycle
-        self._span = None if run.truth is None else run.truth.span
-        self._end_s = float(run.time_s()[-1]) if run.cycle.size else 0.0
-        self._adaptations = [
-            (section.label, section.start_s, _left_s(section, sections))
-            for section in sections
-            if section.kind == "adaptation"
-        ]
-        self._adaptation_s: dict[str, float | None] = dict.fromkeys(label for label, _, _ in self._adaptations)
-        self._largest: dict[str, Vector | None] = dict.fromkeys(
-            section.label for section in sections if section.kind == "detection"
-        )
+    def __init__(self, settings: Settings) -> None:
+        self._a_rad_s = settings.filter.a_rad_s
+        self._judge = StreamJudge(round(SETTLING_TIME_CONSTANTS / self._a_rad_s * 1e9))
+        self._adaptation_s: dict[str, float] = {}
+        self._largest: dict[str, Vector | None] = {}
 
-    def add(self, piece: Run, time_s: Vector, free: Mask) -> None:
-        """Take in the next cycles, at such times (n,); free: those free of contact (n,)."""
-        stream = piece.beside
+    def add_stream(self, piece: Run, outline: Run, sections: Sequence[Section], free: Mask) -> None:
+        """Take in the next cycles (n,); free: those free of contact (n,)."""
+        stream, time_s, end_s = piece.beside, piece.time_s(), float(outline.time_s()[-1])
         assert stream is not None
-        armed = stream.is_armed & ~_parked(time_s, self._sections, self._end_s)
+        armed = stream.is_armed & ~_parked(time_s, sections, end_s)
         over = armed & (np.abs(stream.tau_ext_hat) > stream.threshold).any(axis=1)
-        is_judged = np.ones(over.size, np.bool_) if self._span is None else self._span.covers(piece.cycle)
-        if self._finish_cycle is not None:
-            is_judged &= piece.cycle < self._finish_cycle
-        self._judge.add(piece.t_ns, over, is_judged)
-        for label, start_s, left_s in self._adaptations:
-            if self._adaptation_s[label] is None and start_s <= time_s[-1] and left_s >= time_s[0]:
+        is_judged = np.ones(over.size, np.bool_)
+        if outline.truth is not None and outline.truth.span is not None:
+            is_judged = outline.truth.span.covers(piece.cycle)
+        if outline.finish_cycle is not None:
+            is_judged &= piece.cycle < outline.finish_cycle
+        self._judge.add_samples(self._contacts(outline, sections), piece.t_ns, over, is_judged)
+        for section in sections:
+            if section.start_s > time_s[-1]:
+                break
+            if section.kind == "adaptation" and section.label not in self._adaptation_s:
                 # In the first cycle of ADAPT it still has its value of before.
-                rows = slice(np.searchsorted(time_s, start_s, "right"), np.searchsorted(time_s, left_s, "right"))
+                left_s = _left_s(section, sections)
+                rows = slice(
+                    np.searchsorted(time_s, section.start_s, "right"), np.searchsorted(time_s, left_s, "right")
+                )
                 first = np.flatnonzero(stream.is_armed[rows])
                 if first.size:
-                    self._adaptation_s[label] = float(time_s[rows][first[0]]) - start_s
-        for section in self._sections:
-            if section.label in self._largest and section.start_s <= time_s[-1] and section.end_s >= time_s[0]:
-                rows = rows_of(time_s, section, self._end_s)
+                    self._adaptation_s[section.label] = float(time_s[rows][first[0]]) - section.start_s
+            if section.kind == "detection" and section.end_s >= time_s[0]:
+                rows = rows_of(time_s, section, end_s)
                 values = stream.tau_ext_hat[rows][free[rows] & armed[rows]]
-                self._largest[section.label] = larger(self._largest[section.label], values)
+                self._largest[section.label] = larger(self._largest.get(section.label), values)
 
-    def beside(self) -> Beside:
-        """Return the sums over all cycles taken so far."""
-        score = self._judge.score()
-        zero_ns = self._zero_ns
-        false_s = tuple((alarm.t_ns - zero_ns) * 1e-9 for alarm in score.false_alarms)
+    def _contacts(self, run: Run, sections: Sequence[Section]) -> list[TrueContact]:
+        """Place the true contacts on the clock of a run, as the paper's scheme has them."""
+        assert run.beside is not None
+        time_s = run.time_s()
+        armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
+        threshold = np.array(run.settings.detector.threshold_Nm)
+        return [placed_in(run, contact, self._a_rad_s, threshold, armed) for contact in contacts_of(run)]
+
+    def beside(self, run: Run, sections: Sequence[Section]) -> Beside:
+        """Sum up all cycles; run: the outline of all of them."""
+        score = self._judge.score(self._contacts(run, sections))
+        has_truth = run.truth is not None
+        false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
+        labels = {kind: [section.label for section in sections if section.kind == kind] for kind in _LEARNT_OR_WATCHED}
         return Beside(
-            adaptation_s=self._adaptation_s,
-            frozen_residual_max_Nm={
-                label: None if values is None else (float(values[0]), float(values[1]))
-                for label, values in self._largest.items()
-            },
+            adaptation_s={label: self._adaptation_s.get(label) for label in labels["adaptation"]},
+            frozen_residual_max_Nm={label: _pair(self._largest.get(label)) for label in labels["detection"]},
             contacts=tuple(
-                BesideContact(
-                    contact.number,
-                    contact.is_armed,
-                    None if contact.detected_ns is None else (contact.detected_ns - zero_ns) * 1e-9,
-                    contact.delay_ms,
-                )
+                {
+                    "number": contact.number,
+                    "is_armed": contact.is_armed,
+                    "detected_s": None if contact.detected_ns is None else (contact.detected_ns - run.zero_ns) * 1e-9,
+                    "delay_ms": contact.delay_ms,
+                }
                 for contact in score.contacts
             ),
-            false_alarms=len(false_s) if self._has_truth else None,
-            false_alarms_s=false_s if self._has_truth else None,
-            missed=score.missed if self._has_truth else None,
+            false_alarms=len(false_s) if has_truth else None,
+            false_alarms_s=false_s if has_truth else None,
+            missed=score.missed if has_truth else None,
         )
+
+
+_LEARNT_OR_WATCHED = ("adaptation", "detection")
 
 
 def _left_s(adaptation: Section, sections: Sequence[Section]) -> float:
@@ -213,13 +204,13 @@ class MarginGatherer:
         self._share: Vector | None = None  # largest residual / threshold (channels, 2)
         self._thresholds = [[Distribution() for _ in range(JOINTS)] for _ in self._channels]
 
-    def add(self, tau_ext: Vector, threshold: Vector) -> None:
+    def add_residuals(self, tau_ext: Vector, threshold: Vector) -> None:
         """Take in cycles free of contact: residuals and thresholds (k, channels, 2), k > 0."""
         self._residual = larger(self._residual, tau_ext)
         self._share = larger(self._share, np.abs(tau_ext) / threshold)
         for place, distributions in enumerate(self._thresholds):
             for joint, distribution in enumerate(distributions):
-                distribution.add(threshold[:, place, joint])
+                distribution.add_values(threshold[:, place, joint])
 
     def margins(self) -> tuple[ChannelMargin, ...]:
         """Sum up each channel; return () before the first cycle."""
@@ -246,34 +237,32 @@ def _inverse(share: float) -> float:
 
 
 class UntouchedGatherer:
-    """Gathers pieces of a run, whose contacts, detections and sections are known."""
+    """Gathers the cycles of a run that are free of contact, piece by piece."""
 
-    def __init__(self, run: Run) -> None:
-        """Take from `run` when something begins or ends."""
-        self._sections = split_sections(run)
-        touches = true_contacts(run)
-        self._free = _Free(run, touches, find_detections(run))
-        self._end_s = float(run.time_s()[-1]) if run.cycle.size else 0.0
-        self._residuals: dict[str, _Largest] = {}
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._last_react_ns: int | None = None
+        self._residuals: dict[str, Residual] = {}
         self._margins: dict[str, MarginGatherer] = {}
         self._done: dict[str, tuple[ChannelMargin, ...]] = {}
-        self._push = PushGatherer(run.settings)
+        self._push = PushGatherer(settings)
         self._promotions = 0
         self._promoted = 0.0  # the count so far
-        self._beside = None if run.beside is None else BesideGatherer(run, self._sections, touches)
+        self._beside: BesideGatherer | None = None
 
-    def add(self, piece: Run) -> None:
+    def add_untouched(self, piece: Run, outline: Run) -> None:
         """Take in the next cycles."""
         if piece.cycle.size == 0:
             return
-        time_s = piece.time_s()
-        free = self._free.mask(piece, time_s)
-        for section in self._sections:
+        time_s, end_s = piece.time_s(), float(outline.time_s()[-1])
+        free = self._free(piece, outline)
+        sections = split_sections(outline)
+        for section in sections:
             if section.start_s > time_s[-1]:
                 break
-            if section.end_s < time_s[0] or section.kind not in ("adaptation", "detection"):
+            if section.end_s < time_s[0] or section.kind not in _LEARNT_OR_WATCHED:
                 continue
-            rows = rows_of(time_s, section, self._end_s)
+            rows = rows_of(time_s, section, end_s)
             self._add_residual(piece, section, rows, free[rows])
             if piece.certified is not None:
                 self._add_margin(piece, section, rows, free[rows])
@@ -281,30 +270,54 @@ class UntouchedGatherer:
                 self._close(section.label)
         if piece.certified is not None:
             self._count_promotions(piece.certified.promotions)
-        if self._beside is not None:
-            self._beside.add(piece, time_s, free)
+        if piece.beside is not None:
+            self._beside = self._beside or BesideGatherer(self._settings)
+            self._beside.add_stream(piece, outline, sections, free)
+
+    def _free(self, piece: Run, outline: Run) -> Mask:
+        """Mark the cycles (n,) of a piece that are free of contact."""
+        settling_ns = round(SETTLING_TIME_CONSTANTS / outline.a_rad_s * 1e9)
+        t_ns, truth, finish = piece.t_ns, outline.truth, outline.finish_cycle
+        free = np.ones(t_ns.size, dtype=np.bool_) if finish is None else piece.cycle < finish
+        if truth is None:
+            around = [(found.t_ns - settling_ns, found.t_ns + settling_ns) for found in find_detections(outline)]
+        else:
+            zero_ns = outline.zero_ns
+            spans_s = [contact.time_s[[0, -1]] for contact in contacts_of(outline) if contact.time_s is not None]
+            around = [(zero_ns + round(a * 1e9), zero_ns + round(b * 1e9) + settling_ns) for a, b in spans_s]
+            if truth.span is not None:
+                free &= truth.span.covers(piece.cycle)
+        for start_ns, end_ns in around:
+            free[np.searchsorted(t_ns, start_ns) : np.searchsorted(t_ns, end_ns, side="right")] = False
+        never = np.iinfo(np.int64).min // 2
+        reacted_ns = np.where(piece.state == SchemeState.REACT, t_ns, never)
+        reacted_ns[0] = max(reacted_ns[0], never if self._last_react_ns is None else self._last_react_ns)
+        last_ns = np.maximum.accumulate(reacted_ns)
+        self._last_react_ns = int(last_ns[-1])
+        return np.asarray(free & (t_ns - last_ns > settling_ns))
 
     def _add_residual(self, piece: Run, section: Section, rows: slice, free: Mask) -> None:
         is_frozen = section.kind == "detection"
         if is_frozen:
             free = free & (piece.state[rows] == SchemeState.MONITOR)
-        largest = self._residuals.setdefault(section.label, _Largest())
-        largest.cycles += int(free.sum())
+        before = self._residuals.get(section.label, Residual(None, None, 0))
+        identified, cad = before.identified, before.cad
         if is_frozen:
-            largest.identified = larger(largest.identified, piece.tau_ext_hat[rows][free])
+            identified = _larger_pair(identified, piece.tau_ext_hat[rows][free])
         if piece.has_cad:
-            largest.cad = larger(largest.cad, piece.tau_ext_hat_cad[rows][free])
+            cad = _larger_pair(cad, piece.tau_ext_hat_cad[rows][free])
+        self._residuals[section.label] = Residual(identified, cad, before.cycles + int(free.sum()))
 
     def _add_margin(self, piece: Run, section: Section, rows: slice, free: Mask) -> None:
         assert piece.certified is not None
         threshold = piece.certified.threshold[rows]
         chosen = free & np.isfinite(threshold).all(axis=(1, 2))
         if chosen.any():
-            margin = self._margins.setdefault(section.label, MarginGatherer(piece.settings))
-            margin.add(piece.certified.tau_ext[rows][chosen], threshold[chosen])
+            margin = self._margins.setdefault(section.label, MarginGatherer(self._settings))
+            margin.add_residuals(piece.certified.tau_ext[rows][chosen], threshold[chosen])
         armed = chosen & (piece.state[rows] == SchemeState.MONITOR)
         if armed.any():
-            self._push.add(piece.certified.tau_ext[rows][armed], threshold[armed])
+            self._push.add_residuals(piece.certified.tau_ext[rows][armed], threshold[armed])
 
     def _close(self, label: str) -> None:
         """Sum up a section that is complete: its values need not be kept."""
@@ -316,61 +329,23 @@ class UntouchedGatherer:
         self._promotions += int(np.maximum(steps, 0.0).sum())
         self._promoted = float(promotions[-1])
 
-    def gathered(self) -> Untouched:
-        """Return the sums over all cycles taken so far."""
+    def untouched(self, run: Run) -> Untouched:
+        """Sum up all cycles; run: the outline of all of them."""
         for label in list(self._margins):
             self._close(label)
-        labels = [section.label for section in self._sections]
-        residuals = {label: self._residuals[label].residual() for label in labels if label in self._residuals}
-        margins = {label: self._done[label] for label in labels if label in self._done}
-        beside = None if self._beside is None else self._beside.beside()
+        sections = split_sections(run)
+        residuals = {each.label: self._residuals[each.label] for each in sections if each.label in self._residuals}
+        margins = {each.label: self._done[each.label] for each in sections if each.label in self._done}
+        beside = None if self._beside is None else self._beside.beside(run, sections)
         return Untouched(residuals, margins, self._promotions, beside, self._push.smallest_push())
-
-
-class _Largest:
-    """Of a section: the largest residuals so far, over how many cycles."""
-
-    def __init__(self) -> None:
-        self.identified: Vector | None = None
-        self.cad: Vector | None = None
-        self.cycles = 0
-
-    def residual(self) -> Residual:
-        return Residual(_pair(self.identified), _pair(self.cad), self.cycles)
 
 
 def _pair(values: Vector | None) -> tuple[float, float] | None:
     return None if values is None else (float(values[0]), float(values[1]))
 
 
-class _Free:
-    """Tells which cycles are free of contact, piece by piece."""
-
-    def __init__(self, run: Run, touches: Sequence[TruthTouch], detections: Sequence[LoggedDetection]) -> None:
-        self._settling_s = SETTLING_TIME_CONSTANTS / run.a_rad_s
-        if run.truth is None:
-            around = [(d.detected_s - self._settling_s, d.detected_s + self._settling_s) for d in detections]
-        else:
-            around = [(touch.onset_s, touch.end_s + self._settling_s) for touch in touches]
-        self._windows = np.array(around).reshape(-1, 2)
-        self._span = None if run.truth is None else run.truth.span
-        self._finish_cycle = run.finish_cycle
-        self._last_react_s = -np.inf
-
-    def mask(self, piece: Run, time_s: Vector) -> Mask:
-        """Mark the cycles (n,) of a piece, at such times (n,)."""
-        finish = self._finish_cycle
-        free = np.ones(time_s.size, dtype=np.bool_) if finish is None else piece.cycle < finish
-        if self._span is not None:
-            free &= self._span.covers(piece.cycle)
-        is_here = (self._windows[:, 0] <= time_s[-1]) & (self._windows[:, 1] >= time_s[0])
-        for start_s, end_s in self._windows[is_here].tolist():
-            free[np.searchsorted(time_s, start_s) : np.searchsorted(time_s, end_s, side="right")] = False
-        reacted_s = np.where(piece.state == SchemeState.REACT, time_s, -np.inf)
-        reacted_s[0] = max(reacted_s[0], self._last_react_s)
-        last_react_s = np.maximum.accumulate(reacted_s)
-        self._last_react_s = float(last_react_s[-1])
-        return np.asarray(free & (time_s - last_react_s > self._settling_s))
+def _larger_pair(largest: tuple[float, float] | None, values: Vector) -> tuple[float, float] | None:
+    return _pair(larger(None if largest is None else np.array(largest), values))
 
 
 class PushGatherer:
@@ -383,15 +358,15 @@ class PushGatherer:
         self._share = np.zeros((self._shown.size, JOINTS))  # largest of residual over threshold
         self._push, self._threshold = ([Distribution() for _ in range(JOINTS)] for _ in range(2))
 
-    def add(self, tau_ext: Vector, threshold: Vector) -> None:
+    def add_residuals(self, tau_ext: Vector, threshold: Vector) -> None:
         """Take in residuals and thresholds (k, channels, 2), k > 0."""
         push = np.zeros((len(tau_ext), JOINTS))
         _fill(tau_ext, threshold, self._shown, push)
         in_force = threshold.min(axis=1)
         self._share = np.maximum(self._share, (np.abs(tau_ext) / threshold).max(axis=0))
         for joint in range(JOINTS):
-            self._push[joint].add(push[:, joint])
-            self._threshold[joint].add(in_force[:, joint])
+            self._push[joint].add_values(push[:, joint])
+            self._threshold[joint].add_values(in_force[:, joint])
 
     def smallest_push(self) -> SmallestPush | None:
         """Sum up; return None before the first cycle."""

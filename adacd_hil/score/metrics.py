@@ -156,25 +156,16 @@ class SmallestPush:
 
 
 @dataclass(frozen=True)
-class BesideContact:
-    """A true contact as the paper's scheme would have seen it; number as in the list of contacts."""
-
-    number: int
-    is_armed: bool
-    detected_s: float | None
-    delay_ms: float | None
-
-
-@dataclass(frozen=True)
 class Beside:
     """The results of the paper's scheme beside, by the definitions of the module's first lines.
 
-    Without the truth there are no contacts, and false alarms and misses are None.
+    contacts: of each true contact `number`, as in the list of contacts, `is_armed`, `detected_s`, `delay_ms`. Without
+    the truth there are no contacts, and false alarms and misses are None.
     """
 
     adaptation_s: dict[str, float | None]
     frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
-    contacts: tuple[BesideContact, ...]
+    contacts: tuple[dict[str, Any], ...]
     false_alarms: int | None
     false_alarms_s: tuple[float, ...] | None
     missed: int | None
@@ -295,7 +286,8 @@ class ReportedContact:
     state: of the scheme at the onset, on a real arm at the detection.
     law_ms: closed-form delay of a step of the largest torque up to the detection, the faster joint; None if never.
     ideal_ms: delay that the filter alone gives to the true torque as it was; None if never.
-    link_at_alarm, link_detected: isolated at detection and at the end of the isolation window.
+    link_at_alarm, link_detected: isolated at detection and at the end of the isolation window. link_ok: somebody
+    touched that link at some time until then.
     torque_error_ratio: peak with the filter undone over the true peak, at the joint with the larger true torque.
     true_force_N: size of the true force, at whatever angle.
     level to blind_deg: of the last report, in the names of `records`; None where it has no value. A sigma is a
@@ -315,6 +307,7 @@ class ReportedContact:
     ideal_ms: float | None = None
     link_at_alarm: int | None = None
     link_detected: int | None = None
+    link_ok: bool | None = None
     direction: tuple[int, int] | None = None
     direction_ok: bool | None = None
     tau_ext_Nm: tuple[float, float] | None = None

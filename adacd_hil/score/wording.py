@@ -101,7 +101,7 @@ def score_sentence(score: Score) -> str:
     delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
     within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
     if not armed:
-        found = "no contact while detection was armed"
+        found = "no contact while the arm was watched"
     elif score.missed:
         found = f"{len(delays_ms)} of {number_of(len(armed), 'contact')} detected{within}, {score.missed} missed"
     else:
@@ -110,7 +110,7 @@ def score_sentence(score: Score) -> str:
     if not armed and not score.false_alarms:
         false = "no false alarm"
     disarmed = [contact for contact in score.contacts if not contact.is_armed]
-    outside = f", {len(disarmed)} more while it was not armed" if disarmed else ""
+    outside = f", {len(disarmed)} more while it was not watched" if disarmed else ""
     early = sum(contact.detected_ns is not None for contact in disarmed)
     outside += f" ({early} of them detected)" if early else ""
     return f"{found}{outside}, {false}"

@@ -24,36 +24,41 @@ included; errors on the bus are left out.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import NamedTuple
 
+from cantools.database.can import Message
+
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.contract_frames import (
-    ASSUMED_INTERVAL_MS,
+    EMERGENCY_ID,
+    HEARTBEAT_ID,
+    HOST_HEARTBEAT,
     NMT_ID,
-    ContractFrame,
-    ContractTiming,
-    Trigger,
-    read_contract,
-    share_bus,
+    NODE_MASK,
+    SYNC_ID,
+    move_id,
+    read_attribute,
 )
-from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FrameBits, unstuffed_frame, worst_case_frame
+from adacd_hil.wire.frame_lengths import FrameBits, unstuffed_frame, worst_case_frame
 
+ASSUMED_INTERVAL_MS = 100
+"""Interval of an event frame without a declared one: the usual heartbeat period."""
 HORIZON_NS = 1_000_000_000
 """Longest busy period that is followed; response times after it count as unbounded."""
 
 
 class Stream(NamedTuple):
-    """Frames of one message: time on the bus, smallest interval between two, release jitter."""
+    """Frames of one message: time on the bus, smallest interval between two."""
 
     duration_ns: int
     interval_ns: int
-    jitter_ns: int = 0
 
     def arrivals(self, window_ns: int) -> int:
-        """Most frames that can be queued within a window: ceil((window + J) / T)."""
-        return -(-(window_ns + self.jitter_ns) // self.interval_ns)
+        """Most frames that can be queued within a window: ceil(window / T)."""
+        return -(-window_ns // self.interval_ns)
 
 
 class ResponseTime(NamedTuple):
@@ -90,7 +95,7 @@ def response_time(
             if longer_ns == waiting_ns:
                 break
             waiting_ns = longer_ns
-        worst_ns = max(worst_ns, stream.jitter_ns + waiting_ns - instance * stream.interval_ns + stream.duration_ns)
+        worst_ns = max(worst_ns, waiting_ns - instance * stream.interval_ns + stream.duration_ns)
     return ResponseTime(worst_ns)
 
 
@@ -115,7 +120,7 @@ def _exceeded(stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns
     instance = 0
     while worst_ns <= limit_ns and instance * stream.interval_ns <= HORIZON_NS:
         longer_ns = _waiting(stream, higher, blocking_ns, bit_ns, instance, waiting_ns)
-        worst_ns = max(worst_ns, stream.jitter_ns + longer_ns - instance * stream.interval_ns + stream.duration_ns)
+        worst_ns = max(worst_ns, longer_ns - instance * stream.interval_ns + stream.duration_ns)
         if longer_ns == waiting_ns:
             instance += 1
             longer_ns += stream.duration_ns
@@ -131,17 +136,49 @@ class LoadCase(Enum):
     EMERGENCIES = "emergencies"
 
 
+class Trigger(Enum):
+    """When a frame is sent; the DBC's `Trigger`."""
+
+    SYNC = "sync"
+    COMMAND = "command"
+    EVENT = "event"
+    REQUEST = "request"
+
+
 @dataclass(frozen=True)
 class FrameBudget:
-    """Bits, durations, deadline and response times of a message."""
+    """Identifier, bits, durations, deadline and response times of a message; deadline None: it has none."""
 
-    frame: ContractFrame
+    name: str
+    can_id: int
+    is_extended: bool
+    length: int
+    trigger: Trigger
     unstuffed: FrameBits
     worst: FrameBits
     duration_ns: int
     interval_ns: int
+    """Smallest interval between two of them that the budget assumes."""
     deadline_ns: int | None
-    responses: dict[LoadCase, ResponseTime]
+    has_interval: bool
+    """Whether an inhibit or cycle time bounds its rate; heartbeats always have one."""
+    responses: dict[LoadCase, ResponseTime] = field(default_factory=dict)
+
+    @property
+    def priority(self) -> tuple[int, int]:
+        """Arbitration order; lower wins. A base frame wins over an extended one with the same first 11 bits."""
+        return (self.can_id >> 18, 1 + (self.can_id & 0x3FFFF)) if self.is_extended else (self.can_id, 0)
+
+    @property
+    def is_cyclic(self) -> bool:
+        """Whether it is sent on every SYNC."""
+        return self.trigger in (Trigger.SYNC, Trigger.COMMAND)
+
+    @property
+    def is_emergency(self) -> bool:
+        """Whether it is a CiA 301 EMCY."""
+        is_emcy_id = _function(self.can_id, self.is_extended) == EMERGENCY_ID and self.can_id != SYNC_ID
+        return is_emcy_id and self.trigger is Trigger.EVENT
 
     def late_ns(self, traffic: LoadCase = LoadCase.OPERATION) -> int:
         """Time by which its response misses the deadline (at least, if unbounded); 0: in time."""
@@ -155,19 +192,21 @@ class FrameBudget:
 class Budget:
     """Budget of a contract at a period and bit rates. Times in ns, at worst-case stuffing."""
 
-    contract: ContractTiming
+    name: str
+    arms: int
+    """Number of arms on the bus, each with its host."""
     period_us: int
     bitrate: int
     data_bitrate: int
     frames: tuple[FrameBudget, ...]
 
     def _sum_ns(self, *triggers: Trigger) -> int:
-        return sum(entry.duration_ns for entry in self.frames if entry.frame.trigger in triggers)
+        return sum(entry.duration_ns for entry in self.frames if entry.trigger in triggers)
 
     @property
     def cyclic(self) -> tuple[FrameBudget, ...]:
         """Frames that are sent in every cycle."""
-        return tuple(entry for entry in self.frames if entry.frame.is_cyclic)
+        return tuple(entry for entry in self.frames if entry.is_cyclic)
 
     @property
     def unstuffed_bits(self) -> int:
@@ -202,7 +241,7 @@ class Budget:
     @property
     def longest_event_ns(self) -> int:
         """Duration of the longest event frame, which can delay SYNC, feedback and commands."""
-        events = [e.duration_ns for e in self.frames if e.frame.trigger is Trigger.EVENT and not e.frame.is_emergency]
+        events = [e.duration_ns for e in self.frames if e.trigger is Trigger.EVENT and not e.is_emergency]
         return max(events, default=0)
 
     @property
@@ -230,13 +269,13 @@ class Budget:
     @property
     def line(self) -> str:
         """The verdict in one line."""
-        where = f"{self.contract.name} at {self.period_us} µs"
+        where = f"{self.name} at {self.period_us} µs"
         if self.is_fit:
             return f"{where} fits: {us(self.cyclic_ns)} µs of cyclic frames, {us(self.host_ns)} µs left for the host"
         reasons = []
         if self.host_ns < 0:
             reasons.append(f"the cyclic frames need {us(self.cyclic_ns)} µs, {us(-self.host_ns)} µs too many")
-        first, *more = sorted(self.late, key=lambda entry: (not entry.frame.is_cyclic, -entry.late_ns()))
+        first, *more = sorted(self.late, key=lambda entry: (not entry.is_cyclic, -entry.late_ns()))
         reasons.append(_describe_late(first, LoadCase.OPERATION) + (f", {len(more)} more miss theirs" if more else ""))
         return f"{where} doesn't fit: {'; '.join(reasons)}"
 
@@ -246,12 +285,12 @@ class Budget:
         notes = []
         if self.longest_event_ns:
             notes.append(f"each event frame in the way takes up to {us(self.longest_event_ns)} µs of the host's time")
-        if any(entry.frame.trigger is Trigger.REQUEST for entry in self.frames):
-            whose = "one SDO" if self.contract.arms == 1 else "one SDO of each host"
+        if any(entry.trigger is Trigger.REQUEST for entry in self.frames):
+            whose = "one SDO" if self.arms == 1 else "one SDO of each host"
             notes.append(f"{whose} in every cycle: {self._describe_traffic(LoadCase.REQUESTS)}")
-        if any(entry.frame.is_emergency for entry in self.frames):
+        if any(entry.is_emergency for entry in self.frames):
             notes.append(f"and every EMCY at once: {self._describe_traffic(LoadCase.EMERGENCIES)}")
-        open_ended = [entry.frame for entry in self.frames if not entry.frame.has_interval]
+        open_ended = [entry for entry in self.frames if not entry.has_interval]
         if open_ended:
             notes.append(
                 f"event frames without inhibit time (GenMsgDelayTime): {len(open_ended)}. Nothing bounds how often "
@@ -265,7 +304,7 @@ class Budget:
         last = max(self.cyclic, key=lambda entry: entry.responses[traffic].time_ns)
         if last.late_ns(traffic):
             return _describe_late(last, traffic)
-        return f"in time, {last.frame.name} within {us(last.responses[traffic].time_ns)} µs"
+        return f"in time, {last.name} within {us(last.responses[traffic].time_ns)} µs"
 
 
 def us(time_ns: int) -> str:
@@ -277,7 +316,18 @@ def _describe_late(entry: FrameBudget, traffic: LoadCase) -> str:
     response = entry.responses[traffic]
     about = "" if response.is_bounded else "at least "
     deadline_ns = entry.deadline_ns or 0
-    return f"{entry.frame.name} misses its deadline of {us(deadline_ns)} µs by {about}{us(entry.late_ns(traffic))} µs"
+    return f"{entry.name} misses its deadline of {us(deadline_ns)} µs by {about}{us(entry.late_ns(traffic))} µs"
+
+
+def describe_excess(codec: Codec, settings: Settings) -> str:
+    """Describe how the frames of a contract miss their deadlines in the configured period; "" if they meet them.
+
+    A DBC without attribute Trigger can't be judged.
+    """
+    if b'"Trigger"' not in codec.text:
+        return ""
+    budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
+    return "" if budget.is_fit else f"contract {codec.path.stem}: {budget.line}"
 
 
 def check_budget(
@@ -291,47 +341,92 @@ def check_budget(
 
     Period in µs and rates in bit/s default to the DBC's own. Raises CodecError.
     """
-    contract = share_bus(read_contract(codec.text, codec.path.name), arms)
-    return find_budget(contract, period_us, bitrate, data_bitrate)
-
-
-def find_budget(
-    contract: ContractTiming, period_us: int | None = None, bitrate: int | None = None, data_bitrate: int | None = None
-) -> Budget:
-    """Compute the budget of a contract; see `check_budget`."""
-    period_us = _given(contract, "BusPeriod_us", period_us, contract.period_us)
-    bitrate = _given(contract, "Baudrate", bitrate, contract.bitrate)
-    is_fd = any(frame.length > CLASSIC_BYTES for frame in contract.frames)
-    data_bitrate = _given(contract, "BaudrateCANFD", data_bitrate, contract.data_bitrate) if is_fd else 0
-    period_ns = period_us * 1000
-    entries = []
-    for frame in contract.frames:
-        try:
-            worst = worst_case_frame(frame.length, frame.is_extended)
-        except ValueError as error:
-            raise CodecError(f"DBC {contract.name}: {frame.name}: {error}") from None
-        unstuffed = unstuffed_frame(frame.length, frame.is_extended)
-        duration_ns = worst.duration_ns(bitrate, data_bitrate)
-        interval_ns, deadline_ns = frame.interval_ns(period_ns), frame.deadline_ns(period_ns)
-        entries.append(FrameBudget(frame, unstuffed, worst, duration_ns, interval_ns, deadline_ns, {}))
+    name, dbc = codec.path.name, codec.database.dbc
+    if dbc is None or "Trigger" not in dbc.attribute_definitions:
+        raise CodecError(f"DBC {name} has no attribute Trigger, which tells when messages are sent")
+    period_us = _given(codec, "BusPeriod_us", period_us)
+    bitrate = _given(codec, "Baudrate", bitrate)
+    data_bitrate = _given(codec, "BaudrateCANFD", data_bitrate) if codec.is_fd else 0
+    one = [_read_frame(message, name, period_us * 1000, bitrate, data_bitrate) for message in codec.database.messages]
+    entries = sorted(_share_bus(one, name, arms), key=lambda entry: entry.priority)
     bit_ns = FrameBits(1).duration_ns(bitrate)
     for place, entry in enumerate(entries):
         for traffic in LoadCase:
-            entry.responses[traffic] = _respond(entries, place, traffic, bit_ns, period_ns, contract.arms)
-    return Budget(contract, period_us, bitrate, data_bitrate, tuple(entries))
+            entry.responses[traffic] = _respond(entries, place, traffic, bit_ns, period_us * 1000, arms)
+    return Budget(name if arms == 1 else f"{arms} × {name}", arms, period_us, bitrate, data_bitrate, tuple(entries))
 
 
-def _given(contract: ContractTiming, attribute: str, chosen: int | None, declared: int) -> int:
-    value = declared if chosen is None else chosen
+def _given(codec: Codec, attribute: str, chosen: int | None) -> int:
+    value = int(read_attribute(codec.database, attribute)) if chosen is None else chosen
     if value <= 0:
-        raise CodecError(f"DBC {contract.name} has no {attribute}, and none is given")
+        raise CodecError(f"DBC {codec.path.name} has no {attribute}, and none is given")
     return value
 
 
+def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, data_bitrate: int) -> FrameBudget:
+    choices = list(message.dbc.attribute_definitions["Trigger"].choices or ()) if message.dbc else []
+    value = read_attribute(message, "Trigger")
+    chosen = choices[value] if isinstance(value, int) and 0 <= value < len(choices) else value
+    try:
+        trigger = Trigger(chosen)
+    except ValueError:
+        known = ", ".join(trigger.value for trigger in Trigger)
+        raise CodecError(f"DBC {contract}: {message.name}: Trigger = {chosen!r}; known: {known}") from None
+    cycle_ms, inhibit_ms = (int(read_attribute(message, f"GenMsg{name}Time")) for name in ("Cycle", "Delay"))
+    length, is_extended = message.length, message.is_extended_frame
+    worst = worst_case_frame(length, is_extended)
+    interval_ns, deadline_ns = period_ns, period_ns if trigger is not Trigger.REQUEST else None
+    if trigger is Trigger.EVENT:
+        interval_ns = (inhibit_ms or cycle_ms or ASSUMED_INTERVAL_MS) * 1_000_000
+        deadline_ns = cycle_ms * 1_000_000 or None
+    return FrameBudget(
+        message.name,
+        message.frame_id,
+        is_extended,
+        length,
+        trigger,
+        unstuffed_frame(length, is_extended),
+        worst,
+        worst.duration_ns(bitrate, data_bitrate),
+        interval_ns,
+        deadline_ns,
+        trigger is not Trigger.EVENT or inhibit_ms > 0 or _function(message.frame_id, is_extended) == HEARTBEAT_ID,
+    )
+
+
+def _function(can_id: int, is_extended: bool) -> int:
+    """Return the function code of the predefined connection set; -1 for an extended frame."""
+    return -1 if is_extended else can_id & ~NODE_MASK
+
+
+def _share_bus(frames: list[FrameBudget], contract: str, arms: int) -> list[FrameBudget]:
+    """Return the frames of several arms of one contract on a bus, for any order of the arms.
+
+    The devices' node ids follow each other from 1, the hosts' go down from the contract's. Raises CodecError for an
+    identifier without node id.
+    """
+    if arms == 1:
+        return frames
+    nodes = {f.can_id & NODE_MASK for f in frames if f.name != HOST_HEARTBEAT and f.can_id & NODE_MASK}
+    first, step = min(nodes, default=1), max(nodes, default=1) - min(nodes, default=1) + 1
+    common = [frame for frame in frames if not (frame.is_extended or frame.can_id & NODE_MASK)]
+    shared = list(common)
+    for arm in range(arms):
+        for frame in frames:
+            if frame in common:
+                continue
+            if frame.name == HOST_HEARTBEAT:
+                can_id = frame.can_id - arm
+            else:
+                can_id = move_id(frame.can_id, 1 - first + arm * step, 0, f"DBC {contract}: {frame.name}")
+            shared.append(replace(frame, name=f"Arm{arm + 1}.{frame.name}", can_id=can_id, responses={}))
+    return shared
+
+
 def _is_sent(entry: FrameBudget, traffic: LoadCase) -> bool:
-    if entry.frame.trigger is Trigger.REQUEST:
-        return traffic is not LoadCase.OPERATION and entry.frame.can_id != NMT_ID
-    return not entry.frame.is_emergency or traffic is LoadCase.EMERGENCIES
+    if entry.trigger is Trigger.REQUEST:
+        return traffic is not LoadCase.OPERATION and entry.can_id != NMT_ID
+    return not entry.is_emergency or traffic is LoadCase.EMERGENCIES
 
 
 def _respond(
@@ -341,10 +436,10 @@ def _respond(
     entry = entries[place]
     above = [other for other in entries[:place] if _is_sent(other, traffic)]
     below = [other for other in entries[place + 1 :] if _is_sent(other, traffic)]
-    if entry.frame.trigger is Trigger.REQUEST:
-        above, below = ([o for o in part if o.frame.trigger is not Trigger.REQUEST] for part in (above, below))
-    higher = [Stream(o.duration_ns, o.interval_ns) for o in above if o.frame.trigger is not Trigger.REQUEST]
-    request_ns = max((o.duration_ns for o in above if o.frame.trigger is Trigger.REQUEST), default=0)
+    if entry.trigger is Trigger.REQUEST:
+        above, below = ([o for o in part if o.trigger is not Trigger.REQUEST] for part in (above, below))
+    higher = [Stream(o.duration_ns, o.interval_ns) for o in above if o.trigger is not Trigger.REQUEST]
+    request_ns = max((o.duration_ns for o in above if o.trigger is Trigger.REQUEST), default=0)
     if request_ns:
         higher.extend([Stream(request_ns, period_ns)] * hosts)
     blocking_ns = max((o.duration_ns for o in below), default=0)

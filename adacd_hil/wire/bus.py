@@ -166,7 +166,7 @@ def take_first(received: deque[Frame], most: int) -> list[Frame]:
 
 
 class Tap(Bus):
-    """Records the frames of a bus; `take` returns those since the last call, oldest first, with True for sent ones.
+    """Records the frames of a bus; `take_passed` returns those since the last call, oldest first, True for sent ones.
 
     `held_ns`, if set, is the stamp of sent frames instead of a new reading of the clock.
     """
@@ -237,7 +237,7 @@ class Tap(Bus):
         """Put a received frame back; the next `receive` returns it."""
         self._unread = frame
 
-    def take(self) -> list[tuple[bool, Frame]]:
+    def take_passed(self) -> list[tuple[bool, Frame]]:
         """Return the frames recorded since the last call, and forget them."""
         passed, self._passed = self._passed, []
         return passed

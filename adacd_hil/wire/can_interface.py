@@ -84,7 +84,7 @@ class CanInterface:
             )
         return ""
 
-    def restart(self) -> None:
+    def take_down_and_up(self) -> None:
         """Take the interface down and up, which drops every frame in its queue and in its controller.
 
         Raises InterfaceDownError when it doesn't come up again, BusError with the command when it isn't permitted.

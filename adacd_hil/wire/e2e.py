@@ -179,16 +179,11 @@ class E2eReceiver:
         self.counts[E2eStatus.NO_NEW_DATA] += 1
         return E2eStatus.NO_NEW_DATA
 
-    @property
-    def rejected(self) -> int:
-        """Number of frames that were not valid."""
-        return sum(self.counts[s] for s in E2eStatus if not s.is_valid) - self.counts[E2eStatus.NO_NEW_DATA]
-
     def tally(self) -> list[tuple[E2eStatus, int]]:
         """Return the number of frames by status."""
         return list(zip(E2eStatus, self.counts, strict=True))
 
-    def restart(self) -> None:
+    def restart_sequence(self) -> None:
         """Forget the sequence: the next frame with a right CRC starts a new one. The counts stay."""
 
     def _judge(self, frame: bytes) -> E2eStatus:  # noqa: ARG002
@@ -205,9 +200,9 @@ class _SequenceReceiver(E2eReceiver):
         super().__init__()
         self._length = length
         self._tolerance = tolerance
-        self.restart()
+        self.restart_sequence()
 
-    def restart(self) -> None:
+    def restart_sequence(self) -> None:
         """Forget the sequence: the next frame with a right CRC starts a new one. The counts stay."""
         self._last: int | None = None
         self._missing = 0
@@ -250,9 +245,9 @@ class Profile2Receiver(_SequenceReceiver):
         super().__init__(length, tolerance)
         self._data_ids = data_ids
 
-    def restart(self) -> None:
+    def restart_sequence(self) -> None:
         """Forget the sequence: the next frame with a right CRC starts a new one. The counts stay."""
-        super().restart()
+        super().restart_sequence()
         self._max_delta = self._tolerance.max_delta
 
     @property

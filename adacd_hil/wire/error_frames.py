@@ -4,7 +4,6 @@ One frame may report several errors: the kind is the gravest of them, the text n
 """
 
 from enum import Enum
-from typing import NamedTuple
 
 from adacd_hil.wire.bus import Frame
 
@@ -89,22 +88,16 @@ _WIRES = {
 }
 
 
-class BusTrouble(NamedTuple):
-    """Content of an error frame. The controller's error counters are None if the frame has none."""
-
-    kind: TroubleKind
-    text: str
-    tx_errors: int | None = None
-    rx_errors: int | None = None
-
-
 def is_bus_off(frame: Frame) -> bool:
     """Return whether an error frame reports bus-off."""
     return bool(frame.can_id & _BUS_OFF)
 
 
-def decode_error(frame: Frame) -> BusTrouble:
-    """Decode an error frame; missing data bytes count as zero. Raises ValueError for other frames."""
+def decode_error(frame: Frame) -> tuple[TroubleKind, str]:
+    """Decode an error frame to its gravest kind and a text; missing data bytes count as zero.
+
+    Raises ValueError for other frames.
+    """
     if not frame.is_error:
         raise ValueError(f"frame 0x{frame.can_id:X} is not an error frame")
     data = frame.data.ljust(_DATA_BYTES, b"\0")
@@ -115,8 +108,8 @@ def decode_error(frame: Frame) -> BusTrouble:
     kind = min((kind for kind, _ in found), key=_GRAVITY.__getitem__)
     # Drivers older than the flag fill in the counters without it.
     if not frame.can_id & _COUNTERS and not any(data[6:8]):
-        return BusTrouble(kind, text)
-    return BusTrouble(kind, f"{text}; error counters: sending {data[6]}, receiving {data[7]}", data[6], data[7])
+        return kind, text
+    return kind, f"{text}; error counters: sending {data[6]}, receiving {data[7]}"
 
 
 def _of_controller(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:

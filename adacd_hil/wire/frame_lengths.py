@@ -48,17 +48,6 @@ class FrameBits(NamedTuple):
         return self.nominal / bitrate + (self.data / data_bitrate if self.data else 0.0)
 
 
-def unstuffed_bits(length: int, is_extended: bool = False) -> int:
-    """Return the bits of a classic frame with `length` bytes, without stuff bits. Raises ValueError over 8 bytes."""
-    return _stuffable_bits(length, is_extended) + TAIL_BITS
-
-
-def worst_case_bits(length: int, is_extended: bool = False) -> int:
-    """Return the most bits of a classic frame with `length` bytes. Raises ValueError over 8 bytes."""
-    stuffable = _stuffable_bits(length, is_extended)
-    return stuffable + TAIL_BITS + (stuffable - 1) // 4
-
-
 def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
     """Return the bits of a CAN FD frame, without dynamic stuff bits. Raises ValueError if no such frame exists."""
     if length not in FRAME_LENGTHS:
@@ -69,37 +58,30 @@ def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
     return FrameBits(fd_head_bits(is_extended) + _FD_TAIL_BITS, 5 + 8 * length + 4 + crc + fixed_stuff + 1)
 
 
-def worst_case_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the most bits of a CAN FD frame.
+def unstuffed_frame(length: int, is_extended: bool = False) -> FrameBits:
+    """Return the bits of a frame, classic up to 8 bytes, without content-dependent stuff bits. Raises ValueError."""
+    if length > CLASSIC_BYTES:
+        return unstuffed_fd_bits(length, is_extended)
+    return FrameBits(_stuffable_bits(length, is_extended) + TAIL_BITS)
 
-    Stuff bits from start of frame to the end of the data, as in a classic frame; as many of them as possible are
-    counted before the rate switch, where they take longest. Raises ValueError if no such frame exists.
+
+def worst_case_frame(length: int, is_extended: bool = False) -> FrameBits:
+    """Return the most bits of a frame, classic up to 8 bytes. Raises ValueError.
+
+    In CAN FD, stuff bits go from start of frame to the end of the data, as in a classic frame; as many of them as
+    possible are counted before the rate switch, where they take longest.
     """
-    plain = unstuffed_fd_bits(length, is_extended)
+    plain = unstuffed_frame(length, is_extended)
+    if length <= CLASSIC_BYTES:
+        return FrameBits(plain.nominal + (_stuffable_bits(length, is_extended) - 1) // 4)
     head = fd_head_bits(is_extended)
     stuff = (head + 5 + 8 * length - 1) // 4
     nominal_stuff = (head - 1) // 4
     return FrameBits(plain.nominal + nominal_stuff, plain.data + stuff - nominal_stuff)
 
 
-def unstuffed_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the bits of a frame, classic up to 8 bytes, without content-dependent stuff bits. Raises ValueError."""
-    if length > CLASSIC_BYTES:
-        return unstuffed_fd_bits(length, is_extended)
-    return FrameBits(unstuffed_bits(length, is_extended))
-
-
-def worst_case_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the most bits of a frame, classic up to 8 bytes. Raises ValueError."""
-    if length > CLASSIC_BYTES:
-        return worst_case_fd_bits(length, is_extended)
-    return FrameBits(worst_case_bits(length, is_extended))
-
-
 def _stuffable_bits(length: int, is_extended: bool) -> int:
-    """Return the bits from start of frame to CRC."""
-    if not 0 <= length <= CLASSIC_BYTES:
-        raise ValueError(f"a classic frame can't have {length} bytes, at most {CLASSIC_BYTES}")
+    """Return the bits of a classic frame from start of frame to CRC."""
     return (54 if is_extended else 34) + 8 * length
 
 

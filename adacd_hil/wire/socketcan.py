@@ -238,7 +238,7 @@ class SocketCanBus(Bus):
             self._is_down = True  # not noticed before, so no frame was sent since
         may_hold = self._interface.waiting_frames() > 0 or not (self._is_down or self._interface.is_virtual)
         if may_hold and not (self._is_shared and self._carries_frames()):
-            self._interface.restart()
+            self._interface.take_down_and_up()
         self._retire_socket()
         self._is_down = True  # should it not open
         self._open()

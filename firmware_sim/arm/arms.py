@@ -16,8 +16,7 @@ The host's a₁ = α + γ, a₂ = β, a₃ = γ appear in the truth record only.
 
 An arm of one's own stands in place of a profile: section `[own_arm]` of a scenario. It also says how its devices are
 wired: the joint, the direction and the counts of each, in the counts of the host's configuration.
-Places 1 and 2 are those of the contract's names, Drive1 and Drive2, Sensor1 and Sensor2. Pairs are by joint, or by
-place where they are about devices.
+Places 1 and 2 are those of the contract's names, Drive1 and Drive2, Sensor1 and Sensor2.
 """
 
 import math
@@ -36,84 +35,13 @@ STOP_DAMPING_NM_S: Final = (10.0, 2.0)
 """Of the joint stops, per rad/s."""
 
 
-@dataclass(frozen=True)
-class RigidLink:
-    """One rigid link: its length and where its mass is, seen from the joint that carries it."""
-
-    length_m: float
-    mass_kg: float
-    center_m: float
-    inertia_kg_m2: float  # about the centre of mass
-
-
-@dataclass(frozen=True)
-class ArmProfile:
-    """A profile: links, joint friction, and the drives' ratings. Pairs are (joint 1, joint 2)."""
-
-    name: str
-    links: tuple[RigidLink, RigidLink]
-    viscous_Nm_s: tuple[float, float]  # per rad/s of the joint
-    coulomb_Nm: tuple[float, float]
-    rated_torque_Nm: tuple[float, float]  # 0x6076, also the most that the drive gives
-    brake_damping_Nm_s: tuple[float, float]  # quick stop and fault: braking torque per rad/s
-    stop_deg: tuple[float, float] = (170.0, 160.0)  # joint stops at ±
-
-    @property
-    def link_length_m(self) -> tuple[float, float]:
-        """Joint 1 to joint 2, joint 2 to tip."""
-        return self.links[0].length_m, self.links[1].length_m
-
-    def inertia(self, payload_kg: float = 0.0) -> tuple[float, float, float]:
-        """Lump the masses into α, β, γ, kg m²."""
-        first, second = self.links
-        alpha = first.inertia_kg_m2 + first.mass_kg * first.center_m**2
-        alpha += (second.mass_kg + payload_kg) * first.length_m**2
-        beta = first.length_m * (second.mass_kg * second.center_m + payload_kg * second.length_m)
-        gamma = second.inertia_kg_m2 + second.mass_kg * second.center_m**2 + payload_kg * second.length_m**2
-        return alpha, beta, gamma
-
-    def theta(self, payload_kg: float = 0.0) -> Vector:
-        """Give the dynamic parameters in the order of `records.PARAMETER_NAMES` (7,)."""
-        alpha, beta, gamma = self.inertia(payload_kg)
-        return np.array([alpha + gamma, beta, gamma, *self.viscous_Nm_s, *self.coulomb_Nm])
-
-    def numbers(self) -> np.void:
-        """Pack the empty arm for compiled functions, one element of ARM_NUMBERS."""
-        numbers: np.void = np.zeros(1, ARM_NUMBERS)[0]
-        numbers["alpha"], numbers["beta"], numbers["gamma"] = self.inertia()
-        numbers["length_m"][:] = self.link_length_m
-        numbers["viscous_Nm_s"][:] = self.viscous_Nm_s
-        numbers["coulomb_Nm"][:] = self.coulomb_Nm
-        numbers["torque_limit_Nm"][:] = self.rated_torque_Nm
-        numbers["brake_damping_Nm_s"][:] = self.brake_damping_Nm_s
-        numbers["current_loop_rad_s"][:] = CURRENT_LOOP_RAD_S
-        numbers["stop_high_rad"][:] = np.radians(self.stop_deg)
-        numbers["stop_low_rad"][:] = -numbers["stop_high_rad"]
-        numbers["stop_stiffness_Nm_rad"][:] = STOP_STIFFNESS_NM_RAD
-        numbers["stop_damping_Nm_s"][:] = STOP_DAMPING_NM_S
-        first, second = self.links
-        numbers["moment_kg_m"] = first.mass_kg * first.center_m + second.mass_kg * first.length_m
-        return numbers
-
-
-_LINKS: Final = (RigidLink(0.35, 3.0, 0.20, 0.040), RigidLink(0.30, 1.5, 0.13, 0.015))
-_LIGHT_LINKS: Final = (RigidLink(0.35, 1.5, 0.20, 0.020), RigidLink(0.30, 0.75, 0.13, 0.0075))
-_RATED_TORQUE_NM: Final = (12.0, 6.0)
-
-# Braking slows the unloaded arm with time constants of 10 to 30 ms, long enough that the 1.6 ms lag of the drive's
-# velocity leaves them well damped, and the arm with 1 kg at its tip within 0.1 s.
-_BRAKE_DAMPING_NM_S: Final = (25.0, 3.0)
-_LIGHT_BRAKE_DAMPING_NM_S: Final = (12.5, 1.5)
-
-ARMS: Final = {
-    # Reproduces the paper's two adaptation times.
-    "P": ArmProfile("P", _LIGHT_LINKS, (0.03, 0.015), (0.0375, 0.02), _RATED_TORQUE_NM, _LIGHT_BRAKE_DAMPING_NM_S),
-    # Twice the inertia, little friction.
-    "S": ArmProfile("S", _LINKS, (0.024, 0.012), (0.03, 0.016), _RATED_TORQUE_NM, _BRAKE_DAMPING_NM_S),
-    # The torque sensor sees the gear's friction.
-    "M": ArmProfile("M", _LINKS, (0.12, 0.06), (0.15, 0.08), _RATED_TORQUE_NM, _BRAKE_DAMPING_NM_S),
-}
-"""Profiles by name."""
+def pack_fields(settings: object, layout: np.dtype[np.void]) -> np.void:
+    """Make one element of a layout for compiled functions; its fields that the settings have, too, are filled."""
+    numbers: np.void = np.zeros(1, layout)[0]
+    for name in layout.names or ():
+        if hasattr(settings, name):
+            numbers[name] = getattr(settings, name)
+    return numbers
 
 
 Pair = tuple[float, float]
@@ -122,8 +50,8 @@ IN_ORDER: Joints = (1, 2)
 
 
 @dataclass(frozen=True)
-class OwnArmSettings:
-    """Two links of one's own, and the devices at their joints."""
+class EmulatedArm:
+    """Two links, and the devices at their joints. Pairs are by joint, or by place where they are about devices."""
 
     name: str = setting(meaning="name of the arm")
     link_length_m: Pair = setting(unit="m", low=0.01, high=5.0, meaning="joint to joint, and joint 2 to tip")
@@ -168,21 +96,32 @@ class OwnArmSettings:
             if 0 in getattr(self, key):
                 raise ConfigError(f"`own_arm.{key}` = {list(getattr(self, key))} must be +1 or -1 for each device")
 
-    @property
-    def profile(self) -> ArmProfile:
-        """The arm without its wiring."""
-        first, second = (
-            RigidLink(self.link_length_m[i], self.mass_kg[i], self.center_m[i], self.inertia_kg_m2[i]) for i in range(2)
-        )
-        return ArmProfile(
-            self.name,
-            (first, second),
-            self.viscous_Nm_s,
-            self.coulomb_Nm,
-            self.rated_torque_Nm,
-            self.brake_damping_Nm_s,
-            self.stop_deg,
-        )
+    def inertia(self, payload_kg: float = 0.0) -> tuple[float, float, float]:
+        """Lump the masses into α, β, γ, kg m²."""
+        (length1_m, length2_m), (mass1_kg, mass2_kg) = self.link_length_m, self.mass_kg
+        (center1_m, center2_m), (inertia1_kg_m2, inertia2_kg_m2) = self.center_m, self.inertia_kg_m2
+        alpha = inertia1_kg_m2 + mass1_kg * center1_m**2
+        alpha += (mass2_kg + payload_kg) * length1_m**2
+        beta = length1_m * (mass2_kg * center2_m + payload_kg * length2_m)
+        gamma = inertia2_kg_m2 + mass2_kg * center2_m**2 + payload_kg * length2_m**2
+        return alpha, beta, gamma
+
+    def theta(self, payload_kg: float = 0.0) -> Vector:
+        """Give the dynamic parameters in the order of `records.PARAMETER_NAMES` (7,)."""
+        alpha, beta, gamma = self.inertia(payload_kg)
+        return np.array([alpha + gamma, beta, gamma, *self.viscous_Nm_s, *self.coulomb_Nm])
+
+    def numbers(self) -> np.void:
+        """Pack the empty arm for compiled functions, one element of ARM_NUMBERS."""
+        numbers = pack_fields(self, ARM_NUMBERS)
+        numbers["alpha"], numbers["beta"], numbers["gamma"] = self.inertia()
+        numbers["current_loop_rad_s"][:] = CURRENT_LOOP_RAD_S
+        numbers["stop_high_rad"][:] = np.radians(self.stop_deg)
+        numbers["stop_low_rad"][:] = -numbers["stop_high_rad"]
+        numbers["stop_stiffness_Nm_rad"][:] = STOP_STIFFNESS_NM_RAD
+        numbers["stop_damping_Nm_s"][:] = STOP_DAMPING_NM_S
+        numbers["moment_kg_m"] = self.mass_kg[0] * self.center_m[0] + self.mass_kg[1] * self.link_length_m[0]
+        return numbers
 
     @property
     def wiring(self) -> "Wiring":
@@ -191,6 +130,40 @@ class OwnArmSettings:
         torque = tuple(turn * up for turn, up in zip(self.drive_sign, self.motor_sign, strict=True))
         zero = tuple(round(math.radians(zero_deg) / POSITION_LSB_RAD) for zero_deg in self.zero_deg)
         return Wiring(drive, sensor, self.drive_sign, self.sensor_sign, torque, zero)  # type: ignore[arg-type]
+
+
+_LENGTH_M: Final = (0.35, 0.30)
+_CENTER_M: Final = (0.20, 0.13)
+_STOP_DEG: Final = (170.0, 160.0)
+_RATED_TORQUE_NM: Final = (12.0, 6.0)
+
+# Braking slows the unloaded arm with time constants of 10 to 30 ms, long enough that the 1.6 ms lag of the drive's
+# velocity leaves them well damped, and the arm with 1 kg at its tip within 0.1 s.
+_BRAKE_DAMPING_NM_S: Final = (25.0, 3.0)
+_LIGHT_BRAKE_DAMPING_NM_S: Final = (12.5, 1.5)
+
+
+def _profile(
+    name: str, mass_kg: Pair, inertia_kg_m2: Pair, viscous_Nm_s: Pair, coulomb_Nm: Pair, brake_damping_Nm_s: Pair
+) -> EmulatedArm:
+    return EmulatedArm(
+        name, _LENGTH_M, mass_kg, _CENTER_M, inertia_kg_m2, viscous_Nm_s, coulomb_Nm,
+        _RATED_TORQUE_NM, brake_damping_Nm_s, _STOP_DEG,
+    )  # fmt: skip
+
+
+ARMS: Final = {
+    arm.name: arm
+    for arm in (
+        # Reproduces the paper's two adaptation times.
+        _profile("P", (1.5, 0.75), (0.020, 0.0075), (0.03, 0.015), (0.0375, 0.02), _LIGHT_BRAKE_DAMPING_NM_S),
+        # Twice the inertia, little friction.
+        _profile("S", (3.0, 1.5), (0.040, 0.015), (0.024, 0.012), (0.03, 0.016), _BRAKE_DAMPING_NM_S),
+        # The torque sensor sees the gear's friction.
+        _profile("M", (3.0, 1.5), (0.040, 0.015), (0.12, 0.06), (0.15, 0.08), _BRAKE_DAMPING_NM_S),
+    )
+}
+"""Profiles by name."""
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ its nominal torque constant. Equations: `firmware_sim.body.motor`, `firmware_sim
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from adacd_hil.settings.schema import ConfigError, setting
-from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, ArmProfile
+from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, EmulatedArm, pack_fields
 from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS, REFERENCE_C
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
 from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
@@ -143,7 +143,7 @@ class MechanicsSettings:
         first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, self.ripple_Nm, strict=True)
         return sum(first), sum(second)
 
-    def check(self, arm: ArmProfile, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:
+    def check(self, arm: EmulatedArm, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:
         """Raise ConfigError when these mechanics do not go with the arm, its start pose or its payloads."""
         for joint in range(2):
             static_Nm, coulomb_Nm = self.static_Nm[joint], arm.coulomb_Nm[joint]
@@ -168,7 +168,7 @@ class MechanicsSettings:
                 "less stiffness or damping, or more inertia"
             )
 
-    def arm_numbers(self, arm: ArmProfile) -> np.void:
+    def arm_numbers(self, arm: EmulatedArm) -> np.void:
         """Pack the arm with its stops for compiled functions, one element of ARM_NUMBERS."""
         numbers = arm.numbers()
         low_deg, high_deg = self._stops_deg(arm)
@@ -177,22 +177,17 @@ class MechanicsSettings:
         numbers["stop_damping_Nm_s"] = self.stop_damping_Nm_s
         return numbers
 
-    def _stops_deg(self, arm: ArmProfile) -> tuple[Pair, Pair]:
+    def _stops_deg(self, arm: EmulatedArm) -> tuple[Pair, Pair]:
         if self.stop_low_deg is None or self.stop_high_deg is None:
             return (-arm.stop_deg[0], -arm.stop_deg[1]), arm.stop_deg
         return self.stop_low_deg, self.stop_high_deg
 
-    def numbers(self, arm: ArmProfile) -> np.void:
+    def numbers(self, arm: EmulatedArm) -> np.void:
         """Pack for compiled functions, one element of MECHANICS_NUMBERS."""
-        numbers: np.void = np.zeros(1, MECHANICS_NUMBERS)[0]
-        own = {field.name for field in fields(self)}
-        for name in own.intersection(MECHANICS_NUMBERS.names or ()):
-            numbers[name] = getattr(self, name)
+        numbers = pack_fields(self, MECHANICS_NUMBERS)
         surplus = [max(0.0, self.static_Nm[joint] - arm.coulomb_Nm[joint]) for joint in range(2)]
         numbers["surplus_Nm"] = surplus
-        numbers["stribeck_rad_s"] = self.stribeck_velocity_rad_s
         numbers["sigma2_Nm_s"] = self._sigma2(arm)
-        numbers["capacity_J_K"] = self.heat_capacity_J_K
         numbers["ripple_phase_rad"] = np.radians(self.ripple_phase_deg)
         numbers["is_encoder_on_link"] = self.encoder_side == "link"
         numbers["gravity_m_s2"] = STANDARD_GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))
@@ -205,10 +200,10 @@ class MechanicsSettings:
             numbers["is_free"][joint] = not (on_link or on_motor)
         return numbers
 
-    def _sigma2(self, arm: ArmProfile) -> Pair:
+    def _sigma2(self, arm: EmulatedArm) -> Pair:
         return arm.viscous_Nm_s if self.sigma2_Nm_s is None else self.sigma2_Nm_s
 
-    def eigenvalues(self, arm: ArmProfile, payloads: Sequence[PayloadBody]) -> tuple[float, float]:
+    def eigenvalues(self, arm: EmulatedArm, payloads: Sequence[PayloadBody]) -> tuple[float, float]:
         """Give the largest |Im λ| and |λ| in rad/s of the arm linearised about rest, bristles stuck and stops touched.
 
         The largest of elbow angles from 0 to 180 degrees in steps of 45, with each of the payloads.
@@ -250,7 +245,7 @@ class MechanicsSettings:
                 largest = max(largest, float(np.abs(eigenvalues).max()))
         return oscillation, largest
 
-    def substeps(self, arm: ArmProfile, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
+    def substeps(self, arm: EmulatedArm, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
         """Choose the substeps of a 100 µs tick; touch_rad_s: fastest rate of bodies, hands and walls."""
         oscillation, largest = self.eigenvalues(arm, payloads)
         oscillation = max(oscillation, touch_rad_s)

@@ -45,14 +45,14 @@ REFERENCE_C: Final = 25.0
 MECHANICS_NUMBERS: Final = float_fields(
     {
         "surplus_Nm": PAIR,  # F_s − F_c, Nm
-        "stribeck_rad_s": PAIR,  # v_s, rad/s
+        "stribeck_velocity_rad_s": PAIR,  # v_s, rad/s
         "sigma0_Nm_rad": PAIR,  # Nm/rad; 0: no bristles
         "sigma1_Nm_s": PAIR,
         "sigma2_Nm_s": PAIR,
         "load_friction": PAIR,  # k_load
         "viscous_drop_per_K": PAIR,  # k_v, 1/K
         "coulomb_drop_per_K": PAIR,  # k_c, 1/K
-        "capacity_J_K": PAIR,  # C, J/K; 0: the temperature stays
+        "heat_capacity_J_K": PAIR,  # C, J/K; 0: the temperature stays
         "cooling_s": PAIR,  # t_cool, s
         "ambient_C": PAIR,  # T_ambient, °C
         "is_free": PAIR,  # no dry friction in this joint, it never sticks
@@ -83,7 +83,7 @@ def dry_level(
     level = coulomb_Nm
     surplus = mechanics["surplus_Nm"][joint]
     if surplus != 0.0:
-        ratio = velocity_rad_s / mechanics["stribeck_rad_s"][joint]
+        ratio = velocity_rad_s / mechanics["stribeck_velocity_rad_s"][joint]
         level += surplus * math.exp(-ratio * ratio)
     return float(level * drift + mechanics["load_friction"][joint] * abs(transmitted_Nm))
 
@@ -115,7 +115,7 @@ def advance_bristle(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, l
 @compiled
 def warm(mechanics: np.void, joint: int, temperature_C: float, power_W: float, step_s: float) -> float:
     """Give the lubricant's temperature after a step of constant friction power, °C."""
-    capacity_J_K = mechanics["capacity_J_K"][joint]
+    capacity_J_K = mechanics["heat_capacity_J_K"][joint]
     if capacity_J_K == 0.0:
         return temperature_C
     cooling_s = mechanics["cooling_s"][joint]
@@ -193,7 +193,7 @@ def gravity_torque(state: np.void, arm: np.void, mechanics: np.void, q1: float, 
     gravity = mechanics["gravity_m_s2"]
     if gravity == 0.0:
         return 0.0, 0.0
-    length1_m = arm["length_m"][0]
+    length1_m = arm["link_length_m"][0]
     downhill1 = mechanics["downhill_rad"] - q1
     downhill2 = downhill1 - q2
     moment1 = arm["moment_kg_m"] + state["payload_kg"] * length1_m

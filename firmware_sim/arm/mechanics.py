@@ -332,7 +332,7 @@ def integrate_mechanics(
     for index in range(substeps):
         done_s = index * substep_s
         _step(around, time_s + done_s, elapsed_s + done_s, target1, target2, substep_s, work)
-    if mechanics["capacity_J_K"][0] != 0.0 or mechanics["capacity_J_K"][1] != 0.0:
+    if mechanics["heat_capacity_J_K"][0] != 0.0 or mechanics["heat_capacity_J_K"][1] != 0.0:
         _warm(around, step_s, work)
     start = work.rows[_START]
     for joint in range(2):

@@ -40,10 +40,10 @@ ARM_NUMBERS: Final = float_fields(
         "alpha": (),  # kg m², without payload, as β and γ
         "beta": (),
         "gamma": (),
-        "length_m": PAIR,
+        "link_length_m": PAIR,
         "viscous_Nm_s": PAIR,
         "coulomb_Nm": PAIR,
-        "torque_limit_Nm": PAIR,
+        "rated_torque_Nm": PAIR,
         "brake_damping_Nm_s": PAIR,
         "current_loop_rad_s": PAIR,  # rad/s, bandwidth of the drives' torque loops
         "moment_kg_m": (),  # first moment of all masses about joint 1 with link 2 folded into joint 2; no payload
@@ -53,7 +53,7 @@ ARM_NUMBERS: Final = float_fields(
         "stop_damping_Nm_s": PAIR,
     }
 )
-"""Filled in by `firmware_sim.arm.arms.ArmProfile.numbers`. The table is here because
+"""Filled in by `firmware_sim.arm.arms.EmulatedArm.numbers`. The table is here because
 compiled code contains it, and the cache of compiled code is keyed by the modules that compile."""
 
 MECHANICAL_STATE: Final = float_fields(
@@ -97,7 +97,7 @@ def fit_payload(
     m11, m12, m22 = mass_matrix(state, state["q"][1])
     momentum1 = m11 * state["dq"][0] + m12 * state["dq"][1]
     momentum2 = m12 * state["dq"][0] + m22 * state["dq"][1]
-    length1_m, length2_m = arm["length_m"][0], arm["length_m"][1]
+    length1_m, length2_m = arm["link_length_m"][0], arm["link_length_m"][1]
     state["payload_kg"] = payload_kg
     state["alpha"] = arm["alpha"] + payload_kg * length1_m * length1_m
     reach_m = length2_m + along_m
@@ -228,7 +228,9 @@ def external_torque(
     stop1, stop2 = _stop_torque(arm, 0, q1, dq1), _stop_torque(arm, 1, q2, dq2)
     if contact.size == 0:
         return stop1, stop2
-    ext1, ext2 = contact_torque(contact[0], contact_force(contact[0], elapsed_s), arm["length_m"][0], q1, q2, dq1, dq2)
+    ext1, ext2 = contact_torque(
+        contact[0], contact_force(contact[0], elapsed_s), arm["link_length_m"][0], q1, q2, dq1, dq2
+    )
     return ext1 + stop1, ext2 + stop2
 
 

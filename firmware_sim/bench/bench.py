@@ -177,8 +177,8 @@ class Bench:
             self.injector.receive(place, 0x000, data, device.on_nmt, t_ns)
         is_reset = len(data) == 2 and data[0] in (RESET_NODE, RESET_COMMUNICATION)
         if is_reset and data[1] in (0, self.devices[0].node_id):
-            self._order.restart()
-            self._nodes.listeners.restart()
+            self._order.forget_last()
+            self._nodes.listeners.forget_unheard()
 
     def _on_host_heartbeat(self, data: bytes, t_ns: int) -> None:
         def take(_data: bytes, t_ns: int) -> None:

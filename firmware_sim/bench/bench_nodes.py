@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
-from firmware_sim.arm.arms import STRAIGHT, OwnArmSettings
+from firmware_sim.arm.arms import STRAIGHT, EmulatedArm
 from firmware_sim.arm.hardware_settings import HabitSettings
 from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
 from firmware_sim.arm.touch_settings import TICK_S
@@ -54,20 +54,17 @@ class BenchNodes:
         self.wiring = wiring = scenario.wiring
         self.is_crossed = wiring != STRAIGHT
         """Whether some device isn't at its own joint or counts the other way."""
-        described = [contract.describe(place) for place in range(len(_NODES))]
+        described = [contract.describe_device(place) for place in range(len(_NODES))]
         right_ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
         ids = device_ids(scenario.faults, right_ids)
         longest = longest_pdo(codec)
         self.devices = tuple(
             EmulatedDevice(
                 ids[i],
-                described[i].eds,
+                described[i],
                 injector.sender(i),
                 own_messages(codec.by_id, right_ids[i], ids[i]),
                 longest,
-                described[i].defaults,
-                described[i].fallbacks,
-                described[i].made_up,
             )
             for i in range(len(_NODES))
         )
@@ -90,7 +87,7 @@ class BenchNodes:
             for alias, place in description.aliases.items():
                 if alias != place:
                     device.serve(*alias, device.reader(*place))
-                    device.pdos.accept(*alias, device.pdos.writer(*place))
+                    device.pdos.accept_values(*alias, device.pdos.writer(*place))
         injector.attach(self.devices, self.drives, self.sensors)
         self.latch_motors()
         self.period_ns = contract.period_us * 1000 or _UNTOLD_PERIOD_NS
@@ -176,7 +173,7 @@ class BenchNodes:
             self.period_ns = self.told_period_ns
 
 
-def _scale_of(own: OwnArmSettings | None, place: int) -> DriveScale:
+def _scale_of(own: EmulatedArm | None, place: int) -> DriveScale:
     if own is None:
         return DriveScale()
     increments = own.increments_per_joint_rev[place] or ENCODER_COUNTS

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.records import TRUTH_LAYOUT, Vector
 from adacd_hil.structured import Structured
-from firmware_sim.arm.arms import ArmProfile
+from firmware_sim.arm.arms import EmulatedArm
 from firmware_sim.arm.mechanics import work_space
 from firmware_sim.arm.plant import fit_payload
 from firmware_sim.arm.sensing import Measurement, TorqueNoise
@@ -37,11 +37,10 @@ from firmware_sim.body.body_ticks import (
     fill_truth,
     sample_body,
 )
-from firmware_sim.body.motor import error_code, motor_numbers, motor_state, winding_temperature
+from firmware_sim.body.motor import error_code, motor_numbers, motor_state
 from firmware_sim.body.sensors import (
     NOISE_TICKS,
     EncoderNoise,
-    converter_ends,
     encoder_numbers,
     read_angle,
     settle_transducer,
@@ -49,6 +48,8 @@ from firmware_sim.body.sensors import (
 )
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 
+PERIOD_TICKS: Final = 10
+"""Ticks of a period of 1 ms."""
 _POSES: Final = 181
 _POINTS: Final = 61
 """Grid on which the smallest effective mass of the arm is searched: 1° of the elbow, 1/60 of the link."""
@@ -56,7 +57,7 @@ _FASTEST_BLOW_M_S: Final = 2.0
 """Fastest blow that `largest_rate_rad_s` covers: the tip of both links, straight, at 180 deg/s."""
 
 
-def _largest_mobility(arm: ArmProfile, link: int, points_m: Vector) -> float:
+def _largest_mobility(arm: EmulatedArm, link: int, points_m: Vector) -> float:
     """Give the largest 1/mass, 1/kg, that the unloaded arm shows a force at these points of a link, in any pose."""
     alpha, beta, gamma = arm.inertia()
     length1_m = arm.link_length_m[0]
@@ -75,7 +76,7 @@ def _largest_mobility(arm: ArmProfile, link: int, points_m: Vector) -> float:
     return float(largest.max())
 
 
-def _row(kind: int, arm: ArmProfile, thing: BodySettings | HandSettings | WallSettings) -> np.void:
+def _row(kind: int, arm: EmulatedArm, thing: BodySettings | HandSettings | WallSettings) -> np.void:
     """Fill the columns that all things have."""
     row: np.void = np.full(THING.itemsize // 8, np.nan).view(THING)[0]
     row["kind"] = kind
@@ -85,7 +86,7 @@ def _row(kind: int, arm: ArmProfile, thing: BodySettings | HandSettings | WallSe
     return row
 
 
-def _body_row(arm: ArmProfile, body: BodySettings) -> np.void:
+def _body_row(arm: EmulatedArm, body: BodySettings) -> np.void:
     row = _row(BODY, arm, body)
     row["link"], row["x_m"], row["y_m"] = body.link, body.x_m, body.y_m
     row["stiffness"], row["damping"], row["mass_kg"] = body.stiffness, body.damping_N_s_m, body.mass
@@ -98,7 +99,7 @@ def _body_row(arm: ArmProfile, body: BodySettings) -> np.void:
     return row
 
 
-def _hand_row(arm: ArmProfile, hand: HandSettings) -> np.void:
+def _hand_row(arm: EmulatedArm, hand: HandSettings) -> np.void:
     row = _row(HAND, arm, hand)
     row["link"], row["point_m"] = hand.link, hand.point_m
     row["force_limit_N"], row["speed_m_s"] = hand.force_limit_N, hand.speed_m_s
@@ -113,7 +114,7 @@ def _hand_row(arm: ArmProfile, hand: HandSettings) -> np.void:
     return row
 
 
-def _wall_row(arm: ArmProfile, wall: WallSettings) -> np.void:
+def _wall_row(arm: EmulatedArm, wall: WallSettings) -> np.void:
     row = _row(WALL, arm, wall)
     row["x_m"], row["y_m"], row["angle_rad"] = wall.x_m, wall.y_m, math.radians(wall.normal_deg)
     row["stiffness"], row["damping"] = wall.stiffness_N_m, wall.damping_s_m
@@ -201,7 +202,7 @@ class MovableArm(Protocol):
     def start_scenario(self) -> None: ...  # noqa: D102
 
     def advance(  # noqa: D102
-        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int | None = None
+        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int
     ) -> None: ...
 
     def sample(self) -> Measurement: ...  # noqa: D102
@@ -238,16 +239,9 @@ def _pack_numbers(scenario: Scenario) -> Vector:
 class Body:
     """One emulated arm, from power-on. After construction it compiles no code and allocates no large array."""
 
-    def __init__(self, scenario: Scenario, period_s: float = 1e-3, seed: int | None = None) -> None:
-        """Put the arm at the scenario's start pose, at rest.
-
-        `seed` outweighs the scenario's. Raises ValueError when the period isn't a multiple of 100 µs.
-        """
-        self._ticks_per_period = ticks(period_s)
-        if self._ticks_per_period < 1 or not math.isclose(self._ticks_per_period * TICK_S, period_s, rel_tol=1e-9):
-            raise ValueError(f"period_s = {period_s} s is no multiple of {TICK_S} s")
+    def __init__(self, scenario: Scenario, seed: int | None = None) -> None:
+        """Put the arm at the scenario's start pose, at rest. `seed` outweighs the scenario's."""
         self.scenario = scenario
-        self.period_s = period_s
         self._contacts = contact_table(scenario.contacts)
         self._payloads = payload_table(scenario.payloads)
         self._things = touch_table(scenario)
@@ -259,14 +253,12 @@ class Body:
         self._number_vector = _pack_numbers(scenario)
         self._numbers: np.void = self._number_vector.view(BODY_NUMBERS)[0]
         motor = self._numbers["motor"]
-        self._gain, self._offset_Nm = motor["gain"].tolist(), motor["offset_Nm"].tolist()
+        self._gain, self._offset_Nm = motor["gain"].tolist(), motor["torque_offset_Nm"].tolist()
         self._can_overload = float(motor["can_overload"])
         self.has_ideal_motors = not motor["has_limits"] and np.array_equal(
             motor["peak_Nm"], scenario.arm.rated_torque_Nm
         )
         """Whether no motor ever has less torque than its drive wants, or calls for a fault."""
-        self.torque_ends = converter_ends(scenario.sensors, 0), converter_ends(scenario.sensors, 1)
-        """Lowest and highest counts of each torque sensor; there its value is a bound only."""
         seed = scenario.seed if seed is None else seed
         quiet = (0.0, 0.0)
         self._noise = TorqueNoise(seed, scenario.sensors.torque_noise_Nm if scenario.noise else quiet)
@@ -333,18 +325,8 @@ class Body:
 
     def start_scenario(self) -> None:
         """Let scenario time start now: both drives are enabled and show torque mode. Later calls have no effect."""
-        if not self.is_started:
+        if self._course["start_tick"] < 0.0:
             self._course["start_tick"] = self._course["tick"]
-
-    @property
-    def is_started(self) -> bool:
-        """Whether scenario time runs."""
-        return bool(self._course["start_tick"] >= 0.0)
-
-    @property
-    def scenario_time_s(self) -> float:
-        """Time since the scenario started, 0 before."""
-        return float(self._course["tick"] - self._course["start_tick"]) * TICK_S if self.is_started else 0.0
 
     @property
     def motor_torque_Nm(self) -> tuple[float, float]:
@@ -377,31 +359,21 @@ class Body:
         return first, second
 
     @property
-    def winding_temperature_C(self) -> tuple[float, float]:
-        """True temperature of each motor's winding, °C."""
-        motor, motors = self._numbers["motor"], self._motors
-        return winding_temperature(motor, motors, 0), winding_temperature(motor, motors, 1)
-
-    @property
     def drive_velocity_rad_s(self) -> tuple[float, float]:
         """Velocity that the drives know, not quantised; by this they see standstill."""
         first, second = self._velocity_rad_s.tolist()
         return first, second
 
     def advance(
-        self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int], tick_count: int | None = None
+        self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int], tick_count: int = PERIOD_TICKS
     ) -> None:
-        """Advance by one period, or by `tick_count` ticks of 100 µs.
-
-        Set-points (2,) and `DriveMode` (2,) hold for the whole of it.
-        """
-        left = self._ticks_per_period if tick_count is None else tick_count
-        while left > 0:
-            count = left
+        """Advance by ticks of 100 µs. Set-points (2,) and `DriveMode` (2,) hold for the whole of it."""
+        while tick_count > 0:
+            count = tick_count
             if self._encoder_noise.is_on:
-                count = min(left, NOISE_TICKS)
+                count = min(tick_count, NOISE_TICKS)
                 self._encoder_noise.draw(int(self._course["tick"]) + count - 1)
-            left -= count
+            tick_count -= count
             advance_body(
                 self._state_vector,
                 self._number_vector,

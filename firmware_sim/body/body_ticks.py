@@ -130,7 +130,7 @@ def _scenario_s(course: np.void) -> float:
 @compiled
 def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velocity_rad_s: float) -> float:
     """Return a drive's set-point for its torque loop, Nm, within its rated torque."""
-    limit_Nm = arm["torque_limit_Nm"][joint]
+    limit_Nm = arm["rated_torque_Nm"][joint]
     if mode == _TORQUE:
         return float(min(max(setpoint_Nm, -limit_Nm), limit_Nm))
     damping = arm["brake_damping_Nm_s"][joint]
@@ -214,7 +214,7 @@ def advance_body(
             _scenario_s(course), elapsed_s, target1, target2, TICK_S, substeps, work,
         )  # fmt: skip
         add_prescribed_work(
-            contact, elapsed_s, TICK_S, arm["length_m"][0], before1, before2, now["q"][0], now["q"][1], touch_state
+            contact, elapsed_s, TICK_S, arm["link_length_m"][0], before1, before2, now["q"][0], now["q"][1], touch_state
         )
         _measure_tick(state, numbers, encoder_noise)
         course["tick"] += 1.0
@@ -263,7 +263,7 @@ def fill_truth(
     change_touch(things, time_s, q1, q2, touch_state, contact.size != 0)
     describe_touch(
         things, time_s, q1, q2, dq1, dq2, touch_state,
-        contact, course["contact"], elapsed_s, arm["length_m"][0], touched,
+        contact, course["contact"], elapsed_s, arm["link_length_m"][0], touched,
     )  # fmt: skip
     ext1, ext2, friction1, friction2, held1, held2 = observe(
         now, arm, numbers["mechanics"], contact, things, touch_state, time_s, elapsed_s, work

@@ -27,6 +27,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.structured import float_fields
+from firmware_sim.arm.arms import pack_fields
 from firmware_sim.arm.hardware_settings import CURRENT_LOOP_HZ, DriveSettings
 from firmware_sim.arm.touch_settings import PAIR, TICK_S
 
@@ -39,7 +40,7 @@ MOTOR_NUMBERS: Final = float_fields(
     {
         "haste": PAIR,  # way of this torque loop in a tick over that of the plant's
         "gain": PAIR,
-        "offset_Nm": PAIR,
+        "torque_offset_Nm": PAIR,
         "peak_Nm": PAIR,
         "continuous_Nm": PAIR,  # Nm; 0: no I²t
         "budget_Nm2_s": PAIR,
@@ -71,7 +72,7 @@ MOTOR_STATE: Final = float_fields(
 
 def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float]) -> np.void:
     """Pack the drives' properties for compiled functions, one element of MOTOR_NUMBERS."""
-    numbers: np.void = np.zeros(1, MOTOR_NUMBERS)[0]
+    numbers = pack_fields(settings, MOTOR_NUMBERS)
     plant_way = math.expm1(-2.0 * math.pi * CURRENT_LOOP_HZ * TICK_S)
     for joint in range(2):
         rated_Nm = rated_torque_Nm[joint]
@@ -82,7 +83,6 @@ def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float])
         way = math.expm1(-2.0 * math.pi * settings.current_loop_Hz[joint] * TICK_S)
         numbers["haste"][joint] = way / plant_way
         numbers["gain"][joint] = 1.0 + settings.torque_constant_error[joint]
-        numbers["offset_Nm"][joint] = settings.torque_offset_Nm[joint]
         numbers["peak_Nm"][joint] = peak_Nm
         numbers["continuous_Nm"][joint] = continuous_Nm
         numbers["budget_Nm2_s"][joint] = (peak_Nm**2 - continuous_Nm**2) * settings.peak_time_s[joint]
@@ -90,10 +90,6 @@ def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float])
         numbers["winding_share"][joint] = -math.expm1(-TICK_S / settings.winding_time_s[joint])
         numbers["housing_rise_K_Nm2"][joint] = settings.housing_rise_K[joint] / rated_Nm**2
         numbers["housing_share"][joint] = -math.expm1(-TICK_S / settings.housing_time_s[joint])
-        numbers["ambient_C"][joint] = settings.ambient_C[joint]
-        numbers["derating_start_C"][joint] = settings.derating_start_C[joint]
-        numbers["derating_end_C"][joint] = settings.derating_end_C[joint]
-        numbers["overheat_C"][joint] = settings.overheat_C[joint]
         numbers["tracking_rad_s"][joint] = 2.0 * math.pi * settings.velocity_loop_Hz[joint]
     numbers["can_overload"] = 1.0 if settings.i2t_reaction == "fault" else 0.0
     heats = (*settings.winding_rise_K, *settings.housing_rise_K)
@@ -142,7 +138,7 @@ def command_torque(
     target_Nm = min(max(wanted_Nm, -limit_Nm), limit_Nm)
     state["is_limited"][joint] = 1.0 if abs(wanted_Nm) > limit_Nm else 0.0
     if is_powered:
-        target_Nm = numbers["gain"][joint] * (target_Nm + numbers["offset_Nm"][joint])
+        target_Nm = numbers["gain"][joint] * (target_Nm + numbers["torque_offset_Nm"][joint])
     if numbers["haste"][joint] == 1.0:
         return float(target_Nm)
     return float(tau_Nm + (target_Nm - tau_Nm) * numbers["haste"][joint])

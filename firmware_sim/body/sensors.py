@@ -33,6 +33,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.structured import float_fields
+from firmware_sim.arm.arms import pack_fields
 from firmware_sim.arm.hardware_settings import SensorSettings
 from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.sensing import TORQUE_LSB_NM, TORQUE_RANGE_NM, torque_counts
@@ -41,10 +42,10 @@ from firmware_sim.arm.touch_settings import PAIR, TICK_S
 ENCODER_NUMBERS: Final = float_fields(
     {
         "index_error_rad": PAIR,
-        "once_rad": PAIR,  # e₁, rad
-        "once_phase_rad": PAIR,  # p₁, rad
-        "twice_rad": PAIR,  # e₂, rad
-        "twice_phase_rad": PAIR,  # p₂, rad
+        "eccentricity_rad": PAIR,  # e₁, rad
+        "eccentricity_phase_rad": PAIR,  # p₁, rad
+        "ellipticity_rad": PAIR,  # e₂, rad
+        "ellipticity_phase_rad": PAIR,  # p₂, rad
         "lsb_rad": PAIR,
     }
 )
@@ -55,12 +56,7 @@ NOISE_TICKS: Final = 64
 
 def encoder_numbers(settings: SensorSettings) -> np.void:
     """Pack the encoders' properties for compiled functions, one element of ENCODER_NUMBERS."""
-    numbers: np.void = np.zeros(1, ENCODER_NUMBERS)[0]
-    numbers["index_error_rad"][:] = settings.index_error_rad
-    numbers["once_rad"][:] = settings.eccentricity_rad
-    numbers["once_phase_rad"][:] = settings.eccentricity_phase_rad
-    numbers["twice_rad"][:] = settings.ellipticity_rad
-    numbers["twice_phase_rad"][:] = settings.ellipticity_phase_rad
+    numbers = pack_fields(settings, ENCODER_NUMBERS)
     numbers["lsb_rad"][:] = [2.0 * math.pi / (1 << bits) for bits in settings.encoder_bits]
     return numbers
 
@@ -69,10 +65,12 @@ def encoder_numbers(settings: SensorSettings) -> np.void:
 def read_angle(numbers: np.void, joint: int, angle_rad: float, noise_counts: float) -> float:
     """Give the angle that the drive reads, rad."""
     disc_rad = angle_rad + numbers["index_error_rad"][joint]
-    if numbers["once_rad"][joint] != 0.0:
-        disc_rad += numbers["once_rad"][joint] * math.sin(angle_rad + numbers["once_phase_rad"][joint])
-    if numbers["twice_rad"][joint] != 0.0:
-        disc_rad += numbers["twice_rad"][joint] * math.sin(2.0 * angle_rad + numbers["twice_phase_rad"][joint])
+    if numbers["eccentricity_rad"][joint] != 0.0:
+        disc_rad += numbers["eccentricity_rad"][joint] * math.sin(angle_rad + numbers["eccentricity_phase_rad"][joint])
+    if numbers["ellipticity_rad"][joint] != 0.0:
+        disc_rad += numbers["ellipticity_rad"][joint] * math.sin(
+            2.0 * angle_rad + numbers["ellipticity_phase_rad"][joint]
+        )
     lsb_rad = numbers["lsb_rad"][joint]
     return float(math.floor(disc_rad / lsb_rad + noise_counts + 0.5) * lsb_rad)
 
@@ -107,13 +105,13 @@ TRANSDUCER_NUMBERS: Final = float_fields(
         "gain_drift_1_K": PAIR,
         "cross_talk": PAIR,
         "offset_Nm": PAIR,
-        "offset_ramp_Nm_s": PAIR,  # Nm/s
+        "offset_drift_Nm_s": PAIR,  # Nm/s
         "offset_drift_Nm_K": PAIR,  # Nm/K
         "loop_weight": PAIR,  # w above
         "loop_radius_Nm": PAIR,  # r above, Nm
         "bandwidth_rad_s": PAIR,  # rad/s; 0: no filter
         "rate_Hz": PAIR,  # Hz of the own clock, error included; 0: at SYNC
-        "phase": PAIR,  # sample periods
+        "clock_phase": PAIR,  # sample periods
         "lsb_Nm": PAIR,  # of the converter, Nm
         "count_Nm": PAIR,  # of the wire, Nm
         "highest": PAIR,  # code of the converter; the lowest is −1 − HIGHEST
@@ -139,19 +137,14 @@ TRANSDUCER_STATE: Final = float_fields(
 
 def transducer_numbers(settings: SensorSettings, offset_Nm: tuple[float, float]) -> np.void:
     """Pack the sensors' properties for compiled functions, one element of TRANSDUCER_NUMBERS."""
-    numbers: np.void = np.zeros(1, TRANSDUCER_NUMBERS)[0]
+    numbers = pack_fields(settings, TRANSDUCER_NUMBERS)
     reach_Nm = np.array(settings.hysteresis_reach_Nm)
     numbers["gain"][:] = 1.0 + np.array(settings.gain_error)
-    numbers["gain_drift_1_K"][:] = settings.gain_drift_1_K
-    numbers["cross_talk"][:] = settings.cross_talk
     numbers["offset_Nm"][:] = offset_Nm
-    numbers["offset_ramp_Nm_s"][:] = settings.offset_drift_Nm_s
-    numbers["offset_drift_Nm_K"][:] = settings.offset_drift_Nm_K
     numbers["loop_weight"][:] = np.array(settings.hysteresis_Nm) / (2.5 * reach_Nm)
     numbers["loop_radius_Nm"][:] = 0.5 * reach_Nm
     numbers["bandwidth_rad_s"][:] = 2.0 * math.pi * np.array(settings.torque_bandwidth_Hz)
     numbers["rate_Hz"][:] = np.array(settings.sample_rate_Hz) * (1.0 + 1e-6 * np.array(settings.clock_error_ppm))
-    numbers["phase"][:] = settings.clock_phase
     numbers["lsb_Nm"][:] = 2.0 * np.array(settings.torque_range_Nm) / 2.0 ** np.array(settings.torque_bits)
     numbers["count_Nm"][:] = [count_Nm(settings, joint) for joint in range(2)]
     numbers["highest"][:] = 2.0 ** (np.array(settings.torque_bits) - 1.0) - 1.0
@@ -198,7 +191,7 @@ def settle_transducer(
         state["shaped_Nm"][joint] = state["bridge_Nm"][joint]
         state["amplified_Nm"][joint] = state["bridge_Nm"][joint]
         state["held_Nm"][joint] = state["bridge_Nm"][joint]
-        state["index"][joint] = math.floor(-numbers["phase"][joint])
+        state["index"][joint] = math.floor(-numbers["clock_phase"][joint])
         state["sent_index"][joint] = state["index"][joint] - 1.0
 
 
@@ -222,9 +215,11 @@ def _sense_joint(numbers: np.void, state: np.void, joint: int, tick: float, brid
         amplified_Nm = shaped_Nm - lag_Nm + (before_Nm - state["shaped_Nm"][joint] + lag_Nm) * math.exp(-turn)
     rate_Hz = numbers["rate_Hz"][joint]
     if rate_Hz > 0.0:
-        index = math.floor((tick + 1.0) * TICK_S * rate_Hz - numbers["phase"][joint])
+        index = math.floor((tick + 1.0) * TICK_S * rate_Hz - numbers["clock_phase"][joint])
         if index > state["index"][joint]:
-            share = (index + numbers["phase"][joint]) / (rate_Hz * TICK_S) - tick  # of the tick, when it was sampled
+            share = (index + numbers["clock_phase"][joint]) / (
+                rate_Hz * TICK_S
+            ) - tick  # of the tick, when it was sampled
             share = min(max(share, 0.0), 1.0)
             state["index"][joint] = index
             state["held_Nm"][joint] = before_Nm + share * (amplified_Nm - before_Nm)
@@ -282,7 +277,7 @@ def sample_torque(
         state["sent_index"][joint] = state["index"][joint]
         torque_Nm = state["held_Nm"][joint]
     offset_Nm = (
-        numbers["offset_Nm"][joint] + numbers["offset_ramp_Nm_s"][joint] * (tick * TICK_S) + state["walk_Nm"][joint]
+        numbers["offset_Nm"][joint] + numbers["offset_drift_Nm_s"][joint] * (tick * TICK_S) + state["walk_Nm"][joint]
     )
     offset_Nm += numbers["offset_drift_Nm_K"][joint] * (temperature_C - REFERENCE_C)
     counts = _convert(numbers, joint, torque_Nm + offset_Nm + noise_Nm)

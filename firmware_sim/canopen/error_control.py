@@ -40,8 +40,41 @@ HISTORY_LENGTH = 4
 _EMERGENCY = struct.Struct("<HBBI")
 
 
+_COUNT_SUB = 2  # 0x2210: counts are at sub-index 2 + number
+
+
+class Watchdog(IntEnum):
+    """Numbers of the watchdogs. Each says how it clears."""
+
+    SYNC = 1  # a SYNC comes
+    COMMAND = 2  # a valid command acts
+    HEARTBEAT = 3  # the master's heartbeat comes, or monitoring ends
+    OPERATIONAL = 4  # NMT start
+    LENGTH = 5  # a command frame of the right length comes
+    SYNC_ORDER = 6  # 100 SYNCs in a row are right
+    SYNC_LENGTH = 7  # a SYNC of the right length comes
+    COMMAND_PDO = 8  # Enable operation is withdrawn, or can be obeyed
+
+
+ERROR_CODES = {
+    # CiA 301 has no code for a missing SYNC (0x8140 is recovery from bus-off, 0x8240 a SYNC of the wrong length).
+    Watchdog.SYNC: 0x8700,
+    Watchdog.COMMAND: 0x8250,
+    Watchdog.HEARTBEAT: 0x8130,
+    Watchdog.OPERATIONAL: 0x8100,
+    Watchdog.LENGTH: 0x8210,
+    Watchdog.SYNC_ORDER: 0x8200,
+    Watchdog.SYNC_LENGTH: 0x8240,
+    Watchdog.COMMAND_PDO: 0x6320,
+}
+"""EMCY error code and 0x603F by watchdog."""
+
+WARNINGS = frozenset({Watchdog.LENGTH, Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH, Watchdog.COMMAND_PDO})
+"""Those that never cause a fault."""
+
+
 class ErrorReporter:
-    """Sends EMCY messages with inhibit time and remembers their codes, newest first."""
+    """Sends EMCY messages with inhibit time, remembers their codes, newest first, and which watchdogs are tripped."""
 
     def __init__(
         self, dictionary: ObjectDictionary, send: Send, register: Callable[[], int], is_allowed: Callable[[], bool]
@@ -56,6 +89,10 @@ class ErrorReporter:
         self._is_valid = True
         self._cob_id = 0x80 + dictionary.node_id
         self._history: deque[int] = deque(maxlen=HISTORY_LENGTH)
+        self.tripped: set[Watchdog] = set()
+        self._last = 0
+        self._last_ms = 0
+        self._counts = dict.fromkeys(Watchdog, 0)
         dictionary.serve(0x1001, 0, register)
         dictionary.serve(0x1003, 0, lambda: len(self._history))
         for sub in range(1, HISTORY_LENGTH + 1):
@@ -63,14 +100,18 @@ class ErrorReporter:
         dictionary.watch(0x1003, 0, lambda _: self._history.clear(), one_of(0))
         dictionary.watch(0x1014, 0, self._validate, self._check_cob_id)
         dictionary.watch(0x1015, 0, self._set_inhibit)
+        dictionary.serve(0x2210, 1, lambda: self._last)
+        dictionary.serve(0x2210, 2, lambda: self._last_ms & 0xFFFFFFFF)
+        for watchdog in Watchdog:
+            dictionary.serve(0x2210, _COUNT_SUB + watchdog, lambda w=watchdog: self._counts[w] & 0xFFFF)  # type: ignore[misc]
 
-    def report(self, code: int, t_ns: int, number: int = 0, time_ms: int = 0) -> None:
+    def report_error(self, code: int, t_ns: int, number: int = 0, time_ms: int = 0) -> None:
         """Send an EMCY. `number`, `time_ms`: the manufacturer's part, which watchdog and when on the device's clock."""
         if code != 0:
             self._history.appendleft(code)
         if self._is_valid and self._is_allowed():
             self._waiting.append(_EMERGENCY.pack(code, self._register(), number, time_ms & 0xFFFFFFFF))
-            self.poll(t_ns)
+            self.send_waiting(t_ns)
 
     def report_at_once(self, code: int, t_ns: int) -> None:
         """Send an EMCY without regard to the inhibit time and to those that wait."""
@@ -79,13 +120,33 @@ class ErrorReporter:
             self._allowed_ns = t_ns + self._inhibit_ns
             self._send(self._cob_id, _EMERGENCY.pack(code, self._register(), 0, 0))
 
-    def reset(self) -> None:
-        """Forget everything, as at power-on."""
+    def trip(self, watchdog: Watchdog, t_ns: int, time_ms: int) -> None:
+        """Note and report a watchdog that isn't tripped yet. `time_ms`: on the device's clock."""
+        if watchdog in self.tripped:
+            return
+        self.tripped.add(watchdog)
+        self._last, self._last_ms = watchdog, time_ms
+        self._counts[watchdog] += 1
+        self.report_error(ERROR_CODES[watchdog], t_ns, watchdog, time_ms)
+
+    def clear(self, watchdog: Watchdog, t_ns: int, time_ms: int) -> None:
+        """Report that the cause of a tripped watchdog has gone."""
+        self.tripped.remove(watchdog)
+        self.report_error(0, t_ns, watchdog, time_ms)
+
+    def forget_messages(self) -> None:
+        """Forget the messages that wait and the history, as without power."""
         self._waiting.clear()
         self._history.clear()
         self._allowed_ns = 0
 
-    def poll(self, t_ns: int) -> int:
+    def forget_trips(self) -> None:
+        """Forget the watchdogs that have tripped, as at a reset of the node."""
+        self.tripped.clear()
+        self._last = self._last_ms = 0
+        self._counts = dict.fromkeys(Watchdog, 0)
+
+    def send_waiting(self, t_ns: int) -> int:
         """Send messages that the inhibit time held back; return when to look again."""
         while self._waiting and t_ns >= self._allowed_ns:
             self._allowed_ns = t_ns + self._inhibit_ns
@@ -122,11 +183,11 @@ class HeartbeatProducer:
         self._due_ns = NEVER_NS
         dictionary.watch(0x1017, 0, self._set_period)
 
-    def restart(self, t_ns: int) -> None:
+    def begin_heartbeats(self, t_ns: int) -> None:
         """Begin a period."""
         self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
 
-    def poll(self, t_ns: int) -> int:
+    def send_due(self, t_ns: int) -> int:
         """Send a heartbeat that is due; return when the next one is."""
         if t_ns >= self._due_ns:
             self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
@@ -135,7 +196,7 @@ class HeartbeatProducer:
 
     def _set_period(self, period_ms: int) -> None:
         self._period_ns = period_ms * 1_000_000
-        self.restart(self._now_ns())
+        self.begin_heartbeats(self._now_ns())
 
 
 class HeartbeatConsumer:
@@ -164,7 +225,7 @@ class HeartbeatConsumer:
         self._due_ns = t_ns + self._timeout_ns
         self._find(t_ns)
 
-    def poll(self, t_ns: int) -> int:
+    def find_silence(self, t_ns: int) -> int:
         """Notice a silence; return when to look again."""
         if t_ns >= self._due_ns:
             self._due_ns = NEVER_NS
@@ -188,74 +249,6 @@ def _check_node(value: int) -> None:
     """Accept a node that can exist, or a time of 0: off."""
     if value & 0xFFFF and not 1 <= value >> 16 <= 127:
         refuse(Abort.VALUE_RANGE)
-
-
-_COUNT_SUB = 2  # 0x2210: counts are at sub-index 2 + number
-
-
-class Watchdog(IntEnum):
-    """Numbers of the watchdogs. Each says how it clears."""
-
-    SYNC = 1  # a SYNC comes
-    COMMAND = 2  # a valid command acts
-    HEARTBEAT = 3  # the master's heartbeat comes, or monitoring ends
-    OPERATIONAL = 4  # NMT start
-    LENGTH = 5  # a command frame of the right length comes
-    SYNC_ORDER = 6  # 100 SYNCs in a row are right
-    SYNC_LENGTH = 7  # a SYNC of the right length comes
-    COMMAND_PDO = 8  # Enable operation is withdrawn, or can be obeyed
-
-
-ERROR_CODES = {
-    # CiA 301 has no code for a missing SYNC (0x8140 is recovery from bus-off, 0x8240 a SYNC of the wrong length).
-    Watchdog.SYNC: 0x8700,
-    Watchdog.COMMAND: 0x8250,
-    Watchdog.HEARTBEAT: 0x8130,
-    Watchdog.OPERATIONAL: 0x8100,
-    Watchdog.LENGTH: 0x8210,
-    Watchdog.SYNC_ORDER: 0x8200,
-    Watchdog.SYNC_LENGTH: 0x8240,
-    Watchdog.COMMAND_PDO: 0x6320,
-}
-"""EMCY error code and 0x603F by watchdog."""
-
-WARNINGS = frozenset({Watchdog.LENGTH, Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH, Watchdog.COMMAND_PDO})
-"""Those that never cause a fault."""
-
-
-class Watchdogs:
-    """The watchdogs that are tripped now, and the record of earlier trips."""
-
-    def __init__(self, dictionary: ObjectDictionary) -> None:
-        self.tripped: set[Watchdog] = set()
-        self._last = 0
-        self._last_ms = 0
-        self._counts = dict.fromkeys(Watchdog, 0)
-        dictionary.serve(0x2210, 1, lambda: self._last)
-        dictionary.serve(0x2210, 2, lambda: self._last_ms & 0xFFFFFFFF)
-        for watchdog in Watchdog:
-            dictionary.serve(0x2210, _COUNT_SUB + watchdog, lambda w=watchdog: self._counts[w] & 0xFFFF)  # type: ignore[misc]
-
-    def trip(self, watchdog: Watchdog, reporter: ErrorReporter, t_ns: int, time_ms: int) -> None:
-        """Note and report a watchdog that isn't tripped yet. `time_ms`: on the device's clock."""
-        if watchdog in self.tripped:
-            return
-        self.tripped.add(watchdog)
-        self._last, self._last_ms = watchdog, time_ms
-        self._counts[watchdog] += 1
-        reporter.report(ERROR_CODES[watchdog], t_ns, watchdog, time_ms)
-
-    def clear(self, watchdog: Watchdog, reporter: ErrorReporter, t_ns: int, time_ms: int) -> None:
-        """Report that the cause of a tripped watchdog has gone."""
-        if watchdog in self.tripped:
-            self.tripped.remove(watchdog)
-            reporter.report(0, t_ns, watchdog, time_ms)
-
-    def reset(self) -> None:
-        """Forget everything, as at power-on."""
-        self.tripped.clear()
-        self._last = self._last_ms = 0
-        self._counts = dict.fromkeys(Watchdog, 0)
 
 
 TOLERATED = 3
@@ -293,7 +286,7 @@ class SyncOrder:
         self._last_ns = 0
         self._lateness_ns = 0.0
 
-    def restart(self) -> None:
+    def forget_last(self) -> None:
         """Take the next SYNC for the first."""
         self.counter = 0
 
@@ -358,7 +351,7 @@ class SyncCounts:
         """Whether SYNC can be relied on."""
         return self.odd <= TOLERATED
 
-    def note(self, kind: SyncKind, lost: int) -> None:
+    def count_sync(self, kind: SyncKind, lost: int) -> None:
         """Count a SYNC, and those that were lost before it."""
         self._counts[_LOST_SUB] += lost
         if kind is not SyncKind.RIGHT:
@@ -371,7 +364,7 @@ class SyncCounts:
             self.odd += 1
             self._clean = 0
 
-    def reset(self) -> None:
+    def forget_counts(self) -> None:
         """Forget everything, as at power-on."""
         self.odd = self._clean = 0
         self._counts = [0] * (_LOST_SUB + 1)

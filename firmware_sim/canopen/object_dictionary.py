@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 import canopen
-from canopen.network import PeriodicMessageTask
 from canopen.objectdictionary import ODVariable, datatypes
 from canopen.sdo.server import SdoServer
 
@@ -31,10 +30,9 @@ from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
 Send = Callable[[int, bytes], None]
 Values = Mapping[tuple[int, int], int]
 """Values of objects by index and sub-index."""
-_NO_VALUES: Values = {}
 
 _FIRST_INDEX = 0x1000  # below are data types: dummy mapping entries, no objects
-_FORMATS = {
+FORMATS = {
     datatypes.BOOLEAN: "B",
     datatypes.INTEGER8: "b",
     datatypes.INTEGER16: "h",
@@ -45,6 +43,7 @@ _FORMATS = {
     datatypes.UNSIGNED32: "I",
     datatypes.UNSIGNED64: "Q",
 }
+"""Formats of `struct` by data type, for numbers."""
 _EXPEDITED, _IS_SIZE_GIVEN, _IS_LAST = 0x02, 0x01, 0x01  # bits of command specifiers
 _RESPONSE_DOWNLOAD = 0x60
 
@@ -91,16 +90,6 @@ def one_of(*allowed: int) -> Callable[[int], None]:
     return check
 
 
-class DictionaryVariable(NamedTuple):
-    """The mapping and access rules of one numeric object. `format`: of `struct`, empty when it isn't a number."""
-
-    bits: int
-    format: str
-    is_mappable: bool
-    is_readable: bool
-    is_writable: bool
-
-
 class _SilentNetwork(canopen.Network):
     """A network without bus and threads: a node's frames go to a function."""
 
@@ -110,15 +99,6 @@ class _SilentNetwork(canopen.Network):
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002 (canopen's signature)
         self._send(can_id, bytes(data))
-
-    def send_periodic(
-        self,
-        can_id: int,
-        data: bytes,  # noqa: ARG002
-        period: float,  # noqa: ARG002
-        remote: bool = False,  # noqa: ARG002
-    ) -> PeriodicMessageTask:
-        raise RuntimeError(f"periodic frame {can_id:#x}: timers belong to the bench")
 
 
 class _Server(SdoServer):
@@ -207,7 +187,7 @@ def _compare_lengths(length: int, expected: int) -> None:
 
 
 @cache
-def _read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
+def read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
     """Read an EDS or a DCF of any encoding and ending; nodes never change the result."""
     stream = io.StringIO(readable_eds(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff")))
     stream.name = "object dictionary.eds"
@@ -222,35 +202,46 @@ class MadeUp(NamedTuple):
     value: int
 
 
-def _with_defaults(
-    objects: canopen.ObjectDictionary, defaults: Values, fallbacks: Values, made_up: Mapping[int, MadeUp]
-) -> canopen.ObjectDictionary:
-    """Copy a dictionary with omitted objects and other defaults; a number without a default gets its fallback, or 0."""
+@dataclass(frozen=True)
+class DeviceDescription:
+    """One device: its EDS, and further values of its objects at power-on.
+
+    defaults: values in place of the EDS's. fallbacks: values that the EDS lacks. made_up: objects that the EDS
+    omits, by index. aliases: objects that hold the live value of another.
+    """
+
+    eds: Path
+    defaults: Values = field(default_factory=dict)
+    fallbacks: Values = field(default_factory=dict)
+    made_up: Mapping[int, MadeUp] = field(default_factory=dict)
+    aliases: Mapping[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
+
+
+def _read_objects(node_id: int, description: DeviceDescription) -> canopen.ObjectDictionary:
+    """Read the objects of a device with their values at power-on; a number without one is 0."""
+    objects = read_eds(description.eds, node_id)
+    if not (description.defaults or description.fallbacks or description.made_up):
+        return objects
     objects = copy.deepcopy(objects)
-    for index, made in made_up.items():
+    for index, made in description.made_up.items():
         added = ODVariable(made.name, index)
         added.data_type, added.access_type, added.default = made.data_type, "rw", made.value
         objects.add_object(added)
     for index, entry in objects.items():
         for subindex, variable in {0: entry}.items() if isinstance(entry, ODVariable) else entry.subindices.items():
             key = (index, subindex)
-            if key in defaults:
-                variable.default = variable.value = defaults[key]
+            if key in description.defaults:
+                variable.default = variable.value = description.defaults[key]
             elif variable.default is None and variable.value is None and variable.data_type in datatypes.NUMBER_TYPES:
-                variable.default = fallbacks.get(key, 0)
+                variable.default = description.fallbacks.get(key, 0)
     return objects
 
 
 class _DictionaryNode(canopen.LocalNode):
     """canopen's local node with strict sub-indices and without its own heartbeat."""
 
-    def __init__(
-        self, node_id: int, eds_path: Path, defaults: Values, fallbacks: Values, made_up: Mapping[int, MadeUp]
-    ) -> None:
-        objects = _read_eds(eds_path, node_id)
-        if defaults or fallbacks or made_up:
-            objects = _with_defaults(objects, defaults, fallbacks, made_up)
-        super().__init__(node_id, objects)
+    def __init__(self, node_id: int, description: DeviceDescription) -> None:
+        super().__init__(node_id, _read_objects(node_id, description))
         self._write_callbacks.clear()  # NmtSlave.on_write would start a periodic task
         self.sdo = _Server(self)
         self.sdo._index = self.sdo._subindex = 0  # an abort before the first transfer needs an index to name
@@ -269,19 +260,8 @@ class _DictionaryNode(canopen.LocalNode):
 class ObjectDictionary:
     """The objects of one device: values from the EDS, live values, checked writes, and SDO over the bus."""
 
-    def __init__(
-        self,
-        node_id: int,
-        eds_path: Path,
-        send: Send,
-        defaults: Values = _NO_VALUES,
-        fallbacks: Values = _NO_VALUES,
-        made_up: Mapping[int, MadeUp] | None = None,
-    ) -> None:
-        """Read the EDS; `defaults` outweigh its own, `fallbacks` are for numbers without one, `made_up` it omits.
-
-        Raises OSError when it can't be read.
-        """
+    def __init__(self, node_id: int, description: DeviceDescription, send: Send) -> None:
+        """Read the EDS. Raises OSError when it can't be read."""
         self.node_id = node_id
         self._readers: dict[tuple[int, int], Callable[[], int]] = {}
         self._checks: dict[tuple[int, int], list[Callable[[int], None]]] = {}
@@ -289,7 +269,7 @@ class ObjectDictionary:
         self.is_locked: Callable[[int, int], bool] = lambda _index, _subindex: False
         """Whether the state of the device forbids SDO to write an object now."""
         self._is_requested = False  # an SDO request is in progress
-        self._node = _DictionaryNode(node_id, eds_path, defaults, fallbacks, made_up or {})
+        self._node = _DictionaryNode(node_id, description)
         self._node.associate_network(_SilentNetwork(send))
         self._node.add_read_callback(self._read)  # type: ignore[no-untyped-call]
         self._node.add_write_callback(self._write)  # type: ignore[no-untyped-call]
@@ -313,17 +293,9 @@ class ObjectDictionary:
             return 0
         return len(self.objects[index])
 
-    def find(self, index: int, subindex: int) -> DictionaryVariable:
-        """Describe an object; an absent one refuses the SDO request in progress."""
-        found = self._node._find_object(index, subindex)
-        access = found.access_type
-        return DictionaryVariable(
-            bits=len(found),
-            format=_FORMATS.get(found.data_type or 0, ""),
-            is_mappable=bool(found.pdo_mappable),
-            is_readable=access not in ("wo", "rww"),
-            is_writable=access in ("rw", "rww", "wo"),
-        )
+    def find(self, index: int, subindex: int) -> ODVariable:
+        """Return an object; an absent one refuses the SDO request in progress."""
+        return self._node._find_object(index, subindex)
 
     def serve(self, index: int, subindex: int, read: Callable[[], int]) -> None:
         """Answer reads of an object with a live value. An object that the EDS lacks stays absent."""
@@ -417,21 +389,6 @@ def _call_all(functions: list[Callable[[int], None]], value: int) -> None:
 
 
 @dataclass(frozen=True)
-class DeviceDescription:
-    """One device: its EDS, and further values of its objects at power-on.
-
-    defaults: values in place of the EDS's. fallbacks: values that the EDS lacks. made_up: objects that the EDS
-    omits, by index. aliases: objects that hold the live value of another.
-    """
-
-    eds: Path
-    defaults: Values = field(default_factory=dict)
-    fallbacks: Values = field(default_factory=dict)
-    made_up: Mapping[int, MadeUp] = field(default_factory=dict)
-    aliases: Mapping[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class EmulatedContract:
     """File names within `contract_folder`.
 
@@ -445,7 +402,7 @@ class EmulatedContract:
     devices: tuple[DeviceDescription, ...] = ()
     period_us: int = 0
 
-    def describe(self, place: int) -> DeviceDescription:
+    def describe_device(self, place: int) -> DeviceDescription:
         """Describe the device at a place: drive 1, drive 2, sensor 1, sensor 2."""
         if self.devices:
             return self.devices[place]

@@ -24,23 +24,13 @@ COUNT = 8
 """PDOs of a device that are looked for, each way; our own have 4."""
 
 
-class PdoUser:
-    """The device's side of its PDOs. The methods of this base class are empty."""
-
-    def act(self, t_ns: int) -> None:
-        """Act on a frame that doesn't wait for SYNC; its values have been written."""
-
-    def mind_length(self, is_right: bool, t_ns: int) -> None:
-        """Take note of the length of a frame for the device."""
-
-
 class TransmitPdo(PdoRecord):
     """One TPDO."""
 
     is_received = False
 
     def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
-        super().__init__(pdos, index, message)
+        super().__init__(pdos.dictionary, index, message, pdos.longest, pdos.message_ids, pdos.refresh)
         self._pdos = pdos
         self.is_due = False
         """Whether an event has happened that the bus hasn't seen."""
@@ -55,7 +45,7 @@ class TransmitPdo(PdoRecord):
         self.is_compared = False
         """Whether its events are the changes of its content."""
 
-    def restart(self) -> None:
+    def restart_sequence(self) -> None:
         """Count the protected frames from their beginning."""
         if self.message is not None and self.message.is_protected:
             self._sender = self.message.sender()
@@ -68,7 +58,7 @@ class TransmitPdo(PdoRecord):
         self._syncs = 0
         self.send = self._make_sender()
 
-    def begin(self, t_ns: int) -> None:
+    def begin_sending(self, t_ns: int) -> None:
         """Become active: an event-driven PDO begins with a frame."""
         self.is_due = True
         self._allowed_ns = t_ns
@@ -148,7 +138,7 @@ class ReceivePdo(PdoRecord):
     is_received = True
 
     def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
-        super().__init__(pdos, index, message)
+        super().__init__(pdos.dictionary, index, message, pdos.longest, pdos.message_ids, pdos.refresh)
         self._pdos = pdos
         self.receiver = None if message is None or not message.is_protected else message.receiver()
         """Checks the frames of the contract's message; None where that isn't protected."""
@@ -162,10 +152,10 @@ class ReceivePdo(PdoRecord):
         """Whether this PDO counts as the device's command."""
         self._is_length_wrong = False
 
-    def restart(self) -> None:
+    def restart_sequence(self) -> None:
         """Forget the sequence of the protected frames, and the last one."""
         if self.receiver is not None:
-            self.receiver.restart()
+            self.receiver.restart_sequence()
         self.forget()
         self.acted_ns = None
 
@@ -183,7 +173,7 @@ class ReceivePdo(PdoRecord):
         layout = self.layout
         if len(data) != layout.length:
             self._is_length_wrong = True
-            self._pdos.user.mind_length(False, self._pdos.own_ns(t_ns))
+            self._pdos.mind_length(False, self._pdos.own_ns(t_ns))
             return
         if layout.header_bytes and self.receiver is not None:
             if self.receiver.check(data) > E2eStatus.OK_SOME_LOST:
@@ -191,7 +181,7 @@ class ReceivePdo(PdoRecord):
             self._pdos.header = data
         if self._is_length_wrong:
             self._is_length_wrong = False
-            self._pdos.user.mind_length(True, self._pdos.own_ns(t_ns))
+            self._pdos.mind_length(True, self._pdos.own_ns(t_ns))
         self.pending = layout.packing.unpack_from(data, layout.header_bytes)
         if self.type in EVENT_DRIVEN:
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
@@ -217,7 +207,10 @@ class Pdos:
         self.longest = longest
         self.message_ids = frozenset(messages)
         """Identifiers of the contract, which the device hears besides those that any PDO may have."""
-        self.user: PdoUser
+        self.act: Callable[[int], None] = lambda _t_ns: None
+        """Called when a frame that doesn't wait for SYNC has been written."""
+        self.mind_length: Callable[[bool, int], None] = lambda _is_right, _t_ns: None
+        """Called when frames begin or cease to have a wrong length."""
         self.header = bytes(4)
         """Header of the last protected frame, received or sent."""
         self.header_status: Callable[[], int] = int
@@ -260,7 +253,7 @@ class Pdos:
         """Tell whether an exchanged PDO brings values of an object."""
         return any((index, subindex) in pdo.layout.keys for pdo in self._receiving)
 
-    def accept(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
+    def accept_values(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
         """Give received values of an object to a function instead of writing the object as SDO does."""
         self._writers[index, subindex] = write
 
@@ -282,14 +275,15 @@ class Pdos:
         """Take over a new configuration."""
         self._receiving = tuple(pdo for pdo in self.receive if self._is_operational and pdo.is_active)
         sending = tuple(pdo for pdo in self.transmit if self._is_operational and pdo.is_active)
-        for pdo in (*self._receiving, *sending):
+        exchanged: tuple[ReceivePdo | TransmitPdo, ...] = (*self._receiving, *sending)
+        for pdo in exchanged:
             pdo.bind()
         for waiting in self.receive:
             if waiting not in self._receiving or not waiting.is_synchronous:
                 waiting.forget()
         for begun in sending:
             if begun not in self._sending:
-                begun.begin(self._now_ns)
+                begun.begin_sending(self._now_ns)
         self._sending = frozenset(sending)
         self.answers = frozenset(pdo.can_id for pdo in sending if pdo.type == 1)
         self.on_sync = tuple(pdo.send if pdo.type == 1 else pdo.on_sync for pdo in sending if pdo.is_synchronous)
@@ -309,10 +303,11 @@ class Pdos:
                     pdo.is_command = True
                 return
 
-    def restart(self) -> None:
+    def restart_sequences(self) -> None:
         """Begin all end-to-end sequences anew."""
-        for pdo in (*self.receive, *self.transmit):
-            pdo.restart()
+        pdos: tuple[ReceivePdo | TransmitPdo, ...] = (*self.receive, *self.transmit)
+        for pdo in pdos:
+            pdo.restart_sequence()
 
     def act_on_sync(self, t_ns: int) -> bool:
         """Let the frames that waited for SYNC act; return whether a command has acted since the SYNC before."""
@@ -322,7 +317,7 @@ class Pdos:
     def act_at_once(self, pdo: ReceivePdo, t_ns: int) -> None:
         """Apply a frame that doesn't wait for SYNC."""
         self._is_commanded |= self._act((pdo,), t_ns)
-        self.user.act(t_ns)
+        self.act(t_ns)
 
     @staticmethod
     def _act(pdos: Iterable[ReceivePdo], t_ns: int) -> bool:

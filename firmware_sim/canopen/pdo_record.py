@@ -7,14 +7,13 @@ instead of objects) leave gaps in frames that are received. Source: CiA 301 (4.2
 """
 
 import struct
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.contract_frames import NOT_VALID
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
-from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Refusal, one_of, refuse
+from firmware_sim.canopen.object_dictionary import FORMATS, Abort, ObjectDictionary, Refusal, one_of, refuse
 
 EVENT_DRIVEN = (254, 255)
 """Transmission types."""
@@ -35,30 +34,30 @@ def _is_restricted(can_id: int) -> bool:
     return any(low <= can_id <= high for low, high in zip(lowest, highest, strict=True))
 
 
-class PdoOwner(Protocol):
-    """The owner of the PDO."""
-
-    dictionary: ObjectDictionary
-    longest: int
-    message_ids: frozenset[int]
-
-    def refresh(self) -> None:
-        """Take over a new configuration."""
-
-
-class PdoRecord(ABC):
+class PdoRecord:
     """Communication and mapping record of one PDO."""
 
     is_received: bool
 
-    def __init__(self, owner: PdoOwner, index: int, message: MessageCodec | None) -> None:
-        dictionary = owner.dictionary
+    def __init__(
+        self,
+        dictionary: ObjectDictionary,
+        index: int,
+        message: MessageCodec | None,
+        longest: int,
+        message_ids: frozenset[int],
+        refresh: Callable[[], None],
+    ) -> None:
+        """`longest`: frame, in bytes. `message_ids`: those of the contract. `refresh`: takes over a new configuration.
+
+        `message`: the contract's with the PDO's default COB-ID.
+        """
+        self._dictionary, self._longest, self._message_ids, self._refresh = dictionary, longest, message_ids, refresh
         self.layout = NOTHING
-        self._owner = owner
         self.message = message
         self.can_id = dictionary.value(index, 1) & 0x7FF
         self._is_valid = not dictionary.value(index, 1) & NOT_VALID
-        self._can_be_invalid = dictionary.find(index, 1).is_writable
+        self._can_be_invalid = dictionary.find(index, 1).writable
         self.type = dictionary.value_or(EVENT_DRIVEN[-1], index, 2)
         self.inhibit_ns = dictionary.value_or(0, index, 3) * 100_000
         self.timer_ns = dictionary.value_or(0, index, 5) * 1_000_000
@@ -90,19 +89,11 @@ class PdoRecord(ABC):
         """Whether it goes by SYNC."""
         return self.type not in EVENT_DRIVEN
 
-    @abstractmethod
-    def bind(self) -> None:
-        """Take over a new mapping."""
-
-    @abstractmethod
-    def restart(self) -> None:
-        """Begin anew after a reset."""
-
     def _check_cob_id(self, value: int) -> None:
         can_id = value & 0x7FF
         if value & _IS_EXTENDED or value & 0x1FFFF800 or _is_restricted(can_id):
             refuse(Abort.VALUE_RANGE)
-        if self.is_received and can_id not in LISTENED_IDS and can_id not in self._owner.message_ids:
+        if self.is_received and can_id not in LISTENED_IDS and can_id not in self._message_ids:
             refuse(Abort.VALUE_RANGE)
         if self._is_valid and not value & NOT_VALID and can_id != self.can_id:
             refuse(Abort.DEVICE_STATE)
@@ -110,11 +101,11 @@ class PdoRecord(ABC):
     def _identify(self, value: int) -> None:
         self.can_id = value & 0x7FF
         self._is_valid = not value & NOT_VALID
-        self._owner.refresh()
+        self._refresh()
 
     def _set_type(self, value: int) -> None:
         self.type = value
-        self._owner.refresh()
+        self._refresh()
 
     @property
     def _is_held(self) -> bool:
@@ -130,7 +121,7 @@ class PdoRecord(ABC):
 
     def _set_timer(self, period_ms: int) -> None:
         self.timer_ns = period_ms * 1_000_000
-        self._owner.refresh()
+        self._refresh()
 
     def _entry_check(self, place: int) -> Callable[[int], None]:
         def check(value: int) -> None:
@@ -139,7 +130,7 @@ class PdoRecord(ABC):
             if self._is_held or self._count != 0:
                 refuse(Abort.DEVICE_STATE)
             if value != 0:
-                check_entry(self._owner.dictionary, value, self.is_received)
+                check_entry(self._dictionary, value, self.is_received)
 
         return check
 
@@ -161,11 +152,11 @@ class PdoRecord(ABC):
     def _map(self, value: int) -> None:
         self._count = value
         self._lay_out(value)
-        self._owner.refresh()
+        self._refresh()
 
     def _lay_out(self, count: int) -> None:
         """Lay out the first `count` entries, or refuse and leave everything as it is."""
-        layout = lay_out(self._owner.dictionary, self._entries[:count], self.is_received, self._owner.longest)
+        layout = lay_out(self._dictionary, self._entries[:count], self.is_received, self._longest)
         if layout.header_bytes and not self._has_data_ids(layout.header_bytes):
             refuse(Abort.INCOMPATIBLE)
         self.layout = layout
@@ -189,13 +180,6 @@ _HEADERS = {
 _HEADER_OBJECTS = {key for keys in _HEADERS.values() for key in keys}
 
 
-class MappingEntry(NamedTuple):
-    """One mapping entry: index << 16 | sub-index << 8 | bits."""
-
-    key: tuple[int, int]
-    bits: int
-
-
 class PdoLayout(NamedTuple):
     """The layout of a frame: header_bytes, then `packing` with the values of `keys`, then padding up to `length`."""
 
@@ -209,24 +193,24 @@ NOTHING = PdoLayout((), struct.Struct("<"), 0, 0)
 
 
 def check_entry(dictionary: ObjectDictionary, value: int, is_received: bool) -> str:
-    """Refuse an entry that can't be mapped in this direction; return its `struct` format."""
-    (index, subindex), bits = decode_entry(value)
+    """Refuse an entry that can't be mapped in this direction; return its `struct` format.
+
+    An entry is index << 16 | sub-index << 8 | bits.
+    """
+    index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
     dummy_bits = dictionary.dummy_bits(index)
     if dummy_bits:
         if not is_received or subindex != 0 or bits != dummy_bits:
             refuse(Abort.NOT_MAPPABLE)
         return f"{bits // 8}x"
     variable = dictionary.find(index, subindex)
-    is_reachable = variable.is_writable if is_received else variable.is_readable
-    is_number = variable.format != "" and variable.bits % 8 == 0
-    if not (variable.is_mappable and is_reachable and is_number) or bits != variable.bits:
+    # rww is for receiving only
+    access = variable.access_type
+    is_reachable = access in ("rw", "rww", "wo") if is_received else access not in ("wo", "rww")
+    size, kind = len(variable), FORMATS.get(variable.data_type or 0, "")
+    if not (variable.pdo_mappable and is_reachable and kind and size % 8 == 0) or bits != size:
         refuse(Abort.NOT_MAPPABLE)
-    return variable.format
-
-
-def decode_entry(value: int) -> MappingEntry:
-    """Take an entry apart."""
-    return MappingEntry((value >> 16, value >> 8 & 0xFF), value & 0xFF)
+    return kind
 
 
 def lay_out(dictionary: ObjectDictionary, values: Sequence[int], is_received: bool, longest: int) -> PdoLayout:
@@ -235,11 +219,10 @@ def lay_out(dictionary: ObjectDictionary, values: Sequence[int], is_received: bo
     A header must lead and be whole. Frames of more than 8 bytes have one of CAN FD's lengths.
     """
     formats = [check_entry(dictionary, value, is_received) for value in values]
-    entries = [decode_entry(value) for value in values]
-    size = sum(entry.bits for entry in entries) // 8
+    size = sum(value & 0xFF for value in values) // 8
     if size > longest:
         refuse(Abort.PDO_TOO_LONG)
-    keys = [entry.key for entry in entries]
+    keys = [(value >> 16, value >> 8 & 0xFF) for value in values]
     header_bytes = next((n for n, header in _HEADERS.items() if tuple(keys[: len(header)]) == header), 0)
     skipped = len(_HEADERS[header_bytes]) if header_bytes else 0
     if any(key in _HEADER_OBJECTS for key in keys[skipped:]):

@@ -7,11 +7,9 @@ the bench's time; a device and its application exchange times of the device's ow
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
-from pathlib import Path
 
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
-from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.canopen.error_control import (
     ErrorReporter,
@@ -20,10 +18,9 @@ from firmware_sim.canopen.error_control import (
     SyncCounts,
     SyncKind,
     Watchdog,
-    Watchdogs,
 )
-from firmware_sim.canopen.object_dictionary import Abort, MadeUp, ObjectDictionary, Send, Values, refuse
-from firmware_sim.canopen.pdo import Pdos, PdoUser
+from firmware_sim.canopen.object_dictionary import Abort, DeviceDescription, ObjectDictionary, Send, refuse
+from firmware_sim.canopen.pdo import Pdos
 
 _GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
 _RECOVERED_FROM_BUS_OFF = 0x8140
@@ -45,13 +42,19 @@ RESET_NODE, RESET_COMMUNICATION = 129, 130
 _OF_SYNC = {Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH}
 
 
-class Application(PdoUser):
+class Application:
     """The application of a device: everything besides communication. The methods of this base class are empty."""
 
     @property
     def is_at_work(self) -> bool:
         """Whether the device is at work, so that its objects must not change."""
         return False
+
+    def act(self, t_ns: int) -> None:
+        """Act on a frame that doesn't wait for SYNC; its values have been written."""
+
+    def mind_length(self, is_right: bool, t_ns: int) -> None:
+        """Take note of the length of a frame for the device."""
 
     def leave_operational(self, t_ns: int) -> None:
         """React to leaving Operational; EMCY messages can still be sent."""
@@ -71,7 +74,7 @@ class Application(PdoUser):
     def note_error(self) -> None:
         """Take note that the error register, 0x1001, may have changed."""
 
-    def restart(self, is_node_reset: bool) -> None:
+    def restart_node(self, is_node_reset: bool) -> None:
         """Begin anew: communication only, or all of the device."""
 
 
@@ -81,20 +84,16 @@ class EmulatedDevice(ObjectDictionary):
     def __init__(
         self,
         node_id: int,
-        eds_path: Path,
+        description: DeviceDescription,
         send: Send,
-        messages: Mapping[int, MessageCodec] | None = None,
-        longest_pdo: int = CLASSIC_BYTES,
-        defaults: Values | None = None,
-        fallbacks: Values | None = None,
-        made_up: Mapping[int, MadeUp] | None = None,
+        messages: Mapping[int, MessageCodec],
+        longest_pdo: int,
     ) -> None:
-        """Read the EDS; the device sends no frame before `boot`. Raises OSError when the EDS can't be read.
+        """Read the EDS; the device sends no frame before `power_on`. Raises OSError when the EDS can't be read.
 
-        `messages`: the contract's, by identifier. `longest_pdo` in bytes. `defaults`, `fallbacks`, `made_up`: of
-        objects.
+        `messages`: the contract's, by identifier. `longest_pdo` in bytes.
         """
-        super().__init__(node_id, eds_path, self._send, defaults or {}, fallbacks or {}, made_up)
+        super().__init__(node_id, description, self._send)
         self.clock = NodeClock()
         self.is_powered = True
         self.is_on_bus = True
@@ -118,7 +117,8 @@ class EmulatedDevice(ObjectDictionary):
         self._producer = HeartbeatProducer(self, self._send, lambda: self.state, lambda: self.now_ns)
         self._consumer = HeartbeatConsumer(self, self.lose_heartbeat, self.find_heartbeat, lambda: self.now_ns)
         self._errors = ErrorReporter(self, self._send, lambda: self.error_register, lambda: self.state in _EMCY_STATES)
-        self.watchdogs = Watchdogs(self)
+        self.tripped = self._errors.tripped
+        """Watchdogs that are tripped now."""
         self.sync_counts = SyncCounts(self)
         self.is_locked = self._is_locked_at_work
         self.watch(0x1006, 0, check=self._check_period)
@@ -127,24 +127,24 @@ class EmulatedDevice(ObjectDictionary):
         self.watch(0x1019, 0, self._set_overflow, self._check_overflow)
         self.open_at_work = frozenset({_CLEAR_HISTORY})
         """Objects that SDO may write while the device is at work."""
-        self.pdos = Pdos(self, send, messages or {}, longest_pdo)
+        self.pdos = Pdos(self, send, messages, longest_pdo)
         self.pdos.own_ns = self.clock.own_ns
 
     @property
     def error_register(self) -> int:
         """0x1001."""
-        register = _GENERIC | _COMMUNICATION if self.watchdogs.tripped else 0
+        register = _GENERIC | _COMMUNICATION if self.tripped else 0
         return register | (_GENERIC | self.fault_bits if self.is_faulty else 0)
 
     @property
     def is_sync_odd(self) -> bool:
         """Whether an odd SYNC is remembered, so that right ones count."""
-        return bool(_OF_SYNC & self.watchdogs.tripped)
+        return bool(_OF_SYNC & self.tripped)
 
     def attach(self, application: Application) -> None:
         """Connect the application."""
         self._application = application
-        self.pdos.user = application
+        self.pdos.act, self.pdos.mind_length = application.act, application.mind_length
 
     def power_on(self, t_ns: int) -> None:
         """Give the device power: its time begins, then it boots, with its defaults if it was off."""
@@ -156,7 +156,7 @@ class EmulatedDevice(ObjectDictionary):
     def power_off(self, _t_ns: int) -> None:
         """Take the power away: the device neither sends nor hears, and forgets all written values."""
         self.is_powered = self.is_on_bus = False
-        self._errors.reset()
+        self._errors.forget_messages()
         self.is_operational = False
         self.state = NmtState.INITIALISING
         self.pdos.set_operational(False, self.now_ns)
@@ -174,7 +174,7 @@ class EmulatedDevice(ObjectDictionary):
         self._is_bus_off = False
         self.is_on_bus = self.is_powered
         if self.is_on_bus:
-            self._errors.report(_RECOVERED_FROM_BUS_OFF, self.clock.own_ns(t_ns))
+            self._errors.report_error(_RECOVERED_FROM_BUS_OFF, self.clock.own_ns(t_ns))
 
     def cry(self, code: int, t_ns: int) -> None:
         """Send an EMCY at once, whatever its inhibit time, as a device out of control does."""
@@ -183,7 +183,7 @@ class EmulatedDevice(ObjectDictionary):
     def _boot(self, t_ns: int) -> None:
         """Announce the device and enter Pre-operational."""
         self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
-        self._producer.restart(t_ns)
+        self._producer.begin_heartbeats(t_ns)
         self._enter(NmtState.PRE_OPERATIONAL, t_ns)
 
     def on_nmt(self, data: bytes, t_ns: int) -> None:
@@ -231,7 +231,7 @@ class EmulatedDevice(ObjectDictionary):
             return
         t_ns = self.clock.own_ns(t_ns)
         counts = self.sync_counts
-        counts.note(kind, lost)
+        counts.count_sync(kind, lost)
         if kind is SyncKind.WRONG_LENGTH:
             self.trip(Watchdog.SYNC_LENGTH, t_ns)
         elif kind is SyncKind.RIGHT:
@@ -245,26 +245,26 @@ class EmulatedDevice(ObjectDictionary):
 
     def trip(self, watchdog: Watchdog, t_ns: int) -> None:
         """Report a watchdog that trips; once, until it has cleared."""
-        self.watchdogs.trip(watchdog, self._errors, t_ns, self._time_ms(t_ns))
+        self._errors.trip(watchdog, t_ns, self._time_ms(t_ns))
         self._application.note_error()
 
     def clear(self, watchdog: Watchdog, t_ns: int) -> None:
         """Report that the cause of a tripped watchdog has gone, by an EMCY with code 0."""
-        if watchdog in self.watchdogs.tripped:
-            self.watchdogs.clear(watchdog, self._errors, t_ns, self._time_ms(t_ns))
+        if watchdog in self.tripped:
+            self._errors.clear(watchdog, t_ns, self._time_ms(t_ns))
             self._application.note_error()
 
     def report_fault(self, code: int, t_ns: int) -> None:
         """Send the EMCY of a fault that no watchdog found."""
-        self._errors.report(code, t_ns, time_ms=self._time_ms(t_ns))
+        self._errors.report_error(code, t_ns, time_ms=self._time_ms(t_ns))
 
     def report_no_error(self, t_ns: int) -> None:
         """Report the reset of a fault by an EMCY with code 0."""
-        self._errors.report(0, t_ns)
+        self._errors.report_error(0, t_ns)
 
     def poll(self, t_ns: int) -> int:
         """Act on timers that are due by its own clock; return when the next one is."""
-        return min(self._producer.poll(t_ns), self._consumer.poll(t_ns), self._errors.poll(t_ns))
+        return min(self._producer.send_due(t_ns), self._consumer.find_silence(t_ns), self._errors.send_waiting(t_ns))
 
     def _is_locked_at_work(self, index: int, subindex: int) -> bool:
         """Whether SDO may not write an object now: while the device is at work, only objects in `open_at_work`."""
@@ -305,11 +305,11 @@ class EmulatedDevice(ObjectDictionary):
     def _reset(self, is_node_reset: bool) -> None:
         """Restore the EDS values: the communication profile's, or all."""
         self.restore(0xFFFF if is_node_reset else 0x1FFF)
-        self.pdos.restart()
+        self.pdos.restart_sequences()
         if is_node_reset:
-            self.watchdogs.reset()
-            self.sync_counts.reset()
-        self._application.restart(is_node_reset)
+            self._errors.forget_trips()
+            self.sync_counts.forget_counts()
+        self._application.restart_node(is_node_reset)
 
 
 _BILLION = 1_000_000_000
@@ -366,7 +366,7 @@ class SyncListeners:
             device.watch(0x1019, 0, lambda _: self._sort())
         self._sort()
 
-    def restart(self) -> None:
+    def forget_unheard(self) -> None:
         """Take the next SYNC for the first."""
         self._unheard = [0] * len(self._devices)
 

@@ -66,8 +66,8 @@ class DriveNode(Application):
         motor: Motor,
         rated_torque_Nm: float,
         is_free_running: bool,
-        scale: DriveScale = DriveScale(),  # noqa: B008 (a constant)
-        habits: HabitSettings = HabitSettings(),  # noqa: B008 (a constant)
+        scale: DriveScale,
+        habits: HabitSettings,
     ) -> None:
         """Connect the node to its device.
 
@@ -81,7 +81,7 @@ class DriveNode(Application):
         """Whether a change waits to be sent on the bus."""
         self._pdos = device.pdos
         self._clock = device.clock
-        self._tripped = device.watchdogs.tripped
+        self._tripped = device.tripped
         self._motor = motor
         self.is_free_running = is_free_running
         """Whether time passes without SYNC, so that SYNC is watched."""
@@ -120,7 +120,7 @@ class DriveNode(Application):
         if not codec.message(f"Drive{number}Command").is_protected:
             device.open_at_work |= {(0x6071, 0)}
         device.attach(self)
-        self.restart(is_node_reset=True)
+        self.restart_node(is_node_reset=True)
 
     def _serve(self, codec: Codec) -> None:
         """Register readers of the drive's live objects in the object dictionary."""
@@ -144,7 +144,7 @@ class DriveNode(Application):
         device = self.device
         device.open_at_work |= {_CONTROLWORD}
         self._pdos.events = _EVENTS
-        self._pdos.accept(*_CONTROLWORD, self._receive_word)
+        self._pdos.accept_values(*_CONTROLWORD, self._receive_word)
         device.watch(*_CONTROLWORD, check=self._obey_by_sdo)
         device.watch(0x605A, 0, check=one_of(*QUICK_STOPS))
         device.watch(0x605B, 0, check=one_of(*RAMPS))
@@ -311,7 +311,7 @@ class DriveNode(Application):
         if self.is_enabled:
             self._fault(Watchdog.SYNC, t_ns)
 
-    def restart(self, is_node_reset: bool) -> None:
+    def restart_node(self, is_node_reset: bool) -> None:
         """Forget the last command; a node reset also runs the state machine from its start (0, 1)."""
         self._received_word = None
         if not is_node_reset:
@@ -326,7 +326,7 @@ class DriveNode(Application):
         self._limits.target = 0
         self._mode = self._wanted_mode
         self._ramp_end = None
-        self._patience.restart()
+        self._patience.forget_command()
         self.state = DriveState.START
         self._apply(DriveEvent.POWER_ON, 0)
         self._apply(DriveEvent.INITIALISED, 0)
@@ -412,7 +412,7 @@ class DriveNode(Application):
         self.motor_mode = stop.mode
         self._is_braking = True
         self.has_news = True
-        self._standstill.begin(t_ns)
+        self._standstill.begin_braking(t_ns)
 
     def _reset_fault(self, t_ns: int) -> None:
         """Leave Fault, unless its cause is still there."""

@@ -170,7 +170,7 @@ class Standstill:
     def __init__(self) -> None:
         self._since_ns = self._moving_ns = 0
 
-    def begin(self, t_ns: int) -> None:
+    def begin_braking(self, t_ns: int) -> None:
         """Begin braking."""
         self._since_ns = self._moving_ns = t_ns
 
@@ -201,7 +201,7 @@ class TorqueLimits:
         takers: dict[int, Callable[[int], None]] = {0x6071: self._set_target, 0x60B2: self._set_offset}
         takers |= {index: functools.partial(self._limit, index) for index in _LIMITS}
         for index, take in takers.items():
-            pdos.accept(index, 0, take)
+            pdos.accept_values(index, 0, take)
             dictionary.watch(index, 0, take)
         self.target, self._offset = dictionary.default_or(0, 0x6071), dictionary.default_or(0, 0x60B2)
         self._combine()
@@ -244,9 +244,9 @@ class Motor(NamedTuple):
 
     velocity_rad_s: Callable[[], float]
     torque_Nm: Callable[[], float]
-    is_limited: Callable[[], bool] = lambda: False
-    error_code: Callable[[], int] = lambda: 0
-    is_ideal: bool = False
+    is_limited: Callable[[], bool]
+    error_code: Callable[[], int]
+    is_ideal: bool
 
 
 class DriveScale(NamedTuple):
@@ -287,7 +287,7 @@ class Patience:
             return NEVER_NS
         return self.sync_ns + self._period_us * self._tenth_periods * 100
 
-    def restart(self) -> None:
+    def forget_command(self) -> None:
         """Forget the last command."""
         self.silent_syncs = _NO_COMMAND_YET
 
@@ -303,7 +303,7 @@ class Patience:
         self._tenth_periods = tenth_periods
 
 
-def velocity_lsb(codec: Codec, number: int, factor: float = 1.0) -> float | None:
+def velocity_lsb(codec: Codec, number: int, factor: float) -> float | None:
     """Return the LSB of velocity in rad/s, the contract's divided by `factor`; None when it is the body's own."""
     signals = codec.message(f"Drive{number}Feedback").signals
     scale = next(signal.scale for signal in signals if signal.name == "velocity") / factor

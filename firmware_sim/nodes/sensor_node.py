@@ -12,7 +12,7 @@ Source: CiA 404, objects 0x6125, 0x6150, 0x9130.
 from collections.abc import Callable
 
 from adacd_hil.wire.codec import Codec
-from firmware_sim.arm.sensing import TORQUE_COUNTS, TORQUE_LSB_NM
+from firmware_sim.arm.sensing import TORQUE_LSB_NM
 from firmware_sim.canopen.error_control import Watchdog
 from firmware_sim.canopen.object_dictionary import Abort, refuse
 from firmware_sim.nodes.device import Application, EmulatedDevice
@@ -38,9 +38,9 @@ class SensorNode(Application):
         device: EmulatedDevice,
         codec: Codec,
         number: int,
-        converter_ends: tuple[int, int] = TORQUE_COUNTS,
-        temperature_C: Callable[[], float] = lambda: ROOM_TEMPERATURE_C,
-        count_Nm: float | None = None,
+        converter_ends: tuple[int, int],
+        temperature_C: Callable[[], float],
+        count_Nm: float | None,
     ) -> None:
         """Connect the node to its device.
 
@@ -128,7 +128,7 @@ class SensorNode(Application):
         """Whether a host relies on its measurement."""
         return self.device.is_operational
 
-    def restart(self, is_node_reset: bool) -> None:
+    def restart_node(self, is_node_reset: bool) -> None:
         """Forget the zero at a node reset."""
         if is_node_reset:
             self._status = STATUS_NOT_VALID

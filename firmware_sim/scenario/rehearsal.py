@@ -193,13 +193,7 @@ def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
             f"links, friction and stops of profile {arm.profile}, since the file has neither arm.link_length_m nor "
             "arm.cad_theta"
         )
-        first, second = model.links
-        links = _Links(
-            model.link_length_m,
-            (first.mass_kg, second.mass_kg),
-            (first.center_m, second.center_m),
-            (first.inertia_kg_m2, second.inertia_kg_m2),
-        )
+        links = _Links(model.link_length_m, model.mass_kg, model.center_m, model.inertia_kg_m2)
         return _multiply(links, truth)
     if truth.arm.link_length_m is None and "arm.link_length_m" not in told.own_keys:
         assumed.append(f"links of {told_m[0]:g} and {told_m[1]:g} m, since the file has no arm.link_length_m")

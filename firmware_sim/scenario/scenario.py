@@ -34,7 +34,7 @@ import numpy as np
 from adacd_hil.records import FaultReason, Vector
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
-from firmware_sim.arm.arms import ARMS, STRAIGHT, ArmProfile, OwnArmSettings, Wiring
+from firmware_sim.arm.arms import ARMS, STRAIGHT, EmulatedArm, Wiring
 from firmware_sim.arm.hardware_settings import (
     DriveSettings,
     HabitSettings,
@@ -201,7 +201,7 @@ class Scenario:
         0, low=0, high=1000, meaning="how many faults the person acknowledges, each 1 s after it"
     )
     profile: str = setting("P", choices=tuple(ARMS), meaning="which arm")
-    own_arm: OwnArmSettings | None = setting(None, meaning="an arm of one's own in place of the profile")
+    own_arm: EmulatedArm | None = setting(None, meaning="an arm of one's own in place of the profile")
     seed: int = setting(1, low=0, high=2**63 - 1, meaning="of the sensor noise")
     noise: bool = setting(True, meaning="noise of torque sensors and encoders; quantisation stays")
     start_deg: tuple[float, float] = setting(
@@ -275,9 +275,9 @@ class Scenario:
         return own or self.expect
 
     @property
-    def arm(self) -> ArmProfile:
+    def arm(self) -> EmulatedArm:
         """The arm of one's own, or that of the profile."""
-        return ARMS[self.profile] if self.own_arm is None else self.own_arm.profile
+        return ARMS[self.profile] if self.own_arm is None else self.own_arm
 
     @property
     def wiring(self) -> Wiring:

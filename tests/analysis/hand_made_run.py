@@ -18,8 +18,8 @@ from adacd_hil.records import (
     Request,
     SchemeOutput,
     SchemeState,
-    scheme_layout,
 )
+from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import parse
 
@@ -187,22 +187,35 @@ def like_an_old_log(run: Run) -> Run:
     return replace(run, timing=replace(run.timing, columns={name: run.timing[name] for name in names}))
 
 
-def record(path: Path, run: Run, attachments: dict[str, bytes]) -> None:
+def record(path: Path, run: Run, attachments: dict[str, bytes], clock: str = "lockstep") -> None:
     """Write a log with the scheme's topic of a hand-made run."""
-    layout = scheme_layout(7)
+    slices = layout_of(run.settings).slices
+    blocks = np.zeros((len(run.cycle), layout_of(run.settings).size))
+    columns = {name: getattr(run, name) for name in ("tau_ext_hat", "theta_hat", "threshold")}
+    if run.certified is not None and run.beside is not None:
+        columns |= {
+            "tau_ext_hat_cad": run.tau_ext_hat_cad,
+            "tau_ext_bank": run.certified.tau_ext,
+            "threshold_bank": run.certified.threshold,
+            **{name: getattr(run.certified, name) for name in ("theta_further", "theta_std", "promotions")},
+            **{f"paper_{name}": getattr(run.beside, name) for name in ("is_armed", "tau_ext_hat", "threshold")},
+        }
+    for name, column in columns.items():
+        blocks[:, slices[name]] = column.reshape(len(blocks), -1)
     with Recorder(
-        path, attachments=attachments, metadata={"clock": "lockstep", "scenario": "paper"}, blocking=True
+        path,
+        attachments=attachments,
+        metadata={"clock": clock, "scenario": "paper"},
+        further_count=0 if run.certified is None else run.settings.further_count,
+        channel_count=0 if run.certified is None else run.settings.channel_count,
+        blocking=True,
     ) as recorder:
         for row, cycle in enumerate(run.cycle.tolist()):
-            block = np.zeros(layout.size)
-            block[layout.slices["tau_ext_hat"]] = run.tau_ext_hat[row]
-            block[layout.slices["theta_hat"]] = run.theta_hat[row]
-            block[layout.slices["threshold"]] = run.threshold[row]
             state = SchemeState(run.state[row])
             joints = int(state is SchemeState.REACT)
             output = SchemeOutput(
                 cycle, state, state, FaultReason.NONE, joints, False, run.theta_hat[row], run.theta_hat[row],
-                run.tau_ext_hat[row], None, block,
+                run.tau_ext_hat[row], None, blocks[row],
             )  # fmt: skip
             times = CycleRecord(*(int(run.timing[name][row]) for name in CycleRecord._fields))
             messages = [

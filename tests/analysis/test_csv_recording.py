@@ -255,11 +255,6 @@ def test_times_that_jitter_are_a_note_with_the_period_that_replaces_them(read: C
     assert note.startswith("rows are 3 to 7 ms apart")
     assert "`sampling.period_s` = 0.005" in note
     assert read("".join(lines(plain))).notes == ()
-    measured = lines(
-        lambda k, q, tau: f"{0.005 * k + 0.002 * (k % 2):.3f},{q},{tau},{10.0 * np.cos(0.05 * k)}",
-        "t,angle,torque,speed\n",
-    )
-    assert read("".join(measured), 'time = "t" -> time = "t"\ndq = ["speed"]').notes == ()
 
 
 def test_noise_is_at_least_that_of_rounding(read: Callable[..., ForeignRecording]) -> None:

@@ -61,14 +61,14 @@ def test_a_few_last_cycles_are_no_second():
     assert gather_data(missing_frames(make_run((A, 1000), (M, 100)), np.arange(1050, 1100))).worst_incomplete == 0.0
 
 
-@pytest.mark.parametrize("size", [1, 7, 333, 1000, 5000])
+@pytest.mark.parametrize("size", [1, 333])
 def test_pieces_come_to_the_same_as_the_whole(size):
     run = make_run((A, 700), (SchemeState.FAULT, 50), (A, 900), (M, 1700))
     run = missing_frames(run, np.random.default_rng(1).random(len(run.cycle)) < 0.05, age=1)
     gatherer = CyclicDataGatherer(run.settings)
     for start in range(0, len(run.cycle), size):
         rows = np.arange(start, min(start + size, len(run.cycle)))
-        gatherer.add(run.timing.rows(rows), run.cycle[rows], run.state[rows])
+        gatherer.add_columns(run.timing.rows(rows), run.cycle[rows], run.state[rows])
     assert gatherer.data(run) == gather_data(run)
 
 

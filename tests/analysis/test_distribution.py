@@ -13,7 +13,7 @@ FINEST = 2.0**-12
 def distribution_of(values, exact, pieces=7):
     found = Distribution(exact)
     for part in np.array_split(values, pieces):
-        found.add(part)
+        found.add_values(part)
     return found
 
 
@@ -76,5 +76,5 @@ def test_what_is_not_a_number_is_left_out():
 @pytest.mark.parametrize("exact", [0, 100])
 def test_no_value_has_no_percentile(exact):
     found = Distribution(exact)
-    found.add(np.empty(0))
+    found.add_values(np.empty(0))
     assert (found.percentiles(), found.low_percentiles(), np.isnan(found.median())) == ({}, {}, True)

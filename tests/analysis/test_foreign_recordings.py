@@ -76,20 +76,25 @@ def example():
     return read_map(EXAMPLE / "map.toml")
 
 
-def test_units_and_signs_are_those_of_the_map(free: Path, example) -> None:
-    (stretch,) = read_recording(free, example).stretches
+def copy_example(folder: Path, change=("", ""), urdf=("", "")) -> Path:
+    """Copy the example's map and URDF, with a text of each replaced, and return the map."""
+    for name, (old, new) in (("map.toml", change), ("planar-arm.urdf", urdf)):
+        text = (EXAMPLE / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1))
+    return folder / "map.toml"
+
+
+def test_units_and_signs_are_those_of_the_map_period_and_noise_the_recordings(free: Path, example) -> None:
+    recording = read_recording(free, example)
+    assert (recording.period_s, recording.duration_s) == pytest.approx((PERIOD_S, 10.0))
+    assert_allclose(recording.noise_Nm, NOISE_NM, rtol=0.1)
+    (stretch,) = recording.stretches
     q, dq, ddq = motion(PERIOD_S * np.arange(len(stretch.record.q)))
     assert_allclose(stretch.record.q, q, atol=1e-7)
     assert_allclose(stretch.record.dq[20:-20], dq[20:-20], atol=2e-3)
     expected = np.array([inverse_dynamics(*row, THETA, 0.0) for row in zip(q[:200], dq[:200], ddq[:200], strict=True)])
     assert_allclose(stretch.record.tau_J[:200], expected, atol=6 * NOISE_NM)
-
-
-def test_period_and_noise_are_found_in_the_recording(free: Path, example) -> None:
-    recording = read_recording(free, example)
-    assert recording.period_s == pytest.approx(PERIOD_S)
-    assert_allclose(recording.noise_Nm, NOISE_NM, rtol=0.1)
-    assert recording.duration_s == pytest.approx(10.0)
 
 
 @pytest.mark.long
@@ -141,24 +146,15 @@ def test_a_test_in_two_stretches_is_judged_by_the_worse(free: Path, tmp_path: Pa
 
 
 def test_rotors_are_parameters_only_of_motors(tmp_path: Path, example) -> None:
-    text = (EXAMPLE / "map.toml").read_text().replace("planar-arm.urdf", str(EXAMPLE / "planar-arm.urdf"))
-    path = tmp_path / "map.toml"
-    path.write_text(text.replace("[columns]", "has_rotors = true\n\n[columns]"))
+    described = read_map(copy_example(tmp_path, ("[columns]", "has_rotors = true\n\n[columns]")))
     rows = table(6.0)
     acceleration = motion(rows[:, 0] * 1e-3)[2] * np.array([0.0, -0.05])
     rows[:, 3:5] += acceleration * 1e3
-    described = read_map(path)
     found = identify(described, [read_recording(write(tmp_path / "geared.csv", rows), described)], None)
     names = found.model.parameter_names
     assert names[-2:] == ("rotor1", "rotor2")
     assert found.estimate.theta[names.index("rotor2")] == pytest.approx(0.05, abs=0.005)
-    assert not any(name.startswith("rotor") for name in identify_names(example))
-
-
-def identify_names(described):
-    from adacd_hil.scheme.identify import offline
-
-    return offline.model_of(described.urdf.chain, described.arm.has_rotors).parameter_names
+    assert not any(name.startswith("rotor") for name in model_of(example.urdf.chain).parameter_names)
 
 
 @pytest.mark.parametrize(
@@ -174,13 +170,9 @@ def identify_names(described):
     ],
 )
 def test_a_wrong_map_is_one_line(tmp_path: Path, free: Path, old: str, new: str, line: str) -> None:
-    text = (EXAMPLE / "map.toml").read_text()
-    assert old in text
-    text = text.replace(old, new)
-    (tmp_path / "map.toml").write_text(text)
-    (tmp_path / "planar-arm.urdf").write_text((EXAMPLE / "planar-arm.urdf").read_text())
+    described = copy_example(tmp_path, (old, new))
     with pytest.raises(ConfigError) as refusal:
-        read_recording(free, read_map(tmp_path / "map.toml"))
+        read_recording(free, read_map(described))
     assert line in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
@@ -216,7 +208,7 @@ def test_a_wrong_recording_is_one_line(tmp_path: Path, example, text: str, line:
 
 
 def test_a_row_is_counted_over_all_blocks_that_are_read(tmp_path: Path, example, monkeypatch) -> None:
-    monkeypatch.setattr(recorded_columns, "_BLOCK_ROWS", 25)
+    monkeypatch.setattr(recorded_columns, "BLOCK_ROWS", 25)
     for text, note in (
         ("60,1,3,4,5,0\n", "1 row with the time of the row before left out (row 62: 0.059 s once more)"),
         ("61,1,x,4,5,0\n", "1 row that can't be read left out (row 62: column 'j2_deg' is 'x', no number)"),
@@ -226,17 +218,9 @@ def test_a_row_is_counted_over_all_blocks_that_are_read(tmp_path: Path, example,
         assert read_recording(tmp_path / "some.csv", example).notes == (note,)
 
 
-def test_blocks_are_the_recording(free: Path, example, monkeypatch) -> None:
-    whole = read_recording(free, example)
-    monkeypatch.setattr(recorded_columns, "_BLOCK_ROWS", 701)
-    for mine, read in zip(read_recording(free, example).stretches, whole.stretches, strict=True):
-        np.testing.assert_array_equal(mine.record.q, read.record.q)
-        np.testing.assert_array_equal(mine.record.tau_J, read.record.tau_J)
-
-
 def test_of_a_recording_that_is_too_long_only_a_span_is_kept(free: Path, example, monkeypatch) -> None:
     whole = read_recording(free, example).between(4.0, 7.0)
-    monkeypatch.setattr(recorded_columns, "_BLOCK_ROWS", 500)
+    monkeypatch.setattr(recorded_columns, "BLOCK_ROWS", 500)
     monkeypatch.setattr(recorded_columns, "MOST_ROWS", 3000)
     with pytest.raises(LogError, match=r"more than 3000 rows: cut it$"):
         read_recording(free, example)
@@ -254,20 +238,9 @@ def test_of_a_recording_that_is_too_long_only_a_span_is_kept(free: Path, example
 
 
 def test_a_period_that_would_make_too_many_samples_is_refused(tmp_path: Path, free: Path) -> None:
-    text = (EXAMPLE / "map.toml").read_text() + "\n[sampling]\nperiod_s = 1e-9\n"
-    (tmp_path / "map.toml").write_text(text)
-    (tmp_path / "planar-arm.urdf").write_text((EXAMPLE / "planar-arm.urdf").read_text())
+    described = read_map(copy_example(tmp_path, ("[scheme]", "[sampling]\nperiod_s = 1e-9\n[scheme]")))
     with pytest.raises(LogError, match="more than 4000000 samples of 1e-09 s"):
-        read_recording(free, read_map(tmp_path / "map.toml"))
-
-
-def copy_example(folder: Path, old: str, new: str) -> Path:
-    """Copy the example's map and URDF, with one text of the URDF replaced, and return the map."""
-    urdf = (EXAMPLE / "planar-arm.urdf").read_text()
-    assert old in urdf
-    (folder / "planar-arm.urdf").write_text(urdf.replace(old, new, 1))
-    (folder / "map.toml").write_text((EXAMPLE / "map.toml").read_text())
-    return folder / "map.toml"
+        read_recording(free, described)
 
 
 @pytest.mark.parametrize(
@@ -281,12 +254,9 @@ def test_a_number_of_the_urdf_that_nothing_can_be_reckoned_with_is_one_line(
     tmp_path: Path, old: str, new: str, said: str
 ) -> None:
     with pytest.raises(ConfigError, match=said):
-        read_map(copy_example(tmp_path, old, new))
-
-
-def test_the_largest_length_of_a_urdf_can_be_reckoned_with(tmp_path: Path) -> None:
-    described = read_map(copy_example(tmp_path, '<origin xyz="0.35 0 0"/>', '<origin xyz="1e18 1e18 1e18"/>'))
-    model_of(described.urdf.chain)
+        read_map(copy_example(tmp_path, urdf=(old, new)))
+    largest = ('<origin xyz="0.35 0 0"/>', '<origin xyz="1e18 1e18 1e18"/>')
+    model_of(read_map(copy_example(tmp_path, urdf=largest)).urdf.chain)
 
 
 def test_the_command_says_by_its_status_whether_the_test_is_explained(

@@ -1,15 +1,17 @@
 """The one judge: which alarm is about which contact, what was found, how late, and what was false."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from adacd_hil.log.logged_run import enters_react
 from adacd_hil.records import SchemeState
 from adacd_hil.score.judge import (
-    Alarm,
+    Detection,
     Score,
     StreamJudge,
-    TouchWindow,
+    TrueContact,
     begins_of,
     contact_bounds,
     explained_until,
@@ -20,11 +22,11 @@ MS = 1_000_000
 
 
 def touch(onset_ms, forgotten_ms, number=1, is_armed=True, is_reacting=False):
-    return TouchWindow(number, 1, onset_ms * MS, forgotten_ms * MS, is_armed, is_reacting)
+    return TrueContact(number, 1, onset_ms * MS, forgotten_ms * MS, is_armed, is_reacting)
 
 
 def alarms(*at_ms, **changes):
-    return [Alarm(at * MS, True)._replace(**changes) for at in at_ms]
+    return [replace(Detection(at * MS, True), **changes) for at in at_ms]
 
 
 def found_ms(score: Score):
@@ -58,24 +60,14 @@ def test_what_an_earlier_contact_left_is_explained_after_a_later_one_is_forgotte
     assert found_ms(score) == [None, 150.0]
 
 
-def test_the_first_alarm_about_a_contact_finds_it():
-    assert found_ms(judge([touch(100, 300)], alarms(110, 120))) == [10.0]
-
-
-def test_a_contact_that_is_not_armed_is_not_missed():
-    score = judge([touch(100, 300, is_armed=False)], [])
-    assert (score.missed, score.armed, len(score.contacts)) == (0, 0, 1)
-
-
-def test_what_the_truth_does_not_cover_is_neither_false_nor_right():
-    score = judge([], [*alarms(10), *alarms(20, is_known=False)])
-    assert false_ms(score) == [10.0]
-    assert [alarm.t_ns for alarm in score.unjudged] == [20 * MS]
-
-
-def test_false_alarms_of_armed_detection_are_told_apart():
-    score = judge([], [*alarms(10), *alarms(20, is_armed=False)])
-    assert (len(score.false_alarms), score.armed_false_alarms) == (2, 1)
+def test_only_what_armed_detection_missed_or_raised_counts_against_it_and_nothing_beyond_the_truth():
+    score = judge(
+        [touch(100, 300), touch(400, 500, number=2, is_armed=False)],
+        [*alarms(10), *alarms(20, is_armed=False), *alarms(30, is_known=False), *alarms(110, 120)],
+    )
+    assert (found_ms(score), score.missed, score.armed) == ([10.0, None], 0, 1)
+    assert (false_ms(score), score.armed_false_alarms) == ([10.0, 20.0], 1)
+    assert [alarm.t_ns for alarm in score.unjudged] == [30 * MS]
 
 
 @pytest.mark.parametrize(("is_reacting", "delay_ms"), [(True, 4.0), (False, None)])
@@ -99,10 +91,11 @@ def test_of_a_stretch_only_what_begins_in_it_counts():
 def stream(touches, over_ms, judged=lambda t_ms: t_ms == t_ms, pieces=1):
     t_ms = np.arange(1000)
     over = np.isin(t_ms, over_ms)
-    streamed = StreamJudge(touches, 100 * MS)
+    streamed = StreamJudge(100 * MS)
     for part in np.array_split(t_ms, pieces):
-        streamed.add(part * MS, over[part], judged(part))
-    return streamed.score()
+        begun = [each for each in touches if each.onset_ns <= part[-1] * MS]
+        streamed.add_samples(begun, part * MS, over[part], judged(part))
+    return streamed.score(touches)
 
 
 @pytest.mark.parametrize("pieces", [1, 7, 1000])

@@ -1,6 +1,7 @@
 """Two logs beside each other: what differs is named with the first cycle, contacts are matched by time."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,10 +9,12 @@ from log.recorded_run import make_run, record
 
 from adacd_hil.lab.cli.compare_command import contact_in_words
 from adacd_hil.lab.report.run_reading import read_run
-from adacd_hil.lab.runs.log_comparison import MATCH_S, ComparedContact, compare_logs, match_contacts
+from adacd_hil.lab.runs.log_comparison import MATCH_S, Contact, compare_logs, match_contacts
 from adacd_hil.log import logged_run
 from adacd_hil.log.log_files import LogError
-from adacd_hil.settings.configuration import apply_settings, load_settings
+from adacd_hil.records import ContactReport
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.settings.toml_files import to_toml
 
 SETTINGS = load_settings("paper")
@@ -27,12 +30,12 @@ def write(folder: Path, count: int = 40, change=None, settings=SETTINGS) -> Path
     return folder / "run.mcap"
 
 
-def contact(time_s: float) -> ComparedContact:
-    return ComparedContact(time_s, 1, 2, 0, (0.0, 0.0), 0.0)
+def contact(time_s: float, **changes: Any) -> Contact:
+    return time_s, ContactReport(0, 1, (0, 0), (0.0, 0.0), (0.0, 0.0), True)._replace(**changes)
 
 
 def test_a_place_that_a_later_version_may_have_is_no_trouble() -> None:
-    assert contact_in_words(contact(1.0)._replace(force_N=5.0, location=77)) == "1.000 s, link 1, 5.0 N"
+    assert contact_in_words(contact(1.0, force_N=5.0, location=77)) == "1.000 s, link 1, 5.0 N"
 
 
 @pytest.mark.parametrize(
@@ -108,7 +111,7 @@ def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone() -> No
 
 
 def test_a_lower_bound_reads_as_one_in_a_comparison() -> None:
-    bound, known = contact(1.0)._replace(force_N=-14.7, location=2), contact(1.0)._replace(force_N=-14.7, location=1)
+    bound, known = contact(1.0, force_N=-14.7, location=2), contact(1.0, force_N=-14.7, location=1)
     assert [contact_in_words(each) for each in (bound, known, contact(1.0))] == [
         "1.000 s, link 1, ≥ 14.7 N",
         "1.000 s, link 1, -14.7 N",

@@ -56,7 +56,7 @@ HEADS = {
     "units in brackets": (
         "Time [s],q1 [rad],q2 [rad],qd1 [rad/s],qd2 [rad/s],tau1 (N m),tau2 (N m)",
         ("Time [s]", ("q1 [rad]", "q2 [rad]"), ("qd1 [rad/s]", "qd2 [rad/s]"), ("tau1 (N m)", "tau2 (N m)")),
-        {"q": "rad"},
+        {},
     ),
     "of a controller": (
         "timestamp,actual_q_0,actual_q_1,actual_qd_0,actual_qd_1,actual_current_0,actual_current_1",

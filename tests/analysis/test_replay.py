@@ -19,7 +19,7 @@ from adacd_hil.replay.replay import replay, replay_many, replay_source
 from adacd_hil.replay.replayed_outcome import Replay, side_by_side
 from adacd_hil.score.emulator_truth import contacts_beside
 from adacd_hil.score.judge import Score
-from adacd_hil.settings.configuration import apply_settings
+from adacd_hil.settings.setting_keys import apply_settings
 from firmware_sim.bench.bench_time import TruthLog
 
 pytestmark = pytest.mark.slow
@@ -167,7 +167,7 @@ def test_of_a_stretch_that_alone_is_compared_and_told(log: Path, cycles_per_piec
     assert found.score.contacts == whole.score.contacts
     assert found.states == tuple(each for each in whole.states if bounds_ns[0] <= each.t_ns < bounds_ns[1])
     assert found.ending == found.states[-1]
-    assert found.contacts == tuple(each for each in whole.contacts if bounds_ns[0] <= each.t_ns < bounds_ns[1])
+    assert found.contacts == tuple(each for each in whole.contacts if bounds_ns[0] <= each[0] < bounds_ns[1])
     assert 0 < len(found.contacts) <= len(whole.contacts)
     assert found.adaptations == ()
     assert 0.0 < found.monitored_s < 0.5
@@ -318,14 +318,13 @@ def test_a_log_without_its_settings_is_refused(tmp_path: Path) -> None:
 
 def test_what_comes_before_or_after_the_truth_is_not_judged(log: Path, whole: Replay) -> None:
     """As in the report: a detection there is neither right nor a false alarm, and a replay says that there are some."""
-    source, truth = LogSource(log), contacts_beside(log)
-    attempt, onset = truth.contacts[0].attempt, truth.contacts[0].onset
-    first, last = truth.span
+    source, (contacts, span) = LogSource(log), contacts_beside(log)
+    attempt, onset = contacts[0].attempt, contacts[0].onset
+    first, last = span
     assert first < (attempt, onset) < last
 
-    def judged(*span: tuple[int, int]) -> tuple[int, bool, tuple[str, ...]]:
-        untouched = truth._replace(contacts=(), span=span)
-        found = replay_source(LogSource(log), [source.settings], untouched)[0]
+    def judged(*known: tuple[int, int]) -> tuple[int, bool, tuple[str, ...]]:
+        found = replay_source(LogSource(log), [source.settings], ((), known))[0]
         return len(found.score.false_alarms), found.is_whole, found.notes
 
     said = "the truth doesn't cover 1 detection, not judged"
@@ -333,7 +332,7 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(log: Path, whole: Re
     assert judged(first, (attempt, onset - 1)) == (0, False, (said,))
     assert judged(last, last) == (0, False, (said,))
     assert judged(first, (whole.attempts, 0)) == (1, True, ())  # it goes on with the next host
-    assert replay_source(LogSource(log), [source.settings], truth)[0].notes == ()
+    assert replay_source(LogSource(log), [source.settings], (contacts, span))[0].notes == ()
 
 
 def test_a_truth_without_a_cycle_knows_nothing(log: Path, tmp_path: Path) -> None:

@@ -97,13 +97,14 @@ def test_each_cell_of_a_table_that_folds_bears_the_head_of_its_column() -> None:
 
 
 def steps_of(run: Run, source: ReportSource = SOURCE) -> list[NextStep]:
-    return next_steps(evaluate(run), run, source)
+    steps, more = next_steps(evaluate(run), run, source)
+    return [*steps, *more]
 
 
 def test_a_good_run_needs_nothing_and_says_so() -> None:
     run = make_run((A, 1000), (M, 1000))
     texts = [step.text for step in steps_of(run)]
-    assert texts[0] == "Nothing went wrong."
+    assert texts[0] == "Nothing: all went well."
     assert [step.command for step in steps_of(run)][1:] == [
         "adacd-hil replay run.mcap",
         "adacd-hil replay run.mcap --set filter.a_rad_s=20",
@@ -113,7 +114,7 @@ def test_a_good_run_needs_nothing_and_says_so() -> None:
 def test_missed_contacts_and_false_alarms_come_first() -> None:
     commands = [step.command for step in steps_of(touched_run())]
     assert commands[:2] == ["adacd-hil thresholds run.mcap", "adacd-hil tune run.mcap"]
-    assert "Nothing went wrong." not in [step.text for step in steps_of(touched_run())]
+    assert "Nothing: all went well." not in [step.text for step in steps_of(touched_run())]
 
 
 def on_a_bus(run: Run, **said: str) -> Run:
@@ -124,6 +125,15 @@ def test_a_fault_on_a_bus_leads_to_the_doctor_of_that_arm() -> None:
     run = on_a_bus(make_run((A, 100), (SchemeState.FAULT, 50)))
     run.fault[100:] = FaultReason.DRIVE
     assert steps_of(run)[0].command == "adacd-hil doctor -i socketcan -c can1 --config lab.toml"
+
+
+def test_the_first_screen_of_a_run_that_never_watched_has_the_cause_and_its_repair_alone() -> None:
+    run = on_a_bus(make_run((A, 100), (SchemeState.FAULT, 50)))
+    run.fault[100:] = FaultReason.DRIVE
+    page = report_page(evaluate(run), run, SOURCE)
+    first, _, folded = page.partition("<details")
+    assert re.findall(r"<code>(.*?)</code>", first) == ["adacd-hil doctor -i socketcan -c can1 --config lab.toml"]
+    assert ("false alarms</dt>" in page, "adacd-hil replay run.mcap" in folded) == (False, True)
 
 
 def test_a_fault_of_an_emulated_arm_is_played_again() -> None:
@@ -137,8 +147,8 @@ def test_a_fault_of_an_emulated_arm_is_played_again() -> None:
 def test_a_run_without_a_cycle_is_not_told_to_be_replayed() -> None:
     run = make_run((A, 1))
     run = replace(run, **{name: getattr(run, name)[:0] for name in ("state", "cycle", "t_ns", "fault")})
-    steps = next_steps(evaluate(make_run((A, 1))), on_a_bus(run), SOURCE)
-    assert [step.command.split()[1] for step in steps] == ["doctor"]
+    steps, more = next_steps(evaluate(make_run((A, 1))), on_a_bus(run), SOURCE)
+    assert ([step.command.split()[1] for step in steps], more) == (["doctor"], [])
 
 
 def test_what_a_log_says_of_itself_is_quoted_for_the_shell() -> None:

@@ -28,11 +28,12 @@ from adacd_hil.score.metrics import ReportSource
 from adacd_hil.settings.toml_files import to_toml
 
 pytestmark = pytest.mark.slow
+SOURCE = ReportSource("run.mcap")
 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    return write_run_report(touched_run(), tmp_path_factory.mktemp("report"), ReportSource("run.mcap"))
+    return write_run_report(touched_run(), tmp_path_factory.mktemp("report"), SOURCE)
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +91,8 @@ KEYS = {
     "frozen_residual_max_Nm.B": "identified cad cycles",
     "contacts.0": "number section state link onset_s end_s is_armed detected_s delay_ms law_ms ideal_ms link_at_alarm "
     "link_detected direction direction_ok tau_ext_Nm tau_ext_peak_hat_Nm torque_error_ratio true_force_N level kind "
-    "reaction location is_two_sided tau_ext_peak_sigma_Nm impulse_Nm_s impulse_sigma_Nm_s force_N force_sigma_N "
-    "lever_m lever_sigma_m blind_deg",
+    "link_ok reaction location is_two_sided tau_ext_peak_sigma_Nm impulse_Nm_s impulse_sigma_Nm_s force_N "
+    "force_sigma_N lever_m lever_sigma_m blind_deg",
     "parameters.A": "a1 a2 a3 F_v1 F_v2 F_c1 F_c2",
     "cycle": "count duration_s clock scheduler",
     "timing": "is_modelled period_us cycles times_us reaction_us data_age_cycles queues_bytes counts histograms_us",
@@ -158,7 +159,7 @@ def test_the_table_in_the_file_is_the_reports(report, table):
 
 
 def table_of(run):
-    return report_json(evaluate(run), run.metadata, ReportSource("run.mcap"))
+    return report_json(evaluate(run), run.metadata, SOURCE)
 
 
 def test_a_real_arm_has_null_where_only_the_truth_could_tell():
@@ -183,33 +184,35 @@ def test_a_fault_is_in_the_table():
     }
 
 
-def test_the_text_begins_with_the_gravest_finding(report):
-    assert report.as_text().splitlines()[0].startswith("NOT GOOD: 2 of 3 contacts detected within 5 ms, 1 missed")
+def test_the_text_says_what_went_wrong_what_to_do_and_where_the_page_is(report):
+    lines = report.as_text().splitlines()
+    assert lines[0].startswith("NOT GOOD: 2 of 3 contacts detected within 5 ms, 1 missed")
+    assert [line.split()[0] for line in lines if line[:1].isdigit() and " s " in line] == ["3"]  # the one missed
+    commands = ["adacd-hil thresholds run.mcap", "adacd-hil tune run.mcap"]
+    assert [line.strip() for line in lines if line.startswith("    ")] == commands
+    assert lines[-1] == f"Report: {report.html_path}"
 
 
-def test_the_text_lists_the_contacts_that_went_wrong_and_no_other(report):
-    rows = [line.split()[0] for line in report.as_text().splitlines() if line[:1].isdigit() and " s " in line]
-    assert rows == ["3"]
+@pytest.mark.long
+def test_text_and_page_say_what_the_log_lacks(report, tmp_path):
+    cut = ReportSource("run.mcap", "cut after 12 s")
+    assert replace(report, source=cut).as_text().splitlines()[1] == "The log is not whole: cut after 12 s"
+    for source, dropped, words in (
+        (cut, 0, "The log is not whole: cut after 12 s"),
+        (SOURCE, 3, "3 packets are not in"),
+    ):
+        made = write_run_report(replace(make_run((A, 10)), dropped=dropped), tmp_path, source)
+        assert words in made.html_path.read_text(encoding="utf-8")
 
 
-def test_the_text_says_what_to_do(report):
-    assert [line.strip() for line in report.as_text().splitlines() if line.startswith("    ")] == [
-        "adacd-hil thresholds run.mcap", "adacd-hil tune run.mcap",
-    ]  # fmt: skip
-
-
-def test_the_text_ends_with_the_place_of_the_page(report):
-    assert report.as_text().splitlines()[-1] == f"Report: {report.html_path}"
-
-
-def test_the_text_says_what_the_log_lacks(report):
-    text = replace(report, source=ReportSource("run.mcap", "cut after 12 s")).as_text()
-    assert text.splitlines()[1] == "The log is not whole: cut after 12 s"
-
-
-def test_the_page_is_well_formed(html):
+def test_the_page_is_well_formed_and_has_no_inline_style_and_no_foreign_element(html):
     page = Page(html)
     assert (page.unbalanced, page.open) == ([], [])
+    assert page.tags & {"iframe", "object", "img", "link"} == set()
+    assert [(name, value) for name, value in page.attributes if name == "style" or name.startswith("on")] == []
+    ids = [value for name, value in page.attributes if name == "id"]
+    assert len(ids) == len(set(ids))
+    assert len(html.encode()) < 5_000_000
 
 
 SCRIPT = re.compile(r"<script>(.*?)</script>", re.DOTALL)
@@ -222,17 +225,6 @@ def test_the_page_refers_to_nothing_outside(html):
 def test_the_pages_scripts_ask_for_nothing(html):
     asking = r"\b(fetch|XMLHttpRequest|WebSocket|EventSource|sendBeacon|importScripts|Worker|eval)\b|\bimport\s*\("
     assert [re.search(asking, script) for script in SCRIPT.findall(html)] == [None, None]
-
-
-def test_the_page_has_no_inline_style_and_no_foreign_element(html):
-    page = Page(html)
-    assert page.tags & {"iframe", "object", "img", "link"} == set()
-    assert [(name, value) for name, value in page.attributes if name == "style" or name.startswith("on")] == []
-
-
-def test_the_pages_ids_are_there_once(html):
-    ids = [value for name, value in Page(html).attributes if name == "id"]
-    assert len(ids) == len(set(ids))
 
 
 def digests_of(texts):
@@ -254,7 +246,7 @@ def test_the_policy_allows_the_pages_own_styles_and_scripts_and_nothing_else(htm
 @pytest.mark.long
 def test_a_page_without_traces_allows_no_script(tmp_path):
     run = make_run((A, 1))
-    html = write_run_report(run, tmp_path, ReportSource("run.mcap")).html_path.read_text(encoding="utf-8")
+    html = write_run_report(run, tmp_path, SOURCE).html_path.read_text(encoding="utf-8")
     assert ("script-src" in policy_of(html), "<script" in html) == (False, False)
 
 
@@ -294,13 +286,9 @@ def test_the_heading_does_not_part_a_number_from_its_unit(html):
     assert "1.00\u00a0s and again in 0.80\u00a0s after 1\u00a0kg" in html
 
 
-def test_a_run_with_a_missed_contact_looks_bad(html):
-    assert '<header class="bad">' in html
-
-
-def test_a_run_without_fault_looks_good(tmp_path):
-    html = write_run_report(make_run(), tmp_path, ReportSource("run.mcap")).html_path.read_text(encoding="utf-8")
-    assert '<header class="good">' in html
+def test_a_run_with_a_missed_contact_looks_bad_and_one_without_fault_good(html, tmp_path):
+    good = write_run_report(make_run(), tmp_path, SOURCE).html_path.read_text(encoding="utf-8")
+    assert ('<header class="bad">' in html, '<header class="good">' in good) == (True, True)
 
 
 def test_every_curve_of_the_plan_has_its_place_on_the_page(html):
@@ -355,51 +343,25 @@ def test_a_run_without_a_reaction_has_dashes_for_its_latency():
     assert row_of(tables_of(make_run()), "Reaction") == ["–"] * 4
 
 
-@pytest.mark.long
-def test_the_page_says_what_the_log_lacks(tmp_path):
-    report = write_run_report(make_run((A, 10)), tmp_path, ReportSource("run.mcap", "cut after 12 s"))
-    assert "The log is not whole: cut after 12 s" in report.html_path.read_text(encoding="utf-8")
-
-
-@pytest.mark.long
-def test_the_page_says_how_many_packets_were_dropped(tmp_path):
-    report = write_run_report(replace(make_run((A, 10)), dropped=3), tmp_path, ReportSource("run.mcap"))
-    assert "3 packets are not in the log" in report.html_path.read_text(encoding="utf-8")
-
-
-def test_texts_of_a_log_cannot_become_markup(tmp_path):
-    run = make_run((A, 10))
-    evil = '</title></script><script>alert("1")</script>'
-    events = (LoggedEvent(int(run.t_ns[3]), Event("error", evil, evil)),)
-    run = replace(run, metadata={**run.metadata, "config": evil, "profile": evil, evil: evil}, events=events)
-    html = write_run_report(run, tmp_path, ReportSource(evil, evil)).html_path.read_text(encoding="utf-8")
-    page = Page(html)
-    assert (evil in html, page.unbalanced, html.count("alert(")) == (False, [], html.count("alert(&#34;1&#34;)"))
-
-
 def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):
     run = make_run((A, 1))
     names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
     run = replace(run, **{name: getattr(run, name)[:0] for name in names})
-    page = Page(write_run_report(run, tmp_path, ReportSource("run.mcap")).html_path.read_text(encoding="utf-8"))
+    page = Page(write_run_report(run, tmp_path, SOURCE).html_path.read_text(encoding="utf-8"))
     assert page.unbalanced == []
 
 
 @pytest.mark.long
 def test_the_same_run_gives_the_same_page(html, tmp_path):
-    again = write_run_report(touched_run(), tmp_path, ReportSource("run.mcap"))
+    again = write_run_report(touched_run(), tmp_path, SOURCE)
     assert again.html_path.read_text(encoding="utf-8") == html
-
-
-def test_the_page_is_small(html):
-    assert len(html.encode()) < 5_000_000
 
 
 @pytest.mark.long
 def test_a_folder_that_cannot_be_made_is_a_log_error(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(LogError, match=r"report in .*taken can't be written"):
-        write_run_report(make_run((A, 10)), tmp_path / "taken", ReportSource("run.mcap"))
+        write_run_report(make_run((A, 10)), tmp_path / "taken", SOURCE)
 
 
 def without_cycle_times(table):
@@ -413,34 +375,23 @@ def test_a_report_from_files_says_the_same_as_one_from_memory(tmp_path):
     run = replace(touched_run(), tau_ext_hat_cad=touched_run().tau_ext_hat_cad * 0.0)
     record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
     record_truth(tmp_path / "truth.mcap", run)
-    from_files = write_report(tmp_path / "run.mcap", tmp_path / "truth.mcap", tmp_path / "a").as_json()
-    from_memory = write_run_report(run, tmp_path / "b", ReportSource("run.mcap")).as_json()
+    report = write_report(tmp_path / "run.mcap", tmp_path / "truth.mcap", tmp_path / "a")
+    from_files = report.as_json()
+    assert report.metadata["emulator_seed"] == "7"
+    from_memory = write_run_report(run, tmp_path / "b", SOURCE).as_json()
     assert without_cycle_times(from_files) == without_cycle_times(from_memory)
 
 
-@pytest.mark.long
-def test_a_report_from_files_knows_the_emulators_seed(tmp_path):
-    run = make_run((A, 10), (M, 10))
-    record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
-    record_truth(tmp_path / "truth.mcap", run)
-    report = write_report(tmp_path / "run.mcap", tmp_path / "truth.mcap", tmp_path)
-    assert report.metadata["emulator_seed"] == "7"
-
-
-def test_a_log_without_configuration_cannot_be_reported(tmp_path):
-    record(tmp_path / "run.mcap", make_run((A, 10)), {})
-    with pytest.raises(LogError, match=r"run\.mcap has no attachment config\.toml"):
-        write_report(tmp_path / "run.mcap", None, tmp_path)
-
-
-def test_a_configuration_that_is_wrong_is_named(tmp_path):
-    record(tmp_path / "run.mcap", make_run((A, 10)), {"config.toml": b"[fliter]\n"})
-    with pytest.raises(LogError, match=r"config\.toml: unknown key `fliter`; did you mean `filter`"):
-        write_report(tmp_path / "run.mcap", None, tmp_path)
-
-
-def test_a_log_that_does_not_exist_cannot_be_reported(tmp_path):
-    with pytest.raises(LogError):
+@pytest.mark.parametrize(
+    ("attachments", "why"),
+    [
+        ({}, r"run\.mcap has no attachment config\.toml"),
+        ({"config.toml": b"[fliter]\n"}, r"config\.toml: unknown key `fliter`; did you mean `filter`"),
+    ],
+)
+def test_a_log_without_a_readable_configuration_cannot_be_reported(tmp_path, attachments, why):
+    record(tmp_path / "run.mcap", make_run((A, 10)), attachments)
+    with pytest.raises(LogError, match=why):
         write_report(tmp_path / "run.mcap", None, tmp_path)
 
 

@@ -38,7 +38,7 @@ class ThreadWorkers:
     def submit(self, work, task):
         return self.pool.submit(work, task)
 
-    def restart(self) -> None:
+    def replace_dead(self) -> None:
         raise AssertionError("no thread has died")
 
 
@@ -58,13 +58,7 @@ def test_a_task_that_kills_its_worker_costs_its_own_rows_alone(tmp_path: Path) -
     assert [row["seed"] for row in rows if row["status"] == "failed"] == [2, 2]
     assert {row["error"] for row in rows if row["seed"] == 2} == {"the worker process died each time"}
     assert "a worker process has died: killed, or out of memory" in lines
-
-
-@pytest.mark.slow
-def test_processes_and_threads_make_the_same_table(tmp_path: Path, client) -> None:
-    with connect("", 3, preload=("adacd_hil.lab.tune.sweep",)) as workers:
-        _, rows, _ = sweep(tmp_path / "processes", workers, Work(tmp_path))
-    assert rows == sweep(tmp_path / "threads", client, Work(tmp_path))[1]
+    assert [row["seed"] for row in rows] == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
 
 
 SLOW_SWEEP = """
@@ -216,11 +210,3 @@ def test_a_row_of_a_log_says_what_its_replay_came_to(log: Path, whole: Replay) -
     assert deaf["set.detector.threshold_Nm"] == "9.0"
     assert wrong["status"] == "failed"
     assert "detector.threshold_Nm" in wrong["error"]
-
-
-def test_a_log_that_is_none_makes_rows_that_say_so(tmp_path: Path) -> None:
-    (tmp_path / "run.mcap").write_bytes(b"hello")
-    (task,) = plan_logs([tmp_path / "run.mcap"], THRESHOLDS, "", "", "1").tasks(frozenset(), 10)
-    rows = replay_task(task)
-    assert [row["status"] for row in rows] == ["failed", "failed"]
-    assert "run.mcap" in rows[0]["error"]

@@ -220,7 +220,7 @@ def test_thresholds_are_found_limited_by_noise_and_checked(statistics, tmp_path)
 
 
 def test_a_step_is_seen_as_the_loop_makes_it():
-    shape = step_shape(40, 0.4e-3, 1.6e-3, T)
+    shape = step_shape(40, 0.4e-3, T)
     assert shape[0] == 0.0
     fine = (np.arange(40_000) + 0.5) * 1e-6 - 0.4e-3
     x = np.maximum(2.0 * fine / 1.6e-3, 0.0)

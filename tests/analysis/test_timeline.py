@@ -107,29 +107,22 @@ def test_the_arm_is_drawn_at_its_joint_angles():
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_the_force_pushes_toward_its_side_at_its_lever_arm(side):
+def test_the_force_pushes_toward_its_side_at_its_lever_arm_whose_spread_is_a_bar(side):
     svg = arm_at((0.0, 0.0), Push(2, side, 1.0, 0.2, 0.01))
     head = re.search(r'<polygon points="([^,]*),([^ ]*)', svg)
     (_, tail_y), (_, neck_y) = points_of(svg, "force")
     assert (float(head[1]), float(head[2])) == (600.0, 0.0)
     assert side * (neck_y - tail_y) > 100.0
-
-
-def test_the_spread_of_the_lever_arm_is_a_bar_on_the_link():
-    svg = arm_at((0.0, 0.0), Push(2, 1, 1.0, 0.2, 0.01))
     assert points_of(svg, "spread") == ((590, 0), (610, 0))
 
 
-def test_a_stronger_force_is_a_longer_arrow():
-    def length(share):
-        (_, tail), (_, neck) = points_of(arm_at((0.0, 0.0), Push(1, 1, share, 0.1, 0.01)), "force")
+def test_a_stronger_force_is_a_longer_arrow_and_one_without_a_place_dashed():
+    def length(share, kind="force", place=(0.1, 0.01)):
+        (_, tail), (_, neck) = points_of(arm_at((0.0, 0.0), Push(1, 1, share, *place)), kind)
         return neck - tail
 
     assert length(1.0) > 1.5 * length(0.2)
-
-
-def test_a_force_without_a_place_is_dashed():
-    assert 'class="force guessed"' in arm_at((0.0, 0.0), Push(2, 1, 1.0, None, None))
+    assert length(1.0, "force guessed", (None, None)) == length(1.0)
 
 
 def test_an_arm_describes_itself_without_becoming_markup():

@@ -18,7 +18,13 @@ from adacd_hil.cli.main import cli
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.lab.tune import tune_roc
 from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, suggested_toml, write_tuning
-from adacd_hil.lab.tune.tune_candidates import ShownLog, candidates, observe_candidates, thresholds_as_changes
+from adacd_hil.lab.tune.tune_candidates import (
+    ShownLog,
+    candidates,
+    chosen_blocks,
+    observe_candidates,
+    thresholds_as_changes,
+)
 from adacd_hil.lab.tune.tune_roc import (
     FACTORS,
     Candidate,
@@ -39,9 +45,10 @@ from adacd_hil.replay.log_source import LogSource
 from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.score.emulator_truth import contacts_beside
 from adacd_hil.score.judge import least_rate_per_h, rate_bound_per_h, share_bounds
-from adacd_hil.settings.configuration import apply_settings, load_settings
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.scenario.scenario import load_scenario
 
@@ -51,26 +58,18 @@ M, A = SchemeState.MONITOR, SchemeState.ADAPT
 # what was counted
 
 
-@pytest.mark.parametrize(
-    ("alarms", "hours", "bound"), [(0, 10.0, 0.299573), (3, 1.0, 7.753657), (3, 2.0, 3.876828), (0, 0.0, math.inf)]
-)
-def test_a_rate_has_an_exact_upper_bound(alarms, hours, bound):
-    assert rate_bound_per_h(alarms, hours) == pytest.approx(bound, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("alarms", "hours", "bound"), [(0, 1.0, 0.0), (1, 1.0, 0.0512933), (3, 2.0, 0.408846), (1, 0.0, 0.0)]
-)
-def test_a_rate_has_an_exact_lower_bound(alarms, hours, bound):
-    assert least_rate_per_h(alarms, hours) == pytest.approx(bound, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("found", "count", "bounds"),
-    [(0, 10, (0.0, 0.308497)), (10, 10, (0.691503, 1.0)), (8, 10, (0.443905, 0.974789)), (0, 0, (0.0, 1.0))],
-)
-def test_a_share_has_the_interval_of_clopper_and_pearson(found, count, bounds):
-    assert share_bounds(found, count) == pytest.approx(bounds, rel=1e-5)
+def test_rates_and_shares_have_exact_bounds():
+    for alarms, hours, most, least in (
+        (0, 10.0, 0.299573, 0.0),
+        (3, 1.0, 7.753657, 0.817692),
+        (3, 2.0, 3.876828, 0.408846),
+        (0, 0.0, math.inf, 0.0),
+    ):
+        assert rate_bound_per_h(alarms, hours) == pytest.approx(most, rel=1e-5)
+        assert least_rate_per_h(alarms, hours) == pytest.approx(least, rel=1e-5)
+    shares = {(0, 10): (0.0, 0.308497), (10, 10): (0.691503, 1.0), (8, 10): (0.443905, 0.974789), (0, 0): (0.0, 1.0)}
+    for found, bounds in shares.items():
+        assert share_bounds(*found) == pytest.approx(bounds, rel=1e-5)
 
 
 # thresholds from one half
@@ -113,7 +112,7 @@ def test_the_bound_of_the_tail_is_the_wanted_rate():
     assert choice.method == "tail model, extrapolated 12-fold"
     assert choose(observed(), 60.0).method == "tail model"
     assert calibration.bound > 1.05 * calibration.threshold
-    calibrated = calibrate_detector(observed().half(True), 0.1, 1.0)
+    calibrated = calibrate_detector(observed().half(True), 1.0)
     surer = calibrated.calibration.bound / calibrated.calibration.threshold
     np.testing.assert_allclose(choice.thresholds, surer * calibrated.thresholds, rtol=1e-12)
     predicted = dict(zip(FACTORS, (rate for _, _, rate in choice.roc), strict=True))
@@ -167,12 +166,6 @@ def test_too_little_motion_gives_the_largest_value_seen_and_says_so():
         choose(made, 1.0)
 
 
-def test_without_truth_there_are_no_contacts():
-    found = choose(observed(touches=None), 1.0).checked
-    assert found.contacts is None
-    assert set(found.as_json()) == {"hours", "false_alarms", "rate_bound_per_h", "contacts"}
-
-
 # candidates
 
 
@@ -205,7 +198,7 @@ def hand_made_log(count=400):
     """400 cycles, all free but for a contact in rows 200 to 249; a second one, of which nobody was armed."""
     is_free = np.ones(count, bool)
     is_free[150:300] = False
-    windows = (Window(1, 1, 200, 249, True, True), Window(2, 1, 260, 270, False, False))
+    windows = (Window(1, 200, 249, True, True), Window(2, 260, 270, False, False))
     return SimpleNamespace(
         t_ns=np.arange(count) * 1_000_000,
         windows=windows,
@@ -230,7 +223,7 @@ def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_moni
     states = [A] * 50 + [M] * 350
     value = np.linspace(0.0, 1.0, 400)[:, None] * [1.0, -2.0]
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
-    shown.take(rows, batch_of(settings, states, tau_ext_hat=value, threshold=100.0 + np.array([0.0, 0.5])))
+    shown.take_stretch(rows, batch_of(settings, states, tau_ext_hat=value, threshold=100.0 + np.array([0.0, 0.5])))
     peaks = shown.peaks()
     np.testing.assert_allclose(peaks[0, 0], [99 / 399, 2 * 99 / 399 - 0.5], atol=1e-12)
     assert np.isnan(peaks[1:3]).all(), "a block of which a part doesn't count"
@@ -241,12 +234,20 @@ def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_moni
     assert contact.since_s[-1] == pytest.approx(0.049)
 
 
+def test_a_block_of_joined_logs_is_for_choosing_as_its_first_cycle_is():
+    logs = [
+        SimpleNamespace(block=100, is_chosen_on=np.array(chosen), motion=SimpleNamespace(is_free=np.zeros(count)))
+        for count, chosen in ((250, [True, False, True]), (151, [False, True]))
+    ]
+    assert chosen_blocks(logs).tolist() == [True, False, True, False, True]
+
+
 def test_a_candidate_that_does_not_monitor_misses_the_contact_and_counts_no_motion():
     settings = load_settings("paper")
     shown = ShownLog(hand_made_log(), settings)
     states = [M] * 100 + [A] * 300
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
-    shown.take(rows, batch_of(settings, states, tau_ext_hat=1.0, threshold=100.0))
+    shown.take_stretch(rows, batch_of(settings, states, tau_ext_hat=1.0, threshold=100.0))
     assert np.isfinite(shown.peaks()[:, 0, 0]).tolist() == [True, False, False, False]
     assert [len(contact.since_s) for contact in shown.touches()] == [0]
 
@@ -257,7 +258,7 @@ def test_the_certified_scheme_s_statistic_is_the_largest_ratio_to_its_thresholds
     bank = np.zeros(2 * settings.channel_count)
     bank[3] = -0.3
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000 + np.where(np.arange(400) < 100, 0, 7))
-    shown.take(rows, batch_of(settings, [M] * 400, tau_ext_bank=bank, threshold_bank=0.2))
+    shown.take_stretch(rows, batch_of(settings, [M] * 400, tau_ext_bank=bank, threshold_bank=0.2))
     peaks = shown.peaks()
     assert peaks[0].item() == pytest.approx(1.5)
     assert np.isnan(peaks[1:]).all(), "cycles that the log knows nothing of"
@@ -386,6 +387,7 @@ def test_the_report_has_the_figures_and_what_they_show(tmp_path):
     assert content["suggested"]["thresholds"]["checked_on"]["found"] == 1
     assert len(content["suggested"]["thresholds"]["roc"]) == len(FACTORS)
     blind = dataclasses.replace(candidate(), choice=choose(observed(touches=None), 1.0))
+    assert blind.choice.checked.contacts is None
     (tmp_path / "file").write_text("")
     with pytest.raises(LogError, match="can't be written"):
         write_tuning(tuning_of(blind), tmp_path / "file")
@@ -420,7 +422,7 @@ def log_settings(log):
 def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
-    contacts = contacts_beside(log).contacts
+    contacts, _ = contacts_beside(log)
     assert [cycle[window.first] for window in read.windows] == [contact.onset for contact in contacts]
     assert [(window.is_armed, window.is_chosen_on) for window in read.windows] == [(True, True)]
     for window, contact in zip(read.windows, contacts, strict=True):
@@ -433,11 +435,11 @@ def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
 
 
 def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
-    truth, (whole,) = contacts_beside(log), read_logs([log])
-    ((attempt, _), _) = truth.span
+    (contacts, span), (whole,) = contacts_beside(log), read_logs([log])
+    ((attempt, _), _) = span
     cycle = read_log(log, ("/scheme",)).scheme["cycle"].reshape(-1)
     first, last = np.quantile(cycle[whole.motion.is_free], (0.2, 0.8), method="lower").tolist()
-    short = truth._replace(span=((attempt, first), (attempt, last)))
+    short = contacts, ((attempt, first), (attempt, last))
     monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: short)
     (read,) = read_logs([log])
     is_covered = (first <= cycle) & (cycle <= last)
@@ -446,11 +448,10 @@ def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
 
 
 def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeypatch):
-    truth = contacts_beside(log)
-    (first,) = truth.contacts
+    (first,), span = contacts_beside(log)
     later = [dataclasses.replace(first, number=n + 1, attempt=n) for n in range(3)]
-    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: truth._replace(contacts=later))
-    monkeypatch.setattr(tune_roc, "_begins", lambda *_: [0, 241])
+    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: (later, span))
+    monkeypatch.setattr(tune_roc.AttemptBegins, "begins", np.array([0, 241]))
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
     assert [(window.number, cycle[window.first] - first.onset) for window in read.windows] == [(1, 0), (2, 240)]
@@ -477,9 +478,9 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
 
 
 def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
-    truth = contacts_beside(log)
-    three = [dataclasses.replace(truth.contacts[0], number=number) for number in (1, 2, 3)]
-    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: truth._replace(contacts=three))
+    (first,), span = contacts_beside(log)
+    three = [dataclasses.replace(first, number=number) for number in (1, 2, 3)]
+    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: (three, span))
     assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
 
 
@@ -546,8 +547,8 @@ def test_what_can_not_be_tuned_is_said_in_one_line(log, tmp_path):
 
 
 def test_logs_of_different_settings_are_not_tuned_together(log, monkeypatch):
-    one = read_logs([log])[0]
-    others = iter([one, dataclasses.replace(one, settings=apply_settings(one.settings, {"filter.a_rad_s": "12"}))])
-    monkeypatch.setattr(tune_roc, "_read", lambda *_: next(others))
+    own = log_settings(log)
+    sources = iter([own, apply_settings(own, {"filter.a_rad_s": "12"})])
+    monkeypatch.setattr(tune_roc, "LogSource", lambda _: SimpleNamespace(settings=next(sources)))
     with pytest.raises(LogError, match=r"different settings, such as filter.a_rad_s"):
         read_logs([log, log])

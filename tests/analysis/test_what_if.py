@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import pytest
 
-from adacd_hil.settings.configuration import (
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.setting_keys import (
     apply_settings,
     changed_keys,
     keep_facts,
-    load_settings,
     parse_changes,
     parse_variations,
     split_list,
 )
-from adacd_hil.settings.schema import ConfigError
 
 PAPER = load_settings("paper")
 

@@ -13,7 +13,7 @@ from adacd_hil.score.wording import number_text
 
 def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:
     rig.start()
-    rig.tap.take()
+    rig.tap.take_passed()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
     loop.run(0.2, test.observe_cycle)

@@ -7,8 +7,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from adacd_hil.cli.main import cli
-from adacd_hil.control.configuration_check import configuration_checks
-from adacd_hil.control.host_checks import Status
+from adacd_hil.lab.commission.host_checks import Status, configuration_checks
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.toml_files import builtin_names
 

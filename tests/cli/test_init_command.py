@@ -16,11 +16,11 @@ from own_arm import write_sensor_eds
 from rig import Rig, SessionRig
 
 from adacd_hil.cli.main import cli
-from adacd_hil.control.configuration_check import configuration_checks, examine_configuration
-from adacd_hil.control.host_checks import Status, diagnose
+from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
 from adacd_hil.lab.commission.arm_draft import planar_from_urdf, uniform_rods
+from adacd_hil.lab.commission.host_checks import Status, configuration_checks, diagnose
 from adacd_hil.lab.commission.profile_draft import DeviceRatings, draft_profile
 from adacd_hil.scheme.model.urdf import UrdfError
 from adacd_hil.settings.configuration import Settings, load_settings

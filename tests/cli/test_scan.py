@@ -4,8 +4,8 @@ import json
 
 from rig import CODEC, Rig
 
-from adacd_hil.device.survey import compare, expected_nodes, survey
 from adacd_hil.lab.cli.scan_command import as_text, describe
+from adacd_hil.lab.commission.survey import compare, expected_nodes, survey
 from adacd_hil.wire.codec import Codec, parse_codec
 
 

@@ -24,7 +24,7 @@ def run(rig: Rig, seconds: float = 0.2, is_enabling: bool = False) -> tuple[Comm
     rig.start()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master, is_enabling)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
-    rig.tap.take()
+    rig.tap.take_passed()
     fault = loop.run(seconds, test.observe_cycle)
     return test.report(), fault
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from adacd_hil.control.host_checks import HOST_CHECKS, Host, Status
+from adacd_hil.lab.commission.host_checks import HOST_CHECKS, Host, Status
 from adacd_hil.scheduling import RealtimeGrant, Refusal
 from adacd_hil.wire.can_interface import InterfaceState, parse_ip_link
 

@@ -7,9 +7,9 @@ import pytest
 from eds_variants import EdsVariant
 
 from adacd_hil.device.profile import PdoSettings, ScaleSettings
-from adacd_hil.device.survey import Node
 from adacd_hil.lab.commission.device_recognition import fitting_profiles
 from adacd_hil.lab.commission.profile_draft import DeviceRatings, ProfileDraft, draft_profile, kind_of
+from adacd_hil.lab.commission.survey import Node
 from adacd_hil.settings.schema import ConfigError
 
 RPM, MILLI_RPM, DEGREES_PER_S = 0x00B44700, 0xFDB44700, 0x00410300

@@ -81,20 +81,17 @@ def test_a_window_that_is_not_still_is_refused_with_value_and_bound(
     assert words.format(f"joint{joint + 1}") in str(refusal.value)
 
 
-@pytest.mark.parametrize(
-    ("field", "rows", "change"),
-    [
+def test_a_window_within_every_bound_is_taken() -> None:
+    for field, rows, change in (
         ("dq", slice(7, 8), 0.05),
         ("q", slice(390, 400), 0.0017),
         ("tau_J", slice(0, 400, 2), 0.09),
         ("tau_J", slice(3, 4), 0.4),
         ("tau_J", slice(200, 400), 0.012),
-    ],
-)
-def test_a_window_within_every_bound_is_taken(field: str, rows: slice, change: float) -> None:
-    samples = window()
-    samples[field][rows] += change
-    assert measure_pose(**samples, settings=tare_settings()).samples == 400
+    ):
+        samples = window()
+        samples[field][rows] += change
+        assert measure_pose(**samples, settings=tare_settings()).samples == 400
 
 
 def test_a_handful_of_samples_is_no_window() -> None:
@@ -114,16 +111,17 @@ def test_with_vertical_axes_the_offset_is_the_mean_and_its_error_comes_from_the_
     np.testing.assert_allclose(solution.standard_error_Nm, [np.std([2, -2, 3, -3], ddof=1) / 200, 5e-4], rtol=1e-9)
 
 
-def test_a_spread_between_poses_over_its_bound_is_refused() -> None:
-    poses = [exact_pose((0.0, 0.0), np.array((0.0, 0.1))), exact_pose((20.0, 0.0), np.array((0.0, -0.01)))]
-    with pytest.raises(TareRefusedError, match=r"spread between poses of tau_J\[joint2\] = 0.11 Nm exceeds"):
-        solve_tare(poses, tare_settings())
-
-
-@pytest.mark.parametrize(("offset", "name"), [((2.1, 0.0), "joint1"), ((0.0, -2.1), "joint2")])
-def test_an_implausible_offset_means_that_something_pushes(offset: tuple[float, float], name: str) -> None:
-    with pytest.raises(TareRefusedError, match=rf"offset\[{name}\] = -?2.1 Nm exceeds .* something pushes"):
-        solve_tare([exact_pose((0.0, 0.0), np.array(offset))], tare_settings())
+@pytest.mark.parametrize(
+    ("torques", "words"),
+    [
+        ([(2.1, 0.0)], r"offset\[joint1\] = 2.1 Nm exceeds .* something pushes"),
+        ([(0.0, -2.1)], r"offset\[joint2\] = -2.1 Nm exceeds .* something pushes"),
+        ([(0.0, 0.1), (0.0, -0.01)], r"spread between poses of tau_J\[joint2\] = 0.11 Nm exceeds"),
+    ],
+)
+def test_an_offset_or_a_spread_over_its_bound_is_refused(torques: list[tuple[float, float]], words: str) -> None:
+    with pytest.raises(TareRefusedError, match=words):
+        solve_tare([exact_pose((20.0 * n, 0.0), np.array(each)) for n, each in enumerate(torques)], tare_settings())
 
 
 @pytest.mark.slow
@@ -138,7 +136,7 @@ def test_noise_of_the_poses_spreads_into_the_offsets_as_their_error_says() -> No
     settings = tare_settings(NINE, {"cad_theta": ()})
     generator = np.random.default_rng(3)
     found, claimed = [], []
-    for _ in range(300):
+    for _ in range(100):
         poses = [
             dataclasses.replace(pose, mean_Nm=pose.mean_Nm + generator.normal(0.0, 1e-3, 2))
             for pose in gravity_poses([*SPREAD_POSES, (70.0, 10.0), (-70.0, 100.0)])
@@ -147,7 +145,7 @@ def test_noise_of_the_poses_spreads_into_the_offsets_as_their_error_says() -> No
         found.append(solution.offset_Nm)
         claimed.append(solution.standard_error_Nm)
     scatter = np.std(found, axis=0)
-    assert np.all(scatter < 1.1 * np.mean(claimed, axis=0))
+    assert np.all(scatter < 1.2 * np.mean(claimed, axis=0))
     assert np.all(scatter > 0.6 * np.mean(claimed, axis=0))
 
 
@@ -162,13 +160,6 @@ def test_a_cad_model_that_is_wrong_shows_in_the_residuals() -> None:
     settings = tare_settings(NINE, {"cad_theta": CAD}, gravity_model="cad")
     with pytest.raises(TareRefusedError, match=r"residual of pose 1\[joint1\] = -?0.\d+ Nm exceeds tare.pose_limit_Nm"):
         solve_tare(gravity_poses([(0.0, 0.0), (80.0, 0.0), (80.0, 90.0)]), settings)
-
-
-def test_a_push_in_one_pose_shows_in_the_residuals() -> None:
-    poses = gravity_poses([*SPREAD_POSES, (0.0, 90.0)])
-    poses[2].mean_Nm[0] += 0.6
-    with pytest.raises(TareRefusedError, match=r"residual of pose \d\[joint1\]"):
-        solve_tare(poses, tare_settings(NINE, {"cad_theta": ()}))
 
 
 @pytest.mark.parametrize(
@@ -206,15 +197,6 @@ def test_one_pose_twice_has_no_finite_condition() -> None:
 # With the emulator.
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_sensors_offsets_are_found_within_three_standard_errors(seed: int) -> None:
-    tare = TareRig(torque_offset_Nm=OFFSET, seed=seed).session.run()
-    errors = np.array(tare.standard_error_Nm)
-    assert np.all(np.abs(np.subtract(tare.offset_Nm, OFFSET)) < 3 * errors)
-    assert np.all(errors < 0.005)
-    assert tare.samples == round(WINDOW_S * 1000)
-
-
 def test_the_offset_is_in_joint_direction_and_the_configured_one_is_not_subtracted() -> None:
     settings = tare_settings(arm={"sign": (1, -1), "torque_offset_Nm": (0.25, 0.25)})
     tare = TareRig(settings, torque_offset_Nm=OFFSET, noise=False).session.run()
@@ -235,8 +217,16 @@ def test_drives_stay_disabled_and_without_torque_on_the_wire() -> None:
     assert not any(drive.is_enabled for drive in rig.bench.drives)
 
 
-def test_where_it_came_from_is_stored_with_it() -> None:
-    tare = TareRig(torque_offset_Nm=OFFSET, old_offset_Nm=(0.1, 0.0)).session.run()
+def test_the_sensors_offsets_are_found_and_stored_with_where_they_came_from() -> None:
+    rig = TareRig(torque_offset_Nm=OFFSET, old_offset_Nm=(0.1, 0.0))
+    for sensor, temperature in zip(rig.bench.devices[2:], (2345, -150), strict=True):
+        sensor.serve(0x2111, 0, lambda value=temperature: value)
+    tare = rig.session.run()
+    errors = np.array(tare.standard_error_Nm)
+    assert np.all(np.abs(np.subtract(tare.offset_Nm, OFFSET)) < 3 * errors)
+    assert np.all(errors < 0.005)
+    assert tare.samples == round(WINDOW_S * 1000)
+    assert (tare.sensor1.temperature_C, tare.sensor2.temperature_C) == (23.45, -1.5)
     assert [sensor.name for sensor in tare.sensors] == ["Sensor1", "Sensor2"]
     assert [sensor.node_id for sensor in tare.sensors] == [3, 4]
     assert {sensor.vendor for sensor in tare.sensors} == {0x41444143}
@@ -250,14 +240,6 @@ def test_where_it_came_from_is_stored_with_it() -> None:
     np.testing.assert_allclose(np.degrees(tare.poses[0].q_rad), [-30.0, -60.0], atol=1e-3)
 
 
-def test_the_temperature_of_a_sensor_that_measures_it_is_stored() -> None:
-    rig = TareRig()
-    for sensor, temperature in zip(rig.bench.devices[2:], (2345, -150), strict=True):
-        sensor.serve(0x2111, 0, lambda value=temperature: value)
-    tare = rig.session.run()
-    assert (tare.sensor1.temperature_C, tare.sensor2.temperature_C) == (23.45, -1.5)
-
-
 def refusal_of(rig: TareRig) -> str:
     with pytest.raises(TareRefusedError) as refusal:
         rig.session.run()
@@ -269,30 +251,6 @@ def test_a_moving_arm_is_refused(joint: int) -> None:
     rig = TareRig()
     rig.hand = lambda cycle: np.eye(2)[joint] * 1e-4 * max(0, cycle - SETTLED_CYCLE - 100)
     assert f"the arm moves: |dq[joint{joint + 1}]| = 0.1 rad/s exceeds" in refusal_of(rig)
-
-
-def test_a_creeping_arm_is_refused() -> None:
-    rig = TareRig()
-    rig.hand = lambda cycle: np.array([1e-5, 0.0]) * cycle
-    assert "the arm creeps: q[joint1] went through 0.17" in refusal_of(rig)
-
-
-def test_a_trembling_hand_on_the_arm_is_refused() -> None:
-    rig = TareRig()
-    rig.push = lambda cycle, q: np.array([0.0, 0.2 * np.sin(0.05 * cycle)])
-    assert "standard deviation of tau_J[joint2] = 0.1" in refusal_of(rig)
-
-
-def test_a_knock_is_refused() -> None:
-    rig = TareRig()
-    rig.push = lambda cycle, q: np.array([0.6 if cycle == SETTLED_CYCLE + 50 else 0.0, 0.0])
-    assert "peak-to-peak value of tau_J[joint1] = 0.6" in refusal_of(rig)
-
-
-def test_a_push_that_sets_in_is_refused_as_drift() -> None:
-    rig = TareRig()
-    rig.push = lambda cycle, q: np.array([0.0, 0.05 if cycle > SETTLED_CYCLE + 150 else 0.0])
-    assert "drift of tau_J from first to second half[joint2] = 0.0" in refusal_of(rig)
 
 
 def test_a_steady_push_is_refused_as_an_implausible_offset() -> None:
@@ -393,19 +351,13 @@ def test_a_pose_that_moves_again_while_it_is_measured_is_measured_anew() -> None
     assert len(tare.poses) == 2
 
 
-def test_an_arm_that_nobody_moves_is_refused_after_the_timeout() -> None:
+@pytest.mark.parametrize(
+    ("rad_per_cycle", "missing"), [(0.0, "been moved by more than tare.move_deg = 10 deg"), (2e-4, "come to rest")]
+)
+def test_an_arm_that_is_not_brought_to_the_next_pose_is_refused_after_the_timeout(rad_per_cycle, missing) -> None:
     rig = TareRig(tare_settings(poses=2, move_timeout_s=1.0))
-    Hand(rig, [(-21.0, -60.0)])  # 9 degrees
-    expected = (
-        "the arm has not been moved by more than tare.move_deg = 10 deg within tare.move_timeout_s = 1 s for pose 2"
-    )
-    assert refusal_of(rig) == expected
-
-
-def test_an_arm_that_never_comes_to_rest_is_refused_after_the_timeout() -> None:
-    rig = TareRig(tare_settings(poses=2, move_timeout_s=1.0))
-    rig.hand = lambda cycle: np.array([2e-4, 0.0]) * max(0, cycle - 550)
-    assert refusal_of(rig) == "the arm has not come to rest within tare.move_timeout_s = 1 s for pose 2"
+    rig.hand = lambda cycle: np.array([rad_per_cycle, 0.0]) * max(0, cycle - 550)
+    assert refusal_of(rig) == f"the arm has not {missing} within tare.move_timeout_s = 1 s for pose 2"
 
 
 @pytest.mark.slow

@@ -53,7 +53,7 @@ def test_single_misses_add_up_within_the_window() -> None:
     watched.after(2)
     watched.after(1, 40)
     assert watched.after(2).fault is FaultReason.DEADLINE
-    assert watched.watch.describe() == "3 periods missed within 0.1 s; 3 are too many"
+    assert watched.watch.describe_misses() == "3 periods missed within 0.1 s; 3 are too many"
 
 
 def test_misses_further_apart_than_the_window_never_add_up() -> None:

@@ -6,7 +6,7 @@ from rig import CODEC, PERIOD_NS, Rig
 
 from adacd_hil.control.exchange import Exchange, say_trouble
 from adacd_hil.control.pacing import GridPacer
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_checks
 from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.records import ArmCommand, ArmState
 from adacd_hil.wire.bus import EmbeddedBus, Frame
@@ -23,7 +23,7 @@ class ExchangeRig:
         self.exchange = Exchange(bench.settings, bench.tap, bench.arm, bench.master, self.pacer, bench.clock)
 
     def read(self) -> ArmState:
-        return self.exchange.turn().arm
+        return self.exchange.turn()[1]
 
 
 def drain(bus: EmbeddedBus) -> list[Frame]:
@@ -56,7 +56,7 @@ def test_a_frame_that_comes_after_its_cycle_was_given_up_is_of_that_cycle() -> N
     state = rig.read()
     assert state.is_complete
     assert state.age_tau_J == (0, 0)
-    assert "0 NO_NEW_DATA" in ArmReport(rig.bench.arm).describe_checks()[2]
+    assert "0 NO_NEW_DATA" in describe_checks(rig.bench.arm)[2]
 
 
 def test_the_feedback_is_in_when_its_last_frame_came_not_when_it_was_read() -> None:
@@ -99,12 +99,12 @@ def test_frames_that_the_kernel_dropped_are_counted_and_said_at_most_once_a_seco
     counted, said = [], []
     for count in (0, 1, 4, 4):
         lost.append(count)
-        counted.append(exchange.end(exchange.turn(), off).frames_lost)
+        counted.append(exchange.end(*exchange.turn(), off).frames_lost)
         said += exchange.events.take_events()
     assert counted == [0, 1, 4, 4]
     assert [event.message for event in said] == ["1 received frame dropped by the kernel: this host reads too late"]
     bench.clock.sleep_until_ns(bench.clock.now_ns() + 1_000_000_000)
-    exchange.end(exchange.turn(), off)
+    exchange.end(*exchange.turn(), off)
     (event,) = exchange.events.take_events()
     assert event.message.startswith("3 received frames")
 

@@ -140,7 +140,7 @@ def test_a_frame_that_is_put_back_is_the_next_one() -> None:
     assert sync is not None
     follower.tap.unread(sync)
     assert follower.pacer.next().t_ns == 2 * PERIOD_NS
-    assert [frame.data[0] for _, frame in follower.tap.take()] == [1, 2]
+    assert [frame.data[0] for _, frame in follower.tap.take_passed()] == [1, 2]
 
 
 def test_a_pause_that_is_meant_is_no_overrun() -> None:

@@ -5,7 +5,8 @@ import os
 
 import pytest
 
-from adacd_hil.control.operator import CONSOLE_WORDS, ConsoleOperator, FaultAnswer, ScriptedOperator
+from adacd_hil.cli.console_operator import CONSOLE_WORDS, ConsoleOperator
+from adacd_hil.control.operator import FaultAnswer, ScriptedOperator
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 

@@ -215,7 +215,7 @@ def test_a_tare_of_sensors_that_zeroed_themselves_says_that_a_reset_forgets_it(t
 def test_the_sensors_that_were_tared_are_accepted_whatever_the_drives_are(tmp_path: Path) -> None:
     used = use_tare(stored(tmp_path), SETTINGS, DATE_NS + 25 * HOUR_NS)
     found = [identity._replace(serial=9) if identity.name == "Drive1" else identity for identity in identities()]
-    info, warning = used.check_sensors(found)
+    info, warning = used.check_devices(found)
     assert (info.level, info.name) == ("info", "tare")
     assert "0.305, -0.2 Nm subtracted" in info.message
     assert (warning.level, "25.0 h old" in warning.message) == ("warning", True)
@@ -233,7 +233,7 @@ def test_other_sensors_than_those_that_were_tared_are_refused(
     tmp_path: Path, changes: dict[str, int], line: str
 ) -> None:
     with pytest.raises(DeviceError) as error:
-        use_tare(stored(tmp_path), SETTINGS, DATE_NS).check_sensors(identities(**changes))
+        use_tare(stored(tmp_path), SETTINGS, DATE_NS).check_devices(identities(**changes))
     assert str(error.value).startswith(line)
 
 
@@ -241,4 +241,4 @@ def test_the_two_sensors_may_not_be_exchanged(tmp_path: Path) -> None:
     drive1, drive2, sensor1, sensor2 = identities()
     exchanged = [drive1, drive2, sensor1._replace(serial=3002), sensor2._replace(serial=3001)]
     with pytest.raises(DeviceError, match="serial number 3002 is not the 3001"):
-        use_tare(stored(tmp_path), SETTINGS, DATE_NS).check_sensors(exchanged)
+        use_tare(stored(tmp_path), SETTINGS, DATE_NS).check_devices(exchanged)

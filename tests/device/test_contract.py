@@ -8,7 +8,8 @@ import cantools
 import pytest
 
 import adacd_hil
-from adacd_hil.device.contract import compose, load_contract, write_contract
+from adacd_hil.control.session import write_contract
+from adacd_hil.device.contract import compose, load_contract
 from adacd_hil.device.profile import place_devices
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError, parse

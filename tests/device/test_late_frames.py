@@ -36,6 +36,7 @@ class Devices:
         self.cycle = -1
         self.delay_ns: dict[str, int] = {}
         self.lost: set[str] = set()
+        self.last: dict[str, bytes] = {}
 
     def frame(self, name: str, cycle: int, offset: float = 0.0) -> bytes:
         message = self.codec.message(name)
@@ -54,7 +55,7 @@ class Devices:
         self.cycle += 1
         self.arm.synchronise(self.cycle, t_ns, 1)
         for name, usual_ns in USUAL_NS.items():
-            data = self.frame(name, self.cycle)
+            data = self.last[name] = self.frame(name, self.cycle)
             if name not in self.lost:
                 came_ns = t_ns + usual_ns + self.delay_ns.get(name, 0)
                 self.waiting.append((came_ns, Frame(self.codec.message(name).can_id, data, came_ns)))
@@ -162,10 +163,7 @@ def test_the_same_frame_again_is_no_stranger_s() -> None:
         for _ in range(5):
             state = devices.step()
             for name in USUAL_NS:
-                place = [device.name for device in devices.arm.devices].index(
-                    name.removesuffix("Feedback").removesuffix("Torque")
-                )
-                data = devices.arm._last_data[place]
-                devices.arm.accept(Frame(devices.codec.message(name).can_id, data, state.t_ns + 600_000))
+                can_id = devices.codec.message(name).can_id
+                devices.arm.accept(Frame(can_id, devices.last[name], state.t_ns + 600_000))
         assert devices.arm.state().fault is FaultReason.NONE
         assert devices.arm.strangers.take_events() == []

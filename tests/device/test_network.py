@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rig import Rig
 
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
@@ -54,7 +54,7 @@ class NetworkRig(Rig):
         self.arm.synchronise(self.cycle, self.cycle * self.period_ns, 1)
         while (frame := self.bus.receive(0.0)) is not None:
             self.accept(frame)
-        self.arm.write(ArmCommand(np.array(tau or (0.0, 0.0)), enable, False))
+        self.arm.send_command(ArmCommand(np.array(tau or (0.0, 0.0)), enable, False))
         if self.cycle % 100 == 0:
             self.master.send_heartbeat()
         self.cycle += 1
@@ -83,7 +83,7 @@ def test_the_emulated_devices_of_every_contract_are_set_up_enabled_and_moved(con
     assert (state.is_enabled, state.is_complete, state.fault) == (True, True, FaultReason.NONE)
     assert state.dq.min() > 0.1
     np.testing.assert_allclose(state.tau_J, [0.3, 0.1], atol=0.1)
-    assert ArmReport(rig.arm).describe_faults() == rig.master.watch(rig.cycle * rig.period_ns) == []
+    assert describe_faults(rig.arm) == rig.master.watch(rig.cycle * rig.period_ns) == []
 
 
 def test_devices_watch_the_host_for_two_and_a_half_periods() -> None:

@@ -49,7 +49,7 @@ def test_a_saturated_sensor_is_fresh_and_overloaded() -> None:
     rig = Protected()
     for cycle in range(20):
         rig.sensor.accept_cyclic(rig.frame(20.0, status=3), cycle)
-    assert (rig.sensor.sample_cycle, rig.sensor.is_overloaded, rig.sensor.values[0]) == (19, True, 20.0)
+    assert (rig.sensor.sample_cycle, rig.sensor.status, rig.sensor.values[0]) == (19, OVERLOADED, 20.0)
 
 
 def test_a_sensor_that_repeats_its_frame_ages() -> None:
@@ -57,7 +57,7 @@ def test_a_sensor_that_repeats_its_frame_ages() -> None:
     frame = rig.frame(1.5)
     taken = [rig.sensor.accept_cyclic(frame, cycle) for cycle in range(5)]
     assert taken == [True, False, False, False, False]
-    assert (rig.sensor.sample_cycle, rig.sensor.is_overloaded) == (0, False)
+    assert (rig.sensor.sample_cycle, rig.sensor.status) == (0, 0)
 
 
 def test_a_silent_sensor_is_counted_as_no_new_data() -> None:

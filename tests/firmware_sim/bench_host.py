@@ -11,6 +11,7 @@ from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
+from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.bench.bench import Bench
 from firmware_sim.canopen.object_dictionary import CONTRACTS
 from firmware_sim.scenario.scenario import Scenario
@@ -23,6 +24,9 @@ SHUTDOWN, SWITCH_ON, ENABLE = 0x06, 0x07, 0x0F
 DISABLE_VOLTAGE, QUICK_STOP, FAULT_RESET = 0x00, 0x02, 0x80
 INVALID = 1 << 31
 """Bit of a COB-ID."""
+DISABLED, READY, SWITCHED_ON, ENABLED = 0x40, 0x21, 0x23, 0x27
+STOPPING, REACTION, FAULT = 0x07, 0x0F, 0x08
+"""Bits 0 to 3, 5 and 6 of the statusword by state, from the standard's table; x in the table is 0 here."""
 
 
 def quiet_scenario(**changes: Any) -> Scenario:
@@ -159,10 +163,17 @@ class BenchHost:
         """A field of the latest truth block."""
         return self.truths[-1][2][TRUTH_LAYOUT.slices[name]]
 
-    def wait_until_at_rest(self, controlword: int = ENABLE) -> None:
-        """Send SYNCs until a braking drive has surely finished."""
-        for _ in range(1100):
-            self.step(controlword)
+    def wait_until_at_rest(self, controlword: int | None = ENABLE) -> None:
+        """Send SYNCs, with commands or without, until no drive has braked for 20 of them."""
+        count = last = 0
+        while count - last < 20:
+            assert count < 1100
+            if controlword is not None:
+                self.command(controlword)
+            self.sync()
+            count += 1
+            if any(drive.motor_mode > DriveMode.TORQUE for drive in self.bench.drives):
+                last = count
 
 
 def remap(
@@ -196,4 +207,26 @@ def patient_host() -> BenchHost:
         host.write(node, 0x2200, 0, 255)
         host.write(node, 0x2201, 0, 10_000)
     host.enable()
+    return host
+
+
+def in_state(bits: int) -> BenchHost:
+    """Bring both drives to a state; quick stop stays, and braking takes more than one period."""
+    host = BenchHost()
+    for node in (1, 2):
+        host.write(node, 0x605A, 0, 6)
+        host.write(node, 0x1016, 1, 127 << 16 | 250)
+        host.write(node, 0x1017, 0, 100)
+    host.start()
+    words = {DISABLED: (), READY: (SHUTDOWN,), SWITCHED_ON: (SHUTDOWN, SWITCH_ON)}
+    for word in words.get(bits, (SHUTDOWN, SWITCH_ON, ENABLE)):
+        host.step(word)
+    if bits in (STOPPING, REACTION):
+        for _ in range(30):
+            host.step(ENABLE, 300)
+    if bits == STOPPING:
+        host.step(QUICK_STOP)
+    for _ in range({REACTION: 3, FAULT: 20}.get(bits, 0)):
+        host.sync()
+    assert host.state_bits() == bits
     return host

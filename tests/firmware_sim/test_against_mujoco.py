@@ -24,7 +24,9 @@ SPRINGS = {"stiffness_Nm_rad": (6000.0, 2000.0), "rotor_inertia_kg_m2": (0.3, 0.
 def engine(arm: GeneralArm, payload=NONE, ball: str = "") -> mujoco.MjModel:
     """Build the arm: links as bodies, rotors as wheels of their own, springs as tendons between wheel and joint."""
     settings = arm.settings
-    first, second = arm.arm.links
+    lengths_m, masses_kg, centers_m, inertias = (
+        arm.arm.link_length_m, arm.arm.mass_kg, arm.arm.center_m, arm.arm.inertia_kg_m2,
+    )  # fmt: skip
     slope = 9.80665 * math.sin(math.radians(settings.tilt_deg))
     downhill = math.radians(settings.tilt_direction_deg)
     mass_kg, (along_m, beside_m), inertia = payload
@@ -32,7 +34,7 @@ def engine(arm: GeneralArm, payload=NONE, ball: str = "") -> mujoco.MjModel:
     if mass_kg > 0.0:
         # an engine wants some inertia about every axis; only the one about z moves
         load = (
-            f'<body pos="{second.length_m} 0 0"><inertial pos="{along_m} {beside_m} 0" mass="{mass_kg}" '
+            f'<body pos="{lengths_m[1]} 0 0"><inertial pos="{along_m} {beside_m} 0" mass="{mass_kg}" '
             f'diaginertia="{max(inertia, 1e-12)} {max(inertia, 1e-12)} {max(inertia, 1e-12)}"/></body>'
         )
     wheels, tendons = "", ""
@@ -57,13 +59,13 @@ def engine(arm: GeneralArm, payload=NONE, ball: str = "") -> mujoco.MjModel:
       <worldbody>
         <body name="link1">
           <joint name="j0" type="hinge" axis="0 0 1"/>
-          <inertial pos="{first.center_m} 0 0" mass="{first.mass_kg}"
-            diaginertia="{first.inertia_kg_m2} {first.inertia_kg_m2} {first.inertia_kg_m2}"/>
-          <body name="link2" pos="{first.length_m} 0 0">
+          <inertial pos="{centers_m[0]} 0 0" mass="{masses_kg[0]}"
+            diaginertia="{inertias[0]} {inertias[0]} {inertias[0]}"/>
+          <body name="link2" pos="{lengths_m[0]} 0 0">
             <joint name="j1" type="hinge" axis="0 0 1"/>
-            <inertial pos="{second.center_m} 0 0" mass="{second.mass_kg}"
-              diaginertia="{second.inertia_kg_m2} {second.inertia_kg_m2} {second.inertia_kg_m2}"/>
-            <geom name="skin" type="capsule" fromto="0 0 0 {second.length_m} 0 0" size="0.02"
+            <inertial pos="{centers_m[1]} 0 0" mass="{masses_kg[1]}"
+              diaginertia="{inertias[1]} {inertias[1]} {inertias[1]}"/>
+            <geom name="skin" type="capsule" fromto="0 0 0 {lengths_m[1]} 0 0" size="0.02"
               condim="1" solref="-40000 -40"/>
             {load}
           </body>
@@ -108,12 +110,10 @@ def paper_torque(arm: GeneralArm, seconds: float) -> tuple[np.ndarray, np.ndarra
         1,
         [
             (MechanicsSettings(**SPRINGS, damping_Nm_s=(3.0, 1.0), tilt_deg=20.0), BODY_PAYLOAD, 2.0, 1e-5),
-            (AS_RIGID, NONE, 10.0, 1e-4),
             (AS_RIGID, POINT_PAYLOAD, 10.0, 1e-4),
             (MechanicsSettings(tilt_deg=20.0, tilt_direction_deg=-60.0), BODY_PAYLOAD, 10.0, 1e-4),
             # a spring that is off by 1 % moves the links by 4e-5 rad
             (MechanicsSettings(**SPRINGS), POINT_PAYLOAD, 10.0, 1e-5),
-            (MechanicsSettings(**SPRINGS, damping_Nm_s=(3.0, 1.0), tilt_deg=20.0), BODY_PAYLOAD, 10.0, 1e-5),
             # flanks that rattle undamped forget their past: each knock enlarges what the knock before it left
             (MechanicsSettings(**SPRINGS, backlash_rad=(2e-3, 2e-3)), NONE, 2.0, 1e-3),
         ],
@@ -203,8 +203,7 @@ def test_a_prescribed_pulse_changes_the_momentum_as_in_mujoco(settings, link, po
     assert np.linalg.norm(gained - expected) < 0.002 * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("speed_m_s", [0.5, 2.0])
-@pytest.mark.parametrize("payload", [NONE, POINT_PAYLOAD])
+@pytest.mark.parametrize(("speed_m_s", "payload"), [(0.5, NONE), (2.0, POINT_PAYLOAD)])
 def test_a_ball_that_hits_link_2_in_mujoco_moves_our_arm_alike(speed_m_s, payload):
     """The ball's loss of momentum in the engine, given to our arm as a pulse, changes the arm's momentum within 2 %."""
     arm = GeneralArm(without_friction("S"), AS_RIGID, q=(0.3, 0.9), payload=payload)

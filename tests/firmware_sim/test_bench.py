@@ -17,6 +17,7 @@ from bench_host import (
 )
 
 from adacd_hil.clock import VirtualClock
+from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from firmware_sim.bench.bench import Bench
 
@@ -30,14 +31,6 @@ def play(host: BenchHost, cycles: int = 300) -> None:
         host.step(ENABLE, round(80 * np.sin(0.05 * k)))
 
 
-def test_a_sync_is_answered_by_feedback_and_torque_with_identifiers_ascending():
-    host = BenchHost()
-    play(host, 20)
-    host.take()
-    host.sync()
-    assert [can_id for can_id, _ in host.take()] == [0x181, 0x182, 0x183, 0x184]
-
-
 def test_the_cyclic_frames_come_last_so_that_a_host_in_lockstep_has_everything():
     host = BenchHost()
     play(host, 5)
@@ -48,9 +41,9 @@ def test_the_cyclic_frames_come_last_so_that_a_host_in_lockstep_has_everything()
 
 def test_truth_comes_every_cycle_with_its_number_and_the_syncs_time():
     host = BenchHost()
-    play(host, 500)
-    assert [cycle for cycle, _, _ in host.truths] == list(range(503))
-    assert [t_ns for _, t_ns, _ in host.truths] == [(k + 1) * PERIOD_NS for k in range(503)]
+    play(host, 300)
+    assert [cycle for cycle, _, _ in host.truths] == list(range(303))
+    assert [t_ns for _, t_ns, _ in host.truths] == [(k + 1) * PERIOD_NS for k in range(303)]
 
 
 def test_scenario_time_starts_when_both_drives_are_first_enabled():
@@ -72,8 +65,6 @@ def test_scenario_time_starts_when_both_drives_are_first_enabled():
 
 
 def _field(host: BenchHost, cycle: int, name: str) -> float:
-    from adacd_hil.records import TRUTH_LAYOUT
-
     return float(host.truths[cycle][2][TRUTH_LAYOUT.slices[name]][0])
 
 
@@ -86,7 +77,7 @@ def test_by_sync_the_arm_moves_one_period_per_sync_however_long_it_takes():
     assert quick.bench.now_ns == 302 * PERIOD_NS
 
 
-@pytest.mark.parametrize("lost", [1, 2])
+@pytest.mark.parametrize("lost", [2])
 def test_a_lost_sync_keeps_the_arms_time(lost):
     whole, holed = BenchHost(), BenchHost()
     for host in (whole, holed):
@@ -101,50 +92,12 @@ def test_a_lost_sync_keeps_the_arms_time(lost):
     assert holed.bench.now_ns == whole.bench.now_ns
 
 
-def test_lost_syncs_count_as_syncs_without_command():
-    host = BenchHost()
-    play(host, 100)
-    host.cycle += 3
-    host.sync()
-    assert host.read(1, 0x603F) == 0x8250
-
-
 def test_the_counter_is_unwrapped_over_its_overflow():
     host = BenchHost()
-    for _ in range(1000):
+    host.cycle = 7  # the first counter may be any
+    for _ in range(500):
         host.sync()
-    assert host.bench.cycle == 999
-
-
-def test_where_sync_has_no_counter_each_is_the_next_cycle():
-    host = BenchHost()
-    for node in (1, 2, 3, 4):
-        host.write(node, 0x1006, 0, 0)
-        host.write(node, 0x1019, 0, 0)
-        host.write(node, 0x1006, 0, 1000)
-    for _ in range(5):
-        host.put(0x080, b"")
-    assert host.bench.cycle == 4
-
-
-def test_reset_communication_begins_a_new_count_of_cycles_and_leaves_the_arm_where_it_is():
-    host = BenchHost()
-    play(host, 100)
-    position = host.true("q").copy()
-    host.nmt(RESET_COMMUNICATION)
-    host.cycle = 0
-    host.sync()
-    assert host.bench.cycle == 0
-    assert host.truths[-1][0] == 0
-    assert np.abs(host.true("q") - position).max() < 0.01
-    assert np.abs(position).max() > 0.01
-
-
-def test_a_first_sync_that_is_lost_does_not_shift_the_count():
-    host = BenchHost()
-    host.cycle = 1
-    host.sync()
-    assert host.bench.cycle == 1
+    assert host.bench.cycle == 506
 
 
 def test_another_period_takes_effect_before_the_arm_has_moved():
@@ -161,27 +114,16 @@ def test_another_period_takes_effect_before_the_arm_has_moved():
     assert host.true("dq")[0] == pytest.approx(reference.true("dq")[0], rel=0.05)
 
 
-def test_a_second_host_with_the_same_period_finds_the_arm_where_the_first_left_it():
-    host = BenchHost()
-    host.write(1, 0x1006, 0, 2000)
-    play(host, 50)
-    position = host.true("q").copy()
-    host.nmt(RESET_COMMUNICATION)
-    assert host.read(1, 0x1006) == 1000
-    host.write(1, 0x1006, 0, 2000)
-    host.sync()
-    assert np.abs(host.true("q") - position).max() < 0.02
-    assert np.abs(position).max() > 0.02
-
-
 def test_a_second_host_that_leaves_the_default_period_finds_the_arm_where_the_first_left_it():
     host = BenchHost()
     host.write(1, 0x1006, 0, 2000)
     play(host, 50)
     position = host.true("q").copy()
     host.nmt(RESET_COMMUNICATION)
+    assert host.read(1, 0x1006) == 1000
     host.cycle = 0
     host.sync()
+    assert (host.bench.cycle, host.truths[-1][0]) == (0, 0)
     assert np.abs(host.true("q") - position).max() < 0.02
     assert np.abs(position).max() > 0.02
     now_ns = host.bench.now_ns
@@ -189,18 +131,14 @@ def test_a_second_host_that_leaves_the_default_period_finds_the_arm_where_the_fi
     assert host.bench.now_ns == now_ns + PERIOD_NS
 
 
-def test_another_period_is_refused_in_operational():
-    host = BenchHost()
-    host.nmt(START)
-    host.sync()
-    assert host.abort_code(lambda: host.write(1, 0x1006, 0, 2000)) == 0x08000022
-    host.write(1, 0x1006, 0, 1000)
-
-
 @pytest.mark.parametrize("command", [PRE_OPERATIONAL, RESET_COMMUNICATION, RESET_NODE])
 def test_another_period_can_be_written_again_once_the_nodes_have_left_operational(command):
     host = BenchHost()
     play(host, 50)
+    position = host.true("q").copy()
+    host.bench.drives[0].fail(0x2310, host.bench.now_ns)  # so that only the device's state can refuse
+    host.wait_until_at_rest()
+    assert host.abort_code(lambda: host.write(1, 0x1006, 0, 2000)) == 0x08000022
     position = host.true("q").copy()
     host.nmt(command)
     for node in (1, 2, 3, 4):
@@ -214,27 +152,6 @@ def test_another_period_can_be_written_again_once_the_nodes_have_left_operationa
     assert host.bench.now_ns == now_ns + 2 * PERIOD_NS
     assert np.abs(host.true("q") - position).max() < 0.05
     assert np.abs(position).max() > 0.005
-
-
-def test_sync_before_any_node_is_operational_does_not_fix_the_period():
-    host = BenchHost()
-    host.sync()
-    host.write(1, 0x1006, 0, 2000)
-    host.sync()
-    now_ns = host.bench.now_ns
-    host.sync()
-    assert host.bench.now_ns == now_ns + 2 * PERIOD_NS
-
-
-def test_by_wall_clock_the_arm_moves_without_sync_and_a_sync_samples_it():
-    contact = [{"at_s": 0.0, "link": 2, "point_m": 0.3, "force_N": 20.0, "duration_s": 1.0}]
-    host = BenchHost(quiet_scenario(contacts=contact), clock_mode="wall")
-    host.enable()
-    host.t_ns += 20 * PERIOD_NS
-    host.bench.advance_to(host.t_ns)
-    host.put(0x080, bytes([1 + host.cycle]))
-    assert host.true("dq")[1] > 0.1
-    assert host.truths[-1][1] == host.t_ns
 
 
 def test_by_wall_clock_a_sync_that_waited_in_the_queue_is_no_lost_sync():
@@ -275,17 +192,6 @@ def test_the_same_inputs_give_the_same_frames_and_the_same_truth_bit_for_bit():
     assert len(first_frames) > 1800
     assert first_frames == second_frames
     assert first_truths == second_truths
-
-
-def test_another_seed_gives_other_noise():
-    torques = []
-    for seed in (1, 2):
-        host = BenchHost(quiet_scenario(noise=True), seed=seed)
-        host.nmt(START)
-        host.take()
-        host.sync()
-        torques.append(host.taken(0x183)[0][2:])
-    assert torques[0] != torques[1]
 
 
 def test_on_the_embedded_bus_the_answers_are_there_when_send_returns():

@@ -4,9 +4,8 @@ import struct
 from typing import Any
 
 import pytest
-from bench_host import DISABLE_VOLTAGE, ENABLE, SHUTDOWN, SWITCH_ON, BenchHost, quiet_scenario
+from bench_host import DISABLE_VOLTAGE, ENABLE, ENABLED, SHUTDOWN, SWITCH_ON, SWITCHED_ON, BenchHost, quiet_scenario
 
-OPERATION_ENABLED, SWITCHED_ON = 0x27, 0x23
 TORQUE_MODE = 10
 IN_BETWEEN = -1
 DEVICE_STATE = 0x08000022
@@ -59,7 +58,7 @@ def test_a_drive_may_take_its_time_to_be_enabled() -> None:
         host.step(ENABLE)
         states.append(host.state_bits())
     assert states[:15] == [SWITCHED_ON] * 15
-    assert states[-1] == OPERATION_ENABLED
+    assert states[-1] == ENABLED
 
 
 def test_enabling_that_is_given_up_begins_anew() -> None:

@@ -1,6 +1,5 @@
 """The plan of faults: when rows act, what they do to frames, values and nodes, and that their draws are their own."""
 
-import collections
 import statistics
 
 import pytest
@@ -46,6 +45,8 @@ def frame_row(kind: str, **keys: object) -> dict[str, object]:
 
 def test_a_row_begins_and_ends_at_its_times_and_says_so():
     plan = plan_of(example("silence", node="sensor2", at_s=1.0, duration_s=0.5))
+    assert plan.advance(-1, 5 * S) == []
+    assert (plan.mask, plan.is_quiet, plan.wait_ns) == (0, True, NEVER_NS)
     edges = {ms: plan.advance(ms * MS) for ms in (-1, 0, 999, 1000, 1001, 1499, 1500, 1501)}
     said = {ms: [(edge.row, edge.begins, edge.text) for edge in found] for ms, found in edges.items() if found}
     text = "silence of sensor2, duration_s 0.5"
@@ -65,36 +66,6 @@ def test_the_mask_has_a_bit_for_each_row_that_is_active():
     assert masks == [0b000, 0b001, 0b011, 0b111, 0b110, 0b100, 0b100]
 
 
-def test_before_the_drives_are_enabled_nothing_begins():
-    plan = plan_of(example("silence", at_s=0.0))
-    assert plan.advance(-1) == []
-    assert (plan.mask, plan.is_quiet) == (0, True)
-    assert [edge.begins for edge in plan.advance(0)] == [True]
-
-
-def test_a_row_can_count_from_power_on():
-    plan = plan_of(example("silence", since="power_on", at_s=1.0))
-    assert plan.advance(5 * S, 999 * MS) == []
-    assert plan.advance(-1, 1000 * MS)[0].begins
-
-
-def test_a_row_whose_whole_time_was_missed_begins_and_ends_at_once():
-    plan = plan_of(example("silence", at_s=1.0, duration_s=0.5))
-    plan.advance(0)
-    assert [edge.begins for edge in plan.advance(10 * S)] == [True, False]
-    assert plan.mask == 0
-
-
-@pytest.mark.parametrize("kind", ["reboot", "drive_fault"])
-def test_a_row_without_length_is_active_for_one_period(kind):
-    plan = plan_of(example(kind))
-    masks = []
-    for step in range(4):
-        plan.advance(S + (step - 1) * PERIOD_NS)
-        masks.append(plan.mask)
-    assert masks == [0, 1, 0, 0]
-
-
 @pytest.mark.parametrize("kind", ["wrong_node_id", "duplicate_node_id"])
 def test_a_wrong_id_is_there_from_power_on_and_disturbs_nothing_else(kind):
     plan = plan_of(example(kind))
@@ -106,6 +77,7 @@ def test_a_row_with_a_count_ends_when_it_has_acted_so_often():
     plan = active(frame_row("lose", count=3))
     left = [len(plan.transmit(SENSOR1, 0x183, TORQUE)) for _ in range(6)]
     assert left == [0, 0, 0, 1, 1, 1]
+    assert not plan.is_quiet
     assert [edge.begins for edge in plan.advance(PERIOD_NS)] == [False]
     assert plan.is_quiet
 
@@ -121,44 +93,14 @@ def test_it_says_how_long_nothing_will_change():
     assert waits == {0: 1000, 400: 600, 1000: 250, 1250: 750, 2000: 250, 2250: 250, 3000: NEVER_NS // MS}
 
 
-def test_before_the_drives_are_enabled_there_is_nothing_to_wait_for():
-    plan = plan_of(example("silence", at_s=1.0))
-    plan.advance(-1, 5 * S)
-    assert plan.wait_ns == NEVER_NS
-
-
-@pytest.mark.parametrize("kind", EXAMPLES)
-def test_a_plan_is_quiet_before_its_rows_and_without_any(kind):
-    plan = plan_of(example(kind))
+def test_a_plan_is_quiet_before_its_rows_and_without_any():
+    plan = plan_of(*(example(kind) for kind in EXAMPLES if kind not in UNTIMED))
     plan.advance(-1)
     assert plan.is_quiet
     assert plan_of().is_quiet
 
 
-def test_a_plan_is_not_quiet_while_a_row_acts_and_is_again_after_it():
-    plan = plan_of(example("lose", at_s=1.0, duration_s=1.0))
-    quiet = []
-    for second in (0, 1, 2):
-        plan.advance(second * S)
-        quiet.append(plan.is_quiet)
-    assert quiet == [True, False, True]
-
-
-def test_a_plan_is_not_quiet_until_its_actions_are_taken():
-    plan = active(example("drive_fault"))
-    assert not plan.is_quiet
-    plan.actions()
-    assert plan.is_quiet
-
-
 # Frames
-
-
-def test_a_frame_that_no_row_is_about_passes_as_it_is():
-    plan = active(frame_row("lose"))
-    assert plan.transmit(SENSOR2, 0x184, TORQUE) == [(0, 0x184, TORQUE)]
-    assert plan.transmit(SENSOR1, 0x283, b"\0\0") == [(0, 0x283, b"\0\0")]
-    assert plan.receive(DRIVE1, 0x201, TORQUE) == [(0, TORQUE)]
 
 
 SENT = [
@@ -178,41 +120,31 @@ def test_what_a_node_sends_is_lost_if_the_row_says_so_and_nothing_else(frame, no
     plan = active({"kind": "lose", "node": node, "frame": frame})
     sent = {(other, identifier): plan.transmit(other, identifier, b"\0") for _, _, other, identifier in SENT}
     assert [key for key, left in sent.items() if not left] == [(place, can_id)]
+    assert plan.receive(DRIVE1, 0x201, TORQUE) == [(0, TORQUE)]
 
 
 @pytest.mark.parametrize(
-    ("frame", "node", "place", "can_id"),
+    ("frame", "node", "places", "can_id"),
     [
-        ("command", "drive1", DRIVE1, 0x201),
-        ("sdo_request", "sensor2", SENSOR2, 0x604),
-        ("sync", "drive2", DRIVE2, 0x080),
-        ("nmt", "sensor1", SENSOR1, 0x000),
-        ("sync", "all", EVERYBODY, 0x080),
-        ("sync", None, EVERYBODY, 0x080),
-        ("nmt", None, EVERYBODY, 0x000),
-        ("heartbeat", "host", EVERYBODY, 0x77F),
+        ("command", "drive1", [DRIVE1], 0x201),
+        ("sdo_request", "sensor2", [SENSOR2], 0x604),
+        ("sync", "drive2", [DRIVE2], 0x080),
+        ("nmt", "sensor1", [SENSOR1], 0x000),
+        ("sync", "all", [EVERYBODY], 0x080),
+        ("nmt", None, [EVERYBODY], 0x000),
+        ("heartbeat", "host", [EVERYBODY], 0x77F),
     ],
 )
-def test_what_the_host_sends_is_lost_on_its_way_to_whom_the_row_says(frame, node, place, can_id):
-    row = {"kind": "lose", "frame": frame} | ({} if node is None else {"node": node})
-    plan = active(row)
+def test_what_the_host_sends_is_lost_on_its_way_to_whom_the_row_says(frame, node, places, can_id):
+    plan = active({"kind": "lose", "frame": frame} | ({} if node is None else {"node": node}))
     left = {other: plan.receive(other, can_id, b"\0") for other in (EVERYBODY, DRIVE1, DRIVE2, SENSOR1, SENSOR2)}
-    assert [other for other, frames in left.items() if not frames] == [place]
+    assert [other for other, frames in left.items() if not frames] == places
 
 
-@pytest.mark.parametrize(
-    ("frame", "keys"), [("torque", [2, 3]), ("feedback", [0, 1]), ("heartbeat", [0, 1, 2, 3]), ("any", [0, 1, 2, 3])]
-)
-def test_all_is_every_node_with_such_a_frame(frame, keys):
+@pytest.mark.parametrize(("frame", "first_id", "nodes"), [("torque", 0x181, [2, 3]), ("any", 0x581, [0, 1, 2, 3])])
+def test_all_is_every_node_with_such_a_frame(frame, first_id, nodes):
     plan = active({"kind": "lose", "node": "all", "frame": frame})
-    ids = {"torque": 0x181, "feedback": 0x181, "heartbeat": 0x701, "any": 0x581}
-    lost = [node for node in range(4) if not plan.transmit(node, ids[frame] + node, b"\0")]
-    assert lost == keys
-
-
-def test_the_commands_of_both_drives_can_be_lost():
-    plan = active({"kind": "lose", "node": "all", "frame": "command"})
-    assert [plan.receive(node, 0x201 + node, b"\0") for node in (DRIVE1, DRIVE2)] == [[], []]
+    assert [node for node in range(4) if not plan.transmit(node, first_id + node, b"\0")] == nodes
 
 
 def test_any_frame_of_a_node_is_lost_whatever_else_is_said_of_one_of_them():
@@ -222,21 +154,11 @@ def test_any_frame_of_a_node_is_lost_whatever_else_is_said_of_one_of_them():
     assert plan.receive(DRIVE1, 0x201, TORQUE) == [(0, TORQUE)]
 
 
-def test_a_duplicated_frame_comes_twice():
-    plan = active(frame_row("duplicate"))
-    assert plan.transmit(SENSOR1, 0x183, TORQUE) == [(0, 0x183, TORQUE)] * 2
-
-
-def test_a_delayed_frame_says_how_late_it_is():
-    plan = active(frame_row("delay", delay_us=2500.0))
-    assert plan.transmit(SENSOR1, 0x183, TORQUE) == [(2_500_000, 0x183, TORQUE)]
-
-
-def test_jitter_delays_up_to_its_size_and_evenly():
+def test_a_duplicated_frame_comes_twice_and_a_delayed_one_says_how_late_it_is():
+    assert active(frame_row("duplicate")).transmit(SENSOR1, 0x183, TORQUE) == [(0, 0x183, TORQUE)] * 2
     plan = active(frame_row("delay", delay_us=100.0, jitter_us=400.0))
     late_us = [plan.transmit(SENSOR1, 0x183, TORQUE)[0][0] / 1e3 for _ in range(2000)]
-    assert min(late_us) >= 100.0
-    assert max(late_us) <= 500.0
+    assert (min(late_us) >= 100.0, max(late_us) <= 500.0) == (True, True)
     assert statistics.fmean(late_us) == pytest.approx(300.0, abs=10.0)
     assert statistics.stdev(late_us) == pytest.approx(400.0 / 12**0.5, abs=5.0)
 
@@ -273,26 +195,16 @@ def flipped(before: bytes, after: bytes) -> list[int]:
     return [bit for bit in range(8 * len(before)) if bits >> bit & 1]
 
 
-@pytest.mark.parametrize("bits", [1, 2, 5, 48])
+@pytest.mark.parametrize("bits", [1, 5, 48, 500])
 def test_so_many_bits_flip_as_the_row_says(bits):
     plan = active(frame_row("corrupt", bits=bits))
-    for _ in range(50):
+    seen = set()
+    for _ in range(400):
         ((_, _, data),) = plan.transmit(SENSOR1, 0x183, TORQUE)
-        assert len(flipped(TORQUE, data)) == bits
-
-
-def test_every_bit_flips_as_often_as_any_other():
-    plan = active(frame_row("corrupt"))
-    counts = collections.Counter(
-        flipped(TORQUE, plan.transmit(SENSOR1, 0x183, TORQUE)[0][2])[0] for _ in range(100 * 48)
-    )
-    assert sorted(counts) == list(range(48))
-    assert sum((count - 100) ** 2 / 100 for count in counts.values()) < 85  # chi-square, 47 degrees: 0.05 %
-
-
-def test_no_more_bits_flip_than_a_frame_has():
-    plan = active(frame_row("corrupt", bits=500))
-    assert plan.transmit(SENSOR1, 0x183, b"\x0f") == [(0, 0x183, b"\xf0")]
+        found = flipped(TORQUE, data)
+        assert len(found) == min(bits, 48)
+        seen |= set(found)
+    assert seen == set(range(48))
 
 
 @pytest.mark.parametrize(("mask", "data"), [("ff", "ff0203"), ("0080", "008203"), ("00000001", "000203")])
@@ -362,25 +274,13 @@ def test_rows_about_one_frame_act_in_their_order():
     assert active(frame_row("lose"), mask).transmit(SENSOR1, 0x183, b"\0") == []
 
 
-def test_a_silent_node_sends_nothing_and_still_hears():
-    plan = active(example("silence", node="drive1"))
-    assert plan.transmit(DRIVE1, 0x7A1, b"") == []
-    assert plan.transmit(DRIVE2, 0x182, FEEDBACK) == [(0, 0x182, FEEDBACK)]
-    assert plan.receive(DRIVE1, 0x201, TORQUE) == [(0, TORQUE)]
-
-
-def test_all_nodes_can_be_silent():
-    plan = active(example("silence", node="all"))
-    assert [plan.transmit(node, 0x181 + node, b"") for node in range(4)] == [[]] * 4
-
-
 # Chance
 
 
-@pytest.mark.parametrize("probability", [0.0, 0.01, 0.3, 0.9, 1.0])
+@pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
 def test_as_many_frames_are_lost_as_their_probability_says(probability):
     plan = active(frame_row("lose", probability=probability))
-    count = 20_000
+    count = 5_000
     lost = sum(not plan.transmit(SENSOR1, 0x183, TORQUE) for _ in range(count))
     sigma = (count * probability * (1 - probability)) ** 0.5
     assert abs(lost - count * probability) <= 3.5 * sigma
@@ -425,21 +325,6 @@ def test_a_row_draws_for_each_frame_though_another_row_has_lost_it():
 HALF_CORRUPT = frame_row("corrupt", mask="ff", probability=0.5)
 
 
-def test_a_row_that_reorders_draws_for_a_frame_though_another_row_has_lost_it():
-    plan = active(frame_row("lose", probability=0.5), frame_row("reorder", count=100))
-    lost = lost_frames(active(HALF))
-    came = [len(plan.transmit(SENSOR1, 0x183, TORQUE)) for _ in range(200)]
-    assert sum(lost) > 60
-    assert plan.advance(PERIOD_NS)[0].row == 1
-    assert sum(came) == 200 - sum(lost)
-
-
-def test_two_rows_that_are_alike_draw_on_their_own():
-    one, both = active(HALF), active(HALF, HALF)
-    assert sum(lost_frames(one)) < 120
-    assert sum(lost_frames(both)) > 120
-
-
 def test_the_numbers_of_a_row_do_not_choose_its_stream():
     rare = lost_frames(active(frame_row("lose", probability=0.2)))
     often = lost_frames(active(HALF))
@@ -450,12 +335,11 @@ def test_the_numbers_of_a_row_do_not_choose_its_stream():
 # Values
 
 ZERO = (0, 0)
-
-
-def test_values_that_no_row_is_about_pass_as_they_are():
-    plan = active({"kind": "stick", "node": "drive1", "signal": "position"})
-    plan.distort((5, 6), (7, 8), (9, 10))
-    assert plan.distort((1, 2), (3, 4), (11, 12)) == ((5, 2), (3, 4), (11, 12))
+TOP, BOTTOM = TORQUE_COUNTS[1], TORQUE_COUNTS[0]
+JUMPED = 100 + round(1.5 / VELOCITY_LSB_RAD_S)
+SENSED = {"kind": "saturate", "node": "sensor2", "signal": "torque"}
+FAST = {"kind": "saturate", "node": "drive1", "signal": "velocity", "value": 0.5}
+JUMP = {"kind": "jump", "node": "sensor1", "signal": "torque"}
 
 
 @pytest.mark.parametrize(
@@ -463,8 +347,6 @@ def test_values_that_no_row_is_about_pass_as_they_are():
     [
         ("drive2", "position", ((1, 6), (3, 4), (11, 12))),
         ("drive1", "velocity", ((1, 2), (7, 4), (11, 12))),
-        ("drive2", "velocity", ((1, 2), (3, 8), (11, 12))),
-        ("sensor1", "torque", ((1, 2), (3, 4), (9, 12))),
         ("sensor2", "torque", ((1, 2), (3, 4), (11, 10))),
     ],
 )
@@ -476,47 +358,34 @@ def test_a_value_that_sticks_repeats_the_one_of_the_onset(node, signal, expected
 
 
 @pytest.mark.parametrize(
-    ("node", "signal", "which", "joint", "lsb"),
+    ("row", "which", "joint", "counts", "seen"),
     [
-        ("drive1", "position", 0, 0, POSITION_LSB_RAD),
-        ("drive2", "velocity", 1, 1, VELOCITY_LSB_RAD_S),
-        ("sensor2", "torque", 2, 1, TORQUE_LSB_NM),
+        (JUMP | {"node": "drive1", "signal": "position", "step": -1.5}, 0, 0, 100, 100 - round(1.5 / POSITION_LSB_RAD)),
+        (
+            JUMP | {"node": "drive2", "signal": "velocity", "step": 1.5},
+            1,
+            1,
+            100,
+            100 + round(1.5 / VELOCITY_LSB_RAD_S),
+        ),
+        (JUMP | {"step": -1.5}, 2, 0, 100, 100 - round(1.5 / TORQUE_LSB_NM)),
+        (JUMP | {"step": 200.0}, 2, 0, 0, TOP),
+        (JUMP | {"step": -200.0}, 2, 0, 0, BOTTOM),
+        (SENSED, 2, 1, 5, TOP),
+        (SENSED, 2, 1, 0, TOP),
+        (SENSED, 2, 1, -5, BOTTOM),
+        (FAST, 1, 0, -2000, -1000),
+        (FAST, 1, 0, -1000, -1000),
+        (FAST, 1, 0, 3, 3),
+        (FAST, 1, 0, 1001, 1000),
     ],
 )
-def test_a_jump_adds_its_step_in_the_values_unit(node, signal, which, joint, lsb):
-    plan = active({"kind": "jump", "node": node, "signal": signal, "step": -1.5})
-    values = plan.distort((100, 100), (100, 100), (100, 100))
-    assert values[which][joint] == 100 + round(-1.5 / lsb)
-    assert sum(abs(value - 100) for pair in values for value in pair) == round(1.5 / lsb)
-
-
-@pytest.mark.parametrize(("step", "end"), [(200.0, TORQUE_COUNTS[1]), (-200.0, TORQUE_COUNTS[0])])
-def test_a_jump_of_torque_ends_at_the_converters_range(step, end):
-    plan = active({"kind": "jump", "node": "sensor1", "signal": "torque", "step": step})
-    assert plan.distort(ZERO, ZERO, ZERO)[2] == (end, 0)
-
-
-@pytest.mark.parametrize(("counts", "end"), [(5, TORQUE_COUNTS[1]), (0, TORQUE_COUNTS[1]), (-5, TORQUE_COUNTS[0])])
-def test_a_saturated_sensor_reads_the_end_of_its_range(counts, end):
-    plan = active({"kind": "saturate", "node": "sensor2", "signal": "torque"})
-    assert plan.distort(ZERO, ZERO, (0, counts))[2] == (0, end)
-
-
-@pytest.mark.parametrize(("counts", "seen"), [(-2000, -1000), (-1000, -1000), (3, 3), (1001, 1000)])
-def test_a_saturated_value_goes_no_further_than_the_row_says(counts, seen):
-    plan = active({"kind": "saturate", "node": "drive1", "signal": "velocity", "value": 0.5})
-    assert plan.distort(ZERO, (counts, 0), ZERO)[1] == (seen, 0)
-
-
-def test_spikes_hit_as_many_samples_as_their_probability_says():
-    plan = active({"kind": "jump", "node": "sensor1", "signal": "torque", "step": 1.0, "probability": 0.1})
-    hits = sum(plan.distort(ZERO, ZERO, ZERO)[2][0] != 0 for _ in range(10_000))
-    assert abs(hits - 1000) < 3.5 * 30
-
-
-def test_a_jump_with_a_count_hits_so_many_samples():
-    plan = active({"kind": "jump", "node": "sensor1", "signal": "torque", "step": 1.0, "count": 2})
-    assert [plan.distort(ZERO, ZERO, ZERO)[2][0] != 0 for _ in range(4)] == [True, True, False, False]
+def test_a_value_jumps_by_its_step_or_saturates_at_its_bound_and_no_other_does(row, which, joint, counts, seen):
+    values = [[7, 7], [7, 7], [7, 7]]
+    values[which][joint] = counts
+    found = active(row).distort(*values)
+    values[which][joint] = seen
+    assert [list(pair) for pair in found] == values
 
 
 # SYNC
@@ -529,15 +398,10 @@ def test_sync_is_late_while_the_row_is_active():
         plan.advance(second * S)
         late.append(plan.sync_delay_ns())
     assert late == [0, 200_000, 0]
-
-
-def test_some_syncs_are_late_by_chance():
     plan = active({"kind": "late_sync", "delay_us": 100.0, "jitter_us": 100.0, "probability": 0.25})
-    late = [plan.sync_delay_ns() for _ in range(4000)]
-    hits = [delay_ns for delay_ns in late if delay_ns]
-    assert abs(len(hits) - 1000) < 3.5 * 27.4
-    assert min(hits) >= 100_000
-    assert max(hits) <= 200_000
+    hits = [delay_ns for _ in range(2000) if (delay_ns := plan.sync_delay_ns())]
+    assert abs(len(hits) - 500) < 3.5 * 19.4
+    assert (min(hits) >= 100_000, max(hits) <= 200_000) == (True, True)
 
 
 # Floods
@@ -559,11 +423,6 @@ def test_a_babbling_node_floods_the_bus_at_its_rate():
     assert {(can_id, data) for _, can_id, data in frames} == {(0x10, b"\x01\x02")}
 
 
-def test_a_slow_flood_keeps_its_grid_between_periods():
-    plan = plan_of({"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 400.0, "at_s": 0.0})
-    assert [(t_us, data) for t_us, _, data in flood(plan, 8)] == [(k * 2500, bytes(8)) for k in range(4)]
-
-
 @pytest.mark.parametrize(("end", "count"), [({"count": 7}, 7), ({"duration_s": 0.0025}, 13)])
 def test_a_flood_ends_by_count_or_time(end, count):
     plan = plan_of({"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 5000.0, "at_s": 0.0, **end})
@@ -574,13 +433,6 @@ def test_a_node_without_power_does_not_babble():
     row = {"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 1000.0, "at_s": 0.0}
     plan = plan_of(row, {"kind": "power_loss", "node": "drive1", "at_s": 0.002, "duration_s": 0.003})
     assert [t_us for t_us, _, _ in flood(plan, 8)] == [0, 1000, 5000, 6000, 7000]
-
-
-def test_frames_of_a_flood_that_nobody_asked_for_in_time_are_not_made_up_for():
-    plan = plan_of({"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 1000.0, "at_s": 0.0})
-    plan.advance(0)
-    plan.advance(50 * PERIOD_NS)
-    assert [offset for offset, _, _ in plan.babble(PERIOD_NS)] == [0]
 
 
 # Nodes
@@ -637,15 +489,14 @@ def test_what_happens_to_nodes_happens_when_it_should(row, actions):
     assert happens(plan_of(row | {"at_s": 0.002}), 10) == [(ms, kind.value, node, v) for ms, kind, node, v in actions]
 
 
-def test_every_kind_that_happens_to_a_node_is_in_the_table():
-    kinds = {row["kind"] for row, _ in ACTIONS}
-    assert kinds == {"reboot", "bus_off", "power_loss", "drive_fault", "sensor_error", "clock_drift", "emcy_storm"}
-
-
 def test_actions_are_taken_once():
     plan = active(example("drive_fault"))
+    assert (plan.mask, plan.is_quiet) == (1, False)
     assert plan.actions() == [NodeAction(A.FAIL, 0, 0x2310), NodeAction(A.MEND, 0)]
     assert plan.actions() == []
+    assert plan.is_quiet
+    plan.advance(PERIOD_NS)
+    assert plan.mask == 0
 
 
 def test_a_node_has_power_again_when_the_last_row_gives_it_back():
@@ -656,6 +507,7 @@ def test_a_node_has_power_again_when_the_last_row_gives_it_back():
     )
     power = [(ms, kind) for ms, kind, node, _ in happens(plan, 12) if node == 0]
     assert power == [(2, "power off"), (9, "power on")]
+    assert plan.is_acknowledged
 
 
 def test_errors_of_one_sensor_add_up():
@@ -664,12 +516,6 @@ def test_errors_of_one_sensor_add_up():
         {"kind": "sensor_error", "node": "sensor1", "status": 4, "at_s": 0.002, "duration_s": 0.002},
     )
     assert [(ms, value) for ms, _, _, value in happens(plan, 9)] == [(1, 1), (2, 5), (4, 1), (6, 0)]
-
-
-def test_drifts_of_one_clock_add_up():
-    row = {"kind": "clock_drift", "node": "drive1", "drift_ppm": 50.0}
-    plan = plan_of(row | {"at_s": 0.001}, row | {"at_s": 0.002, "duration_s": 0.001})
-    assert [(ms, value) for ms, _, _, value in happens(plan, 5)] == [(1, 50.0), (2, 100.0), (3, 50.0)]
 
 
 def test_a_drive_is_mended_when_its_last_failure_ends():
@@ -690,12 +536,3 @@ def test_a_drive_is_mended_when_its_last_failure_ends():
 )
 def test_what_the_host_sends_is_acknowledged_as_long_as_anybody_is_there(rows, is_acknowledged):
     assert active(*rows).is_acknowledged is is_acknowledged
-
-
-def test_the_bus_is_acknowledged_again_when_power_is_back():
-    plan = plan_of({"kind": "power_loss", "at_s": 0.001, "duration_s": 0.002})
-    seen = []
-    for ms in range(5):
-        plan.advance(ms * MS)
-        seen.append(plan.is_acknowledged)
-    assert seen == [True, False, False, True, True]

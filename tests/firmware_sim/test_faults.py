@@ -60,15 +60,9 @@ def test_every_kind_can_be_said_in_toml_and_read_back(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_key_that_a_kind_needs_is_missed(kind):
-    for key in KINDS[kind].required:
-        with pytest.raises(ConfigError, match=rf"faults\[0\]: .*lacks the key `{key}`"):
-            scenario_of(example(kind, **{key: None}))
-
-
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in UNTIMED])
-def test_a_fault_in_time_needs_its_time(kind):
-    with pytest.raises(ConfigError, match=rf"faults\[0\]: kind '{kind}' lacks the key `at_s`"):
-        scenario_of(example(kind, at_s=None))
+    for key in (*KINDS[kind].required, *(() if kind in UNTIMED else ("at_s",))):
+        with pytest.raises(ConfigError, match=rf"faults\[1\]: .*lacks the key `{key}`"):
+            scenario_of(example("power_loss"), example(kind, **{key: None}))
 
 
 FOREIGN = {"node_id": 5, "code": 1, "step": 1.0, "frame": "status", "can_id": 1, "same_as": "drive1", "status": 1}
@@ -86,24 +80,15 @@ def test_every_key_that_a_kind_has_not_is_refused(kind):
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        (example("lose", kind="loose"), "`faults[0].kind` = 'loose' must be one of"),
         (example("lose", kind="loose"), "did you mean 'lose'?"),
-        (example("lose", frame="torqe"), "did you mean 'torque'?"),
-        (example("lose", node="sensro2"), "did you mean 'sensor2'?"),
-        (example("lose", probabilty=0.1), "unknown key `faults[0].probabilty`; did you mean `faults[0].probability`?"),
         (example("lose", node=None), "faults[0]: frame 'torque' lacks the key `node`"),
         (
             example("lose", node="drive1"),
             "node = 'drive1' can't be with frame 'torque', which takes sensor1, sensor2, all",
         ),
         (example("lose", frame="command"), "node = 'sensor1' can't be with frame 'command', which takes drive1"),
-        (example("lose", node="host"), "node = 'host' can't be with frame 'torque'"),
         (example("lose", count=3), "`duration_s` and `count` can't both end it"),
-        (example("lose", probability=1.1), "`faults[0].probability` = 1.1 is above 1"),
-        (example("lose", at_s=-1.0), "`faults[0].at_s` = -1.0 s is below 0 s"),
-        (example("lose", since="boot"), "`faults[0].since` = 'boot' must be one of enabled, power_on"),
         (example("delay", frame="sync", node=None), "frame = 'sync' can't be with kind 'delay'"),
-        (example("corrupt", frame="sync", node=None), "frame = 'sync' can't be with kind 'corrupt'"),
         (example("reorder", frame="nmt"), "frame = 'nmt' can't be with kind 'reorder'"),
         (example("freeze_counter", frame="status"), "frame = 'status' can't be with kind 'freeze_counter'"),
         (example("corrupt", bits=2), "`bits` and `mask` can't both be flipped"),
@@ -114,17 +99,11 @@ def test_every_key_that_a_kind_has_not_is_refused(kind):
         (example("jump", node="drive1"), "node = 'drive1' can't be with signal 'torque', which takes sensor1"),
         (example("saturate", node="drive1", signal="velocity"), "saturate of velocity lacks the key `value`"),
         (example("drive_fault", node="sensor1"), "node = 'sensor1' can't be with kind 'drive_fault'"),
-        (example("sensor_error", node="drive1"), "node = 'drive1' can't be with kind 'sensor_error'"),
         (example("reboot", node="all"), "node = 'all' can't be with kind 'reboot'"),
-        (example("drive_fault", code=0), "`faults[0].code` = 0 is below 1"),
-        (example("delay", delay=3.0), "unknown key `faults[0].delay`; did you mean `faults[0].delay_us`?"),
-        (example("late_sync", duration_ms=3), "unknown key `faults[0].duration_ms`; did you mean"),
         (example("wrong_node_id", at_s=1.0), "kind 'wrong_node_id' has no key `at_s`"),
-        (example("wrong_node_id", since="power_on"), "kind 'wrong_node_id' has no key `since`"),
         (example("reboot", count=2), "kind 'reboot' has no key `count`; its keys: at_s, since, node, duration_s"),
         (example("delay", node_id=2), "kind 'delay' has no key `node_id`; did you mean `node`?"),
         (example("duplicate_node_id", same_as="drive2"), "same_as = 'drive2' is the node itself"),
-        (example("wrong_node_id", node_id=127), "`faults[0].node_id` = 127 is above 126"),
     ],
 )
 def test_a_fault_that_cannot_be_is_refused_in_one_line(row, message):
@@ -132,11 +111,6 @@ def test_a_fault_that_cannot_be_is_refused_in_one_line(row, message):
         scenario_of(row)
     assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)
-
-
-def test_the_row_that_is_wrong_is_named_by_its_number():
-    with pytest.raises(ConfigError, match=r"faults\[1\]: kind 'reboot' lacks the key `node`"):
-        scenario_of(example("lose"), example("reboot", node=None))
 
 
 def test_a_node_has_one_wrong_id_only():
@@ -151,10 +125,6 @@ def test_there_are_no_more_faults_than_the_truth_has_bits_for():
         scenario_of(*[example("lose")] * 54)
 
 
-def test_a_scenario_without_faults_has_none():
-    assert scenario_of().faults == ()
-
-
 @pytest.mark.parametrize(
     ("row", "ids"),
     [
@@ -167,14 +137,6 @@ def test_a_scenario_without_faults_has_none():
 )
 def test_devices_get_the_ids_that_the_rows_say(row, ids):
     assert device_ids(scenario_of(row).faults, (1, 2, 3, 4)) == ids
-
-
-def test_two_nodes_can_swap_their_ids():
-    rows = scenario_of(
-        example("duplicate_node_id", node="drive1", same_as="drive2"),
-        example("duplicate_node_id", node="drive2", same_as="drive1"),
-    ).faults
-    assert device_ids(rows, (1, 2, 3, 4)) == (2, 1, 3, 4)
 
 
 def test_a_device_with_a_wrong_id_keeps_its_own_messages_at_other_identifiers():

@@ -43,19 +43,6 @@ def test_friction_at_steady_speed_lies_on_the_stribeck_curve(model, velocity_rad
     assert moved.observe()["friction"][0] == pytest.approx(expected, rel=2e-3)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("way", [1.0, -1.0])
-def test_a_joint_breaks_away_at_its_static_friction_and_not_before(way):
-    arm, _ = one_joint(COULOMB_NM)
-    held = GeneralArm(arm, MechanicsSettings(**STRIBECK))
-    history = held.run(5_000, way * 0.999 * STATIC_NM)
-    assert not np.any(history["q"][:, 0])
-    assert not np.any(history["dq"][:, 0])
-    assert held.observe()["friction"][0] == pytest.approx(way * 0.999 * STATIC_NM, rel=1e-9)
-    held.run(5_000, way * 1.001 * STATIC_NM)
-    assert way * held.dq[0] > 5e-4
-
-
 def test_a_joint_that_has_broken_away_accelerates_by_what_friction_falls():
     """Above v_s the friction has fallen to Coulomb's: the torque that just broke it away accelerates by F_s - F_c."""
     arm, inertia = one_joint(COULOMB_NM)
@@ -152,16 +139,6 @@ def test_dry_friction_grows_with_the_torque_through_the_joint(speed_rad_s):
         moved.run(100, torque_Nm)
         friction_Nm = moved.observe()["friction"][0]
         assert friction_Nm == pytest.approx(math.copysign(COULOMB_NM + 0.05 * abs(torque_Nm), speed_rad_s), rel=2e-3)
-
-
-def test_a_loaded_joint_holds_more_than_an_unloaded_one():
-    """Self-locking: with k_load = 0.5 a torque of 0.9 Nm meets 0.5 + 0.45 Nm of friction."""
-    arm, _ = one_joint(COULOMB_NM)
-    loaded = GeneralArm(arm, MechanicsSettings(load_friction=(0.5, 0.0)))
-    loaded.run(2_000, 0.9)
-    assert loaded.dq[0] == 0.0
-    loaded.run(2_000, 1.1)
-    assert loaded.dq[0] > 0.0
 
 
 def test_friction_of_a_warm_joint_has_fallen_and_of_a_cold_one_risen():

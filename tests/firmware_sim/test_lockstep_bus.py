@@ -116,24 +116,11 @@ def test_answers_follow_sync_one_after_the_other_by_identifier() -> None:
     assert rig.receive_all(0.0009) == [(0x181, 200_000), (0x183, 300_000), (0x184, 400_000)]
 
 
-def test_waiting_for_a_frame_moves_the_clock_to_its_end() -> None:
-    rig = Rig((0x181,))
-    rig.bus.send(SYNC, b"\x01")
-    rig.bus.receive(0.0007)
-    assert rig.clock.now_ns() == 200_000
-
-
-def test_waiting_in_vain_takes_the_whole_time() -> None:
-    rig = Rig((0x181,))
-    rig.bus.send(SYNC, b"\x01")
-    rig.receive_all(0.0007)
-    assert rig.clock.now_ns() == 700_000
-
-
 def test_a_frame_that_ends_after_the_wait_is_there_next_time() -> None:
     rig = Rig((0x181, 0x182))
     rig.bus.send(SYNC, b"\x01")
     assert rig.receive_all(0.00025) == [(0x181, 200_000)]
+    assert rig.clock.now_ns() == 250_000
     assert rig.receive_all(0.0005) == [(0x182, 300_000)]
 
 
@@ -215,20 +202,6 @@ def test_released_frames_come_when_they_are_released() -> None:
     assert rig.receive_all(0.0009) == [(0x181, 200_000), (0x182, 550_000)]
 
 
-def test_after_release_frames_beyond_the_expected_ones_are_awaited() -> None:
-    rig = Rig((0x181,))
-
-    def answer_twice(can_id: int, data: bytes) -> None:
-        rig.devices.mark(MarkKind.RELEASE, 0)
-        rig.devices.say(0x181, b"a")
-        rig.devices.say(0x181, b"b")
-        rig.devices.mark(MarkKind.END)
-
-    rig.devices.on_frame = answer_twice
-    rig.bus.send(SYNC, b"\x01")
-    assert rig.receive_all(0.0009) == [(0x181, 200_000), (0x181, 300_000)]
-
-
 def test_what_came_before_the_first_mark_is_before_it() -> None:
     rig = Rig((0x181, 0x182))
 
@@ -241,14 +214,6 @@ def test_what_came_before_the_first_mark_is_before_it() -> None:
     rig.devices.on_frame = answer
     rig.bus.send(SYNC, b"\x01")
     assert [frame.data for _ in range(2) if (frame := rig.bus.receive(0.0007))] == [b"old", b"new"]
-
-
-def test_in_a_fifo_sync_overtakes_nothing() -> None:
-    rig = Rig(is_fifo=True)
-    rig.at(950_000).bus.send(0x201, b"")
-    rig.bus.send(0x202, b"")
-    rig.at(PERIOD_NS)
-    assert rig.bus.waiting_frames == ()
 
 
 def test_end_says_that_what_is_missing_does_not_come() -> None:
@@ -273,25 +238,11 @@ def test_without_sync_devices_live_with_the_hosts_clock() -> None:
     assert rig.receive_all(0.5) == [(0x701, 600_100_000)]
 
 
-def test_a_frame_of_the_host_waits_for_what_the_devices_have_before_it() -> None:
-    rig = Rig()
-    rig.bus.receive(0.0)
-    rig.devices.events = [(4_950_000, 0x701, b"\x05")]
-    rig.at(5_000_000).bus.send(0x601, b"")
-    assert rig.receive_all(0.001) == [(0x701, 5_050_000)]
-
-
 def test_an_answer_is_handed_over_when_its_request_is_through() -> None:
     rig = Rig()
     rig.devices.on_frame = lambda can_id, data: rig.devices.say(0x581)
     rig.bus.send(0x601, b"")
     assert rig.receive_all(0.5) == [(0x581, 200_000)]
-
-
-def test_a_wait_passes_at_once_by_the_wall_clock() -> None:
-    rig = Rig()
-    rig.receive_all(3600.0)
-    assert (rig.clock.now_ns(), rig.devices.asked_ns[-1]) == (3_600_000_000_000, 3_600_000_000_000)
 
 
 def test_while_nobody_is_powered_frames_stay_in_the_queue_until_it_is_full() -> None:
@@ -320,22 +271,6 @@ def test_when_somebody_is_powered_again_the_stale_queue_goes_out() -> None:
     assert rig.devices.heard == [(0x201, b"old")]
 
 
-def test_recovery_empties_the_queue() -> None:
-    rig = Rig((0x181,))
-    rig.bus.receive(0.0)
-    rig.bus.send(0x201, b"old")
-    rig.bus.recover()
-    rig.receive_all(0.01)
-    assert rig.devices.heard == []
-
-
-def test_closing_lets_what_waits_go_out() -> None:
-    rig = Rig()
-    rig.bus.send(0x000, b"\x80\x00")
-    rig.bus.close()
-    assert rig.devices.heard == [(0x000, b"\x80\x00")]
-
-
 def test_devices_without_marks_are_waited_for() -> None:
     rig = Rig((0x181,))
     rig.devices.is_marking = False
@@ -353,7 +288,7 @@ def test_what_is_no_mark_is_none(data: bytes) -> None:
     assert unpack_mark(data) is None
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(8))
 def test_frames_received_together_are_those_received_one_by_one(seed: int) -> None:
     """Whatever the devices and the host say, however the host asks; the clocks agree after each call."""
     random = Random(seed)

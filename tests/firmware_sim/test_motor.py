@@ -3,28 +3,24 @@
 import math
 import struct
 
-import bench_host
 import numpy as np
 import pytest
-from bench_host import ENABLE, FAULT_RESET, BenchHost, quiet_scenario
+from bench_host import DISABLED, ENABLE, ENABLED, FAULT, FAULT_RESET, BenchHost, quiet_scenario
 
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.hardware_settings import DriveSettings
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import TICK_S
-from firmware_sim.bench.bench import Bench
 from firmware_sim.body.body import Body
 from firmware_sim.body.motor import (
     available_torque,
-    command_torque,
     error_code,
     heat_motor,
     motor_numbers,
     motor_state,
     winding_temperature,
 )
-from firmware_sim.nodes.drive_profile import Motor
 from firmware_sim.scenario.scenario import Scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
@@ -33,7 +29,6 @@ BRAKE = (DriveMode.BRAKE, DriveMode.BRAKE)
 RATED_NM = (12.0, 6.0)
 INTERNAL_LIMIT = 1 << 11
 EXCESS_TEMPERATURE, OVER_CURRENT = 0x4310, 0x2310
-FAULT_BITS, DISABLED_BITS, ENABLED_BITS = 0x08, 0x40, 0x27
 
 
 class Motors:
@@ -78,7 +73,7 @@ def true_torque(body: Body) -> np.ndarray:
     return block[TRUTH_LAYOUT.slices["tau_J"]]
 
 
-@pytest.mark.parametrize("bandwidth_Hz", [20.0, 200.0, 1_000.0, 2_000.0, 5_000.0])
+@pytest.mark.parametrize("bandwidth_Hz", [20.0, 1_000.0, 5_000.0])
 def test_a_step_of_the_set_point_arrives_with_the_lag_of_the_torque_loop(bandwidth_Hz):
     body = arm(current_loop_Hz=[bandwidth_Hz, 1_000.0])
     for tick in range(1, 60):
@@ -109,20 +104,6 @@ def test_a_current_offset_is_torque_while_the_motor_is_powered():
     assert body.motor_torque_Nm == pytest.approx((-0.2, 0.0), abs=1e-9)
 
 
-@pytest.mark.parametrize("velocity_Hz", [50.0, 200.0])
-def test_the_velocity_lags_an_acceleration_by_two_time_constants_of_the_tracking_loop(velocity_Hz):
-    body = arm(velocity_loop_Hz=[velocity_Hz, 200.0])
-    block = np.zeros(TRUTH_LAYOUT.size)
-    true, measured = [], []
-    for _ in range(60):
-        body.advance((8.0, 0.0), TORQUE)
-        body.truth(block)
-        true.append(block[TRUTH_LAYOUT.slices["dq"]][0])
-        measured.append(body.sample().dq[0])
-    lags_s = 1e-3 * (np.arange(40, 60) - np.interp(measured[40:], true, np.arange(60)))
-    assert lags_s.mean() == pytest.approx(2.0 / (2.0 * math.pi * velocity_Hz), rel=0.02)
-
-
 @pytest.mark.parametrize(("peak_Nm", "available_Nm"), [(0.0, 12.0), (7.5, 7.5), (20.0, 12.0)])
 def test_the_peak_current_is_rated_torque_at_most(peak_Nm, available_Nm):
     assert Motors(peak_torque_Nm=[peak_Nm, 0.0]).available_Nm() == available_Nm
@@ -149,7 +130,7 @@ def test_a_limited_drive_brakes_with_what_it_has():
 I2T = {"continuous_torque_Nm": [4.0, 0.0], "peak_torque_Nm": [10.0, 0.0], "peak_time_s": [0.5, 1.0]}
 
 
-@pytest.mark.parametrize("torque_Nm", [10.0, -10.0, 7.0, 5.0])
+@pytest.mark.parametrize("torque_Nm", [-10.0, 7.0])
 def test_i2t_allows_each_torque_for_its_time(torque_Nm):
     expected_s = 0.5 * (10.0**2 - 4.0**2) / (torque_Nm**2 - 4.0**2)
     motors = Motors(**I2T)
@@ -157,15 +138,10 @@ def test_i2t_allows_each_torque_for_its_time(torque_Nm):
     assert motors.available_Nm() == 4.0
 
 
-def test_i2t_allows_the_continuous_torque_for_ever():
-    motors = Motors(**I2T)
-    motors.hold(4.0, 5.0)
-    assert motors.available_Nm() == 10.0
-    assert motors.state["effort_Nm2_s"][0] == 0.0
-
-
 def test_i2t_lets_go_when_a_tenth_is_free_again():
     motors = Motors(**I2T)
+    motors.hold(4.0, 1.0)  # the continuous torque costs nothing
+    assert (motors.available_Nm(), motors.state["effort_Nm2_s"][0]) == (10.0, 0.0)
     motors.until_limited(10.0, 9.9)
     motors.hold(4.0, 1.0)
     assert motors.available_Nm() == 4.0
@@ -194,7 +170,7 @@ HEAT = {
 }
 
 
-@pytest.mark.parametrize("torque_Nm", [12.0, -6.0, 3.0])
+@pytest.mark.parametrize("torque_Nm", [-6.0])
 def test_the_winding_warms_with_two_time_constants(torque_Nm):
     motors = Motors(**HEAT, ambient_C=[30.0, 30.0])
     share = (torque_Nm / 12.0) ** 2
@@ -231,14 +207,8 @@ def test_a_derated_drive_finds_the_torque_that_it_can_bear():
     """At 125 °C half the torque is left, and a quarter of 400 K is what that heats."""
     body = arm(winding_rise_K=[400.0, 0.0], winding_time_s=[0.05, 1.0])
     body.advance((12.0, 0.0), TORQUE, 8_000)
-    assert body.winding_temperature_C[0] == pytest.approx(125.0, abs=0.01)
     assert body.motor_torque_Nm[0] == pytest.approx(6.0, abs=0.01)
     assert body.motor_error_code == (0, 0)
-
-
-def test_a_cold_motor_far_below_its_limits_gives_what_it_is_asked_for():
-    motors = Motors(**HEAT)
-    assert command_torque(motors.numbers, motors.state, 0, -12.0, 3.0, True) == -12.0
 
 
 def test_overheating_lasts_until_the_winding_is_below_the_derating_start():
@@ -262,30 +232,10 @@ def test_i2t_limits_or_faults_as_the_scenario_says(reaction, code):
     assert motors.error() == code
 
 
-class WiredBench(Bench):
-    """A bench whose drives know of their motors' limits."""
-
-    def _motor(self, joint: int) -> Motor:
-        return (
-            super()
-            ._motor(joint)
-            ._replace(
-                is_limited=lambda: self._body.is_torque_limited[joint],
-                error_code=lambda: self._body.motor_error_code[joint],
-            )
-        )
-
-
-@pytest.fixture
-def make_host(monkeypatch):
-    monkeypatch.setattr(bench_host, "Bench", WiredBench)
-
-    def make(**drives) -> BenchHost:
-        host = BenchHost(quiet_scenario(profile="S", drives=drives))
-        host.enable()
-        return host
-
-    return make
+def make_host(**drives) -> BenchHost:
+    host = BenchHost(quiet_scenario(profile="S", drives=drives))
+    host.enable()
+    return host
 
 
 OVERHEATING = {"winding_rise_K": [400.0, 0.0], "winding_time_s": [0.05, 1.0], "overheat_C": [120.0, 130.0]}
@@ -301,7 +251,7 @@ def overheat(host: BenchHost) -> int:
     raise AssertionError("the drive did not fault")
 
 
-def test_the_statusword_says_that_a_limit_is_active(make_host):
+def test_the_statusword_says_that_a_limit_is_active():
     host = make_host(peak_torque_Nm=[6.0, 0.0])
     words = []
     for target in (500, 501, 700, 500, 300):
@@ -312,7 +262,7 @@ def test_the_statusword_says_that_a_limit_is_active(make_host):
     assert not host.statusword(2) & INTERNAL_LIMIT
 
 
-def test_a_status_frame_tells_at_once_that_a_limit_has_become_active(make_host):
+def test_a_status_frame_tells_at_once_that_a_limit_has_become_active():
     host = make_host(peak_torque_Nm=[6.0, 0.0])
     host.step(ENABLE, 700)
     host.take()
@@ -322,7 +272,7 @@ def test_a_status_frame_tells_at_once_that_a_limit_has_become_active(make_host):
     assert struct.unpack_from("<H", frames[0])[0] & INTERNAL_LIMIT
 
 
-def test_0x6077_is_what_the_drive_believes(make_host):
+def test_0x6077_is_what_the_drive_believes():
     host = make_host(torque_constant_error=[0.2, 0.0])
     for _ in range(4):
         host.step(ENABLE, 100)
@@ -330,7 +280,7 @@ def test_0x6077_is_what_the_drive_believes(make_host):
     assert host.true("tau_J") == pytest.approx([1.44, 0.6], rel=1e-5)
 
 
-def test_an_overheated_motor_faults_its_drive_and_no_other(make_host):
+def test_an_overheated_motor_faults_its_drive_and_no_other():
     host = make_host(**OVERHEATING)
     host.take()
     syncs = overheat(host)
@@ -344,42 +294,42 @@ def test_an_overheated_motor_faults_its_drive_and_no_other(make_host):
     assert [data for can_id, data in frames if can_id == 0x082] == []
     statuses = [struct.unpack("<HbhH", data) for can_id, data in frames if can_id == 0x281]
     assert statuses[-1][3] == EXCESS_TEMPERATURE
-    assert host.state_bits(2) == ENABLED_BITS
+    assert host.state_bits(2) == ENABLED
 
 
-def test_an_overheat_fault_stays_latched_and_is_reset_once_the_motor_has_cooled(make_host):
+def test_an_overheat_fault_stays_latched_and_is_reset_once_the_motor_has_cooled():
     host = make_host(**OVERHEATING)
     overheat(host)
-    while host.state_bits() != FAULT_BITS:
+    while host.state_bits() != FAULT:
         host.step(ENABLE)
     for _ in range(200):
         host.step(ENABLE)
-    assert host.state_bits() == FAULT_BITS
+    assert host.state_bits() == FAULT
     assert host.read(1, 0x603F) == EXCESS_TEMPERATURE
     host.step(FAULT_RESET)
-    assert host.state_bits() == DISABLED_BITS
+    assert host.state_bits() == DISABLED
     assert host.read(1, 0x603F) == 0
     assert host.read(1, 0x1001) == 0
 
 
-def test_an_overheat_fault_is_not_reset_while_the_motor_is_hot(make_host):
+def test_an_overheat_fault_is_not_reset_while_the_motor_is_hot():
     """0x605E is 2: braking ends before a motor with 20 s of time constant has cooled."""
     host = make_host(preheat_K=[106.0, 0.0], housing_time_s=[20.0, 1.0])
-    while host.state_bits() != FAULT_BITS:
+    while host.state_bits() != FAULT:
         host.step(ENABLE)
     for controlword in (FAULT_RESET, ENABLE, FAULT_RESET):
         host.step(controlword)
-        assert host.state_bits() == FAULT_BITS
+        assert host.state_bits() == FAULT
     host.step(ENABLE)
     # 25 + 106 exp(−t / 20 s) = 110
     cooling_ms = round(1e3 * 20.0 * math.log(106.0 / 85.0))
     host.bench._body.advance((0.0, 0.0), OFF, 10 * cooling_ms)
     host.step(ENABLE)
     host.step(FAULT_RESET)
-    assert host.state_bits() == DISABLED_BITS
+    assert host.state_bits() == DISABLED
 
 
-def test_a_drive_whose_i2t_is_to_fault_reports_over_current(make_host):
+def test_a_drive_whose_i2t_is_to_fault_reports_over_current():
     host = make_host(**I2T | {"peak_time_s": [0.05, 1.0]}, i2t_reaction="fault")
     host.take()
     syncs = overheat(host)
@@ -387,10 +337,3 @@ def test_a_drive_whose_i2t_is_to_fault_reports_over_current(make_host):
     emergencies = [struct.unpack("<HBBI", data)[:3] for data in host.taken(0x081)]
     assert emergencies == [(OVER_CURRENT, 0x03, 0)]
     assert host.read(1, 0x603F) == OVER_CURRENT
-
-
-def test_a_drive_without_errors_believes_what_it_gives():
-    body = arm()
-    for _ in range(30):
-        body.advance((2.7, -0.3), TORQUE)
-        assert body.motor_torque_Nm == tuple(true_torque(body))

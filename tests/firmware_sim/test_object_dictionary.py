@@ -4,7 +4,6 @@ import configparser
 import random
 import struct
 
-import canopen
 import pytest
 from bench_host import (
     CODEC,
@@ -21,9 +20,7 @@ from adacd_hil.wire.codec import contract_folder
 from firmware_sim.canopen.error_control import Watchdog
 from firmware_sim.nodes.device import NmtState
 
-NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
-WRONG_LENGTH, VALUE_RANGE, NO_DATA = 0x06070010, 0x06090030, 0x08000024
-TOO_HIGH, TOO_LOW, CANNOT_STORE, DEVICE_STATE = 0x06090031, 0x06090032, 0x08000020, 0x08000022
+WRITE_ONLY, NO_DATA = 0x06010001, 0x08000024
 
 # What differs from the EDS default right after boot-up: live values.
 LIVE = {
@@ -93,49 +90,6 @@ def test_each_device_has_its_own_identity(host):
     assert [host.read(node, 0x1018, 2) for node in (1, 2, 3, 4)] == [0x402, 0x402, 0x404, 0x404]
 
 
-@pytest.mark.parametrize(
-    ("node", "index", "sub", "code"),
-    [
-        (1, 0x1029, 0, NO_OBJECT),
-        (1, 0x6064, 1, NO_SUBINDEX),
-        (1, 0x1018, 5, NO_SUBINDEX),
-        (1, 0x1003, 5, NO_SUBINDEX),
-        (1, 0x1800, 4, NO_SUBINDEX),
-        (3, 0x6040, 0, NO_OBJECT),
-        (3, 0x9130, 2, NO_SUBINDEX),
-    ],
-)
-def test_reading_what_is_not_there_is_aborted(host, node, index, sub, code):
-    assert host.abort_code(lambda: host.nodes[node].sdo.upload(index, sub)) == code
-
-
-@pytest.mark.parametrize(
-    ("node", "index", "sub", "data", "code"),
-    [
-        (1, 0x1000, 0, b"\0\0\0\0", READ_ONLY),
-        (1, 0x6041, 0, b"\0\0", READ_ONLY),
-        (1, 0x6040, 0, b"\0", WRONG_LENGTH),
-        (1, 0x1006, 0, struct.pack("<I", 1050), VALUE_RANGE),
-        (1, 0x6060, 0, b"\x08", VALUE_RANGE),
-        (1, 0x6076, 0, struct.pack("<I", 12000), READ_ONLY),
-        (1, 0x1019, 0, b"\1", VALUE_RANGE),
-        (1, 0x1019, 0, b"\0", DEVICE_STATE),
-        (1, 0x1019, 0, b"\xf1", TOO_HIGH),
-        (1, 0x605A, 0, struct.pack("<h", 4), VALUE_RANGE),
-        (1, 0x2200, 0, b"\0", TOO_LOW),
-        (1, 0x2201, 0, struct.pack("<H", 10_001), TOO_HIGH),
-        (1, 0x1003, 0, b"\x01", VALUE_RANGE),
-        (1, 0x1014, 0, struct.pack("<I", 0x85), VALUE_RANGE),
-        (3, 0x6125, 1, b"nero", CANNOT_STORE),
-        (3, 0x6132, 1, b"\x03", VALUE_RANGE),
-    ],
-)
-def test_a_write_that_the_device_would_not_obey_is_aborted_and_changes_nothing(host, node, index, sub, data, code):
-    before = None if index == 0x6125 else host.nodes[node].sdo.upload(index, sub)
-    assert host.abort_code(lambda: host.nodes[node].sdo.download(index, sub, data)) == code
-    assert before is None or host.nodes[node].sdo.upload(index, sub) == before
-
-
 def test_all_devices_announce_themselves_at_power_on(host):
     assert host.take() == [(0x701, b"\0"), (0x702, b"\0"), (0x703, b"\0"), (0x704, b"\0")]
 
@@ -144,32 +98,31 @@ STATES = {START: 5, STOP: 4, PRE_OPERATIONAL: 127, RESET_NODE: 127, RESET_COMMUN
 
 
 @pytest.mark.parametrize("first", STATES)
-@pytest.mark.parametrize("second", STATES)
-def test_every_nmt_command_leads_from_every_state_to_its_own(host, first, second):
-    host.nmt(first)
+def test_every_nmt_command_leads_from_every_state_to_its_own(host, first):
+    for second, state in STATES.items():
+        host.nmt(first)
+        host.take()
+        host.nmt(second)
+        assert [device.state for device in host.bench.devices] == [state] * 4
+        boot_ups = [can_id for can_id, _ in host.take() if can_id >= 0x700]
+        assert boot_ups == ([0x701, 0x702, 0x703, 0x704] if second in (RESET_NODE, RESET_COMMUNICATION) else [])
+    host.nmt(START)
+    host.nmt(PRE_OPERATIONAL, 3)
+    assert [device.state for device in host.bench.devices] == [5, 5, 127, 5]
+
+
+def test_a_stopped_device_answers_no_sdo_and_sends_no_emergency(host):
+    host.nmt(STOP)
     host.take()
-    host.nmt(second)
-    assert [device.state for device in host.bench.devices] == [STATES[second]] * 4
-    boot_ups = [can_id for can_id, _ in host.take() if can_id >= 0x700]
-    assert boot_ups == ([0x701, 0x702, 0x703, 0x704] if second in (RESET_NODE, RESET_COMMUNICATION) else [])
-
-
-def test_an_nmt_command_for_one_node_leaves_the_others_alone(host):
-    host.nmt(START, 3)
-    assert [device.state for device in host.bench.devices] == [127, 127, 5, 127]
+    host.put(0x601, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]))
+    host.bench.devices[0].trip(Watchdog.HEARTBEAT, 0)
+    assert host.take() == []
 
 
 @pytest.mark.parametrize("data", [b"", b"\x01", b"\x01\x00\x00", b"\x07\x00"])
 def test_an_nmt_frame_that_makes_no_sense_changes_nothing(host, data):
     host.put(0x000, data)
     assert {device.state for device in host.bench.devices} == {NmtState.PRE_OPERATIONAL}
-
-
-def test_a_stopped_device_answers_no_sdo(host):
-    host.nmt(STOP)
-    host.take()
-    host.put(0x601, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]))
-    assert host.take() == []
 
 
 def test_heartbeats_come_by_bench_time_with_the_nmt_state(host):
@@ -182,33 +135,23 @@ def test_heartbeats_come_by_bench_time_with_the_nmt_state(host):
     host.nmt(STOP)
     host.bench.advance_to(450_000_000)
     assert host.take() == [(0x701, b"\x04")] * 3
-
-
-def test_a_heartbeat_time_of_zero_ends_the_heartbeats(host):
-    host.write(1, 0x1017, 0, 100)
+    host.nmt(PRE_OPERATIONAL)
     host.write(1, 0x1017, 0, 0)
     host.take()
     host.bench.advance_to(1_000_000_000)
     assert host.take() == []
 
 
-def test_reset_communication_restores_the_communication_profile_only(host):
+def test_a_reset_restores_the_communication_profile_or_everything(host):
     host.write(1, 0x1017, 0, 100)
     host.write(1, 0x6072, 0, 500)
     host.nmt(RESET_COMMUNICATION)
-    assert host.read(1, 0x1017) == 0
-    assert host.read(1, 0x6072) == 500
+    assert (host.read(1, 0x1017), host.read(1, 0x6072)) == (0, 500)
     host.take()
     host.bench.advance_to(1_000_000_000)
     assert host.take() == []
-
-
-def test_reset_node_restores_everything(host):
-    host.write(1, 0x6072, 0, 500)
-    host.write(1, 0x6060, 0, 10)
     host.nmt(RESET_NODE)
     assert host.read(1, 0x6072) == 1000
-    assert host.read(1, 0x6061) == 0
 
 
 def test_another_masters_pdo_configuration_of_the_same_contract_is_accepted(host):
@@ -276,27 +219,10 @@ def test_emergency_messages_keep_their_inhibit_time_and_none_is_lost(host):
     assert sent == [(0, 0x8130), (5, 0x8250), (10, 0x8700)]
 
 
-def test_a_stopped_device_sends_no_emergency_message(host):
-    host.nmt(STOP)
-    host.take()
-    host.bench.devices[0].trip(Watchdog.HEARTBEAT, 0)
-    assert host.take() == []
-
-
 def test_no_sdo_frame_however_strange_breaks_the_server(host):
     random_source = random.Random(7)
-    for _ in range(3000):
+    for _ in range(1500):
         length = 8 if random_source.random() < 0.9 else random_source.randrange(8)
         host.put(0x601, bytes(random_source.randrange(256) for _ in range(length)))
     host.nmt(RESET_NODE)
     assert host.read(1, 0x1018, 1) == 0x41444143
-
-
-def test_a_long_string_is_read_in_segments(host):
-    assert host.nodes[1].sdo.upload(0x1008, 0) == b"adacd-hil torque drive"
-
-
-def test_the_devices_need_no_thread(host):
-    with pytest.raises(RuntimeError, match="timers belong to the bench"):
-        host.bench.devices[0]._node.network.send_periodic(0x701, b"\x7f", 0.1)
-    assert isinstance(host.bench.devices[0]._node, canopen.LocalNode)

@@ -3,25 +3,21 @@
 import numpy as np
 import pytest
 from bench_host import (
-    CODEC,
     DISABLE_VOLTAGE,
     ENABLE,
+    ENABLED,
+    FAULT,
     PERIOD_NS,
     RESET_COMMUNICATION,
     BenchHost,
     patient_host,
     quiet_scenario,
 )
-from test_main import MS, ScriptedBus, enabling_script
+from served_bench import MS, enabling_script, serve
 
-from adacd_hil.clock import VirtualClock
 from adacd_hil.records import TRUTH_LAYOUT
-from firmware_sim.bench.bench import Bench
-from firmware_sim.bench.injector import Departure
-from firmware_sim.cli.service import Service, StopRequest
 
 REST_RAD_S = 0.02
-FAULT, REACTION = 0x08, 0x0F
 DQ = TRUTH_LAYOUT.slices["dq"]
 PUSHED = {
     "contacts": [{"at_s": 0.0, "link": 1, "point_m": 0.3, "force_N": 40.0, "duration_s": 60.0}],
@@ -97,22 +93,6 @@ def test_after_an_ordinary_end_nothing_is_added():
     assert (len(host.truths), host.bench.now_ns, len(host.frames)) == (told, now_ns, frames)
 
 
-def test_an_arm_that_coasts_without_power_comes_to_rest_by_its_friction():
-    host = moving(profile="M", torque=50)
-    host.step(DISABLE_VOLTAGE)
-    begun = len(host.truths)
-    assert speeds(host, begun - 1)[0] > REST_RAD_S
-    host.bench.outlive_host()
-    assert speeds(host, begun)[-1] < REST_RAD_S
-    assert host.state_bits() == 0x40
-
-
-def test_before_the_first_sync_there_is_nothing_to_outlive():
-    host = BenchHost()
-    host.bench.outlive_host()
-    assert host.truths == []
-
-
 def test_a_second_host_finds_an_arm_at_rest_and_its_own_count():
     host = moving()
     host.bench.outlive_host()
@@ -122,9 +102,9 @@ def test_a_second_host_finds_an_arm_at_rest_and_its_own_count():
     for word in (0x80, 0x06, 0x07, ENABLE, ENABLE):
         host.step(word)
     assert [cycle for cycle, _, _ in host.truths[-5:]] == [0, 1, 2, 3, 4]
-    assert host.state_bits() == 0x27
+    assert host.state_bits() == ENABLED
     host.bench.advance_to(host.bench.now_ns + 10_000 * MS)  # by SYNC a living host may take its time again
-    assert host.state_bits() == 0x27
+    assert host.state_bits() == ENABLED
 
 
 def test_a_braking_that_a_watchdog_caused_by_time_is_told_too():
@@ -167,53 +147,27 @@ def test_by_the_clock_a_lost_sync_or_two_leave_a_gap_as_ever():
     assert [cycle for cycle, _, _ in host.truths[begun:]] == [begun + 1, begun + 4]
 
 
-def serve(clock_mode: str, cycles: int, is_once: bool, end_ms: int, beat: bool) -> tuple[ScriptedBus, list, Bench, int]:
-    """Enable and turn the arm from 1 ms on; the host dies after so many cycles."""
-    clock, stop = VirtualClock(), StopRequest()
-    bus = ScriptedBus(clock, stop, end_ms * MS)
-    departure = Departure(bus)
-    rows: list[tuple[int, int, float]] = []
-    bench = Bench(
-        quiet_scenario(),
-        CODEC,
-        departure.send,
-        clock_mode=clock_mode,
-        on_answer=departure.go,
-        on_truth=lambda cycle, t_ns, block: rows.append((cycle, t_ns, float(np.abs(block[DQ]).max()))),
-    )
-    service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
-    service.boot()
-    host = BenchHost()
-    script = []
-    for joint in (1, 2):
-        if beat:
-            script.append((0, 0x600 + joint, bytes([0x23, 0x16, 0x10, 1, 250, 0, 127, 0])))
-    for t_ms, can_id, data in enabling_script(cycles):
-        if can_id in (0x201, 0x202):
-            word = (0x06, 0x07, 0x0F)[min(t_ms - 1, 2)]
-            data = host.command_frame(can_id - 0x200, word, 300 if t_ms > 3 else 0)  # noqa: PLW2901
-        script.append((t_ms, can_id, data))
-        if can_id == 0x080 and beat:
-            script.append((t_ms, 0x77F, b"\x05"))
-    bus.script.extend((t_ms * MS, can_id, data) for t_ms, can_id, data in script)
-    service.run()
-    return bus, rows, bench, clock.now_ns()
+HEARTBEAT_250 = bytes([0x23, 0x16, 0x10, 1, 250, 0, 127, 0])
 
 
-@pytest.mark.parametrize("is_once", [False, True])
-@pytest.mark.parametrize("beat", [False, True])
-@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+@pytest.mark.parametrize(
+    ("clock_mode", "beat", "is_once"),
+    [("sync", False, False), ("sync", True, True), ("wall", False, True), ("wall", True, False)],
+)
 def test_the_emulator_outlives_its_host(clock_mode, beat, is_once):
-    _, rows, bench, end_ns = serve(clock_mode, 50, is_once, 4_000, beat)
+    """The host enables and turns the arm from 1 ms on, and dies after 50 cycles."""
+    rows: list[tuple[int, int, float]] = []
+    script = enabling_script(50, 300, (HEARTBEAT_250,) if beat else (), is_beating=beat)
+    _, bench, clock = serve(
+        script, 4_000, clock_mode, is_once,
+        on_truth=lambda cycle, t_ns, block: rows.append((cycle, t_ns, float(np.abs(block[DQ]).max()))),
+    )  # fmt: skip
     assert rows[49][2] > 1.0
     assert rows[-1][2] < REST_RAD_S
     assert [drive.state.value for drive in bench.drives] == ["fault"] * 2
     assert np.diff([cycle for cycle, _, _ in rows]).min() > 0
-    assert (end_ns < 2_300 * MS) == is_once
-
-
-def test_once_ends_with_an_arm_at_rest_and_no_later():
-    _, rows, bench, end_ns = serve("sync", 50, True, 10_000, True)
-    assert bench.is_at_rest
-    assert end_ns < 400 * MS  # the heartbeat's 250 ms, and what notices it
-    assert rows[-1][1] - rows[49][1] < 1_000 * MS
+    assert (clock.now_ns() < 2_300 * MS) == is_once
+    if clock_mode == "sync" and is_once:  # it ends with an arm at rest, and no later
+        assert bench.is_at_rest
+        assert clock.now_ns() < 400 * MS  # the heartbeat's 250 ms, and what notices it
+        assert rows[-1][1] - rows[49][1] < 1_000 * MS

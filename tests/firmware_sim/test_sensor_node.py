@@ -5,7 +5,7 @@ import struct
 import cantools
 import numpy as np
 import pytest
-from bench_host import CODEC, ENABLE, PRE_OPERATIONAL, RESET_COMMUNICATION, START, BenchHost, quiet_scenario
+from bench_host import CODEC, PRE_OPERATIONAL, RESET_COMMUNICATION, START, BenchHost, quiet_scenario
 from cantools.autosar import end_to_end
 
 from adacd_hil.wire.codec import contract_folder
@@ -46,16 +46,6 @@ def test_the_value_is_the_converters_count_in_micronewtonmetres():
     assert torque_uNm(torque_frames(host, 1, 3)[0]) == round(round(1e6 / lsb_uNm) * lsb_uNm)
     assert torque_uNm(torque_frames(host, 1, 4)[0]) == round(round(-2e6 / lsb_uNm) * lsb_uNm)
     assert host.read(3, 0x9130, 1) == pytest.approx(1e6, abs=lsb_uNm)
-
-
-def test_the_value_is_the_joint_torque_of_the_same_sync():
-    host = BenchHost()
-    host.enable()
-    for _ in range(10):
-        host.step(ENABLE, 100)
-    host.take()
-    host.sync()
-    assert torque_uNm(host.taken(0x183)[0]) * 1e-6 == pytest.approx(host.true("tau_J")[0], abs=0.8e-3)
 
 
 @pytest.mark.parametrize(

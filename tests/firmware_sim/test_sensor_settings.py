@@ -11,7 +11,6 @@ import pytest
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_toml
-from firmware_sim.arm.hardware_settings import DriveSettings, SensorSettings
 from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     VELOCITY_LSB_RAD_S,
@@ -61,16 +60,16 @@ EVERY_DRIVE_ERROR = {
 }
 
 
-def run(seed: int, cycles: int = 150, **changes) -> np.ndarray:
+def run(seed: int | None, cycles: int = 150, seed_of_file: int = 1, **changes) -> np.ndarray:
     """Give what is measured, true and believed over a run with commands given in advance, one row per cycle."""
-    body = Body(parse(Scenario, {"profile": "M", **changes}), seed=seed)
+    body = Body(parse(Scenario, {"profile": "M", "seed": seed_of_file, **changes}), seed=seed)
     body.start_scenario()
     block = np.zeros(TRUTH_LAYOUT.size)
     rows = []
     for cycle in range(cycles):
         measured = body.sample()
         body.truth(block)
-        believed = (*body.motor_torque_Nm, *body.drive_velocity_rad_s, *body.winding_temperature_C)
+        believed = (*body.motor_torque_Nm, *body.drive_velocity_rad_s)
         rows.append(np.concatenate([*measured, block, believed]))
         body.advance((2.0 * np.sin(0.03 * cycle), 0.9 * np.cos(0.05 * cycle)), TORQUE)
     return np.array(rows)
@@ -145,12 +144,11 @@ def test_sources_of_chance_have_nothing_in_common(pair):
         assert abs(correlation) < 0.13  # four times the rms of that of 990 independent pairs
 
 
-def test_a_run_with_every_error_repeats_with_its_seed():
-    assert run_with_everything(9).tobytes() == run_with_everything(9).tobytes()
-
-
-def test_a_run_with_every_error_differs_with_another_seed():
-    assert run_with_everything(9).tobytes() != run_with_everything(10).tobytes()
+def test_a_run_with_every_error_repeats_with_its_seed_and_not_with_another():
+    first = run_with_everything(9).tobytes()
+    assert first == run_with_everything(9).tobytes()
+    assert first != run_with_everything(10).tobytes()
+    assert run(None, seed_of_file=9).tobytes() == run(9).tobytes()
 
 
 @pytest.mark.long
@@ -167,7 +165,7 @@ def test_the_interpreted_errors_are_those_of_the_compiled_ones():
         environment = {**os.environ, "NUMBA_DISABLE_JIT": is_disabled}
         finished = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, check=True)
         results.append(np.frombuffer(finished.stdout))
-    assert results[0].size == 60 * (12 + TRUTH_LAYOUT.size)
+    assert results[0].size == 60 * (10 + TRUTH_LAYOUT.size)
     assert np.allclose(results[0], results[1], rtol=1e-9, atol=1e-9)
 
 
@@ -178,25 +176,9 @@ def test_a_scenario_with_every_error_can_be_written_and_read_again(tmp_path):
     assert load_scenario(str(path)) == scenario
 
 
-@pytest.mark.parametrize("name", ["paper", "idle"])
-def test_the_built_in_scenarios_have_no_errors(name):
-    scenario = load_scenario(name)
-    assert scenario.sensors == SensorSettings()
-    assert scenario.drives == DriveSettings()
-
-
 @pytest.mark.parametrize(
     ("section", "text", "message"),
     [
-        ("sensors", "gain_eror = [0.0, 0.0]", "unknown key `sensors.gain_eror`; did you mean `sensors.gain_error`?"),
-        ("sensors", "gain_error = [0.0]", "`sensors.gain_error` has 1 values, 2 expected"),
-        ("sensors", "gain_error = 0.1", "`sensors.gain_error` = 0.1 must be a list"),
-        ("sensors", "cross_talk = [0.6, 0.0]", "`sensors.cross_talk[0]` = 0.6 is above 0.5"),
-        ("sensors", "torque_range_Nm = [50.0, 20000.0]", "`sensors.torque_range_Nm[1]` = 20000.0 Nm is above 10000 Nm"),
-        ("sensors", "torque_bits = [16, 3]", "`sensors.torque_bits[1]` = 3 is below 4"),
-        ("sensors", "torque_bits = [16, 12.5]", "`sensors.torque_bits[1]` = 12.5 must be of type int"),
-        ("sensors", "encoder_bits = [25, 20]", "`sensors.encoder_bits[0]` = 25 is above 24"),
-        ("sensors", "torque_bandwidth_Hz = [-1.0, 0.0]", "`sensors.torque_bandwidth_Hz[0]` = -1.0 Hz is below 0 Hz"),
         (
             "sensors",
             "hysteresis_Nm = [0.0, 6.0]",
@@ -207,8 +189,6 @@ def test_the_built_in_scenarios_have_no_errors(name):
             "clock_error_ppm = [0.0, 20.0]",
             "`sensors.sample_rate_Hz[1]` = 0.0 Hz leaves `clock_error_ppm` and `clock_phase` no clock",
         ),
-        ("drives", "current_loop_Hz = [0.5, 1000.0]", "`drives.current_loop_Hz[0]` = 0.5 Hz is below 1 Hz"),
-        ("drives", "i2t_reaction = 'stop'", "`drives.i2t_reaction` = 'stop' must be one of limit, fault"),
         (
             "drives",
             "continuous_torque_Nm = [5.0, 0.0]\npeak_torque_Nm = [5.0, 0.0]",

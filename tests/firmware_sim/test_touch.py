@@ -28,7 +28,7 @@ def touched_point(link: int, point_m: float, q: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("frame", ["link", "world"])
 def test_the_torque_of_a_contact_is_its_virtual_work(link, frame):
     generator = np.random.default_rng(3)
-    for _ in range(100):
+    for _ in range(30):
         q = generator.uniform(-3, 3, 2)
         point_m, angle_deg = generator.uniform(0, 0.3), generator.uniform(-360, 360)
         row = contact_table((contact(link=link, frame=frame, point_m=point_m, angle_deg=angle_deg),))[0]
@@ -42,26 +42,6 @@ def test_the_torque_of_a_contact_is_its_virtual_work(link, frame):
             behind[joint] -= 1e-5
             moved = touched_point(link, point_m, ahead) - touched_point(link, point_m, behind)
             assert found[joint] == pytest.approx(force @ moved / 2e-5, abs=1e-8)
-
-
-def test_a_push_along_the_normal_of_a_link_turns_its_joint_forward():
-    alone = contact_torque(contact_table((contact(link=1),))[0], 20.0, L1_M, 0.7, -0.3, 0.0, 0.0)
-    assert alone == pytest.approx((4.0, 0.0))
-    forward = contact_torque(contact_table((contact(link=2),))[0], 20.0, L1_M, 0.7, 0.0, 0.0, 0.0)
-    assert forward == pytest.approx((20.0 * (0.35 + 0.2), 4.0))
-
-
-def test_a_push_along_link_2_is_not_felt_by_joint_2():
-    row = contact_table((contact(link=2, angle_deg=0.0),))[0]
-    assert contact_torque(row, 20.0, L1_M, 0.7, -0.3, 0.0, 0.0)[1] == 0.0
-
-
-def test_the_force_and_lever_of_a_link_2_contact_follow_from_both_torques():
-    """Closed form for a frictionless contact: F = (tau1 − tau2) / (l1 cos q2), lever tau2 / F."""
-    tau1, tau2 = contact_torque(contact_table((contact(link=2),))[0], 17.0, L1_M, -0.4, 0.9, 0.0, 0.0)
-    force_N = (tau1 - tau2) / (L1_M * math.cos(0.9))
-    assert force_N == pytest.approx(17.0, rel=1e-12)
-    assert tau2 / force_N == pytest.approx(0.2, rel=1e-12)
 
 
 def velocity_of(link: int, point_m: float, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
@@ -104,18 +84,13 @@ def test_a_force_along_the_motion_is_none_at_rest_and_grows_with_the_speed_from_
 )
 def test_a_contact_gives_the_impulse_of_its_shape(changes, impulse_N_s):
     one = contact(**changes)
-    times_s = np.linspace(0.0, one.duration_s, 20_001)
+    times_s = np.linspace(0.0, one.duration_s, 5_001)
     forces_N = [contact_force(contact_table((one,))[0], elapsed_s) for elapsed_s in times_s]
-    assert np.trapezoid(forces_N, times_s) == pytest.approx(impulse_N_s, rel=1e-6)
+    assert np.trapezoid(forces_N, times_s) == pytest.approx(impulse_N_s, rel=1e-5)
     assert one.impulse_N_s == pytest.approx(impulse_N_s, rel=1e-12)
     assert max(forces_N) == pytest.approx(20.0)
-
-
-@pytest.mark.parametrize("shape", ["half_sine", "push"])
-def test_soft_shapes_begin_and_end_without_force(shape):
-    row = contact_table((contact(shape=shape),))[0]
-    assert contact_force(row, 0.0) == 0.0
-    assert contact_force(row, 0.05) == pytest.approx(0.0, abs=1e-12)
+    if one.shape != "step":
+        assert (forces_N[0], forces_N[-1]) == (0.0, pytest.approx(0.0, abs=1e-12))
 
 
 def test_onset_and_end_lie_on_the_drives_ticks():
@@ -127,13 +102,7 @@ def test_onset_and_end_lie_on_the_drives_ticks():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"link": 3}, "`link` = 3 is above 2"),
-        ({"shape": "sine"}, "`shape` = 'sine' must be one of step, half_sine, push"),
-        ({"shape": "halfsine"}, "did you mean 'half_sine'"),
-        ({"frame": "tool"}, "`frame` = 'tool' must be one of link, world, motion"),
         ({"frame": "motion", "force_N": 101.0}, "force_N = 101.0 N is above 100.0 N, the most with frame 'motion'"),
-        ({"force_N": 0.0}, "`force_N` = 0.0 N is below 0.01 N"),
-        ({"duration_s": 0.0}, "`duration_s` = 0.0 s is below 0.0001 s"),
         ({"ramp_s": 0.01}, "ramp_s = 0.01 s belongs to shape 'push'"),
         ({"shape": "push", "ramp_s": 0.03}, "ramp_s = 0.03 s is above half of duration_s = 0.05 s"),
     ],

@@ -29,32 +29,21 @@ def written(folder: Path, scenario: Scenario | None) -> Path:
     return path
 
 
-def test_a_fault_that_begins_is_in_the_log_at_its_time(tmp_path: Path) -> None:
-    (entry,) = read_log(written(tmp_path, FAULTS)).events
-    assert entry.t_ns == 2_000_000
-    assert entry.event == ("warning", "faults", "begins: lose torque of sensor1")
-
-
-def test_the_truth_says_which_faults_are_active(tmp_path: Path) -> None:
-    assert read_log(written(tmp_path, FAULTS)).truth["faults"].tolist() == [0.0, 1.0, 2.0]
-
-
-def test_the_log_carries_the_scenario_it_was_made_with(tmp_path: Path) -> None:
-    text = read_log(written(tmp_path, FAULTS)).attachments[SCENARIO_NAME].decode()
-    assert parse(Scenario, tomllib.loads(text)) == FAULTS
-
-
-def test_each_bit_of_the_truth_has_its_name(tmp_path: Path) -> None:
-    metadata = read_log(written(tmp_path, FAULTS)).metadata
-    assert {key: value for key, value in metadata.items() if key.startswith("fault_")} == {
+def test_the_log_has_truth_events_the_scenario_and_a_name_for_each_bit(tmp_path: Path) -> None:
+    log = read_log(written(tmp_path, FAULTS))
+    (entry,) = log.events
+    assert (entry.t_ns, entry.event) == (2_000_000, ("warning", "faults", "begins: lose torque of sensor1"))
+    assert log.truth["faults"].tolist() == [0.0, 1.0, 2.0]
+    assert parse(Scenario, tomllib.loads(log.attachments[SCENARIO_NAME].decode())) == FAULTS
+    assert {key: value for key, value in log.metadata.items() if key.startswith("fault_")} == {
         "fault_0": "lose torque of sensor1, duration_s 2, probability 0.1, at 1 s since enabled",
         "fault_1": "wrong_node_id of drive1, node_id 9, from power on",
         "fault_2": "silence of sensor2, at 1 s since power on",
     }
-    assert metadata["profile"] == "P"
+    assert log.metadata["profile"] == "P"
 
 
-def test_a_log_without_scenario_is_what_it_was(tmp_path: Path) -> None:
+def test_a_log_without_scenario_has_neither_attachment_nor_names(tmp_path: Path) -> None:
     log = read_log(written(tmp_path, None))
     assert SCENARIO_NAME not in log.attachments
     assert [key for key in log.metadata if key.startswith("fault_")] == []

@@ -4,30 +4,22 @@ import struct
 
 import pytest
 from bench_host import (
-    CODEC,
+    DISABLED,
     ENABLE,
+    ENABLED,
+    FAULT,
     FAULT_RESET,
     PERIOD_NS,
     PRE_OPERATIONAL,
-    RESET_COMMUNICATION,
     RESET_NODE,
     START,
     BenchHost,
-    quiet_scenario,
     remap,
 )
-from test_main import ScriptedBus, enabling_script
-
-from adacd_hil.clock import VirtualClock
-from firmware_sim.bench.bench import Bench
-from firmware_sim.bench.injector import Departure
-from firmware_sim.cli.service import Service, StopRequest
+from served_bench import HOST_BEAT, MS, enabling_script, serve
 
 SYNC, COMMAND, HEARTBEAT, OPERATIONAL, LENGTH = 1, 2, 3, 4, 5
 CODES = {SYNC: 0x8700, COMMAND: 0x8250, HEARTBEAT: 0x8130, OPERATIONAL: 0x8100, LENGTH: 0x8210}
-FAULT_BITS, DISABLED_BITS, ENABLED_BITS = 0x08, 0x40, 0x27
-HOST_BEAT = (0x77F, b"\x05")
-MS = 1_000_000
 
 
 class Watched:
@@ -81,13 +73,6 @@ class Watched:
         """Take the EMCYs of drive 1: code, register, watchdog, ms."""
         return [struct.unpack("<HBBI", data) for data in self.host.taken(0x081)]
 
-    def settle(self) -> None:
-        """Let the fault reaction end."""
-        for _ in range(1100):
-            if self.watchdog == HEARTBEAT:
-                self.host.put(*HOST_BEAT)
-            self.host.step(ENABLE)
-
 
 FAULTING = (SYNC, COMMAND, HEARTBEAT, OPERATIONAL)
 
@@ -132,13 +117,13 @@ def test_fault_reset_is_refused_while_the_cause_lasts_and_works_by_its_edge_afte
             host.step(ENABLE, joints=(2,))
         else:
             host.step(ENABLE)
-    assert host.state_bits(1) == FAULT_BITS
+    assert host.state_bits(1) == FAULT
     watched.say(0)
     watched.say(FAULT_RESET)
-    assert host.state_bits(1) == FAULT_BITS
+    assert host.state_bits(1) == FAULT
     watched.find()
     watched.say(FAULT_RESET)
-    assert host.state_bits(1) == DISABLED_BITS
+    assert host.state_bits(1) == DISABLED
     host.take()
     assert host.read(1, 0x1001) == 0
 
@@ -182,13 +167,6 @@ def test_a_reset_of_the_node_forgets_what_has_tripped():
     assert [watched.host.read(1, 0x2210, sub) for sub in range(1, 8)] == [0] * 7
 
 
-def test_a_reset_of_communication_keeps_the_count():
-    watched = Watched(COMMAND)
-    watched.lose()
-    watched.host.nmt(RESET_COMMUNICATION, 1)
-    assert watched.host.read(1, 0x2210, 1) == COMMAND
-
-
 @pytest.mark.parametrize(("tenths", "patience_ns"), [(15, 1_500_000), (20, 2_000_000), (500, 50_000_000)])
 def test_the_sync_tolerance_is_a_number_of_tenths_of_the_period(tenths, patience_ns):
     host = BenchHost(clock_mode="wall")
@@ -197,7 +175,7 @@ def test_the_sync_tolerance_is_a_number_of_tenths_of_the_period(tenths, patience
     host.enable()
     last_ns = host.t_ns
     host.bench.advance_to(last_ns + patience_ns - 1)
-    assert host.state_bits() == ENABLED_BITS
+    assert host.state_bits() == ENABLED
     host.bench.advance_to(last_ns + patience_ns)
     assert host.read(1, 0x603F) == 0x8700
 
@@ -212,52 +190,29 @@ def test_the_devices_time_begins_at_power_on(node):
     assert host.read(node, 0x2210, 2) == 50
 
 
-def serve_dying_host(deadline: tuple[int, bytes] | None, reaction: int, end_ms: int) -> tuple[ScriptedBus, Bench]:
+HEARTBEAT_300 = bytes([0x23, 0x16, 0x10, 1, 0x2C, 0x01, 0x7F, 0])
+DEADLINE_300 = bytes([0x2B, 0x00, 0x14, 5, 0x2C, 0x01, 0, 0])
+
+
+def serve_dying_host(deadline: bytes, reaction: int, end_ms: int):
     """Enable and turn both drives by SYNC, then let the host die at 50 ms."""
-    clock, stop = VirtualClock(), StopRequest()
-    bus = ScriptedBus(clock, stop, end_ms * MS)
-    departure = Departure(bus)
-    bench = Bench(quiet_scenario(), CODEC, departure.send, on_answer=departure.go)
-    service = Service(bench, bus, departure, clock, "sync", stop)
-    service.boot()
-    script = []
-    for joint in (1, 2):
-        script.append((0, 0x600 + joint, bytes([0x2B, 0x5E, 0x60, 0, reaction, 0, 0, 0])))
-        if deadline is not None:
-            script.append((0, 0x600 + joint, deadline[1]))
-    host = BenchHost()
-    for t_ms, can_id, data in enabling_script(50):
-        if can_id in (0x201, 0x202) and t_ms > 3:
-            data = host.command_frame(can_id - 0x200, ENABLE, 300)  # noqa: PLW2901
-        elif can_id in (0x201, 0x202):
-            data = host.command_frame(can_id - 0x200, (0x06, 0x07, 0x0F)[t_ms - 1])  # noqa: PLW2901
-        script.append((t_ms, can_id, data))
-        if can_id == 0x080:
-            script.append((t_ms, *HOST_BEAT))
-    bus.script.extend((t_ms * MS, can_id, data) for t_ms, can_id, data in script)
-    service.run()
-    return bus, bench
+    set_up = (bytes([0x2B, 0x5E, 0x60, 0, reaction, 0, 0, 0]), deadline)
+    return serve(enabling_script(50, 300, set_up, is_beating=True), end_ms)[:2]
 
 
-HEARTBEAT_300 = (0x1016, bytes([0x23, 0x16, 0x10, 1, 0x2C, 0x01, 0x7F, 0]))
-DEADLINE_300 = (0x1400, bytes([0x2B, 0x00, 0x14, 5, 0x2C, 0x01, 0, 0]))
-
-
-@pytest.mark.parametrize("reaction", [0, 1, 2, 3])
-@pytest.mark.parametrize(("deadline", "code"), [(HEARTBEAT_300, 0x8130), (DEADLINE_300, 0x8250)])
+@pytest.mark.parametrize(
+    ("deadline", "code", "reaction"),
+    [(HEARTBEAT_300, 0x8130, 0), (HEARTBEAT_300, 0x8130, 2), (DEADLINE_300, 0x8250, 0), (DEADLINE_300, 0x8250, 3)],
+)
 def test_by_sync_too_a_host_that_dies_leaves_no_torque_after_the_watchdogs_time(deadline, code, reaction):
-    bus, bench = serve_dying_host(deadline, reaction, 1_500)
+    bus, bench = serve_dying_host(deadline, reaction, 1_000)
     emergencies = [(t_ns, data) for t_ns, can_id, data in bus.sent if can_id == 0x081]
     assert [struct.unpack_from("<H", data)[0] for _, data in emergencies] == [code]
     assert 350 * MS <= emergencies[0][0] <= 371 * MS
-    assert [drive.torque_Nm for drive in bench.drives] == [0.0, 0.0]
-    assert [drive.state.value for drive in bench.drives] == ["fault", "fault"]
-    assert [drive.motor_mode for drive in bench.drives] == [0, 0]
-    if reaction != 0:
-        assert max(map(abs, bench._body.drive_velocity_rad_s)) < 0.02
+    assert [(drive.torque_Nm, drive.state.value, drive.motor_mode) for drive in bench.drives] == [(0.0, "fault", 0)] * 2
     statuses = [data for _, can_id, data in bus.sent if can_id == 0x281]
     if deadline is DEADLINE_300:  # after a lost heartbeat the node is in Pre-operational
-        assert statuses[-1][0] & 0x4F == FAULT_BITS
+        assert statuses[-1][0] & 0x4F == FAULT
 
 
 def test_by_sync_a_host_that_pauses_within_the_watchdogs_time_finds_everything_as_it_left_it():

@@ -165,7 +165,7 @@ class HostReceiver:
             assert output.state in _MAY_RUN, f"cycle {arm.cycle}: {output.state.name}"
             self._sent.clear()
             is_faulted = output.state is SchemeState.FAULT
-            arm.write(ArmCommand(np.array((5.0, -3.0)), enable=False, quick_stop=is_faulted))
+            arm.send_command(ArmCommand(np.array((5.0, -3.0)), enable=False, quick_stop=is_faulted))
             for sent in self._sent:
                 word, torque = CODEC.by_id[sent.can_id].decode_values(sent.data)
                 assert (word, torque) == (0x0002 if is_faulted else 0x0000, 0.0)

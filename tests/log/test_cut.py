@@ -8,7 +8,7 @@ from mcap.reader import make_reader
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.cut import TimeWindow, contacts_begun, cut, find_contact
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.reader import LoggedContact, read_log
+from adacd_hil.log.reader import read_log
 from adacd_hil.records import ContactReport
 
 INFINITE = float("inf")
@@ -160,7 +160,7 @@ def test_a_log_is_not_overwritten_by_what_is_made_of_it(log_path):
 
 
 def report(cycle, is_final):
-    return LoggedContact(cycle * MILLISECOND, ContactReport(cycle, 2, (1, 1), (0.0, 0.0), (0.0, 0.0), is_final))
+    return cycle * MILLISECOND, ContactReport(cycle, 2, (1, 1), (0.0, 0.0), (0.0, 0.0), is_final)
 
 
 def test_contacts_are_counted_by_the_cycle_that_they_began_in():
@@ -172,7 +172,7 @@ def test_contacts_are_counted_by_the_cycle_that_they_began_in():
         report(20, False),
         report(20, True),
     ]
-    assert [contact.report.cycle for contact in contacts_begun(reports)] == [3, 9, 20]
+    assert contacts_begun(reports) == [3 * MILLISECOND, 9 * MILLISECOND, 20 * MILLISECOND]
 
 
 def test_an_unknown_contact_is_an_error(log_path):

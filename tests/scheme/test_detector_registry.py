@@ -9,8 +9,9 @@ from documents import ROOT
 
 from adacd_hil.scheme.detect import detector_registry
 from adacd_hil.scheme.detect.detectors import DetectorBankSettings, register
-from adacd_hil.settings.configuration import Settings, apply_settings, load_settings, renewed
+from adacd_hil.settings.configuration import Settings, load_settings, renewed
 from adacd_hil.settings.schema import ConfigError, DetectorError, parse
+from adacd_hil.settings.setting_keys import apply_settings
 
 EXAMPLE = ROOT / "docs/examples/detector"
 

@@ -20,7 +20,7 @@ def test_a_push_as_large_as_at_the_worst_moment_is_found_where_it_is_hardest_and
     untouched = play(measured)
     armed = np.flatnonzero(untouched.state == SchemeState.MONITOR)
     pushes = PushGatherer(SETTINGS)
-    pushes.add(untouched.y[armed], untouched.h[armed])
+    pushes.add_residuals(untouched.y[armed], untouched.h[armed])
     within = round(WITHIN_S / PERIOD_S)
     for joint, figures in enumerate(pushes.smallest_push().push_Nm):
         assert 0.02 < figures["p50"] < figures["p99"] < figures["max"] < 1.0
@@ -42,6 +42,6 @@ def pushed_by(untouched, rows):
     gathered = []
     for row in rows:
         one = PushGatherer(SETTINGS)
-        one.add(untouched.y[row : row + 1], untouched.h[row : row + 1])
+        one.add_residuals(untouched.y[row : row + 1], untouched.h[row : row + 1])
         gathered.append([figures["max"] for figures in one.smallest_push().push_Nm])
     return np.array(gathered)

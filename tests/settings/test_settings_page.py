@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import settings_page
 
-from adacd_hil.settings.configuration import known_keys
+from adacd_hil.settings.setting_keys import known_keys
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "settings.md"

@@ -59,6 +59,7 @@ def emulated(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 def connected(channel: str) -> Iterator[canopen.Network]:
     """Connect canopen, its nodes as at power-on."""
     network = canopen.Network()
+    network.NOTIFIER_CYCLE = 0.05  # how long its thread may take to end
     network.connect(channel=channel, interface="socketcan")
     try:
         yield network

@@ -73,8 +73,9 @@ def listening() -> Iterator[list[tuple[int, bytes]]]:
                 frames.append((int.from_bytes(packed[:4], sys.byteorder), packed[8 : 8 + packed[4]]))
 
 
-def test_scan_finds_the_arm(arm: Path) -> None:
-    scanned = command(arm, "scan", "--json")
+def test_scan_finds_the_arm_sends_uploads_only_and_lists_strangers(arm: Path) -> None:
+    with other_program("send(0x055, b'abc')", 0.01), listening() as frames:
+        scanned = command(arm, "scan", "--json")
     assert scanned.status == 0, scanned.stderr
     nodes = [(node["node"], node["device"], node["serial"], node["verdict"]) for node in scanned.json["nodes"]]
     assert nodes == [
@@ -83,11 +84,6 @@ def test_scan_finds_the_arm(arm: Path) -> None:
         (3, "CiA 404 measuring device", 3, ""),
         (4, "CiA 404 measuring device", 4, ""),
     ]
-
-
-def test_scan_sends_uploads_only_and_lists_strangers(arm: Path) -> None:
-    with other_program("send(0x055, b'abc')", 0.01), listening() as frames:
-        scanned = command(arm, "scan", "--json")
     (stranger,) = scanned.json["others"]
     assert (stranger["id"], stranger["message"], stranger["length"]) == (0x055, "unknown", "3")
     requests = [(can_id, data[0] & 0xEF) for can_id, data in frames if can_id & 0x780 == 0x600]

@@ -24,7 +24,7 @@ from adacd_hil.wire.e2e import crc8
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.scenario.scenario import load_scenario
 
-pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.long]
+pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
 CODEC = load_codec()
 SETTINGS = '[safety]\ntolerated_emergencies = [0x1000]\n[operator]\nscript = [{ at_s = 0.36, request = "finish" }]\n'

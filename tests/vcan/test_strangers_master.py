@@ -64,6 +64,7 @@ def bus(request: pytest.FixtureRequest) -> Iterator[Bus]:
 def connection(bus: Bus) -> Iterator[canopen.Network]:
     """Connect canopen, its nodes as at power-on."""
     network = canopen.Network()
+    network.NOTIFIER_CYCLE = 0.05  # how long its thread may take to end
     network.connect(channel=bus.channel, interface="socketcan")
     try:
         network.nmt.send_command(NMT_RESET_NODE)

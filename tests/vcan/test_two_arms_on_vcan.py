@@ -154,7 +154,7 @@ class _Adapter(CanInterface):
     restarts = 0
     is_virtual = False
 
-    def restart(self) -> None:
+    def take_down_and_up(self) -> None:
         self.restarts += 1
 
 

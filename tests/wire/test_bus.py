@@ -35,14 +35,14 @@ def test_a_tap_remembers_the_command_before_its_answer() -> None:
     tap = Tap(bus, VirtualClock())
     tap.send(0x10, b"x")
     tap.receive(0.0)
-    assert [(is_sent, frame.can_id) for is_sent, frame in tap.take()] == [(True, 0x10), (False, 0x20)]
+    assert [(is_sent, frame.can_id) for is_sent, frame in tap.take_passed()] == [(True, 0x10), (False, 0x20)]
 
 
 def test_a_tap_forgets_what_was_taken() -> None:
     tap = Tap(EmbeddedBus(VirtualClock()), VirtualClock())
     tap.send(0x10, b"x")
-    tap.take()
-    assert tap.take() == []
+    tap.take_passed()
+    assert tap.take_passed() == []
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_a_tap_recovers_the_bus_behind_it_and_keeps_what_has_passed() -> None:
     bus.deliver(0x181, b"old")
     tap.recover()
     assert tap.receive(0.0) is None
-    assert tap.take() == [(True, Frame(0x10, b"x", 0))]
+    assert tap.take_passed() == [(True, Frame(0x10, b"x", 0))]
 
 
 def test_a_tap_remembers_the_error_frame_of_a_bus_off() -> None:
@@ -94,7 +94,7 @@ def test_a_tap_remembers_the_error_frame_of_a_bus_off() -> None:
     tap = Tap(OffBus(VirtualClock()), VirtualClock())
     with pytest.raises(BusOffError):
         tap.receive(0.0)
-    assert tap.take() == [(False, Frame(0x40, bytes(8), 5, is_error=True))]
+    assert tap.take_passed() == [(False, Frame(0x40, bytes(8), 5, is_error=True))]
 
 
 def test_frames_that_are_there_together_are_received_together_but_for_error_frames() -> None:
@@ -104,7 +104,7 @@ def test_frames_that_are_there_together_are_received_together_but_for_error_fram
         bus.deliver(can_id, bytes(8), is_error=can_id == 0x40)
     batches = [[frame.can_id for frame in tap.receive_some(0.0, 2)] for _ in range(5)]
     assert batches == [[0x181, 0x182], [0x40], [0x183, 0x184], [0x185], []]
-    assert [frame.can_id for _, frame in tap.take()] == [0x181, 0x182, 0x40, 0x183, 0x184, 0x185]
+    assert [frame.can_id for _, frame in tap.take_passed()] == [0x181, 0x182, 0x40, 0x183, 0x184, 0x185]
 
 
 def test_any_other_python_can_interface_carries_fd_frames_and_marks_them_so() -> None:

@@ -221,7 +221,7 @@ def test_trouble_on_the_bus_is_handed_out_though_other_identifiers_are_filtered(
     bus.close()
     assert frame is not None
     assert frame == Frame(error_class, bytes.fromhex(data), frame.t_ns, is_error=True)
-    assert decode_error(frame).kind is kind
+    assert decode_error(frame)[0] is kind
 
 
 def test_bus_off_is_an_error_that_carries_its_frame_and_the_bus_goes_on_when_the_controller_does(
@@ -238,7 +238,7 @@ def test_bus_off_is_an_error_that_carries_its_frame_and_the_bus_goes_on_when_the
     assert caught.value.frame.can_id == 0x040
     assert "\n" not in str(caught.value)
     assert restarted is not None
-    assert decode_error(restarted).kind is TroubleKind.RESTARTED
+    assert decode_error(restarted)[0] is TroubleKind.RESTARTED
     assert frame is not None
     assert (frame.can_id, frame.is_error) == (0x181, False)
 

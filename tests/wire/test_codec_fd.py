@@ -7,7 +7,6 @@ from cantools.autosar.end_to_end import compute_profile2_crc, compute_profile5_c
 
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
 from adacd_hil.wire.e2e import E2eReceiver, E2eSender, Protection
-from adacd_hil.wire.frame_lengths import FD_LENGTHS
 
 FD = load_codec(contract_folder() / "arm_fd.dbc")
 HALF_MS = load_codec(contract_folder() / "arm_fd_500us.dbc")
@@ -160,37 +159,7 @@ def test_the_layout_digest_of_the_classic_contract_is_that_of_wire_version_1() -
     assert (CLASSIC.wire_version, CLASSIC.layout_digest) == (1, 0xF80FDAE0)
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ('BA_ "Trigger" BO_ 385 0;', 'BA_ "Trigger" BO_ 385 2;'),
-        ('BA_ "GenMsgCycleTime" BO_ 1793 100;', 'BA_ "GenMsgCycleTime" BO_ 1793 50;'),
-        ('BA_ "GenMsgDelayTime" BO_ 129 10;', 'BA_ "GenMsgDelayTime" BO_ 129 20;'),
-        ('BA_ "Baudrate" 1000000;', 'BA_ "Baudrate" 500000;'),
-        ('BA_ "BaudrateCANFD" 5000000;', 'BA_ "BaudrateCANFD" 8000000;'),
-        ('BA_ "BusPeriod_us" 1000;', 'BA_ "BusPeriod_us" 500;'),
-        ("CiA 301 SYNC", "The SYNC"),
-    ],
-)
-def test_the_layout_digest_ignores_what_is_not_on_the_wire(tmp_path: Path, old: str, new: str) -> None:
-    assert load_codec(edited(tmp_path, (old, new))).layout_digest == FD.layout_digest
-
-
-@pytest.mark.parametrize(
-    ("changes", "what"),
-    [
-        ([('BA_ "E2EDataId" BO_ 513 52174;', 'BA_ "E2EDataId" BO_ 513 52175;')], "data id"),
-        ([('BA_ "E2EProfile" BO_ 513 "P05";\n', ""), ('BA_ "E2EDataId" BO_ 513 52174;\n', "")], "profile"),
-        ([("SG_ torque_offset : 64|16@1-", "SG_ torque_offset : 64|16@1+")], "sign"),
-        ([("SG_ temperature : 112|16@1- (0.01,0)", "SG_ temperature : 112|16@1- (0.1,0)")], "scale"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_the_fd_layout_digest_changes_with(tmp_path: Path, changes: list[tuple[str, str]], what: str) -> None:
-    assert load_codec(edited(tmp_path, *changes)).layout_digest != FD.layout_digest, what
-
-
-@pytest.mark.parametrize("length", range(65))
+@pytest.mark.parametrize("length", [0, 1, 8, 9, 11, 12, 13, 20, 24, 33, 48, 63, 64])
 def test_only_lengths_with_a_data_length_code_are_taken(tmp_path: Path, length: int) -> None:
     signals = "".join(f' SG_ b{index} : {8 * index}|8@1+ (1,0) [0|255] "" HOST\n' for index in range(length))
     fd = 'BA_DEF_ BO_ "VFrameFormat" ENUM ' + ",".join(f'"f{index}"' for index in range(14)) + ',"StandardCAN_FD";\n'
@@ -242,7 +211,3 @@ def test_an_fd_contract_that_cant_work_is_refused_by_name(tmp_path: Path, change
     with pytest.raises(CodecError, match=reason) as caught:
         load_codec(edited(tmp_path, change))
     assert "\n" not in str(caught.value)
-
-
-def test_the_lengths_beyond_8_are_those_of_iso_11898() -> None:
-    assert FD_LENGTHS == (12, 16, 20, 24, 32, 48, 64)

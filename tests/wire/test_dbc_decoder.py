@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.cli.connection import Connection
-from adacd_hil.device.survey import BusView
+from adacd_hil.lab.commission.survey import BusView
 from adacd_hil.lab.logs.signal_tables import frame_columns
 from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE
 from adacd_hil.wire.bus import Frame

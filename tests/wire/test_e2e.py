@@ -143,46 +143,6 @@ def test_the_counter_begins_at_0_and_wraps(profile: Profile) -> None:
     assert [frame[profile.counter_byte] for frame in sent] == [*range(profile.modulus), 0, 1]
 
 
-def test_the_status_of_profile_2_passes_through() -> None:
-    assert Profile2Sender(DATA_IDS).protect(bytearray((0, 0x50, 1)))[1] & 0xF0 == 0x50
-
-
-def test_the_status_of_profile_5_passes_through() -> None:
-    assert Profile5Sender(b"\x34\x12").protect(bytearray((0, 0, 0, 0xA5, 1)))[3] == 0xA5
-
-
-@BOTH
-def test_an_unbroken_sequence_is_ok(profile: Profile) -> None:
-    receiver = profile.receiver()
-    assert {receiver.check(frame) for frame in frames(profile, 2 * profile.modulus + 5)} == {E2eStatus.OK}
-
-
-@BOTH
-def test_the_first_frame_may_come_in_the_middle_of_the_sequence(profile: Profile) -> None:
-    assert profile.receiver().check(frames(profile, 12)[11]) is E2eStatus.OK
-
-
-@BOTH
-def test_silence_before_the_first_frame_is_none(profile: Profile) -> None:
-    receiver = profile.receiver()
-    for _ in range(30):
-        receiver.miss()
-    sent = frames(profile, 2)
-    assert [receiver.check(frame) for frame in sent] == [E2eStatus.OK, E2eStatus.OK]
-
-
-@pytest.mark.parametrize(
-    ("profile", "tolerated"), [(profile_2(6), 2), (profile_5(24), 4)], ids=["P02 without miss", "P05"]
-)
-def test_a_jump_of_the_counter_is_loss_up_to_the_tolerance(profile: Profile, tolerated: int) -> None:
-    sent = frames(profile, 9)
-    for lost in range(7):
-        receiver = profile.receiver()
-        receiver.check(sent[0])
-        expected = E2eStatus.OK_SOME_LOST if lost <= tolerated else E2eStatus.WRONG_SEQUENCE
-        assert receiver.check(sent[1 + lost]) is (expected if lost else E2eStatus.OK)
-
-
 @BOTH
 @pytest.mark.parametrize("lost", [1, 2, 3, 4])
 def test_a_short_burst_of_lost_frames_leaves_the_next_one_usable(profile: Profile, lost: int) -> None:
@@ -203,45 +163,6 @@ def test_after_a_long_silence_the_third_frame_is_usable_again(profile: Profile, 
     for _ in range(lost):
         receiver.miss()
     assert [receiver.check(frame).is_valid for frame in sent[1 + lost : 5 + lost]] == [False, False, True, True]
-
-
-@BOTH
-@pytest.mark.parametrize(("silent", "status"), [(4, E2eStatus.OK), (5, E2eStatus.SYNC)])
-def test_a_sender_that_paused_is_not_trusted_at_once(profile: Profile, silent: int, status: E2eStatus) -> None:
-    receiver = profile.receiver()
-    first, second = frames(profile, 2)
-    receiver.check(first)
-    for _ in range(silent):
-        receiver.miss()
-    assert receiver.check(second) is status
-
-
-@BOTH
-def test_a_silence_of_a_whole_turn_of_the_counter_costs_one_frame_more(profile: Profile) -> None:
-    receiver = profile.receiver()
-    sent = frames(profile, profile.modulus + 4)
-    receiver.check(sent[0])
-    for _ in range(profile.modulus - 1):
-        receiver.miss()
-    assert [receiver.check(frame) for frame in sent[profile.modulus :]] == [
-        E2eStatus.REPEATED,
-        E2eStatus.SYNC,
-        E2eStatus.SYNC,
-        E2eStatus.OK,
-    ]
-
-
-@BOTH
-def test_after_a_wrong_sequence_one_frame_is_sync(profile: Profile) -> None:
-    receiver = profile.receiver()
-    sent = frames(profile, 12)
-    receiver.check(sent[0])
-    assert [receiver.check(frame) for frame in sent[7:11]] == [
-        E2eStatus.WRONG_SEQUENCE,
-        E2eStatus.SYNC,
-        E2eStatus.OK,
-        E2eStatus.OK,
-    ]
 
 
 @BOTH
@@ -267,25 +188,6 @@ def test_a_frame_from_the_past_is_not_used_after_a_burst(profile: Profile, misse
         for _ in range(missed):
             receiver.miss()
         assert receiver.check(sent[11 - age]) is E2eStatus.WRONG_SEQUENCE
-
-
-@BOTH
-def test_a_repeated_frame_is_not_valid(profile: Profile) -> None:
-    receiver = profile.receiver()
-    frame = frames(profile, 1)[0]
-    receiver.check(frame)
-    assert {receiver.check(frame) for _ in range(30)} == {E2eStatus.REPEATED}
-
-
-@BOTH
-def test_a_frame_with_a_wrong_crc_leaves_the_sequence_alone(profile: Profile) -> None:
-    receiver = profile.receiver()
-    sent = frames(profile, 9)
-    receiver.check(sent[0])
-    broken = bytearray(sent[8])
-    broken[-1] ^= 1
-    assert receiver.check(bytes(broken)) is E2eStatus.WRONG_CRC
-    assert receiver.check(sent[1]) is E2eStatus.OK
 
 
 @pytest.mark.parametrize(
@@ -333,7 +235,6 @@ def test_every_check_is_counted(profile: Profile) -> None:
     receiver.miss()
     assert receiver.counts == [3, 1, 1, 2, 1, 2, 0]
     assert receiver.tally() == list(zip(E2eStatus, receiver.counts, strict=True))
-    assert receiver.rejected == 4
 
 
 @BOTH
@@ -345,7 +246,7 @@ def test_a_restart_forgets_the_sequence_and_keeps_the_counts(profile: Profile) -
     for _ in range(20):
         receiver.miss()
     counts = list(receiver.counts)
-    receiver.restart()
+    receiver.restart_sequence()
     assert receiver.counts == counts
     assert [receiver.check(sent[3]), receiver.check(sent[4])] == [E2eStatus.OK, E2eStatus.OK]
 
@@ -355,7 +256,7 @@ def test_after_a_restart_the_tolerance_is_that_of_the_start(profile: Profile) ->
     receiver = profile.receiver()
     for _ in range(20):
         receiver.miss()
-    receiver.restart()
+    receiver.restart_sequence()
     sent = frames(profile, 12)
     receiver.check(sent[0])
     assert receiver.check(sent[7]) is E2eStatus.WRONG_SEQUENCE
@@ -363,12 +264,12 @@ def test_after_a_restart_the_tolerance_is_that_of_the_start(profile: Profile) ->
 
 def test_without_protection_every_frame_is_ok_and_passes_as_it_is() -> None:
     receiver = E2eReceiver()
+    assert (receiver.status, receiver.counter_range) == (E2eStatus.NO_NEW_DATA, 0)
     assert E2eSender().protect(bytearray(b"\x01\x02\x03")) == b"\x01\x02\x03"
     assert [receiver.check(frame) for frame in (b"\x01", b"\x01", b"")] == [E2eStatus.OK] * 3
     assert receiver.miss() is E2eStatus.NO_NEW_DATA
-    receiver.restart()
+    receiver.restart_sequence()
     assert receiver.counts == [3, 0, 0, 0, 0, 1, 0]
-    assert receiver.rejected == 0
 
 
 @pytest.mark.parametrize(
@@ -390,13 +291,6 @@ def test_only_ok_frames_may_be_used(status: E2eStatus, number: int, is_valid: bo
 
 def test_the_header_takes_what_the_profile_says() -> None:
     assert [protection.header_bytes for protection in Protection] == [0, 2, 4]
-
-
-def test_without_protection_every_frame_counts_as_ok() -> None:
-    receiver = E2eReceiver()
-    assert (receiver.status, receiver.counter_range) == (E2eStatus.NO_NEW_DATA, 0)
-    assert [receiver.check(frame) for frame in (b"", b"\x00")] == [E2eStatus.OK] * 2
-    assert receiver.counts[E2eStatus.OK] == 2
 
 
 @BOTH

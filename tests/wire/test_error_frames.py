@@ -3,7 +3,7 @@
 import pytest
 
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.error_frames import BusTrouble, TroubleKind, decode_error, is_bus_off
+from adacd_hil.wire.error_frames import TroubleKind, decode_error, is_bus_off
 
 # error class, data, kind, text, counters
 REPORTS = [
@@ -48,8 +48,7 @@ def test_a_report_is_read_as_the_header_says(
 ) -> None:
     if counters is not None:
         text += f"; error counters: sending {counters[0]}, receiving {counters[1]}"
-    expected = BusTrouble(TroubleKind[kind], text, *(counters or (None, None)))
-    assert decode_error(Frame(error_class, bytes.fromhex(data), 0, is_error=True)) == expected
+    assert decode_error(Frame(error_class, bytes.fromhex(data), 0, is_error=True)) == (TroubleKind[kind], text)
 
 
 @pytest.mark.parametrize(
@@ -78,8 +77,8 @@ def test_a_report_is_read_as_the_header_says(
     ],
 )
 def test_the_place_of_a_protocol_error_is_named(place: int, text: str) -> None:
-    trouble = decode_error(Frame(0x008, bytes((0, 0, 0, place, 0, 0, 0, 0)), 0, is_error=True))
-    assert f"protocol error ({text})" in trouble.text
+    _, said = decode_error(Frame(0x008, bytes((0, 0, 0, place, 0, 0, 0, 0)), 0, is_error=True))
+    assert f"protocol error ({text})" in said
 
 
 def test_every_kind_is_reported_by_some_frame() -> None:
@@ -88,7 +87,7 @@ def test_every_kind_is_reported_by_some_frame() -> None:
 
 def test_no_frame_of_any_class_is_without_a_line() -> None:
     for error_class in range(0x400):
-        text = decode_error(Frame(error_class, b"\xff" * 8, 0, is_error=True)).text
+        text = decode_error(Frame(error_class, b"\xff" * 8, 0, is_error=True))[1]
         assert text
         assert "\n" not in text
 

@@ -33,6 +33,7 @@ from adacd_hil.scheme.supervisor.transitions import Observation
 from adacd_hil.settings.configuration import Settings, load_settings, merge
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.arm.touch_settings import ticks
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
 
@@ -77,7 +78,8 @@ class Rig:
 
     def __init__(self, settings: Settings, scenario: Scenario, acknowledge_after_s: float = 0.0) -> None:
         self.settings = settings
-        self._body = Body(scenario, settings.bus.period_s)
+        self._body = Body(scenario)
+        self._ticks = ticks(settings.bus.period_s)
         self._body.start_scenario()
         self._theta = np.array(self._theta_of())
         self._constants, self._memory, self._block, self._values = paper_kernel.numbers_of(settings)
@@ -175,7 +177,9 @@ class Rig:
         else:
             self._floating.begin()
             self._controller.torque(arm.q, arm.dq, self._q_d, self._dq_d, self._ddq_d, self._tau_d)
-        self._body.advance(self._tau_c, _TORQUE if state is not SchemeState.FAULT else (DriveMode.BRAKE,) * 2)
+        self._body.advance(
+            self._tau_c, _TORQUE if state is not SchemeState.FAULT else (DriveMode.BRAKE,) * 2, self._ticks
+        )
         self._gate.limit(self._tau_d, state is not SchemeState.FAULT, self._tau_c)
         self._state = state
         self._cycle += 1

@@ -33,8 +33,9 @@ from adacd_hil.scheme.detect.sensitivity import AGREES
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 from adacd_hil.score.judge import begins_of
-from adacd_hil.settings.configuration import Settings, apply_settings, load_settings, parse_changes
-from firmware_sim.arm.arms import ArmProfile
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.setting_keys import apply_settings, parse_changes
+from firmware_sim.arm.arms import EmulatedArm
 from firmware_sim.arm.hardware_settings import MechanicsSettings, SensorSettings
 
 Array = NDArray[np.float64]
@@ -50,7 +51,7 @@ CABLES_NM = {"cable 0.05 Nm sin q": 0.05, "cable 0.1 Nm sin q": 0.1}
 ELASTIC_DAMPING, ROTOR_KG_M2 = 0.02, (0.05, 0.01)
 
 
-def mechanics_of(error: str, arm: ArmProfile) -> MechanicsSettings:
+def mechanics_of(error: str, arm: EmulatedArm) -> MechanicsSettings:
     """Return what the error named does to the arm; the rigid plant where it is another's."""
     coulomb_Nm, inertia = np.array(arm.coulomb_Nm), arm.theta()[[0, 2]]
 

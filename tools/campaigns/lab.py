@@ -24,7 +24,6 @@ from adacd_hil.control.controller import HANDOVER_S, fill_torque
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.settings.arm_settings import ArmSettings
 from adacd_hil.structured import Structured
-from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import external_torque
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
 from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, ticks
@@ -71,17 +70,6 @@ class Recording:
     tau_c: NDArray[np.float64]
     tau_ext: NDArray[np.float64]
     theta: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Experiment(Scenario):
-    """A scenario whose arm need not be one of the profiles."""
-
-    own_arm: ArmProfile = ARMS["P"]
-
-    @property
-    def arm(self) -> ArmProfile:
-        return self.own_arm
 
 
 @compiled
@@ -210,7 +198,7 @@ def record(
     """
     count = len(motion.q_d)
     degrees = np.degrees(motion.q_d[0])
-    scenario = _Experiment(
+    scenario = Scenario(
         own_arm=arm.arm,
         seed=seed,
         start_deg=(float(degrees[0]), float(degrees[1])),
@@ -224,11 +212,11 @@ def record(
     )
     if any(arm.sensors.encoder_noise_counts) or any(arm.sensors.offset_walk_Nm_rs):
         raise ValueError("encoder noise and a walk of the torque offset are drawn outside the compiled loop")
-    body = Body(scenario, PERIOD_S)
+    body = Body(scenario)
     body.start_scenario()
     parts = body.parts
     numbers = parts.numbers.view(BODY_NUMBERS)[0]
-    numbers["arm"]["torque_limit_Nm"][:] = numbers["motor"]["peak_Nm"][:] = _UNLIMITED_NM
+    numbers["arm"]["rated_torque_Nm"][:] = numbers["motor"]["peak_Nm"][:] = _UNLIMITED_NM
     rated_Nm = np.array(arm.arm.rated_torque_Nm)
     rate_share = np.array(ArmSettings().torque_rate_limit_Nm_s) / ArmSettings().rated_torque_Nm
     noise = np.random.default_rng(seed).standard_normal((count, JOINTS)) * arm.sensors.torque_noise_Nm

@@ -8,7 +8,7 @@ from lab_motion import PERIOD_S
 from numpy.typing import NDArray
 
 from adacd_hil.settings.configuration import load_settings
-from firmware_sim.arm.arms import ARMS, ArmProfile, RigidLink
+from firmware_sim.arm.arms import ARMS, EmulatedArm
 from firmware_sim.arm.hardware_settings import DriveSettings, MechanicsSettings, SensorSettings
 
 Pair = tuple[float, float]
@@ -29,7 +29,7 @@ _REFERENCE = "S"  # whose gains are scaled with the inertia
 class LabArm:
     """An arm to be recorded. torque_offset_Nm: zero error of the torque sensors; pairs are (joint 1, joint 2)."""
 
-    arm: ArmProfile
+    arm: EmulatedArm
     Kp: Pair
     Kd: Pair
     payload_kg: float = 0.0
@@ -90,22 +90,27 @@ def random_arm(seed: int, payload_kg: float = 0.0, friction: str = "plain", **ch
     """
     generator = np.random.default_rng([seed, 4])
     links = []
-    for light, heavy in zip(ARMS["P"].links, ARMS[_REFERENCE].links, strict=True):
-        length_m = light.length_m * generator.uniform(0.8, 1.2)
-        mass_kg = np.exp(generator.uniform(np.log(0.7 * light.mass_kg), np.log(1.5 * heavy.mass_kg)))
+    light = ARMS["P"]
+    for light_m, light_kg, heavy_kg in zip(light.link_length_m, light.mass_kg, ARMS[_REFERENCE].mass_kg, strict=True):
+        length_m = light_m * generator.uniform(0.8, 1.2)
+        mass_kg = np.exp(generator.uniform(np.log(0.7 * light_kg), np.log(1.5 * heavy_kg)))
         center_m = length_m * generator.uniform(0.35, 0.65)
         inertia_kg_m2 = mass_kg * length_m**2 * generator.uniform(0.07, 0.14)
-        links.append(RigidLink(float(length_m), float(mass_kg), float(center_m), float(inertia_kg_m2)))
+        links.append((float(length_m), float(mass_kg), float(center_m), float(inertia_kg_m2)))
     low, high = ARMS[_REFERENCE], ARMS["M"]
     share = generator.uniform(0.0, 1.0, (2, 2))
     viscous, coulomb = (
         np.exp(np.log(0.5 * np.array(least)) * (1.0 - share[row]) + np.log(1.5 * np.array(most)) * share[row])
         for row, (least, most) in enumerate(((low.viscous_Nm_s, high.viscous_Nm_s), (low.coulomb_Nm, high.coulomb_Nm)))
     )
+    lengths_m, masses_kg, centers_m, inertias_kg_m2 = ((first, second) for first, second in zip(*links, strict=True))
     drawn = replace(
         low,
         name=f"random {seed}",
-        links=(links[0], links[1]),
+        link_length_m=lengths_m,
+        mass_kg=masses_kg,
+        center_m=centers_m,
+        inertia_kg_m2=inertias_kg_m2,
         viscous_Nm_s=(float(viscous[0]), float(viscous[1])),
         coulomb_Nm=(float(coulomb[0]), float(coulomb[1])),
     )

@@ -692,7 +692,7 @@ def _collisions_latch(case: Case) -> Iterator[Violation]:
     attempt = case.wire.attempt(case.wire.sync_place[case.scheme_sync])
     for first, last in case.stays(SchemeState.REACT):
         begin_ns, end_ns = int(case.log.scheme.t_ns[first]), int(case.log.scheme.t_ns[last])
-        levels = [entry.report.level for entry in case.log.contacts if begin_ns <= entry.t_ns <= end_ns]
+        levels = [report.level for t_ns, report in case.log.contacts if begin_ns <= t_ns <= end_ns]
         if ContactLevel.COLLISION not in levels or last + 1 >= len(case.state):
             continue
         if attempt[last + 1] != attempt[last]:  # broken off, and begun anew once the user had acknowledged that

@@ -12,7 +12,7 @@ from adacd_hil.given_path import CommandGroup
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.settings.configuration import KnownKey
+    from adacd_hil.settings.setting_keys import KnownKey
 
 EPILOG = "Exit status: 0 done, warnings included; 2 wrong usage, or a configuration that can't be used."
 
@@ -58,16 +58,9 @@ def show_settings(
 def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
     """Return the effective settings with value and default as TOML, and origin. Raises ConfigError, CommandError."""
     from adacd_hil.control.configuration_check import origins_of
-    from adacd_hil.settings.configuration import (
-        Settings,
-        apply_settings,
-        configuration_layers,
-        in_words,
-        parse_changes,
-        resolved_table,
-        value_of,
-    )
+    from adacd_hil.settings.configuration import Settings, configuration_layers, resolved_table
     from adacd_hil.settings.schema import parse
+    from adacd_hil.settings.setting_keys import apply_settings, in_words, parse_changes, value_of
 
     layers = configuration_layers(name, profile)
     changes = parse_changes(given)
@@ -131,7 +124,7 @@ def docs(keys: tuple[str, ...], as_json: bool) -> ExitCode:
 
 
 def _list_groups(as_json: bool) -> None:
-    from adacd_hil.settings.configuration import keys_of, sections
+    from adacd_hil.settings.setting_keys import keys_of, sections
 
     groups: list[dict[str, Any]] = [
         {"group": name or "(top)", "keys": sum(1 for _ in keys_of(section, "")), "meaning": meaning}
@@ -147,7 +140,7 @@ def _list_groups(as_json: bool) -> None:
 def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":
     """Return the settings of these groups and keys; without any, all. Raises CommandError."""
     from adacd_hil.remedies import nearest_name
-    from adacd_hil.settings.configuration import explain_unknown, known_keys, sections
+    from adacd_hil.settings.setting_keys import explain_unknown, known_keys, sections
 
     known = known_keys()
     if not keys:

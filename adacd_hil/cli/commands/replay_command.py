@@ -124,10 +124,10 @@ def _replay_one(
     from adacd_hil.control.operator import ScriptedOperator
     from adacd_hil.replay.replay import replay_source
     from adacd_hil.score.emulator_truth import contacts_beside
-    from adacd_hil.settings.configuration import (
+    from adacd_hil.settings.configuration import load_settings
+    from adacd_hil.settings.setting_keys import (
         apply_settings,
         keep_facts,
-        load_settings,
         parse_changes,
         parse_variations,
         refuse_facts,
@@ -229,7 +229,7 @@ def _as_json(
     path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow"
 ) -> dict[str, Any]:
     from adacd_hil.replay.replayed_outcome import as_json
-    from adacd_hil.settings.configuration import changed_keys
+    from adacd_hil.settings.setting_keys import changed_keys
 
     own = replays[0]
     return {

@@ -22,11 +22,12 @@ from adacd_hil.cli.connection import (
     never_stopped,
     on_interrupt,
 )
+from adacd_hil.cli.console_operator import ConsoleOperator
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
 from adacd_hil.clock import format_date, wall_ns
 from adacd_hil.control.configuration_check import guesses_in_brief
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
-from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
+from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.control.tare_file import TARED, use_tare
 from adacd_hil.device.contract import load_contract
@@ -37,22 +38,9 @@ from adacd_hil.scheme.identify.anchor import unanchored_joints
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line
-from adacd_hil.wire.budget import check_budget
+from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.can_interface import CanInterface
-from adacd_hil.wire.codec import Codec
-
-
-def check_budget_of(codec: Codec, settings: Settings) -> None:
-    """Refuse a contract whose frames miss their deadlines in the configured period. Raises ConfigError, CodecError.
-
-    A DBC without attribute Trigger can't be judged and passes.
-    """
-    if b'"Trigger"' not in codec.text:
-        return
-    budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
-    if not budget.is_fit:
-        raise ConfigError(f"contract {codec.path.stem}: {budget.line}")
 
 
 def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
@@ -107,9 +95,10 @@ def run_on_bus(
         ask_first_run(history)
     if settings.scheme == "certified" and not without_anchor and may_be_hardware(interface, channel):
         ask_without_anchor(unanchored_joints(settings), connection.arguments)
+    files = [file for file in (tare, history) if file is not None]
     codec = load_contract(settings)
-    if clock_name == "realtime":
-        check_budget_of(codec, settings)
+    if clock_name == "realtime" and (excess := describe_excess(codec, settings)):
+        raise ConfigError(excess)
     clock = make_clock(clock_name)
     with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack, never_stopped():
         bus = connection.open(clock, codec, settings)
@@ -128,15 +117,14 @@ def run_on_bus(
             folder.path,
             interface,
             progress=progress,
-            tare=tare,
-            history=history,
+            files=files,
             live=live,
             on_started=functools.partial(folder.link, progress),
         )
         if guesses := guesses_in_brief(settings, () if tare is None else TARED):
             progress(f"warning: {guesses}")
-        for used in (tare, history):
-            for line in () if used is None else used.warnings:
+        for file in files:
+            for line in file.warnings:
                 progress(f"warning: {line}")
         with on_interrupt(session.interrupt, signal.SIGTSTP):  # Ctrl-Z parks: a stopped process would send no commands
             summary = session.run()

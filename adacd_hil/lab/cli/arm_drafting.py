@@ -12,9 +12,7 @@ from adacd_hil import __version__
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, format_date, wall_ns
 from adacd_hil.control.configuration_check import ConfigurationFindings, examine_configuration
-from adacd_hil.control.host_checks import Status, look_for_socketcan
 from adacd_hil.device.profile import ProfileSettings, ScaleSettings, load_profile, profile_names
-from adacd_hil.device.survey import survey
 from adacd_hil.file_access import read_input, replace_file
 from adacd_hil.lab.cli.interview import Interview, Proposal
 from adacd_hil.lab.commission.arm_draft import (
@@ -29,6 +27,7 @@ from adacd_hil.lab.commission.arm_draft import (
     write_draft,
 )
 from adacd_hil.lab.commission.device_recognition import RecognisedDevice, choose_family, recognise
+from adacd_hil.lab.commission.host_checks import Status, look_for_socketcan
 from adacd_hil.lab.commission.profile_draft import (
     DRIVE,
     SENSOR,
@@ -41,11 +40,12 @@ from adacd_hil.lab.commission.profile_draft import (
     is_of,
     kind_of,
 )
+from adacd_hil.lab.commission.survey import survey
 from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.scheme.model.urdf import UrdfError
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
-from adacd_hil.settings.configuration import known_keys
 from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.setting_keys import known_keys
 from adacd_hil.terminal import in_line
 from adacd_hil.wire.can_interface import can_interfaces, read_link
 from adacd_hil.wire.open_bus import open_bus

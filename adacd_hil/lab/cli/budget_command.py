@@ -7,9 +7,9 @@ from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import fold, in_line, terminal_columns
-from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, find_budget, us
+from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, check_budget, us
 from adacd_hil.wire.codec import load_codec
-from adacd_hil.wire.contract_frames import read_contract, share_bus
+from adacd_hil.wire.contract_frames import read_attribute
 
 _COLUMNS = ("id", "message", "bytes", "trigger", "every ms", "bits", "µs", "response µs", "disturbed µs", "deadline µs")
 _WIDTH = 120
@@ -45,8 +45,10 @@ def judge(
     """
     settings = load_settings(config)
     codec = load_contract(settings) if dbc is None else load_codec(find_contract(dbc))
-    contract = share_bus(read_contract(codec.text, codec.path.name), arms or settings.bus.arms)
-    budget = find_budget(contract, period_us or contract.period_us or settings.bus.period_us, bitrate, data_bitrate)
+    declared_us = int(read_attribute(codec.database, "BusPeriod_us"))
+    budget = check_budget(
+        codec, period_us or declared_us or settings.bus.period_us, bitrate, data_bitrate, arms or settings.bus.arms
+    )
     notes = list(budget.notes)
     if period_us is None and settings.bus.period_us != budget.period_us:
         notes.append(
@@ -77,18 +79,17 @@ def as_text(judgement: Judgement) -> str:
     ]
     width = terminal_columns() or _WIDTH
     table = fit_table([_COLUMNS, *map(_row, budget.frames)], _RIGHT_ALIGNED, width)
-    lines = [f"{budget.contract.name}, {budget.period_us} µs, {rates}", "", *table, "", *_LEGEND, ""]
+    lines = [f"{budget.name}, {budget.period_us} µs, {rates}", "", *table, "", *_LEGEND, ""]
     lines += [f"{title:12}  {finding}" for title, finding in findings]
     return "\n".join(fold(in_line(line), width) for line in lines)
 
 
 def _row(entry: FrameBudget) -> tuple[str, ...]:
-    frame = entry.frame
     return (
-        f"0x{frame.can_id:08X}" if frame.is_extended else f"0x{frame.can_id:03X}",
-        frame.name,
-        str(frame.length),
-        frame.trigger.value,
+        f"0x{entry.can_id:08X}" if entry.is_extended else f"0x{entry.can_id:03X}",
+        entry.name,
+        str(entry.length),
+        entry.trigger.value,
         f"{entry.interval_ns / 1e6:g}",
         f"{entry.worst.nominal}+{entry.worst.data}" if entry.worst.data else str(entry.worst.nominal),
         us(entry.duration_ns),
@@ -106,10 +107,10 @@ def as_json(judgement: Judgement) -> dict[str, Any]:
     """Return a budget as a dictionary for JSON."""
     budget = judgement.budget
     return {
-        "contract": budget.contract.name,
+        "contract": budget.name,
         "wire_version": judgement.wire_version,
         "layout_digest": f"0x{judgement.layout_digest:08X}",
-        "arms": budget.contract.arms,
+        "arms": budget.arms,
         "period_us": budget.period_us,
         "bitrate": budget.bitrate,
         "data_bitrate": budget.data_bitrate,
@@ -129,13 +130,12 @@ def as_json(judgement: Judgement) -> dict[str, Any]:
 
 
 def _message(entry: FrameBudget) -> dict[str, Any]:
-    frame = entry.frame
     return {
-        "name": frame.name,
-        "id": frame.can_id,
-        "is_extended": frame.is_extended,
-        "bytes": frame.length,
-        "trigger": frame.trigger.value,
+        "name": entry.name,
+        "id": entry.can_id,
+        "is_extended": entry.is_extended,
+        "bytes": entry.length,
+        "trigger": entry.trigger.value,
         "interval_us": entry.interval_ns / 1000,
         "unstuffed_bits": entry.unstuffed.total,
         "worst_bits": entry.worst.total,

@@ -10,7 +10,7 @@ from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.control.pacing import prepare_spin
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
@@ -68,7 +68,7 @@ def run_commtest(
             master.configure()
         except DeviceError as error:
             raise CommandError(error.line, ExitCode.BUS_MISSING) from None
-        boot_frames = tap.take()
+        boot_frames = tap.take_passed()
         grant = request_realtime(settings.realtime_request)
         for line in grant.missing:
             _progress(f"not granted: {line}")
@@ -92,7 +92,7 @@ def run_commtest(
     described |= {
         "fault": fault.name,
         "is_interrupted": loop.is_interrupted,
-        "device_faults": ArmReport(arm).describe_faults(),
+        "device_faults": describe_faults(arm),
     }
     described |= {"events": [f"{event.name}: {event.message}" for event in master.take_events()]}
     if recorder is not None:

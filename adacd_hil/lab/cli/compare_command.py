@@ -14,7 +14,7 @@ from adacd_hil.progress_lines import Progress
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.lab.runs.log_comparison import ComparedContact, LogComparison
+    from adacd_hil.lab.runs.log_comparison import Contact, LogComparison
     from adacd_hil.log.log_files import TimeWindow
 
 _EPILOG = (
@@ -79,15 +79,16 @@ def _as_text(found: "LogComparison") -> str:
     return "\n".join(lines)
 
 
-def contact_in_words(contact: "ComparedContact | None") -> str:
+def contact_in_words(contact: "Contact | None") -> str:
     """Write a contact in a cell of the table."""
     if contact is None:
         return "–"
     from adacd_hil.records import Location
 
-    is_known = contact.location in Location.__members__.values()  # a later version may have others
-    force = Location(contact.location).force_text(contact.force_N) if is_known else f"{contact.force_N:.1f}"
-    return f"{contact.time_s:.3f} s, link {contact.link}" + ("" if force == "–" else f", {force} N")
+    time_s, report = contact
+    is_known = report.location in Location.__members__.values()  # a later version may have others
+    force = Location(report.location).force_text(report.force_N) if is_known else f"{report.force_N:.1f}"
+    return f"{time_s:.3f} s, link {report.link}" + ("" if force == "–" else f", {force} N")
 
 
 def _states(found: "LogComparison") -> list[tuple[str, str, str]]:

@@ -6,9 +6,16 @@ from typing import Any
 from adacd_hil.cli.connection import Connection, on_interrupt, raise_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.control.configuration_check import configuration_checks
-from adacd_hil.control.host_checks import HOST_CHECKS, Finding, Host, Status, diagnose, summarise
 from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination
+from adacd_hil.lab.commission.host_checks import (
+    HOST_CHECKS,
+    Finding,
+    Host,
+    Status,
+    configuration_checks,
+    diagnose,
+    summarise,
+)
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import request_realtime
 from adacd_hil.terminal import in_line

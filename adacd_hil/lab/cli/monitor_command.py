@@ -10,14 +10,14 @@ from typing import Any
 from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.device.survey import BusView, MessageView, Snapshot
+from adacd_hil.lab.commission.survey import BusView, MessageView, Snapshot
+from adacd_hil.lab.commission.traffic import receive_until
 from adacd_hil.terminal import fold, moves_cursor, plain, terminal_columns, write_screen
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import read_bitrates
 from adacd_hil.wire.dbc_decoder import DbcDecoder
-from adacd_hil.wire.traffic import receive_until
 
 REDRAW_S = 0.2
 """Interval of redrawing a terminal: the eye can follow 5 Hz."""

@@ -29,7 +29,6 @@ _EPILOG = (
     "others are listed; 130 interrupted."
 )
 _DATE_FORMS = "2026-11-25, 2026-11-25T14:22 or 2026-11-25T14:22:33"
-_DRAWN = (".svg", ".png", ".html")
 
 
 class LocalDate(click.ParamType[datetime]):
@@ -154,7 +153,7 @@ def runs(
     help="A threshold that differs by more than this share has changed; a quarter of it where settings have.",
 )
 @click.option(
-    "--out", type=WrittenPath(dir_okay=False), metavar="FILE", help="Draw it: .svg, .png, or .html with the tables."
+    "--out", type=WrittenPath(dir_okay=False), metavar="FILE.html", help="Write a page with its curves and tables."
 )
 @json_option
 @_filtered
@@ -164,15 +163,19 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
     Runs without a report are judged first, which reads their logs. A friction or an offset has changed if it differs by
     more than four standard deviations of both certificates.
     """
+    from adacd_hil.lab.runs.run_pages import trend_page
+    from adacd_hil.lab.runs.run_table import write_result
     from adacd_hil.lab.runs.run_trend import trends
 
-    if out is not None and out.suffix.lower() not in _DRAWN:
-        raise CommandError(f"--out {out} ends in none of {', '.join(_DRAWN)}", ExitCode.USAGE)
+    if out is not None and out.suffix.lower() != ".html":
+        raise CommandError(
+            f"--out {out} doesn't end in .html: a trend is a page, which a browser prints", ExitCode.USAGE
+        )
     with Progress() as progress:
         found = _chosen(folder, asked, True, progress)
         made = trends(found, share)
         if out is not None:
-            _draw(made, out)
+            write_result(trend_page(made), out)
     if as_json:
         print(json.dumps({"folder": str(folder), "arms": [each.as_json() for each in made]}, indent=2))
     else:
@@ -219,24 +222,6 @@ def _page(found: list["RunSummary"], path: Path) -> str:
         report = run.log.parent / HTML_NAME
         listed.append(ListedRun(run, report if report.is_file() else None))
     return runs_page(path.parent, listed)
-
-
-def _draw(made: list["Trend"], out: Path) -> None:
-    from adacd_hil.lab.drawing import paper_svg
-    from adacd_hil.lab.runs.run_pages import draw_trend, trend_page
-    from adacd_hil.lab.runs.run_table import write_result
-
-    kind = out.suffix.lower()
-    if kind == ".html":
-        write_result(trend_page(made), out)
-        return
-    if len(made) != 1:
-        arms = ", ".join(repr(each.arm) for each in made) or "none"
-        raise CommandError(f"--out {out} has room for one arm, there are {arms}: choose by --arm", ExitCode.USAGE)
-    drawing = draw_trend(made[0])
-    if drawing is None:
-        raise LogError(f"nothing to draw: no run of {made[0].arm} is judged")
-    write_result(paper_svg(drawing) if kind == ".svg" else drawing.png(), out)
 
 
 def _as_text(found: list["RunSummary"]) -> str:

@@ -7,10 +7,10 @@ from adacd_hil.cli.connection import Connection
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.device.network import Master
-from adacd_hil.device.survey import Node, Survey, compare, expected_nodes, message_name, survey
+from adacd_hil.lab.commission.survey import Node, Survey, compare, expected_nodes, message_name, survey
+from adacd_hil.lab.commission.traffic import Talk
 from adacd_hil.terminal import in_line
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.traffic import Talk
 
 
 def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], ExitCode]:

@@ -135,7 +135,8 @@ def _plan(
     from adacd_hil import __version__
     from adacd_hil.compiled import program_digest
     from adacd_hil.lab.tune.sweep import plan_logs, plan_scenarios
-    from adacd_hil.settings.configuration import apply_settings, load_settings, parse_variations
+    from adacd_hil.settings.configuration import load_settings
+    from adacd_hil.settings.setting_keys import apply_settings, parse_variations
 
     variants = parse_variations(vary)
     base = load_settings(config or "certified", profile or None)
@@ -183,7 +184,7 @@ def _simulate(task: "Task", row: "SweepRow") -> "Values":
     from adacd_hil.cli.embedded_run import resolve, run_embedded
     from adacd_hil.lab.tune.sweep import REFUSALS, failed, finished
     from adacd_hil.replay.replay import replay
-    from adacd_hil.settings.configuration import apply_settings
+    from adacd_hil.settings.setting_keys import apply_settings
 
     subject = task.subject
     try:

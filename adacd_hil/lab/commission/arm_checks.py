@@ -7,19 +7,18 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.clock import Clock
-from adacd_hil.control.host_checks import Check, CheckOutcome, failed, ok, skipped, warning
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_report import ArmReport
+from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import read_object
-from adacd_hil.device.device_setup import contract_differences, describe_torque_scale, read_pdos
+from adacd_hil.device.device_setup import Slave, command_deadline_ms, pdo_differences, torque_unit
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import host_frames
-from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, survey
 from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.lab.commission.communication_test import (
     CommunicationReport,
@@ -28,12 +27,14 @@ from adacd_hil.lab.commission.communication_test import (
     ZeroTorqueCycle,
     ZeroTorqueLoop,
 )
+from adacd_hil.lab.commission.host_checks import Check, CheckOutcome, failed, ok, skipped, warning
+from adacd_hil.lab.commission.survey import NMT_STATES, compare, expected_nodes, survey
+from adacd_hil.lab.commission.traffic import Traffic, listen
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, BusError, Tap
 from adacd_hil.wire.can_interface import InterfaceState
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.traffic import Traffic, listen
 
 LISTEN_S = 0.5
 """Listening time for other masters: five of the usual heartbeats of 100 ms."""
@@ -62,9 +63,7 @@ class ArmExamination:
     no_move_reason: str = "give --move and move the joints when asked"
     cycle_s: float = 1.0
     move_s: float = 15.0
-    _tap: Tap | None = None
     _bus: Bus | None = None
-    _loop: ZeroTorqueLoop | None = None
     _has_reset: bool = False
     cycles: list[ZeroTorqueCycle] = field(default_factory=list)
     traffic: Traffic = field(default_factory=Traffic)
@@ -72,22 +71,14 @@ class ArmExamination:
     def connect(self) -> None:
         """Open the bus; make arm and master on it. Raises BusMissingError."""
         self._bus = self.open_bus()
-        self._tap = Tap(self._bus, self.clock)
-        self.arm = Arm(self.settings, self.codec, self._tap)
-        self.master = Master(self.settings, self.codec, self._tap)
+        self.tap = Tap(self._bus, self.clock)
+        self.arm = Arm(self.settings, self.codec, self.tap)
+        self.master = Master(self.settings, self.codec, self.tap)
 
-    @property
-    def tap(self) -> Tap:
-        """The open bus."""
-        assert self._tap is not None
-        return self._tap
-
-    @property
+    @cached_property
     def loop(self) -> ZeroTorqueLoop:
         """The zero-torque loop of this examination; later runs continue its cycle count."""
-        if self._loop is None:
-            self._loop = ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
-        return self._loop
+        return ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
 
     def reset(self) -> None:
         """Reset the nodes' communication; `leave` then has to stop them. Raises DeviceError, BusError."""
@@ -130,7 +121,7 @@ def check_other_masters(patient: ArmExamination) -> CheckOutcome:
     """Check that no other master is on the bus."""
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
-    patient.tap.take()
+    patient.tap.take_passed()
     doing = host_frames(patient.settings, patient.codec)
     if patient.settings.bus.is_shared:
         del doing[patient.codec.message("Nmt").can_id]
@@ -192,12 +183,25 @@ def check_pdo_map(patient: ArmExamination) -> CheckOutcome:
     """Check that the devices' PDO parameters and mappings are those of the contract."""
     lines = []
     for slave in patient.master.slaves:
-        lines += contract_differences(slave.device, read_pdos(patient.master.nodes[slave.name]))
+        lines += pdo_differences(slave, command_deadline_ms(patient.settings))
     if lines:
         return failed(
             "; ".join(lines), "correct [[pdo]] of the devices' profiles, or map the devices' PDOs accordingly"
         )
     return ok("read back, equal to the contract")
+
+
+def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
+    """Say how the rated torque of a motor becomes that of its joint, `rated_Nm`. Raises DeviceError."""
+    if not slave.has(0x6076):
+        return f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint"
+    scale = slave.device.settings.scale
+    parts = [f"{slave.read(0x6076)} {torque_unit(scale)}"]
+    if scale.gear_ratio != 1.0:
+        parts.append(f"gear {scale.gear_ratio:g}")
+    if scale.gear_efficiency != 1.0:
+        parts.append(f"efficiency {scale.gear_efficiency:g}")
+    return f"{slave.name}: 0x6076 = {' x '.join(parts)}, {rated_Nm:.4g} Nm at the joint, 0.1 % of it a count"
 
 
 def check_torque_scale(patient: ArmExamination) -> CheckOutcome:
@@ -227,7 +231,7 @@ def check_protection(patient: ArmExamination) -> CheckOutcome:
 
 def check_cycle(patient: ArmExamination) -> CheckOutcome:
     """Run cycles at the period with disabled drives."""
-    patient.tap.take()
+    patient.tap.take_passed()
     patient.master.start()
     patient.loop.run(patient.cycle_s, patient.cycles.append)
     for cycle in patient.cycles:
@@ -290,7 +294,7 @@ def check_heartbeats(patient: ArmExamination) -> CheckOutcome:
 
 def check_devices(patient: ArmExamination) -> CheckOutcome:
     """Check that no drive is in fault and no device reports an error."""
-    lines = [line for line in ArmReport(patient.arm).describe_faults() if ": status" not in line]
+    lines = [line for line in describe_faults(patient.arm) if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
     if lines or events:
         return warning("; ".join([*lines, *events]), "a run resets the fault if its cause has gone")
@@ -308,6 +312,10 @@ def check_saturation(patient: ArmExamination) -> CheckOutcome:
     return ok("within range")
 
 
+def _by_joint(form: str, values: Vector) -> str:
+    return ", ".join(f"joint {number} {form.format(value)}" for number, value in enumerate(values.tolist(), start=1))
+
+
 def check_rest(patient: ArmExamination) -> CheckOutcome:
     """Check that the arm stands still with its drives off."""
     dq = patient.joint_values("dq")
@@ -315,7 +323,7 @@ def check_rest(patient: ArmExamination) -> CheckOutcome:
         return skipped("no complete cycle")
     fastest = np.abs(dq).max(axis=0)
     bound = patient.settings.safety.rest_velocity_rad_s
-    text = ", ".join(f"joint {joint + 1} up to {fastest[joint]:.4f} rad/s" for joint in range(JOINTS))
+    text = _by_joint("up to {:.4f} rad/s", fastest)
     if np.any(fastest > bound):
         return failed(f"{text}, above {bound:g}", "let the arm come to rest and keep hands off")
     return ok(text)
@@ -328,7 +336,7 @@ def check_torque_zero(patient: ArmExamination) -> CheckOutcome:
         return skipped("no complete cycle")
     mean = tau_J.mean(axis=0)
     bound = patient.settings.safety.rest_torque_Nm
-    text = ", ".join(f"joint {joint + 1} {mean[joint]:+.4f} Nm" for joint in range(JOINTS))
+    text = _by_joint("{:+.4f} Nm", mean)
     remedy = "let the arm hang free, then `adacd-hil tare`"
     if np.any(np.abs(mean) > bound):
         return failed(f"{text}, above {bound:g}", remedy)
@@ -343,7 +351,7 @@ def check_noise(patient: ArmExamination) -> CheckOutcome:
     if len(tau_J) < 2:
         return skipped("no complete cycles")
     spread = tau_J.std(axis=0)
-    text = ", ".join(f"joint {joint + 1} {1000.0 * spread[joint]:.3f} mNm rms" for joint in range(JOINTS))
+    text = _by_joint("{:.3f} mNm rms", 1000.0 * spread)
     if np.any(np.ptp(tau_J, axis=0) == 0.0):
         return warning(f"{text}: a value that never changes", "check the cable to the strain gauge")
     if np.any(spread > np.array(patient.settings.detector.threshold_Nm) / 3.0):

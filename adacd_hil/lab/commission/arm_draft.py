@@ -25,8 +25,9 @@ from adacd_hil.records import GRAVITY_M_S2, JOINTS, Vector
 from adacd_hil.scheme.model.chain import PER_LINK, Chain
 from adacd_hil.scheme.model.urdf import BASE, SerialArm, UrdfError, read_urdf
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
-from adacd_hil.settings.configuration import known_keys, load_settings
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.setting_keys import known_keys
 from adacd_hil.settings.toml_files import toml_value
 from adacd_hil.terminal import one_line
 
@@ -75,13 +76,18 @@ class PlanarArm(NamedTuple):
 def uniform_rods(link_length_m: Pair, mass_kg: Pair, mounting_deg: Pair) -> PlanarArm:
     """Describe an arm of two uniform rods: centre of mass in the middle, inertia m l² / 12 about it."""
     (l1, l2), (m1, m2) = link_length_m, mass_kg
-    a3 = m2 * l2**2 / 3.0
-    theta = [m1 * l1**2 / 3.0 + m2 * l1**2 + a3, m2 * l1 * l2 / 2.0, a3, 0.0, 0.0, 0.0, 0.0]
-    arm = PlanarArm(link_length_m, (), mounting_deg, mass_kg=mass_kg)
-    if arm.has_gravity:
+    theta = _theta((m1 * l1**2 / 3.0, m2 * l2**2 / 3.0), (m1 * l1 / 2.0, m2 * l2 / 2.0), m2, l1, mounting_deg)
+    return PlanarArm(link_length_m, theta, mounting_deg, mass_kg=mass_kg)
+
+
+def _theta(inertia: Pair, moment_kg_m: Pair, outer_kg: float, l1: float, mounting_deg: Pair) -> tuple[float, ...]:
+    """Return the parameters of two links. inertia: of each about its joint; moment: along the line of the link."""
+    first, second = inertia
+    theta = [first + outer_kg * l1**2 + second, l1 * moment_kg_m[1], second, 0.0, 0.0, 0.0, 0.0]
+    if mounting_deg[0] > SLIGHT_TILT_DEG:
         share = GRAVITY_M_S2 * math.sin(math.radians(mounting_deg[0]))
-        theta += [share * (m1 * l1 / 2.0 + m2 * l1), share * m2 * l2 / 2.0]
-    return arm._replace(cad_theta=_rounded(theta))
+        theta += [share * max(moment_kg_m[0] + outer_kg * l1, 0.0), share * moment_kg_m[1]]
+    return tuple(map(_short, theta))
 
 
 def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float = 0.0) -> PlanarArm:
@@ -122,26 +128,22 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float
         l2 = 2.0 * float(np.linalg.norm(moment)) / second[0] if second[0] > 0.0 and np.any(moment) else l1
     along = across / l1
     mounting_deg = _mounting(chain, along)
-    has_gravity = mounting_deg[0] > SLIGHT_TILT_DEG
     bent_deg = 0.0
-    theta: list[float] = []
+    theta: tuple[float, ...] = ()
     body: dict[str, Pair] = {}
     if first[0] > 0.0 and second[0] > 0.0:
-        inertia = [_about(link, axis) for link, axis in zip((first, second), chain.axis, strict=True)]
+        inertia = _about(first, chain.axis[0]), _about(second, chain.axis[1])
         if np.linalg.norm(moment) > _LEAST_MOMENT_KG_M:
             bent_deg = _angle_deg(along, chain.rotation[1] @ moment, chain.axis[0])
-        turn = float(np.linalg.norm(moment))
-        theta = [inertia[0] + second[0] * l1**2 + inertia[1], l1 * turn, inertia[1], 0.0, 0.0, 0.0, 0.0]
-        turn_1 = float(first[1:4] @ along)
-        if has_gravity:
-            share = GRAVITY_M_S2 * math.sin(math.radians(mounting_deg[0]))
-            theta += [share * max(turn_1 + second[0] * l1, 0.0), share * turn]
-            doubts += _gravity_doubts(first[1:4], along, chain.axis[0], turn_1 + second[0] * l1)
-        body = _body(arm, (first[0], second[0]), (turn_1, turn), inertia)
+        moments = float(first[1:4] @ along), float(np.linalg.norm(moment))
+        theta = _theta(inertia, moments, second[0], l1, mounting_deg)
+        if mounting_deg[0] > SLIGHT_TILT_DEG:
+            doubts += _gravity_doubts(first[1:4], along, chain.axis[0], moments[0] + second[0] * l1)
+        body = _body(arm, (first[0], second[0]), moments, inertia)
     zero_deg, limits = _straightened(arm, sign[1], bent_deg, doubts)
     return PlanarArm(
         (_short(l1), _short(l2)),
-        _rounded(theta),
+        theta,
         mounting_deg,
         _plausible("position_limit_deg", limits, doubts),
         _plausible("velocity_limit_deg_s", np.degrees(arm.velocity_limit).round(2), doubts),
@@ -223,7 +225,7 @@ def _mass_doubts(arm: SerialArm) -> list[str]:
     return doubts
 
 
-def _body(arm: SerialArm, mass_kg: Pair, moment_kg_m: Pair, inertia: list[float]) -> dict[str, Pair]:
+def _body(arm: SerialArm, mass_kg: Pair, moment_kg_m: Pair, inertia: Pair) -> dict[str, Pair]:
     """Return masses, their centres and the inertia about them, and friction if the URDF has any."""
     center = [moment / mass for moment, mass in zip(moment_kg_m, mass_kg, strict=True)]
     own = [max(whole - mass * c * c, 0.0) for whole, mass, c in zip(inertia, mass_kg, center, strict=True)]
@@ -273,10 +275,6 @@ def _plausible(key: str, values: Vector, doubts: list[str]) -> Pair | None:
 
 def _short(value: float) -> float:
     return float(f"{value:.6g}")
-
-
-def _rounded(values: list[float]) -> tuple[float, ...]:
-    return tuple(map(_short, values))
 
 
 _MODEL_INERTIA = (0.1786065, 0.0189645)

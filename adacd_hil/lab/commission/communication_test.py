@@ -91,10 +91,10 @@ class ZeroTorqueLoop:
 
     def step(self, is_enabling: bool = False, quick_stop: bool = False) -> ZeroTorqueCycle:
         """Do one cycle. Raises BusError, such as SilenceError in lockstep."""
-        turn = self._exchange.turn()
+        tick, arm = self._exchange.turn()
         self._exchange.leave()
-        record = self._exchange.end(turn, ArmCommand(np.zeros(JOINTS), is_enabling, quick_stop))
-        return ZeroTorqueCycle(turn.arm, record, self._bus.take())
+        record = self._exchange.end(tick, arm, ArmCommand(np.zeros(JOINTS), is_enabling, quick_stop))
+        return ZeroTorqueCycle(arm, record, self._bus.take_passed())
 
 
 SUFFICIENT_SHARE = 0.90

@@ -12,9 +12,17 @@ from typing import Any, NamedTuple
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.contract import compose
-from adacd_hil.device.profile import load_profile, place_devices, profile_names
-from adacd_hil.device.survey import BETWEEN_READS_S, Node
-from adacd_hil.lab.commission.profile_draft import KINDS, SENSOR, DeviceRatings, count_of, identity_of, is_of
+from adacd_hil.device.profile import load_profile, place_devices
+from adacd_hil.lab.commission.profile_draft import (
+    KINDS,
+    SENSOR,
+    DeviceRatings,
+    count_of,
+    identity_of,
+    is_of,
+    shipped_profiles,
+)
+from adacd_hil.lab.commission.survey import BETWEEN_READS_S, Node
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError
@@ -60,11 +68,7 @@ def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int,
 def fitting_profiles(node: Node, kind: str) -> tuple[str, ...]:
     """Return the built-in profiles whose EDS has this node's vendor, and its product if the EDS gives one."""
     names = []
-    for name in profile_names():
-        try:
-            profile = load_profile(name, kind)
-        except ConfigError:  # of the other kind
-            continue
+    for name, profile in shipped_profiles(kind):
         identity = identity_of(profile.eds)
         if identity[0] is not None and is_of(identity, (node.vendor, node.product)):
             names.append(name)

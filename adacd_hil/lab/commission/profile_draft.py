@@ -10,15 +10,17 @@ CiA 404.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from adacd_hil.device.canopen_bus import EdsVariable, find_variable, read_eds
-from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT, SIGNAL_OBJECTS
+from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT
 from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, name_velocity_unit, read_drive_units
 from adacd_hil.device.profile import (
     HOST_SIGNALS,
+    DeviceProfile,
     ObjectName,
     PatienceSettings,
     ProfileSettings,
@@ -37,6 +39,24 @@ _DEG_S_PER_RPM = 6.0
 _LEAST_LIMIT_DEG, _MOST_LIMIT_DEG, _MOST_SPEED_DEG_S = 1.0, 360.0, 720.0
 """Plausible limits of a joint; others are a drive's factory values. A wrist of a UR3e turns at 360 deg/s."""
 _Place = tuple[int, int]
+_SIGNAL_OBJECTS = {
+    "position": 0x6064,
+    "velocity": 0x606C,
+    "statusword": 0x6041,
+    "mode_display": 0x6061,
+    "torque_actual": 0x6077,
+    "torque_demand": 0x6074,
+    "error_code": 0x603F,
+    "error_register": 0x1001,
+    "controlword": 0x6040,
+    "target_torque": 0x6071,
+    "torque_offset": 0x60B2,
+    "max_torque": 0x6072,
+    "mode": 0x6060,
+    "torque": 0x9130,
+    "status": 0x6150,
+}
+"""CiA 301, 402 and 404: the object behind a signal's name."""
 
 
 class DeviceRatings(NamedTuple):
@@ -81,13 +101,13 @@ class Guess(NamedTuple):
 
 
 class ProfileDraft(NamedTuple):
-    """The text of a profile. remarks: limits of the device, a line each.
+    """The text of a profile, and what it says. remarks: limits of the device, a line each.
 
     rated_torque_Nm: at the joint, by 0x6076; None if unknown. is_rated_known: no guess went into it.
     """
 
-    kind: str
     text: str
+    settings: ProfileSettings
     guessed: tuple[Guess, ...]
     remarks: tuple[str, ...] = ()
     rated_torque_Nm: float | None = None
@@ -97,11 +117,6 @@ class ProfileDraft(NamedTuple):
     def guesses(self) -> tuple[str, ...]:
         """The guesses as text, a line each."""
         return tuple(f"{guess.key.partition('.')[2]} = {guess.text}" for guess in self.guessed)
-
-    @property
-    def settings(self) -> ProfileSettings:
-        """The draft, parsed as a profile."""
-        return parse(ProfileSettings, parse_toml(self.text))
 
 
 def identity_of(eds: Path) -> tuple[int | None, int | None]:
@@ -163,13 +178,13 @@ def draft_profile(
     writer = make(eds, objects, ratings, answers or {})
     text = writer.text()
     try:
-        parse(ProfileSettings, parse_toml(text))
+        settings = parse(ProfileSettings, parse_toml(text))
     except ConfigError as error:
         raise ConfigError(f"EDS {eds}: {error}") from None
     keys = {guess.key for guess in writer.guessed}
     is_rated_known = not (keys & TORQUE_KEYS or writer.is_factory(0x6076, 0))
     return ProfileDraft(
-        kind, text, tuple(writer.guessed), tuple(writer.remarks), writer.rated_torque_Nm, is_rated_known
+        text, settings, tuple(writer.guessed), tuple(writer.remarks), writer.rated_torque_Nm, is_rated_known
     )
 
 
@@ -179,14 +194,17 @@ def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
     Its values that are not `assumed` hold for all devices of this maker.
     """
     vendor, _ = identity_of(eds)
-    for name in profile_names():
-        try:
-            profile = load_profile(name, kind)
-        except ConfigError:  # of the other kind
-            continue
+    for _, profile in shipped_profiles(kind):
         if vendor is not None and profile.settings.assumed and identity_of(profile.eds)[0] == vendor:
             return profile.settings
     return None
+
+
+def shipped_profiles(kind: str) -> Iterator[tuple[str, DeviceProfile]]:
+    """Yield the shipped profiles of drives, or of sensors, with their names."""
+    for name in profile_names():
+        with suppress(ConfigError):  # of the other kind
+            yield name, load_profile(name, kind)
 
 
 _TORQUE_OBJECTS = ((0x9130, 1), (0x7130, 1))
@@ -424,7 +442,7 @@ class _ProfileWriter(ABC):
         index, sub = place
         if place in _TORQUE_OBJECTS:
             return 'signal = "torque"'
-        name = next((name for name, known in SIGNAL_OBJECTS.items() if known == index), "")
+        name = next((name for name, known in _SIGNAL_OBJECTS.items() if known == index), "")
         unit = ', unit = "permille"' if name in _PERMILLE else ""
         return f'signal = "{name or f"object_{index:04X}_{sub}"}"{unit}'
 
@@ -593,7 +611,7 @@ class _DriveWriter(_ProfileWriter):
     def _command(self) -> _Record:
         wanted = ((0x6040, 0), (0x6071, 0))
         for record in self.records(is_received=True):
-            known = {SIGNAL_OBJECTS[name] for name in HOST_SIGNALS}
+            known = {_SIGNAL_OBJECTS[name] for name in HOST_SIGNALS}
             if record.room >= len(wanted) and self.find((0x6040, 0)):
                 return record
             if not record.room and record.carries(*wanted) and {index for index, _ in record.entries} <= known:

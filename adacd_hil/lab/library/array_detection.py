@@ -22,16 +22,7 @@ from adacd_hil.lab.offline.recording_import import (
     ForeignRecording,
     recording_of,
 )
-from adacd_hil.lab.offline.recording_map import (
-    ArmSection,
-    BagSection,
-    ColumnsSection,
-    CsvSection,
-    RecordingMap,
-    SamplingSection,
-    ScaleSection,
-    UnitsSection,
-)
+from adacd_hil.lab.offline.recording_map import ArmSection, ColumnsSection, RecordingMap
 from adacd_hil.lab.offline.recording_verdict import Verdict
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.robot_description import robot_description
@@ -99,14 +90,6 @@ class OfflineArm:
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints (n,), from the base outward."""
         return self.serial.joint_names
-
-
-class _GivenArrays(NamedTuple):
-    """Arrays as a recording; its time 0 is begin_s of `t`."""
-
-    recording: ForeignRecording
-    begin_s: float
-    has_dq: bool
 
 
 class ArrayContact(NamedTuple):
@@ -178,14 +161,15 @@ def fit(
 
 
 def _fitted(
-    given: _GivenArrays, arm: OfflineArm, fit_s: tuple[float, float] | None, scheme: Mapping[str, Any]
+    recording: ForeignRecording, arm: OfflineArm, fit_s: tuple[float, float] | None, scheme: Mapping[str, Any]
 ) -> FittedModel:
-    start_s, end_s = _span(given, fit_s)
-    described = _described(arm, given.has_dq, scheme)
+    start_s, end_s = _span(recording, fit_s)
+    described = _described(arm, recording.columns.values.shape[1] > 2 * arm.joints, scheme)
     try:
-        found = identify(described, [given.recording.between(start_s, end_s)], None)
+        found = identify(described, [recording.between(start_s, end_s)], None)
     except LogError:
-        bounds = f"{given.begin_s + start_s:g} to {given.begin_s + end_s:g} s"
+        begin_s = recording.columns.begin_s
+        bounds = f"{begin_s + start_s:g} to {begin_s + end_s:g} s"
         raise ArrayError(
             f"too little free motion to fit from {bounds}: {2 * SHORTEST_SAMPLES} samples in a row are the least"
         ) from None
@@ -222,10 +206,10 @@ def detect(
 
     Raises ArrayError, a ValueError, for unusable input, in one line: quantity, value, bound.
     """
-    given = _taken(arrays, arm, velocity_lag_s)
-    recording, begin_s = given.recording, given.begin_s
+    recording = _taken(arrays, arm, velocity_lag_s)
+    begin_s = recording.columns.begin_s
     if model is None:
-        model = _fitted(given, arm, fit_s, scheme)
+        model = _fitted(recording, arm, fit_s, scheme)
     elif fit_s is not None or scheme:
         raise ArrayError(
             f"model is given, and so is {'fit_s' if fit_s is not None else next(iter(scheme))}: choose one"
@@ -267,7 +251,7 @@ def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
     return named
 
 
-def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: float) -> _GivenArrays:
+def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: float) -> ForeignRecording:
     """Check arrays and make a recording of them. Raises ArrayError."""
     named = _named(arrays)
     t_s = _numbers("t", named["t"])
@@ -300,10 +284,9 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
     described = _described(arm, "dq" in named, {})
     try:
         given = RecordedColumns(t_s, float(t_s[0]), np.hstack(columns), touched, ())
-        recording = recording_of(Path("arrays"), described, given)
+        return recording_of(Path("arrays"), described, given)
     except LogError as error:
         raise ArrayError(str(error)) from None
-    return _GivenArrays(recording, float(t_s[0]), "dq" in named)
 
 
 def _numbers(name: str, given: ArrayLike) -> Vector:
@@ -324,13 +307,13 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
     return np.asarray(values, np.float64)
 
 
-def _span(given: _GivenArrays, fit_s: tuple[float, float] | None) -> tuple[float, float]:
+def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tuple[float, float]:
     """Return the span of free motion in the recording's time, from 0. Raises ArrayError."""
     if fit_s is None:
-        last = given.recording.stretches[-1]
-        return 0.0, FIT_SHARE * (last.start_s + len(last.record.q) * given.recording.period_s)
+        last = recording.stretches[-1]
+        return 0.0, FIT_SHARE * (last.start_s + len(last.record.q) * recording.period_s)
     try:
-        start_s, end_s = (float(bound) - given.begin_s for bound in fit_s)
+        start_s, end_s = (float(bound) - recording.columns.begin_s for bound in fit_s)
     except (TypeError, ValueError):
         raise ArrayError(f"fit_s = {fit_s!r} is no pair of times in s") from None
     if not start_s < end_s:
@@ -349,13 +332,8 @@ def _described(arm: OfflineArm, has_dq: bool, scheme: Mapping[str, Any]) -> Reco
     if len(plain.get("noise_Nm", names)) != arm.joints:
         raise ArrayError(f"noise_Nm has {len(plain['noise_Nm'])} values, the arm {arm.joints} joints")
     return RecordingMap(
+        urdf=arm.serial,
         arm=ArmSection(urdf="", has_rotors=arm.has_rotors),
         columns=ColumnsSection(time="t", q=names, tau_J=names, dq=names if has_dq else ()),
-        units=UnitsSection(),
-        scale=ScaleSection(),
-        csv=CsvSection(),
-        bag=BagSection(),
-        sampling=SamplingSection(),
         scheme=plain,
-        urdf=arm.serial,
     )

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import LogError, log_in
 from adacd_hil.log.logged_run import settings_of
-from adacd_hil.log.reader import LoggedContact, LoggedEvent, RunLog, read_log
+from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.records import ContactReport, SchemeState, Vector
 from adacd_hil.remedies import install_command, nearest_name
 from adacd_hil.score.metrics import certificates_in
@@ -131,19 +132,21 @@ class LoadedRun:
 
     def to_pandas(self) -> "pandas.DataFrame":
         """Make a data frame of `columns`, the index `t_s`. Raises ImportError with the command that installs pandas."""
-        try:
-            import pandas
-        except ImportError:
-            raise ImportError(f"to_pandas needs the extra `pandas`: {install_command('pandas')}") from None
-        return pandas.DataFrame(self.columns()).set_index("t_s")
+        frame: pandas.DataFrame = _extra("pandas").DataFrame(self.columns())
+        return frame.set_index("t_s")
 
     def to_polars(self) -> "polars.DataFrame":
         """Make a data frame of `columns`. Raises ImportError with the command that installs polars."""
-        try:
-            import polars
-        except ImportError:
-            raise ImportError(f"to_polars needs the extra `polars`: {install_command('polars')}") from None
-        return polars.DataFrame(self.columns())
+        frame: polars.DataFrame = _extra("polars").DataFrame(self.columns())
+        return frame
+
+
+def _extra(name: str) -> Any:
+    """Import a library that an extra installs."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise ImportError(f"to_{name} needs the extra `{name}`: {install_command(name)}") from None
 
 
 def load(run: str | Path) -> LoadedRun:
@@ -161,10 +164,11 @@ def load(run: str | Path) -> LoadedRun:
     arrays = {"t_s": (t_ns - zero_ns) * 1e-9, **arrays}
     for values in arrays.values():
         values.flags.writeable = False
+    events = sorted(log.events, key=lambda event: event.t_ns)
     return LoadedRun(
         path=path,
         arrays=arrays,
-        events=tuple(RunEvent((t_ns - zero_ns) * 1e-9, *event) for t_ns, event in _in_order(log.events)),
+        events=tuple(RunEvent((t_ns - zero_ns) * 1e-9, *event) for t_ns, event in events),
         contacts=tuple(_contacts(log.contacts, zero_ns)),
         metadata=log.metadata,
         attachments=log.attachments,
@@ -189,14 +193,11 @@ def _arrays(log: RunLog) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _in_order(events: Iterable[LoggedEvent]) -> list[LoggedEvent]:
-    return sorted(events, key=lambda event: event.t_ns)
-
-
-def _contacts(contacts: Iterable[LoggedContact], zero_ns: int) -> Iterator[RunContact]:
+def _contacts(reports: Iterable[tuple[int, ContactReport]], zero_ns: int) -> Iterator[RunContact]:
     """Yield each contact once: the time of its first report, and its last report."""
     found: dict[int, RunContact] = {}
-    for t_ns, report in contacts:
+    for t_ns, report in reports:
         first = found.get(report.cycle)
-        found[report.cycle] = RunContact((t_ns - zero_ns) * 1e-9 if first is None else first.t_s, report)
+        t_s = (t_ns - zero_ns) * 1e-9 if first is None else first.t_s
+        found[report.cycle] = RunContact(t_s, report)
     yield from found.values()

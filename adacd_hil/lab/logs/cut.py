@@ -15,7 +15,8 @@ from adacd_hil.lab.logs.log_copy import LogCopy
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import CUT, RUN_METADATA, LogError, TimeWindow
 from adacd_hil.log.mcap.chunks import Contents
-from adacd_hil.log.reader import LoggedContact, read_log
+from adacd_hil.log.reader import read_log
+from adacd_hil.records import ContactReport
 
 
 class Cut(NamedTuple):
@@ -38,15 +39,15 @@ def find_contact(path: Path, contact: int, around_s: float) -> TimeWindow:
     begun = contacts_begun(log.contacts)
     if not 1 <= contact <= len(begun):
         raise LogError(f"log {path} has {len(begun)} contacts: there is no contact {contact}")
-    at_s = (begun[contact - 1].t_ns + log.epoch_ns - _start_ns(path)) * 1e-9
+    at_s = (begun[contact - 1] + log.epoch_ns - _start_ns(path)) * 1e-9
     return TimeWindow(at_s - around_s, at_s + around_s)
 
 
-def contacts_begun(contacts: Iterable[LoggedContact]) -> list[LoggedContact]:
-    """Take the first report of each contact: all reports of one name the cycle in which it began."""
-    begun: dict[int, LoggedContact] = {}
-    for contact in contacts:
-        begun.setdefault(contact.report.cycle, contact)
+def contacts_begun(reports: Iterable[tuple[int, ContactReport]]) -> list[int]:
+    """Give the time of each contact's first report, ns: all reports of one name the cycle in which it began."""
+    begun: dict[int, int] = {}
+    for t_ns, report in reports:
+        begun.setdefault(report.cycle, t_ns)
     return list(begun.values())
 
 

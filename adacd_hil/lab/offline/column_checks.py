@@ -12,8 +12,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.lab.offline.recording_import import MEDIAN_TO_SIGMA, ForeignRecording, derivative_window, derive
+from adacd_hil.lab.offline.recording_import import ForeignRecording, derivative_window, derive, samples
 from adacd_hil.lab.offline.recording_map import RecordingMap, units_by_slope
+from adacd_hil.lab.signal_noise import white_noise
 from adacd_hil.records import Vector
 from adacd_hil.scheme.model.urdf import SerialArm
 from adacd_hil.score.wording import number_of
@@ -86,9 +87,7 @@ def find_faults(
     stretches = [stretch for recording in recordings for stretch in recording.stretches]
     period_s = recordings[0].period_s
     times = [stretch.start_s + period_s * np.arange(len(stretch.record.q)) for stretch in stretches]
-    q, dq, tau_J = (
-        np.concatenate([getattr(stretch.record, name) for stretch in stretches]) for name in ("q", "dq", "tau_J")
-    )
+    q, dq, tau_J = (samples(recordings, name) for name in ("q", "dq", "tau_J"))
     columns = _Columns(np.concatenate(times), q, dq, tau_J, period_s)
     found = [*_of_torques(described, columns), *_of_positions(described, columns), *_of_spikes(described, columns)]
     still = np.ptp(q, axis=0) < STILL_RAD
@@ -165,9 +164,7 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
     """Return the map's key that changes the unit of all joints, or the scale of some."""
     if is_meant.all():
         return f'`units.{key}` = "{unit}", which the map has as "{getattr(described.units, key)}"'
-    scale = np.array(getattr(described.scale, key) or (1.0,) * described.joints)
-    values = np.where(is_meant, scale * factor, scale).tolist()
-    return f"`scale.{key}` = [{', '.join(f'{value:.6g}' for value in values)}]"
+    return described.scaled(key, np.where(is_meant, factor, 1.0))
 
 
 def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
@@ -245,7 +242,7 @@ def _spikes(column: Vector) -> NDArray[np.int64]:
         return np.zeros(0, np.int64)
     windows = np.lib.stride_tricks.sliding_window_view(column, _SPIKE_WINDOW)
     apart = np.abs(column[2:-2] - np.median(windows, axis=1))
-    noise = MEDIAN_TO_SIGMA * np.median(np.abs(np.diff(column, 2)))
+    noise = float(white_noise(column))
     usual = np.ptp(np.quantile(column, (0.005, 0.995)))
     rows = np.flatnonzero(apart > max(_SPIKE_SIGMAS * noise, _SPIKE_SPAN * usual)) + 2
     return rows if len(rows) <= _SPIKES_SHARE * len(column) else rows[:0]
@@ -261,8 +258,7 @@ def _of_rest(
     described: RecordingMap, part: str, recordings: Sequence[ForeignRecording], still: NDArray[np.bool_]
 ) -> Iterator[RecordingFinding]:
     """Report joints that rest in the fitted, or the tested, part although they move in the other one. still (n,)."""
-    q = np.concatenate([stretch.record.q for recording in recordings for stretch in recording.stretches])
-    rests = np.ptp(q, axis=0) < STILL_RAD
+    rests = np.ptp(samples(recordings, "q"), axis=0) < STILL_RAD
     joints = np.flatnonzero(rests & ~still).tolist()
     if joints:
         names = "the arm" if rests.all() else joined_names([described.urdf.joint_names[i] for i in joints], len(rests))
@@ -279,13 +275,12 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
     products = np.zeros((n, n))
     window = derivative_window(described, recordings[0].period_s)
     squares, own = np.zeros(n), np.zeros(n)
-    for stretch in (stretch for recording in recordings for stretch in recording.stretches):
-        if len(stretch.record.q) < window:
-            continue
-        slope = derive(stretch.record.q, recordings[0].period_s, window)
-        products += slope.T @ stretch.record.dq
-        squares += np.sum(slope**2, axis=0)
-        own += np.sum(stretch.record.dq**2, axis=0)
+    for record in (record for recording in recordings for record in recording.records):
+        if len(record.q) >= window:
+            slope = derive(record.q, recordings[0].period_s, window)
+            products += slope.T @ record.dq
+            squares += np.sum(slope**2, axis=0)
+            own += np.sum(record.dq**2, axis=0)
     slopes = np.diag(products) / np.maximum(squares, 1e-12)
     alike = products / np.sqrt(np.maximum(np.outer(squares, own), 1e-24))
     moving = [joint for joint in range(n) if squares[joint] > 0.0]
@@ -339,8 +334,7 @@ def plateau(torque: Vector) -> tuple[float, float] | None:
     The last band below the extreme reading, as wide as the noise, holds far more readings than the band before it. A
     joint that overcomes only friction looks like this, too.
     """
-    noise = float(MEDIAN_TO_SIGMA) * float(np.median(np.abs(np.diff(torque, 2))))
-    width, span = 2.0 * _PLATEAU_SIGMAS * noise, float(np.ptp(torque))
+    width, span = 2.0 * _PLATEAU_SIGMAS * float(white_noise(torque)), float(np.ptp(torque))
     if not 0.0 < width < _PLATEAU_WIDTH * span:
         return None
     for sign in (1.0, -1.0):

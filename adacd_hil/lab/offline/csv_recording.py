@@ -41,20 +41,13 @@ _KINDS_OF_FILE: Final = (
 )
 
 
-class CsvHead(NamedTuple):
-    """The first row: heads, empty if the map announces no head, and the number of cells."""
-
-    heads: list[str]
-    cells: int
-
-
 class _Column(NamedTuple):
-    """A wanted column: name in errors, index from 0, the function that reads a cell, and its unit in the map."""
+    """A wanted column: name in errors, "" of times that there are not; index from 0; reader of a cell; unit."""
 
     name: str
     place: int
     read: Callable[[str], float]
-    unit: str
+    unit: str = ""
 
 
 def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
@@ -65,11 +58,11 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
     rows = _rows(path, described)
     first = next(rows, (1, []))
     head = _head(path, first[1], described)
-    columns = _columns(path, head, described)
+    columns = _columns(path, head if described.csv.has_header else [], len(head), described)
     read = RecordedRows(path, len(columns), described.time_s, span)
     if not columns[0].name:
         read.notes.append(f"no column of times: a row every {described.sampling.period_s:g} s (sampling.period_s)")
-    reader = _RowReader(path, columns, described, head.cells)
+    reader = _RowReader(path, columns, described, len(head))
     for number, cells in rows if described.csv.has_header else chain([first], rows):
         if row := reader.read(number, cells, read):
             read.append(number, row)
@@ -79,7 +72,7 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
     return read.columns(described, names, has_touches=bool(described.columns.contact))
 
 
-def _head(path: Path, first: list[str], described: RecordingMap) -> CsvHead:
+def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
     while first and not first[-1].strip():  # a delimiter at the end of every row
         first = first[:-1]
     heads = [cell.strip() for cell in first]
@@ -89,7 +82,7 @@ def _head(path: Path, first: list[str], described: RecordingMap) -> CsvHead:
         for delimiter in DELIMITERS:
             if delimiter != described.csv.delimiter and len(heads[0].split(delimiter)) > 2:
                 raise ConfigError(f"recording {path} has one column; with `csv.delimiter` = {delimiter!r} it has more")
-    return CsvHead(heads if described.csv.has_header else [], len(heads))
+    return heads
 
 
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
@@ -138,43 +131,40 @@ def _open_text(path: Path) -> TextIO:
     return io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
 
 
-def _columns(path: Path, head: CsvHead, described: RecordingMap) -> list[_Column]:
+def _columns(path: Path, heads: list[str], cells: int, described: RecordingMap) -> list[_Column]:
     """Find the columns: time, positions, torques, velocities, touches. Raises ConfigError."""
     columns, units = described.columns, described.units
     number = partial(read_number, decimal=",") if described.csv.decimal == "," else float
-    time = _time_column(path, head, described)
-    wanted = (
-        *((name, units.q) for name in columns.q),
-        *((name, units.tau_J) for name in columns.tau_J),
-        *((name, units.dq) for name in columns.dq),
-        *((name, "") for name in filter(None, (columns.contact,))),
-    )
-    return [time, *(_Column(name, find_column(name, head, path), number, unit) for name, unit in wanted)]
+    contact = (columns.contact,) if columns.contact else ()
+    found = [_time_column(path, heads, cells, described)]
+    for names, unit in ((columns.q, units.q), (columns.tau_J, units.tau_J), (columns.dq, units.dq), (contact, "")):
+        found += [_Column(name, _place(path, name, heads, cells), number, unit) for name in names]
+    return found
 
 
-def _time_column(path: Path, head: CsvHead, described: RecordingMap) -> _Column:
+def _time_column(path: Path, heads: list[str], cells: int, described: RecordingMap) -> _Column:
     """Find the time column; without one, if the map gives a period, a nameless column. Raises ConfigError."""
     name, units = described.columns.time, described.units
     read = _time_reader(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
     has_period = described.sampling.period_s > 0.0
-    if name and not (has_period and name not in head.heads and nearest_name(name, head.heads) is None):
+    if name and not (has_period and name not in heads and nearest_name(name, heads) is None):
         try:
-            return _Column(name, find_column(name, head, path), read, units.time)
+            return _Column(name, _place(path, name, heads, cells), read, units.time)
         except ConfigError as error:
             raise ConfigError(f"{error}; without times, give their distance by `sampling.period_s`") from None
     if not has_period:
         raise ConfigError("missing key `columns.time`; where there are no times `sampling.period_s` is the period")
-    return _Column("", 0, read, "")
+    return _Column("", 0, read)
 
 
-def find_column(name: str, head: CsvHead, path: Path) -> int:
+def _place(path: Path, name: str, heads: list[str], cells: int) -> int:
     """Find a column by its head or its number from 1. Raises ConfigError."""
-    if name in head.heads:
-        return head.heads.index(name)
-    if name.isdecimal() and 1 <= int(name) <= head.cells:
+    if name in heads:
+        return heads.index(name)
+    if name.isdecimal() and 1 <= int(name) <= cells:
         return int(name) - 1
-    nearest = nearest_name(name, head.heads)
-    known = f"did you mean {nearest!r}?" if nearest else f"there are {', '.join(head.heads) or f'1 to {head.cells}'}"
+    nearest = nearest_name(name, heads)
+    known = f"did you mean {nearest!r}?" if nearest else f"there are {', '.join(heads) or f'1 to {cells}'}"
     raise ConfigError(f"recording {path} has no column {name!r}; {known}")
 
 
@@ -278,17 +268,17 @@ def _iso_seconds(text: str) -> Decimal:
 
 def is_number(text: str, decimal: str) -> bool:
     """Tell whether a text is a number with this decimal sign."""
-    try:
-        read_number(text, decimal)
-    except ValueError:
-        return False
-    return True
+    return _is_readable(text, partial(read_number, decimal=decimal))
 
 
 def is_iso_time(text: str) -> bool:
     """Tell whether a text is a date and time of ISO 8601."""
+    return _is_readable(text, _iso_seconds)
+
+
+def _is_readable(text: str, read: Callable[[str], object]) -> bool:
     try:
-        _iso_seconds(text)
+        read(text)
     except ValueError:
         return False
     return True

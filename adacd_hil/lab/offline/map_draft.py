@@ -23,7 +23,6 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import toml_value
 
 _FINGERS: Final = re.compile(r"finger|gripper|claw|knuckle|jaw", re.IGNORECASE)
-_DEGREES: Final = 180.0 / np.pi
 _BEYOND: Final = 1.5
 """Factor on the limits of the URDF, from which positions are degrees."""
 _BEYOND_EFFORT: Final = 5.0
@@ -117,31 +116,26 @@ def _of_table(recording: Path, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
+    """Draft the units that differ from the map's defaults."""
     keys = []
+
+    def add_unit(role: str, default: str, guessed: str, reason: str) -> str:
+        unit = guess.units.get(role) or guessed
+        if unit != default:
+            keys.append(DraftedKey("units", role, unit, "" if role in guess.units else reason))
+        return unit
+
     step = 1e-3
     if guess.is_iso:
         keys.append(DraftedKey("units", "time", ISO, ""))
     elif "time" in guess.columns:
         step = float(np.nanmedian(np.diff(guess.of("time")[:, 0])))
-        unit = guess.units.get("time") or time_unit_of(step) or "s"
-        if unit != "s":
-            why = "" if "time" in guess.units else f"rows are {step:g} {unit} apart"
-            keys.append(DraftedKey("units", "time", unit, why))
-        step *= TIME_S[unit]
-    angle = guess.units.get("q") or _angle_unit(guess.of("q"), arm)
-    if "q" in guess.units or angle != "rad":
-        why = "" if "q" in guess.units else _span(guess.of("q"), arm)
-        keys.append(DraftedKey("units", "q", angle, why))
+        guessed = time_unit_of(step) or "s"
+        step *= TIME_S[add_unit("time", "s", guessed, f"rows are {step:g} {guessed} apart")]
+    angle = add_unit("q", "rad", *_angle_unit(guess.of("q"), arm))
     if "dq" in guess.columns:
-        speed = guess.units.get("dq") or _speed_unit(guess, angle, step)
-        if speed != "rad/s":
-            keys.append(
-                DraftedKey("units", "dq", speed, "" if "dq" in guess.units else "by the slope of the positions")
-            )
-    torque = guess.units.get("tau_J") or _torque_unit(guess.of("tau_J"), arm)
-    if torque != "Nm":
-        why = "" if "tau_J" in guess.units else _reach(guess.of("tau_J"), arm)
-        keys.append(DraftedKey("units", "tau_J", torque, why))
+        add_unit("dq", "rad/s", _speed_unit(guess, angle, step), "by the slope of the positions")
+    torque = add_unit("tau_J", "Nm", *_torque_unit(guess.of("tau_J"), arm))
     if torque in ("A", "mA"):
         ones = (1.0,) * len(arm.joint_names)
         keys.append(DraftedKey("scale", "tau_J", ones, "Nm/A of each joint, which only its maker knows"))
@@ -149,43 +143,34 @@ def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
     return keys
 
 
-def _angle_unit(q: Vector, arm: SerialArm) -> str:
-    """Return "deg" if positions go far beyond the URDF's limits in radians, else "rad"."""
-    bound = _bounds(arm)
-    reach = np.nanmax(np.abs(q), axis=0)
-    is_revolute = arm.chain.is_prismatic == 0.0
-    return "deg" if np.any((reach > _BEYOND * bound) & is_revolute) else "rad"
-
-
-def _bounds(arm: SerialArm) -> Vector:
+def _angle_unit(q: Vector, arm: SerialArm) -> tuple[str, str]:
+    """Return "deg" and the reason if positions go far beyond the URDF's limits in radians, else "rad"."""
     bound = np.maximum(np.abs(arm.position_low), np.abs(arm.position_high))
-    return np.where(np.isfinite(bound) & (bound > 0.0), bound, 2.0 * np.pi)
-
-
-def _span(q: Vector, arm: SerialArm) -> str:
-    reach, bound = np.nanmax(np.abs(q), axis=0), _bounds(arm)
-    joint = int(np.argmax(reach / bound))
-    return f"{arm.joint_names[joint]} goes to {reach[joint]:.3g}, the URDF to {bound[joint]:.3g} rad"
+    bound = np.where(np.isfinite(bound) & (bound > 0.0), bound, 2.0 * np.pi)
+    reach = np.nanmax(np.abs(q), axis=0)
+    over = np.nan_to_num(reach / bound) * (arm.chain.is_prismatic == 0.0)
+    joint = int(np.argmax(over))
+    if over[joint] <= _BEYOND:
+        return "rad", ""
+    return "deg", f"{arm.joint_names[joint]} goes to {reach[joint]:.3g}, the URDF to {bound[joint]:.3g} rad"
 
 
 def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
     """Return the unit in which velocities equal the slope of the positions."""
-    slope = np.gradient(guess.of("q"), axis=0) / step_s * (1.0 / _DEGREES if angle == "deg" else 1.0)
+    slope = np.gradient(guess.of("q"), axis=0) / step_s * (np.pi / 180.0 if angle == "deg" else 1.0)
     square = np.nansum(slope**2)
     factor = abs(float(np.nansum(slope * guess.of("dq")) / square)) if square > 0.0 else 1.0
     return next((unit for key, unit in units_by_slope(UnitsSection(), factor) if key == "dq"), "rad/s")
 
 
-def _torque_unit(tau: Vector, arm: SerialArm) -> str:
-    """Return "mNm" if torques exceed the effort of the URDF, but wouldn't in mNm, else "Nm"."""
+def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
+    """Return "mNm" and the reason if torques exceed the effort of the URDF, but wouldn't in mNm, else "Nm"."""
     largest, effort = largest_torques(tau, arm)
-    return "mNm" if np.any(largest > _BEYOND_EFFORT * effort) else "Nm"
-
-
-def _reach(tau: Vector, arm: SerialArm) -> str:
-    largest, effort = largest_torques(tau, arm)
-    joint = int(np.nanargmax(largest / effort))
-    return f"they reach {largest[joint]:.3g}, the effort of the URDF is {effort[joint]:g} Nm"
+    over = np.nan_to_num(largest / effort)
+    joint = int(np.argmax(over))
+    if over[joint] <= _BEYOND_EFFORT:
+        return "Nm", ""
+    return "mNm", f"they reach {largest[joint]:.3g}, the effort of the URDF is {effort[joint]:g} Nm"
 
 
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
@@ -216,10 +201,10 @@ def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
         q, tau = (
             np.array([[row.get(name, np.nan) for name in chosen] for row in rows]) for rows in (positions, efforts)
         )
-        if np.isfinite(q).any() and _angle_unit(q, arm) != "rad":
-            keys.append(DraftedKey("units", "q", "deg", _span(q, arm)))
-        if np.isfinite(tau).any() and _torque_unit(tau, arm) != "Nm":
-            keys.append(DraftedKey("units", "tau_J", "mNm", _reach(tau, arm)))
+        for key, values, unit_of, default in (("q", q, _angle_unit, "rad"), ("tau_J", tau, _torque_unit, "Nm")):
+            unit, reason = unit_of(values, arm) if np.isfinite(values).any() else (default, "")
+            if unit != default:
+                keys.append(DraftedKey("units", key, unit, reason))
     return keys
 
 

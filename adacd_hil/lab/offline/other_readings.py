@@ -41,29 +41,29 @@ UNITS: Final = {"deg": "degrees", "rad": "radians"}
 
 
 class Reading(NamedTuple):
-    """A reading that fits: its description, the key of the map, and the least share of torque explained at a joint."""
+    """A tried reading: its description and the key of the map, "" for the map's own.
+
+    weight: number of differences from the map. unexplained: largest share of a joint's torque that it leaves in the
+    test. is_possible: an arm can have its parameters.
+    """
 
     text: str
     remedy: str
-    share: float
+    weight: int
+    unexplained: float
+    is_possible: bool
 
 
 class _Motion(NamedTuple):
-    """A reading of the motion. T (n, n), R (n, n) of the torques: see above; R None: unchanged."""
+    """A reading of the motion. T (n, n), R (n, n) of the torques: see above; R None: unchanged. turned: one joint."""
 
-    kind: str  # "map": unchanged
+    text: str
+    remedy: str
+    model: ArmModel
     T: Vector
     R: Vector | None = None
-    joints: tuple[int, ...] = ()
-    unit: str = ""
-    has_rotors: bool | None = None  # None: as in the map
-    gravity_m_s2: tuple[float, ...] | None = None  # None: as in the map
+    turned: int | None = None
     is_of_velocities: bool = True
-
-    @property
-    def weight(self) -> int:
-        """Number of differences from the map."""
-        return int(self.kind != "map")
 
 
 class _Torques(NamedTuple):
@@ -71,11 +71,8 @@ class _Torques(NamedTuple):
 
     signs: tuple[float, ...]
     places: tuple[int, ...]
-
-    @property
-    def weight(self) -> int:
-        """Number of differences from the map."""
-        return min(self.signs.count(-1.0), 2) + (self.places != tuple(range(len(self.places))))
+    text: str = ""
+    remedy: str = ""
 
 
 class _Equations(NamedTuple):
@@ -93,49 +90,28 @@ class _Equations(NamedTuple):
         return np.maximum(np.diag(self.S) - self.u**2 / np.maximum(self.U, 1e-18), 1e-18)
 
 
-class _Judged(NamedTuple):
-    motion: _Motion
-    torques: _Torques
-    unexplained: float  # the largest share of a joint
-    is_possible: bool
-
-    @property
-    def weight(self) -> int:
-        return self.motion.weight + self.torques.weight
-
-
 def find_readings(
     described: RecordingMap, model: ArmModel, settings: OfflineSettings, fitted: list[Record], tested: list[Record]
-) -> tuple[Reading, ...]:
+) -> list[Reading]:
     """Return the readings that explain the test far better than the map's; the simplest of nearly equal ones first."""
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
     settings = replace(settings, period_s=step * settings.period_s, fit_every=max(1, round(settings.fit_every / step)))
-    judged: list[_Judged] = []
+    tried: list[Reading] = []
     for motion in _motions(described, model):
-        other = _model_of(model, motion)
-        fit, test = (_equations(other, part, settings, motion) for part in (fitted, tested))
+        fit, test = (_equations(part, settings, motion) for part in (fitted, tested))
         if fit is not None and test is not None:
-            for torques in _torques(model.joints, most_turned=1 if motion.weight else model.joints):
-                judged.append(_judge(other, fit, test, motion, torques, fitted))
-    of_map = next((each for each in judged if each.weight == 0), None)
+            for torques in _torques(described, most_turned=1 if motion.text else model.joints):
+                tried.append(_judge(described, fit, test, motion, torques, fitted))
+    of_map = next((each for each in tried if each.weight == 0), None)
     if of_map is None:
-        return ()
+        return []
     limit = min(1.0 - EXPLAINED, _BETTER * of_map.unexplained if of_map.is_possible else 1.0)
-    right = [each for each in judged if each.weight and each.is_possible and each.unexplained <= limit]
-    if not right:
-        return ()
-    best = min(each.unexplained for each in right)
+    right = [each for each in tried if each.weight and each.is_possible and each.unexplained <= limit]
+    best = min((each.unexplained for each in right), default=0.0)
     alike = [each for each in right if each.unexplained <= max(_ALIKE * best, best + 1e-4)]
-    simplest = min(each.weight for each in alike)
-    named = sorted((each for each in alike if each.weight == simplest), key=lambda each: each.unexplained)
-    return tuple(Reading(*_texts(described, each), 1.0 - each.unexplained) for each in named)
-
-
-def _model_of(model: ArmModel, motion: _Motion) -> ArmModel:
-    if motion.gravity_m_s2 is not None:
-        return offline.model_of(model.chain._replace(gravity_m_s2=np.array(motion.gravity_m_s2)), model.has_rotors)
-    return model if motion.has_rotors is None else offline.model_of(model.chain, motion.has_rotors)
+    simplest = min((each.weight for each in alike), default=0)
+    return sorted((each for each in alike if each.weight == simplest), key=lambda each: each.unexplained)
 
 
 def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
@@ -145,10 +121,14 @@ def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
     idle = _IDLE_FRICTION * (np.abs(F_c).max() + np.abs(F_v).max() * speed.mean()) * speed
     if np.any(F_c * speed + F_v * square < -idle):
         return False
-    poses = q[:: max(1, len(q) // 8)]
-    return all(
-        float(offline.mass_terms(model, pose, unit) @ theta) > 0.0 for pose in poses for unit in np.eye(len(F_c))
-    )
+    return bool(np.all(mass_rows(model, q, 8) @ theta > 0.0))
+
+
+def mass_rows(model: ArmModel, q: Vector, poses: int) -> Vector:
+    """Return the rows (m, n, p) whose product with theta is the inertia about each joint, in some poses of q (k, n)."""
+    units = np.eye(model.joints)
+    spread = q[:: max(1, len(q) // poses)]
+    return np.array([[offline.mass_terms(model, pose, unit) for unit in units] for pose in spread])
 
 
 def _step(settings: OfflineSettings) -> int:
@@ -167,8 +147,9 @@ def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
     return kept
 
 
-def _equations(model: ArmModel, records: list[Record], settings: OfflineSettings, motion: _Motion) -> _Equations | None:
+def _equations(records: list[Record], settings: OfflineSettings, motion: _Motion) -> _Equations | None:
     """Sum the normal equations of a reading of the motion; None if its numbers overflow."""
+    model = motion.model
     n, p = model.joints, len(model.parameter_names)
     found = _Equations(*(np.zeros(shape) for shape in ((n, p, p), (n, n, p), (n, n), (n,), (1,))))
     offset = model.place_of("offset").start
@@ -189,10 +170,15 @@ def _equations(model: ArmModel, records: list[Record], settings: OfflineSettings
 
 
 def _judge(
-    model: ArmModel, fit: _Equations, test: _Equations, motion: _Motion, torques: _Torques, fitted: list[Record]
-) -> _Judged:
-    """Fit one reading; return the largest share of a joint's torque that it leaves unexplained in the test."""
-    signs, places, joints = np.array(torques.signs), list(torques.places), range(model.joints)
+    described: RecordingMap,
+    fit: _Equations,
+    test: _Equations,
+    motion: _Motion,
+    torques: _Torques,
+    fitted: list[Record],
+) -> Reading:
+    """Fit one reading, and test it."""
+    signs, places, joints = np.array(torques.signs), list(torques.places), range(motion.model.joints)
     weight = 1.0 / fit.spread[places]
     A = np.tensordot(weight, fit.A, axes=1)
     b = np.sum([weight[i] * signs[i] * fit.b[i, places[i]] for i in joints], axis=0)
@@ -203,59 +189,95 @@ def _judge(
         for i in joints
     ]
     unexplained = float(np.max(np.maximum(left, 0.0) / test.spread[places]))
-    is_of_map = motion.weight + torques.weight == 0
-    if unexplained > 1.0 - EXPLAINED and not is_of_map:
-        return _Judged(motion, torques, unexplained, is_possible=False)
-    q, dq = (np.concatenate([getattr(record, name) for record in fitted]) @ motion.T.T for name in ("q", "dq"))
-    return _Judged(motion, torques, unexplained, is_possible(model, theta, q, dq))
+    turned = np.flatnonzero(signs < 0.0).tolist()
+    differences = bool(motion.text) + min(len(turned), 2) + (places != list(joints))
+    texts, remedies = [motion.text, torques.text], [motion.remedy, torques.remedy]
+    if turned == [motion.turned]:
+        texts = [f"{described.urdf.joint_names[turned[0]]} counts the other way round, position and torque"]
+    is_right = differences == 0 or unexplained <= 1.0 - EXPLAINED
+    if is_right:
+        q, dq = (np.concatenate([getattr(record, name) for record in fitted]) @ motion.T.T for name in ("q", "dq"))
+        is_right = is_possible(motion.model, theta, q, dq)
+    text, remedy = ", and ".join(filter(None, texts)), ", ".join(filter(None, dict.fromkeys(remedies)))
+    return Reading(text, remedy, differences, unexplained, is_right)
 
 
-def _torques(n: int, most_turned: int) -> Iterator[_Torques]:
+def _torques(described: RecordingMap, most_turned: int) -> Iterator[_Torques]:
     """Yield readings of torques: some or all turned, two exchanged, all in reverse order."""
+    n, names = described.joints, described.urdf.joint_names
     straight, ones = tuple(range(n)), (1.0,) * n
-    for signs in itertools.product((1.0, -1.0), repeat=min(n, _MOST_SIGNS)):
-        turned = signs.count(-1.0)
-        if turned <= most_turned or turned == n:
-            yield _Torques(signs + ones[len(signs) :], straight)
-    for i, j in itertools.combinations(range(n), 2):
-        yield _Torques(ones, tuple(_exchanged(n, i, j)))
+    for choice in itertools.product((1.0, -1.0), repeat=min(n, _MOST_SIGNS)):
+        turned = [i for i, sign in enumerate(choice) if sign < 0.0]
+        signs = choice + ones[len(choice) :]
+        if not turned:
+            yield _Torques(ones, straight)
+        elif len(turned) in (*range(most_turned + 1), n):
+            some = "all torques have" if len(turned) == n > 1 else f"the torque of {_both(names, turned)} has"
+            remedy = described.scaled("tau_J", np.array(signs))
+            yield _Torques(signs, straight, f"{some} the other sign", remedy)
+    for pair in itertools.combinations(range(n), 2):
+        text = f"the torques of {_both(names, pair)} are exchanged"
+        yield _Torques(ones, tuple(_exchanged(n, *pair)), text, "exchange them in `columns.tau_J`")
     if n > 3:
-        yield _Torques(ones, straight[::-1])
+        text, remedy = "the torques begin with the outermost joint", "turn the order round in `columns.tau_J`"
+        yield _Torques(ones, straight[::-1], text, remedy)
 
 
 def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
     """Yield readings of the motion, the map's first."""
-    n, straight = model.joints, np.eye(model.joints)
-    yield _Motion("map", straight)
+    n, straight, names = model.joints, np.eye(model.joints), described.urdf.joint_names
+    yield _Motion("", "", model, straight)
     for unit, factor in (("deg", math.pi / 180.0), ("rad", 180.0 / math.pi)):
         if unit != described.units.q:
-            yield _Motion("unit", factor * straight, unit=unit)
+            found = _Motion(f"the positions are {UNITS[unit]}", f'`units.q` = "{unit}"', model, factor * straight)
+            yield found
             if described.columns.dq:
-                yield _Motion("unit", factor * straight, unit=unit, is_of_velocities=False)
+                yield found._replace(is_of_velocities=False)
     for i in range(n):
-        yield _Motion("turned", np.diag(np.where(np.arange(n) == i, -1.0, 1.0)), joints=(i,))
-    for i, j in itertools.combinations(range(n), 2):
-        swap = straight[_exchanged(n, i, j)]
-        yield _Motion("exchanged", swap, joints=(i, j))
-        yield _Motion("joints", swap, swap, joints=(i, j))
+        signs = np.where(np.arange(n) == i, -1.0, 1.0)
+        text = f"the position of {names[i]} counts the other way round"
+        yield _Motion(text, described.scaled("q", signs), model, np.diag(signs), turned=i)
+    both_columns = "`columns.q`, `columns.tau_J`"
+    for pair in itertools.combinations(range(n), 2):
+        swap, both = straight[_exchanged(n, *pair)], _both(names, pair)
+        yield _Motion(f"the positions of {both} are exchanged", "exchange them in `columns.q`", model, swap)
+        text = f"{both} are exchanged, positions and torques"
+        yield _Motion(text, f"exchange them in {both_columns}", model, swap, swap)
     if n > 3:
-        yield _Motion("order", straight[::-1], straight[::-1])
+        text, remedy = "the columns begin with the outermost joint", f"turn the order round in {both_columns}"
+        yield _Motion(text, remedy, model, straight[::-1], straight[::-1])
     # A column may count from the base, or with the joint before, as behind belts: then torques do the same power.
-    for i, sign in itertools.product(range(1, n), (-1.0, 1.0)):
+    for i, (sign, what) in itertools.product(range(1, n), ((-1.0, "sum"), (1.0, "difference"))):
         T = straight.copy()
         T[i, i - 1] = sign
-        for R in (None, np.linalg.inv(T).T.astype(np.float64)):
-            yield _Motion("sum" if sign < 0.0 else "difference", T, R, joints=(i - 1, i))
+        text = f"the column of {names[i]} has the {what} of {_both(names, (i - 1, i))}"
+        yield from _coupled(text, model, T)
     if n > 2:
-        T = straight - np.eye(n, k=-1)
-        for R in (None, np.linalg.inv(T).T.astype(np.float64)):
-            yield _Motion("absolute", T, R)
-    yield _Motion("rotors", straight, has_rotors=not model.has_rotors)
+        text = "each position counts from the base, not from the link before"
+        yield from _coupled(text, model, straight - np.eye(n, k=-1))
+    text = "the torques turn no rotors"
+    if not model.has_rotors:
+        text = "the torques are those of geared motors, which turn their rotors too"
+    turning = offline.model_of(model.chain, not model.has_rotors)
+    yield _Motion(text, f"`arm.has_rotors` = {str(turning.has_rotors).lower()}", turning, straight)
     gravity_of_map = model.chain.gravity_m_s2
     size = float(np.linalg.norm(gravity_of_map)) or float(np.linalg.norm(STANDARD_GRAVITY_M_S2))
-    for direction in (np.zeros(3), *np.eye(3), *-np.eye(3)):
-        if not np.allclose(size * direction, gravity_of_map):
-            yield _Motion("gravity", straight, gravity_m_s2=tuple((size * direction + 0.0).tolist()))
+    for axis, direction in zip(
+        ("", "+x", "+y", "+z", "-x", "-y", "-z"), (np.zeros(3), *np.eye(3), *-np.eye(3)), strict=True
+    ):
+        gravity = size * direction + 0.0
+        if not np.allclose(gravity, gravity_of_map):
+            text = f"gravity acts along {axis} of the URDF's root" if axis else "there is no gravity in the torques"
+            remedy = f"`arm.gravity_m_s2` = [{', '.join(f'{value:g}' for value in gravity)}]"
+            other = offline.model_of(model.chain._replace(gravity_m_s2=gravity), model.has_rotors)
+            yield _Motion(text, remedy, other, straight)
+
+
+def _coupled(text: str, model: ArmModel, T: Vector) -> Iterator[_Motion]:
+    """Yield coupled positions, without and with the torques that do the same power."""
+    remedy = "record the joints' own positions and torques, or write them into new columns"
+    yield _Motion(text, remedy, model, T)
+    yield _Motion(f"{text}, and so do the torques", remedy, model, T, np.linalg.inv(T).T.astype(np.float64))
 
 
 def _exchanged(n: int, i: int, j: int) -> list[int]:
@@ -264,65 +286,5 @@ def _exchanged(n: int, i: int, j: int) -> list[int]:
     return places
 
 
-def _texts(described: RecordingMap, judged: _Judged) -> tuple[str, str]:
-    """Return a reading's description, and the change of the map that adopts it."""
-    motion, torques = judged.motion, judged.torques
-    turned = [i for i, sign in enumerate(torques.signs) if sign < 0.0]
-    if motion.kind == "turned" and turned == list(motion.joints):
-        keys = f"{_scale(described, 'q', turned)}, {_scale(described, 'tau_J', turned)}"
-        return f"{described.urdf.joint_names[turned[0]]} counts the other way round, position and torque", keys
-    pairs = [_motion_texts(described, motion)] if motion.weight else []
-    pairs += [_torque_texts(described, torques, turned)] if torques.weight else []
-    return ", and ".join(text for text, _ in pairs), ", ".join(dict.fromkeys(remedy for _, remedy in pairs))
-
-
-def _motion_texts(described: RecordingMap, motion: _Motion) -> tuple[str, str]:
-    names = [described.urdf.joint_names[joint] for joint in motion.joints]
-    both, last = " and ".join(names), names[-1] if names else ""
-    likewise = ", and so do the torques" if motion.R is not None else ""
-    own = "record the joints' own positions and torques, or write them into new columns"
-    columns = "`columns.q`, `columns.tau_J`"
-    gravity = motion.gravity_m_s2 or (0.0, 0.0, 0.0)
-    along = next(
-        (f"{'-' if value < 0.0 else '+'}{axis}" for axis, value in zip("xyz", gravity, strict=True) if value), ""
-    )
-    texts = {
-        "gravity": (
-            f"gravity acts along {along} of the URDF's root" if along else "there is no gravity in the torques",
-            f"`arm.gravity_m_s2` = [{', '.join(f'{value:g}' for value in gravity)}]",
-        ),
-        "unit": (f"the positions are {UNITS.get(motion.unit)}", f'`units.q` = "{motion.unit}"'),
-        "turned": (f"the position of {both} counts the other way round", _scale(described, "q", motion.joints)),
-        "exchanged": (f"the positions of {both} are exchanged", "exchange them in `columns.q`"),
-        "joints": (f"{both} are exchanged, positions and torques", f"exchange them in {columns}"),
-        "order": ("the columns begin with the outermost joint", f"turn the order round in {columns}"),
-        "sum": (f"the column of {last} has the sum of {both}{likewise}", own),
-        "difference": (f"the column of {last} has the difference of {both}{likewise}", own),
-        "absolute": (f"each position counts from the base, not from the link before{likewise}", own),
-        "rotors": (
-            "the torques are those of geared motors, which turn their rotors too"
-            if motion.has_rotors
-            else "the torques turn no rotors",
-            f"`arm.has_rotors` = {str(motion.has_rotors).lower()}",
-        ),
-    }
-    return texts[motion.kind]
-
-
-def _torque_texts(described: RecordingMap, torques: _Torques, turned: list[int]) -> tuple[str, str]:
-    n, names = len(torques.signs), described.urdf.joint_names
-    moved = [i for i in range(n) if torques.places[i] != i]
-    if len(moved) > 2:
-        return "the torques begin with the outermost joint", "turn the order round in `columns.tau_J`"
-    if moved:
-        both = " and ".join(names[i] for i in moved)
-        return f"the torques of {both} are exchanged", "exchange them in `columns.tau_J`"
-    some = " and ".join(names[i] for i in turned)
-    which = "all torques have" if len(turned) == n > 1 else f"the torque of {some} has"
-    return f"{which} the other sign", _scale(described, "tau_J", turned)
-
-
-def _scale(described: RecordingMap, key: str, turned: Sequence[int]) -> str:
-    given = getattr(described.scale, key) or (1.0,) * described.joints
-    values = [-value if i in turned else value for i, value in enumerate(given)]
-    return f"`scale.{key}` = [{', '.join(f'{value:g}' for value in values)}]"
+def _both(names: Sequence[str], joints: Sequence[int]) -> str:
+    return " and ".join(names[joint] for joint in joints)

@@ -6,6 +6,7 @@ recording is refused only if they are many, and the error shows the first of the
 A recording is held in memory, at most `MOST_ROWS` rows of it: of a longer file only the requested span.
 """
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -24,7 +25,7 @@ SHORTEST_SAMPLES: Final = 50
 """A shorter stretch can't be used: the filters have not settled."""
 LARGEST: Final = 1e6
 """Limit in rad, rad/s or Nm: a larger value isn't a measurement, and its square would spoil all others."""
-_BLOCK_ROWS = 50_000
+BLOCK_ROWS: Final = 50_000
 _SPARE_S = 1.0
 """Time kept before and after the requested span, for derived velocities and the grid of samples."""
 _FEW_ROWS, _FEW_SHARE = 3, 0.01
@@ -48,14 +49,6 @@ class RecordedColumns:
     notes: tuple[str, ...]
 
 
-@dataclass
-class _Drop:
-    """Number of rows dropped for one reason, and a description of the first."""
-
-    count: int
-    first: str
-
-
 class RecordedRows:
     """Collects the rows of a recording one by one, and makes columns of them."""
 
@@ -67,7 +60,8 @@ class RecordedRows:
         self._path, self._width, self._unit_s, self._span = path, width + 1, time_unit_s, span
         self._block: list[float] = []
         self._kept: list[Vector] = []
-        self._drops: dict[str, _Drop] = {}
+        self._drops: Counter[str] = Counter()
+        self._first_drops: dict[str, str] = {}
         self._begin_s = self._latest_s = -np.inf
         self._is_long = False  # only the span is kept
 
@@ -76,13 +70,14 @@ class RecordedRows:
         self._block.append(number)
         self._block += row
         self.count += 1
-        if self.count % _BLOCK_ROWS == 0:
+        if self.count % BLOCK_ROWS == 0:
             self._flush()
 
     def drop(self, kind: str, first: str, count: int = 1) -> None:
         """Count dropped rows. kind: text after the word "row"; first: description of the first of them."""
         if count:
-            self._drops.setdefault(kind, _Drop(0, first)).count += count
+            self._drops[kind] += count
+            self._first_drops.setdefault(kind, first)
 
     @property
     def is_past_span(self) -> bool:
@@ -146,17 +141,18 @@ class RecordedRows:
         return table[(time_s >= self._span.start_s - _SPARE_S) & (time_s <= self._span.end_s + _SPARE_S)]
 
     def _dropped(self) -> list[str]:
-        return [f"{number_of(drop.count, 'row')} {kind} left out ({drop.first})" for kind, drop in self._drops.items()]
+        return [
+            f"{number_of(count, 'row')} {kind} left out ({self._first_drops[kind]})"
+            for kind, count in self._drops.items()
+        ]
 
     def _check_drops(self, kept: int) -> None:
         """Raise LogError if more than a few rows are unusable; repeated ones don't count."""
-        spoilt = {kind: drop for kind, drop in self._drops.items() if kind != _DOUBLED}
-        count = sum(drop.count for drop in spoilt.values())
+        count = self._drops.total() - self._drops[_DOUBLED]
         if count > max(_FEW_ROWS, _FEW_SHARE * (kept + count)):
-            kind, worst = max(spoilt.items(), key=lambda pair: pair[1].count)
-            raise LogError(
-                f"recording {self._path}, {worst.first}; {number_of(worst.count, 'row')} {kind} are too many"
-            )
+            kind, most = max((pair for pair in self._drops.items() if pair[0] != _DOUBLED), key=lambda pair: pair[1])
+            first = self._first_drops[kind]
+            raise LogError(f"recording {self._path}, {first}; {number_of(most, 'row')} {kind} are too many")
 
     def _check_values(self, given: Vector, values: Vector, time_s: Vector, names: list[str]) -> None:
         too_large = np.argwhere(np.isfinite(given) & ~(np.abs(values) <= LARGEST))

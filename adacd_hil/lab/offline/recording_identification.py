@@ -58,23 +58,25 @@ class Watched:
 
 
 @dataclass(frozen=True)
-class Identified:
-    """Parameters (p,) with standard deviations, and the share of torque that they explain in the test."""
+class Identified(Fitted):
+    """A fit, its verdict, and the contacts found in the test and in further recordings."""
 
-    model: offline.ArmModel
-    settings: OfflineSettings
-    joint_names: tuple[str, ...]
-    estimate: ModelEstimate
-    deviation: Vector
-    certificate: OfflineCertificate
     verdict: Verdict
-    fit_s: float
     test: Watched
     watched: tuple[Watched, ...]
-    notes: dict[Path, tuple[str, ...]]  # dropped rows and assumptions, by recording
 
     def __repr__(self) -> str:
         return f"<Identified: {self.verdict.headline}>"
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints (n,)."""
+        return self.described.urdf.joint_names
+
+    @property
+    def notes(self) -> dict[Path, tuple[str, ...]]:
+        """Dropped rows and assumptions, by recording."""
+        return {recording.path: recording.notes for recording in (*self.fitted, self.tested)}
 
     @property
     def is_explained(self) -> bool:
@@ -149,26 +151,17 @@ def identify(
     settings = described.settings(source.noise_Nm, source.period_s, source.velocity_noise_rad_s)
     model = offline.model_of(described.urdf.chain, described.arm.has_rotors)
     before = estimate = offline.prior(model)
-    records = [stretch.record for recording in recordings for stretch in recording.stretches]
+    records = [record for recording in recordings for record in recording.records]
     for record in records:
         estimate = offline.identify(model, record, estimate, settings)
     deviation = offline.parameter_deviation(model, records, before, estimate, settings)
-    certificate = _joined(
-        [offline.certify(model, part.record, estimate, settings) for part in tested.stretches], tested
-    )
+    certificate = _joined([offline.certify(model, part, estimate, settings) for part in tested.records], tested)
     fit = Fitted(described, model, settings, before, estimate, deviation, certificate, tuple(recordings), tested)
     return Identified(
-        model=model,
-        settings=settings,
-        joint_names=described.urdf.joint_names,
-        estimate=estimate,
-        deviation=deviation,
-        certificate=certificate,
+        **vars(fit),
         verdict=judge_fit(fit),
-        fit_s=sum(recording.duration_s for recording in recordings),
         test=watch(model, settings, estimate, np.zeros(model.joints), tested),
         watched=tuple(watch(model, settings, estimate, certificate.lack_Nm, recording) for recording in watched),
-        notes={recording.path: recording.notes for recording in (*recordings, tested)},
     )
 
 
@@ -179,7 +172,7 @@ def _finite(value: float) -> float | None:
 
 def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:
     """Join the certificates of all stretches, weighted by length."""
-    weights = np.array([len(stretch.record.q) for stretch in tested.stretches], np.float64)
+    weights = np.array([len(record.q) for record in tested.records], np.float64)
     weights /= weights.sum()
     return OfflineCertificate(
         residual_rms_Nm=np.sqrt(sum(w * part.residual_rms_Nm**2 for w, part in zip(weights, parts, strict=True))),
@@ -210,11 +203,10 @@ def watch(
             start_s = stretch.start_s + contact.sample * recording.period_s
             spells.append(Spell(start_s, contact.link + 1, contact.direction, is_true))
         if stretch.is_touched is not None:
-            bounds = _touches(stretch)
-            touches = (touches or 0) + len(bounds)
+            touches = (touches or 0) + len(stretch.touches)
             places, firsts = np.unique(about, return_index=True)
-            found = firsts[places >= 0]
-            delays += ((samples[found] - bounds[about[found], 0]) * recording.period_s).tolist()
+            found = zip(places.tolist(), samples[firsts].tolist(), strict=True)
+            delays += [(at - stretch.touches[k][0]) * recording.period_s for k, at in found if k >= 0]
     return Watched(
         recording=recording,
         tau_ext_hat=tuple(detection.tau_ext_hat for detection in detections),
@@ -226,21 +218,13 @@ def watch(
     )
 
 
-def _touches(stretch: RecordingStretch) -> NDArray[np.int64]:
-    """Return the first and the last sample of each touch (k, 2)."""
-    if stretch.is_touched is None:
-        return np.zeros((0, 2), np.int64)
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], stretch.is_touched, [False])).astype(np.int8)))
-    return edges.reshape(-1, 2) - (0, 1)
-
-
 def _owners(
     stretch: RecordingStretch, samples: NDArray[np.int64], recording: ForeignRecording, settings: OfflineSettings
 ) -> NDArray[np.int64]:
     """Return the touch that each contact belongs to, -1 without one, as far as the touches' times are known."""
-    firsts, lasts = _touches(stretch).T
+    firsts, ends = np.array(stretch.touches, np.int64).reshape(-1, 2).T
     onsets = firsts - round(recording.blur_s / recording.period_s)
-    return owners(samples, onsets, explained_until(onsets, lasts + round(settings.isolation_s / settings.period_s)))
+    return owners(samples, onsets, explained_until(onsets, ends - 1 + round(settings.isolation_s / settings.period_s)))
 
 
 def draw_watched(identified: Identified, watched: Watched, name: str) -> Drawing:

@@ -4,8 +4,8 @@ A gap in time, a missing or infinite value, and the beginning or end of a touch 
 model is carried over, the filters restart. Values between two samples are interpolated.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,11 @@ from adacd_hil.lab.offline.bag_recording import read_bag
 from adacd_hil.lab.offline.csv_recording import read_csv
 from adacd_hil.lab.offline.recorded_columns import MOST_ROWS, SHORTEST_SAMPLES, RecordedColumns
 from adacd_hil.lab.offline.recording_map import RecordingMap, time_unit_of
+from adacd_hil.lab.signal_noise import resolution, white_noise
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.records import Vector
 from adacd_hil.scheme.identify.offline import Record
+from adacd_hil.score.judge import contact_bounds
 from adacd_hil.score.wording import number_of
 
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.1
@@ -29,7 +31,6 @@ _MOST_BESIDE_JUMP_RAD = 0.8
 _JITTER = 0.25
 """Share of a period by which the intervals of rows may vary: a derived velocity is wrong by as much."""
 _DEGREE = 3  # of the polynomial whose slope is a derived velocity
-MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white noise
 _STEP_TO_SIGMA = 1.0 / np.sqrt(12.0)  # of the rounding to a step
 
 
@@ -40,6 +41,11 @@ class RecordingStretch:
     start_s: float
     record: Record
     is_touched: NDArray[np.bool_] | None
+
+    @property
+    def touches(self) -> list[tuple[int, int]]:
+        """First sample of each touch, and the one after its last."""
+        return [] if self.is_touched is None else _true_runs(self.is_touched)
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,12 @@ class ForeignRecording:
     @property
     def duration_s(self) -> float:
         """Sum of the stretches' durations, s."""
-        return sum(len(stretch.record.q) for stretch in self.stretches) * self.period_s
+        return sum(len(record.q) for record in self.records) * self.period_s
+
+    @property
+    def records(self) -> list[Record]:
+        """The samples of the stretches."""
+        return [stretch.record for stretch in self.stretches]
 
     def between(self, start_s: float, end_s: float) -> "ForeignRecording":
         """Return the part within a span of the recording's time, which begins with 0."""
@@ -86,11 +97,17 @@ class ForeignRecording:
             return [stretch]
         width = 2 * round(self.blur_s / self.period_s) + 1
         is_touched = np.convolve(stretch.is_touched, np.ones(width), "same") > 0.5
-        bounds = [0, *(np.flatnonzero(np.diff(is_touched)) + 1).tolist(), len(is_touched)]
-        parts = [
-            _part(stretch, self.period_s, first, last) for first, last in pairwise(bounds) if not is_touched[first]
-        ]
+        parts = [_part(stretch, self.period_s, *bounds) for bounds in _true_runs(~is_touched)]
         return [part for part in parts if len(part.record.q) >= SHORTEST_SAMPLES]
+
+
+def _true_runs(is_true: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    return contact_bounds(np.where(is_true, 0, -1), None)
+
+
+def samples(recordings: Iterable[ForeignRecording], name: str) -> Vector:
+    """Return q, dq or tau_J of recordings, one after the other (k, n)."""
+    return np.concatenate([getattr(record, name) for recording in recordings for record in recording.records])
 
 
 def read_recording(
@@ -149,13 +166,13 @@ def recording_of(
     if not stretches:
         raise LogError(f"{path}: no {shortest} samples of {period_s:g} s without a gap")
     noise_Nm = _noise([stretch.record.tau_J for stretch in stretches], values[:, n : 2 * n])
-    velocity = _noise([stretch.record.dq for stretch in stretches], values[:, 2 * n :]) if has_dq else np.zeros(n)
+    velocity = max(_noise([stretch.record.dq for stretch in stretches], values[:, 2 * n :])) if has_dq else 0.0
     return ForeignRecording(
         path=path,
         period_s=period_s,
         stretches=tuple(stretches),
-        noise_Nm=tuple(np.maximum(noise_Nm, _LEAST_NOISE_NM).tolist()),
-        velocity_noise_rad_s=min(float(velocity.max()), 1.0),
+        noise_Nm=tuple(max(each, _LEAST_NOISE_NM) for each in noise_Nm),
+        velocity_noise_rad_s=min(velocity, 1.0),
         blur_s=0.0 if has_dq else 0.5 * window * period_s,
         columns=given,
         notes=tuple(notes),
@@ -182,12 +199,8 @@ def _jitter(time_s: Vector, period_s: float) -> str:
         return ""
     return (
         f"rows are {1e3 * short_s:.3g} to {1e3 * long_s:.3g} ms apart: if they were sampled evenly, leave "
-        f"`columns.time` out and write `sampling.period_s` = {_even_period_s(time_s):.6g}"
+        f"`columns.time` out and write `sampling.period_s` = {(time_s[-1] - time_s[0]) / (len(time_s) - 1):.6g}"
     )
-
-
-def _even_period_s(time_s: Vector) -> float:
-    return float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
 
 
 def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
@@ -227,22 +240,11 @@ def derive(q: Vector, period_s: float, window: int) -> Vector:
     return np.asarray(savgol_filter(q, window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
 
 
-def _noise(parts: list[Vector], given: Vector) -> Vector:
-    """Estimate the rms of white noise (n,) by the median of the second difference, which motion hardly changes.
-
-    given (k, n): the values as recorded; the noise is at least that of their rounding.
-    """
-    seconds = np.concatenate([np.abs(np.diff(part, 2, axis=0)) for part in parts])
-    rounding = _STEP_TO_SIGMA * np.array([_step(column) for column in given.T])
-    return np.asarray(np.maximum(MEDIAN_TO_SIGMA * np.median(seconds, axis=0), rounding))
-
-
-def _step(column: Vector) -> float:
-    """Return the smallest difference of two recorded values."""
-    levels = np.unique(column)
-    steps = np.diff(levels)
-    steps = steps[steps > 1e-9 * (levels[-1] - levels[0])]
-    return float(np.min(steps)) if steps.size else 0.0
+def _noise(parts: list[Vector], given: Vector) -> list[float]:
+    """Estimate the rms of each joint's white noise, at least that of the rounding of the values as recorded (k, n)."""
+    rounding = [_STEP_TO_SIGMA * resolution(column) for column in given.T]
+    noise: list[float] = np.maximum(white_noise(*parts), rounding).tolist()
+    return noise
 
 
 def _cut(stretch: RecordingStretch, period_s: float, start_s: float, end_s: float) -> RecordingStretch:

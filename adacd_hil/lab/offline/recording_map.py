@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from adacd_hil.file_access import read_input
+from adacd_hil.records import Vector
 from adacd_hil.scheme.identify.offline import OfflineSettings
 from adacd_hil.scheme.model.urdf import STANDARD_GRAVITY_M_S2, SerialArm, UrdfError, read_urdf
 from adacd_hil.settings.schema import ConfigError, parse, setting
@@ -135,15 +138,15 @@ def _is_near(value: float, wanted: float) -> bool:
 class RecordingMap:
     """A map, and the arm that it names."""
 
+    urdf: SerialArm
     arm: ArmSection
     columns: ColumnsSection
-    units: UnitsSection
-    scale: ScaleSection
-    csv: CsvSection
-    bag: BagSection
-    sampling: SamplingSection
     scheme: dict[str, Any]  # keys of OfflineSettings, which override its defaults and the recording's estimates
-    urdf: SerialArm
+    units: UnitsSection = UnitsSection()
+    scale: ScaleSection = ScaleSection()
+    csv: CsvSection = CsvSection()
+    bag: BagSection = BagSection()
+    sampling: SamplingSection = SamplingSection()
 
     @property
     def joints(self) -> int:
@@ -172,6 +175,11 @@ class RecordingMap:
 
     def _factors(self, given: tuple[float, ...]) -> tuple[float, ...]:
         return given or (1.0,) * self.joints
+
+    def scaled(self, key: str, factors: Vector) -> str:
+        """Return the line of `scale.q` or `scale.tau_J` that multiplies it by factors (n,)."""
+        values = np.array(self._factors(getattr(self.scale, key))) * factors
+        return f"`scale.{key}` = [{', '.join(f'{value:g}' for value in values)}]"
 
     def settings(self, noise_Nm: tuple[float, ...], period_s: float, velocity_noise_rad_s: float) -> OfflineSettings:
         """Return the scheme's settings: the recording's estimates, overridden by the map's keys. Raises ConfigError."""

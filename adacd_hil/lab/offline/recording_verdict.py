@@ -23,9 +23,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from adacd_hil.lab.offline.column_checks import CLIPPED_REMEDY, RecordingFinding, find_faults, joined_names, plateau
-from adacd_hil.lab.offline.other_readings import UNITS, find_readings
-from adacd_hil.lab.offline.recording_import import ForeignRecording
+from adacd_hil.lab.offline.other_readings import UNITS, find_readings, mass_rows
+from adacd_hil.lab.offline.recording_import import ForeignRecording, samples
 from adacd_hil.lab.offline.recording_map import RecordingMap
+from adacd_hil.lab.signal_noise import low_pass
 from adacd_hil.records import Vector
 from adacd_hil.scheme.identify import offline
 from adacd_hil.scheme.identify.offline import ArmModel, ModelEstimate, OfflineCertificate, OfflineSettings
@@ -88,8 +89,12 @@ class Verdict:
         }
 
 
-class Fitted(NamedTuple):
-    """A fit with its recordings and its test, to be judged. before: the estimate that the fit began with."""
+@dataclass(frozen=True)
+class Fitted:
+    """A fit with its recordings and its test, to be judged. before: the estimate that the fit began with.
+
+    estimate, deviation: parameters (p,) with P, and their standard deviations.
+    """
 
     described: RecordingMap
     model: ArmModel
@@ -100,6 +105,11 @@ class Fitted(NamedTuple):
     certificate: OfflineCertificate
     fitted: tuple[ForeignRecording, ...]
     tested: ForeignRecording
+
+    @property
+    def fit_s(self) -> float:
+        """Length of the fitted recordings, s."""
+        return sum(recording.duration_s for recording in self.fitted)
 
 
 def judge_fit(fit: Fitted) -> Verdict:
@@ -156,9 +166,7 @@ def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
 
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
     """Compute each joint's share and margin."""
-    parts = [
-        offline.filtered(fit.model, stretch.record, fit.estimate, fit.settings) for stretch in fit.tested.stretches
-    ]
+    parts = [offline.filtered(fit.model, record, fit.estimate, fit.settings) for record in fit.tested.records]
     torque, residual = (np.concatenate([getattr(part, name) for part in parts]) for name in ("torque", "residual"))
     unit = np.concatenate([part.unit for part in parts])
     spread = torque - np.outer(unit, unit @ torque / (unit @ unit))
@@ -203,26 +211,25 @@ def _headline(fit: Fitted, joints: Sequence[JointShare], is_explained: bool) -> 
 
 def _of_length(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report parts that are too short."""
-    fit_s, test_s = sum(recording.duration_s for recording in fit.fitted), fit.tested.duration_s
-    if fit_s < _SHORTEST_FIT_S or test_s < _SHORTEST_TEST_S:
+    if fit.fit_s < _SHORTEST_FIT_S or fit.tested.duration_s < _SHORTEST_TEST_S:
         yield RecordingFinding(
-            f"too short: {fit_s:.2g} s fitted and {test_s:.2g} s tested, {_SHORTEST_FIT_S:g} and {_SHORTEST_TEST_S:g} "
-            "s are the least, 10 s a good beginning",
+            f"too short: {fit.fit_s:.2g} s fitted and {fit.tested.duration_s:.2g} s tested, {_SHORTEST_FIT_S:g} and "
+            f"{_SHORTEST_TEST_S:g} s are the least, 10 s a good beginning",
             "record more, in which every joint turns fast and slow, both ways",
         )
 
 
 def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[RecordingFinding]:
     """Report the mistake of the map that explains at least this share of the torque."""
-    fitted = [stretch.record for recording in fit.fitted for stretch in recording.stretches]
-    tested = [stretch.record for stretch in fit.tested.stretches]
-    readings = find_readings(fit.described, fit.model, fit.settings, fitted, tested)
-    if not readings or readings[0].share < least:
+    fitted = [record for recording in fit.fitted for record in recording.records]
+    readings = find_readings(fit.described, fit.model, fit.settings, fitted, fit.tested.records)
+    if not readings or 1.0 - readings[0].unexplained < least:
         return
     text = ", or ".join(reading.text for reading in readings[:3])
     by_map, where = percent(min(joint.share for joint in joints)), " at the worst joint" if len(joints) > 1 else ""
     yield RecordingFinding(
-        f"{text}: so {percent(readings[0].share)} of the torque is explained{where}, {by_map} as the map has it",
+        f"{text}: so {percent(1.0 - readings[0].unexplained)} of the torque is explained{where}, {by_map} as the map "
+        "has it",
         f"in the map: {', or '.join(dict.fromkeys(reading.remedy for reading in readings[:3]))}",
     )
 
@@ -278,42 +285,30 @@ def _related_to_motion(fit: Fitted) -> Vector:
     By least squares on fit or test, evaluated on the other, the better of the two; terms: filtered position, its sine
     and cosine, velocity, its sign, and acceleration.
     """
-    n = fit.model.joints
     period_s, cutoff = fit.settings.period_s, fit.settings.fit_cutoff_rad_s
-    decay = math.exp(-cutoff * period_s)
-    shares = np.zeros(n)
-    parts = [
-        [stretch.record for recording in group for stretch in recording.stretches]
-        for group in (fit.fitted, (fit.tested,))
-    ]
-    for i in range(n):
+    shares = []
+    for i in range(fit.model.joints):
         tables = []
-        for records in parts:
+        for recordings in (fit.fitted, (fit.tested,)):
             rows = []
-            for record in records:
+            for record in (record for recording in recordings for record in recording.records):
                 q, dq = record.q[:, i], record.dq[:, i]
                 terms = np.column_stack([np.ones_like(q), np.sin(q), np.cos(q), q, dq, np.sign(dq), record.tau_J[:, i]])
-                smooth = _low_pass(_low_pass(terms, decay), decay)
-                rate = cutoff * (_low_pass(terms[:, 4:5], decay) - smooth[:, 4:5])
-                rows.append(np.hstack([smooth[:, :6], rate, smooth[:, 6:]]))
+                once = low_pass(terms, (cutoff,), period_s)
+                smooth = low_pass(once, (cutoff,), period_s)
+                rows.append(np.hstack([cutoff * (once - smooth)[:, 4:5], smooth]))
             tables.append(np.concatenate(rows))
-        shares[i] = max(_predicted_share(*tables), _predicted_share(*tables[::-1]))
-    return shares
+        shares.append(max(_predicted_share(*tables), _predicted_share(*tables[::-1])))
+    return np.array(shares)
 
 
 def _predicted_share(fitted: Vector, tested: Vector) -> float:
     """Return the share of a table's last column that a fit of the others to another table explains."""
     coefficients = np.linalg.lstsq(fitted[:, :-1], fitted[:, -1], rcond=1e-6)[0]
-    unit, torque = tested[:, 0], tested[:, -1]
+    unit, torque = tested[:, 1], tested[:, -1]
     spread = torque - unit * (unit @ torque) / max(float(unit @ unit), 1e-18)
     left = torque - tested[:, :-1] @ coefficients
     return 1.0 - float(left @ left) / max(float(spread @ spread), 1e-18)
-
-
-def _low_pass(values: Vector, decay: float) -> Vector:
-    from scipy.signal import lfilter
-
-    return np.asarray(lfilter([1.0 - decay], [1.0, -decay], values, axis=0))
 
 
 def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
@@ -377,43 +372,34 @@ def _mass_at_reach(fit: Fitted) -> float | None:
     reach_m = float(np.sum(np.linalg.norm(arm.translation[1:], axis=1)))
     if reach_m <= 0.0 or np.any(arm.is_prismatic):
         return None
-    record = fit.tested.stretches[0].record
-    unit = np.eye(fit.model.joints)[0]
-    poses = record.q[:: max(1, len(record.q) // 8)]
-    inertia = max(float(offline.mass_terms(fit.model, pose, unit) @ fit.estimate.theta) for pose in poses)
+    inertia = float(np.max(mass_rows(fit.model, fit.tested.records[0].q, 8)[:, 0] @ fit.estimate.theta))
     return inertia / reach_m**2 if inertia > 0.0 else None
 
 
 def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report an inertia that no masses have: kinetic energy would be negative."""
-    names = fit.described.urdf.joint_names
-    n = fit.model.joints
-    record = fit.tested.stretches[0].record
-    worst: tuple[float, int, float, float] | None = None
-    for pose in record.q[:: max(1, len(record.q) // 16)]:
-        for joint, unit in enumerate(np.eye(n)):
-            row = offline.mass_terms(fit.model, pose, unit)
-            inertia, sigma = float(row @ fit.estimate.theta), float(np.sqrt(np.sum((row * fit.deviation) ** 2)))
-            if inertia < -_SIGMAS * sigma and (worst is None or inertia / sigma < worst[0]):
-                worst = (inertia / sigma, joint, inertia, sigma)
-    if worst is not None:
-        _, joint, inertia, sigma = worst
-        unit_text = "kg" if fit.described.urdf.chain.is_prismatic[joint] else "kg m²"
+    urdf, rows = fit.described.urdf, mass_rows(fit.model, fit.tested.records[0].q, 16)
+    inertia = rows @ fit.estimate.theta
+    sigma = np.maximum(np.linalg.norm(rows * fit.deviation, axis=-1), 1e-300)
+    worst = np.unravel_index(np.argmin(inertia / sigma), inertia.shape)
+    if inertia[worst] < -_SIGMAS * sigma[worst]:
+        unit = "kg" if urdf.chain.is_prismatic[worst[1]] else "kg m²"
         yield RecordingFinding(
-            f"the inertia about {names[joint]} is negative, {inertia:.3g} ± {sigma:.1g} {unit_text}: no masses make it",
+            f"the inertia about {urdf.joint_names[worst[1]]} is negative, {inertia[worst]:.3g} ± {sigma[worst]:.1g} "
+            f"{unit}: no masses make it",
             "check signs and order of the columns, and the URDF",
         )
 
 
 def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report friction that drives a joint on, or whose viscous or Coulomb term is negative."""
-    record = np.concatenate([stretch.record.dq for stretch in fit.tested.stretches])
-    speed = np.abs(record)
+    speed = np.abs(samples((fit.tested,), "dq"))
     theta, deviation = fit.estimate.theta, fit.deviation
+    mean, square = speed.mean(axis=0), (speed**2).mean(axis=0)
     for joint, name in enumerate(fit.described.urdf.joint_names):
         F_v, F_c = (fit.model.place_of(kind).start + joint for kind in ("F_v", "F_c"))
-        power = theta[F_c] * speed[:, joint].mean() + theta[F_v] * (speed[:, joint] ** 2).mean()
-        sigma = math.hypot(deviation[F_c] * speed[:, joint].mean(), deviation[F_v] * (speed[:, joint] ** 2).mean())
+        power = theta[F_c] * mean[joint] + theta[F_v] * square[joint]
+        sigma = math.hypot(deviation[F_c] * mean[joint], deviation[F_v] * square[joint])
         if power < -_SIGMAS * sigma:
             yield RecordingFinding(
                 f"friction drives {name} on: F_v {theta[F_v]:.3g} ± {deviation[F_v]:.1g} Nm s/rad, F_c "
@@ -449,10 +435,7 @@ def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFin
     for i, joint in enumerate(joints):
         if joint.is_explained or math.isnan(joint.share):
             continue
-        torque = np.concatenate(
-            [part.record.tau_J[:, i] for each in (*fit.fitted, fit.tested) for part in each.stretches]
-        )
-        bound = plateau(torque)
+        bound = plateau(samples((*fit.fitted, fit.tested), "tau_J")[:, i])
         largest, rms = fit.certificate.residual_max_Nm[i], fit.certificate.residual_rms_Nm[i]
         yield RecordingFinding(
             f"{joint.name}: {percent(joint.share)} is explained, {100.0 * WHOLE:.0f} % are needed; the residual "

@@ -7,7 +7,7 @@ wherever it lies. Texts of a log are quoted for the shell.
 import shlex
 from typing import NamedTuple
 
-from adacd_hil.lab.report.page import went_wrong
+from adacd_hil.lab.report.page import STEPS, went_wrong
 from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked
 from adacd_hil.log.logged_run import EMBEDDED, Run
 from adacd_hil.score.metrics import Metrics, ReportSource
@@ -22,29 +22,30 @@ class NextStep(NamedTuple):
     command: str = ""
 
 
-def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]:
-    """List the next steps, the gravest first."""
+def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[NextStep], list[NextStep]]:
+    """List the next steps, the gravest first, and what else to try."""
     log = _quoted(source.log_name)
     steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(source.problem)
     if run.cycle.size == 0:
-        return [*steps, _checked(run, "The arm was not moved. Mend the cause above.")]
+        return [*steps, _checked(run, "The arm was not moved. Mend the cause above.")], []
     steps += _repairs(metrics, run, log)
-    if metrics.is_clean and not steps:
-        steps.append(NextStep("Nothing went wrong."))
-    if run.truth is None and metrics.contacts:
-        steps.append(NextStep("Nobody recorded when the arm was touched: compare the detections with what you did."))
     key = "filter.a_rad_s=20" if metrics.evidence is None else "certified.noise_sigmas=8"
-    return [
-        *steps,
+    more = [
         NextStep("Check that the log replays to the same decisions.", f"adacd-hil replay {log}"),
         NextStep("See what another setting would have decided.", f"adacd-hil replay {log} --set {key}"),
     ]
+    if run.truth is None and metrics.contacts:
+        more.insert(0, NextStep("Compare the detections with what you did: the log has no record of the touches."))
+    if not steps:
+        steps = [NextStep("Nothing: all went well.")] * metrics.is_clean + more[:1]
+        more = more[1:]
+    return steps[:STEPS], steps[STEPS:] + more
 
 
 def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
     """List the repairs of each kind of failure."""
     has_stopped = bool(metrics.fault) or (not metrics.adaptation_s and run.stretch is None)
-    stopped = _checked(run, "Mend what stopped the run.")
+    stopped = _checked(run, "Mend the cause above.")
     late = _checked(run, "Frames came late or were lost, more than allowed.")
     rows = (
         (has_stopped, stopped),

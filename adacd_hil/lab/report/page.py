@@ -20,7 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from adacd_hil.log.logged_run import StretchOfRun
 from adacd_hil.score.metrics import Beside, Metrics, ReportedContact
-from adacd_hil.score.wording import NONE, number_text, pair_text, signs_text, why_not_found, yes_text
+from adacd_hil.score.wording import NONE, number_text
 from adacd_hil.terminal import keep_units
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ _PACKAGE: Final = "adacd_hil.lab.report"
 
 
 STEPS: Final = 2
-"""Next steps on the first screen; the others are folded."""
+"""Next steps on the first screen, at most; the others are folded."""
 
 
 class Heading(NamedTuple):
@@ -122,7 +122,6 @@ def _environment() -> Environment:
         "CONTACTS": CONTACTS,
         "NOTICES": NOTICES,
         "SECTIONS": SECTIONS,
-        "STEPS": STEPS,
     }
     environment.globals["bounds"] = bounds
     environment.filters |= {"number": number_text, "keep_units": lambda text: keep_units(text, "\u00a0")}
@@ -138,34 +137,6 @@ def _asset(name: str) -> _Asset:
     return _Asset(text, b64encode(hashlib.sha256(text.encode()).digest()).decode())
 
 
-_CONTACT_HEAD: Final = (
-    "contact", "section", "link", "found on link", "first named link", "begins at s", "found after ms",
-    "filter's share ms", "ideal detector ms", "direction", "direction right", "true torque Nm", "peak ratio",
-)  # fmt: skip
-
-
-def _contact_words(contact: ReportedContact) -> tuple[str, ...]:
-    delay = number_text(contact.delay_ms, 0)
-    if contact.detected_s is None:
-        delay = why_not_found(contact.is_armed)
-    onset_s = contact.detected_s if contact.onset_s is None else contact.onset_s
-    return (
-        str(contact.number),
-        contact.section or NONE,
-        number_text(contact.link, 0),
-        number_text(contact.link_detected, 0),
-        number_text(contact.link_at_alarm, 0),
-        number_text(onset_s, 3),
-        delay,
-        number_text(contact.law_ms, 1),
-        number_text(contact.ideal_ms, 0),
-        signs_text(contact.direction),
-        yes_text(contact.direction_ok),
-        pair_text(contact.tau_ext_Nm, 2),
-        number_text(contact.torque_error_ratio, 2),
-    )
-
-
 def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
     """Choose the first contacts to be listed, and of the others as many that went wrong."""
     later = [contact for contact in metrics.contacts[most:] if went_wrong(contact)]
@@ -173,10 +144,9 @@ def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
 
 
 def went_wrong(contact: ReportedContact) -> bool:
-    """Tell whether a contact was missed, or its link or direction is not the true one."""
+    """Tell whether a contact was missed, or named on a link that nobody touched or with a wrong direction."""
     is_missed = contact.is_armed and contact.detected_s is None
-    is_wrong_link = contact.link is not None and contact.link_detected not in (None, contact.link)
-    return is_missed or is_wrong_link or contact.direction_ok is False
+    return is_missed or contact.link_ok is False or contact.direction_ok is False
 
 
 def left_out_text(metrics: Metrics, most: int) -> str:
@@ -186,20 +156,6 @@ def left_out_text(metrics: Metrics, most: int) -> str:
         return ""
     wrong = f" and {shown - most} more that went wrong" if shown > most else ""
     return f"The first {most}{wrong} of {count} contacts; all are in contacts.csv."
-
-
-def contact_rows(
-    metrics: Metrics, contacts: Sequence[ReportedContact]
-) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Give head and rows of a list of contacts, with the delay of the paper's scheme if it is known."""
-    rows = [_contact_words(contact) for contact in contacts]
-    beside = shown_beside(metrics)
-    if beside is None or not beside.contacts:
-        return _CONTACT_HEAD, rows
-    delays = {c.number: number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts}
-    return (*_CONTACT_HEAD, "paper's scheme ms"), [
-        (*row, delays[contact.number]) for row, contact in zip(rows, contacts, strict=True)
-    ]
 
 
 def has_paper(metrics: Metrics) -> bool:

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from adacd_hil.file_access import replace_files
 from adacd_hil.lab.report.next_steps import NextStep, next_steps
-from adacd_hil.lab.report.page import STEPS, has_paper, went_wrong
+from adacd_hil.lab.report.page import has_paper, went_wrong
 from adacd_hil.lab.report.report_json import JSON_NAME, report_json
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.report.run_reading import read_run
@@ -65,7 +65,7 @@ class Report:
             lines += ["", f"{number_of(len(wrong), 'contact')} missed or misnamed{more}:"]
             lines += _contact_lines(wrong[:PRINTED_CONTACTS], terminal_columns())
         lines.append("")
-        for step in self.next_steps[:STEPS]:
+        for step in self.next_steps:
             lines += [in_line(step.text), *([f"    {in_line(step.command)}"] if step.command else [])]
         return "\n".join([*lines, in_line(f"Report: {self.html_path}")])
 
@@ -115,7 +115,7 @@ def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: Ga
         source=source,
         html_path=out_dir / HTML_NAME,
         json_path=out_dir / JSON_NAME,
-        next_steps=tuple(next_steps(metrics, run, source)),
+        next_steps=tuple(next_steps(metrics, run, source)[0]),
         stretch=run.stretch,
     )
     table = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -13,13 +13,14 @@ from adacd_hil.lab.report.page import (
     Cell,
     Heading,
     Table,
-    contact_rows,
     has_paper,
     left_out_text,
     make_table,
     render_page,
+    shown_beside,
     shown_contacts,
     stretch_text,
+    went_wrong,
 )
 from adacd_hil.lab.report.report_tables import (
     counted_sentence,
@@ -48,10 +49,13 @@ from adacd_hil.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.score.wording import (
     NONE,
     number_text,
+    pair_text,
     scaled,
     signs_text,
     state_words,
     uncertain_text,
+    why_not_found,
+    yes_text,
 )
 
 _Point = tuple[float, float]
@@ -140,41 +144,54 @@ CARDS: Final = 48
 """Contacts with a card of their own; the table has all."""
 
 
-class ContactCard(NamedTuple):
-    """The known data of a contact: the report with its uncertainty, the truth, the arm.
-
-    stretch_s: the part of the traces that a script shows.
-    """
-
-    number: int
-    link: int | None
-    at_s: float
-    stretch_s: tuple[float, float]
-    is_wrong: bool
-    kind: str
-    entries: list[tuple[str, str]]
-    arm: ArmDrawing | None
+_CONTACT_HEAD: Final = (
+    "contact", "section", "link", "found on link", "first named link", "begins at s", "found after ms",
+    "filter's share ms", "ideal detector ms", "direction", "direction right", "true torque Nm", "peak ratio",
+)  # fmt: skip
 
 
 def contacts_table(metrics: Metrics) -> Table | None:
-    """Make a row per contact, marked where something went wrong; None without contacts."""
+    """Make a row per contact, marked where something went wrong, with the delay of the paper's scheme if it is known.
+
+    None without contacts.
+    """
     if not metrics.contacts:
         return None
+    beside = shown_beside(metrics)
+    theirs = {} if beside is None else {each["number"]: each for each in beside.contacts}
     rows: list[list[object]] = []
-    contacts = shown_contacts(metrics, CONTACTS)
-    head, words = contact_rows(metrics, contacts)
-    for contact, row in zip(contacts, words, strict=True):
-        wrong = {
-            3: contact.link is not None and contact.link_detected not in (None, contact.link),
-            6: contact.detected_s is None,
-            10: contact.direction_ok is False,
-        }
-        rows.append([Cell(word, "bad") if wrong.get(column) else word for column, word in enumerate(row)])
-    return make_table(head, rows, left=())
+    for contact in shown_contacts(metrics, CONTACTS):
+        is_found = contact.detected_s is not None
+        delay = number_text(contact.delay_ms, 0) if is_found else why_not_found(contact.is_armed)
+        link = number_text(contact.link_detected, 0)
+        right = yes_text(contact.direction_ok)
+        row: list[object] = [
+            str(contact.number),
+            contact.section or NONE,
+            number_text(contact.link, 0),
+            Cell(link, "bad") if contact.link_ok is False else link,
+            number_text(contact.link_at_alarm, 0),
+            number_text(contact.at_s, 3),
+            delay if is_found else Cell(delay, "bad"),
+            number_text(contact.law_ms, 1),
+            number_text(contact.ideal_ms, 0),
+            signs_text(contact.direction),
+            Cell(right, "bad") if contact.direction_ok is False else right,
+            pair_text(contact.tau_ext_Nm, 2),
+            number_text(contact.torque_error_ratio, 2),
+        ]
+        if theirs:
+            their = theirs[contact.number]
+            row.append(number_text(their["delay_ms"], 0) if their["is_armed"] else "not armed")
+        rows.append(row)
+    return make_table((*_CONTACT_HEAD, *["paper's scheme ms"][: len(theirs)]), rows, left=())
 
 
-def contact_cards(metrics: Metrics, run: Run) -> list[ContactCard]:
-    """Make a card for each of the first contacts."""
+def contact_cards(metrics: Metrics, run: Run) -> list[dict[str, Any]]:
+    """Describe each of the first contacts: the report with its uncertainty, the truth, the arm.
+
+    stretch_s: the part of the traces that a script shows.
+    """
     contacts = metrics.contacts[:CARDS]
     strongest_N = max((abs(contact.force_N) for contact in contacts if contact.force_N is not None), default=0.0)
     return [_card(contact, run, strongest_N) for contact in contacts]
@@ -191,23 +208,22 @@ _PLACES: Final = {
 }
 
 
-def _card(contact: ReportedContact, run: Run, strongest_N: float) -> ContactCard:
+def _card(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, Any]:
     entries = _found(contact) if contact.detected_s is not None else [("found", _why_not(contact))]
     entries += _torques(contact)
     if contact.link is not None:
         force = number_text(contact.true_force_N, 1, "N") if contact.true_force_N is not None else NONE
         entries.append(("truth", f"link {contact.link}, {force}"))
-    is_right = contact.detected_s is not None and contact.link in (None, contact.link_detected)
-    return ContactCard(
-        number=contact.number,
-        link=contact.link if contact.link_detected is None else contact.link_detected,
-        at_s=contact.at_s,
-        stretch_s=(contact.at_s - 0.15, contact.at_s + 0.6),
-        is_wrong=contact.is_armed and not is_right,
-        kind=_kind(contact),
-        entries=[(term, text) for term, text in entries if text != NONE],
-        arm=_arm(contact, run, strongest_N),
-    )
+    return {
+        "number": contact.number,
+        "link": contact.link if contact.link_detected is None else contact.link_detected,
+        "at_s": contact.at_s,
+        "stretch_s": (contact.at_s - 0.15, contact.at_s + 0.6),
+        "is_wrong": went_wrong(contact),
+        "kind": _kind(contact),
+        "entries": [(term, text) for term, text in entries if text != NONE],
+        "arm": _arm(contact, run, strongest_N),
+    }
 
 
 def _kind(contact: ReportedContact) -> str:
@@ -292,6 +308,7 @@ def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Pus
 
 def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
     """Write the page."""
+    steps, more_steps = next_steps(metrics, run, source)
     since_ns = None if run.log_start_ns is None else run.zero_ns - run.log_start_ns
     return render_page(
         "run_page.html.j2",
@@ -300,7 +317,8 @@ def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
         traces_of(run, metrics),
         run=run,
         metrics=metrics,
-        next_steps=next_steps(metrics, run, source),
+        next_steps=steps,
+        more_steps=more_steps,
         tiles=_tiles(metrics),
         timeline=timeline_of(run, metrics),
         state_key=state_key(run),
@@ -352,14 +370,15 @@ def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
         times_s = [*times_s[:LISTED], "…"]
     delays_ms = [contact.delay_ms for contact in seen if contact.delay_ms is not None]
     links = [contact for contact in seen if contact.link is not None]
-    right = sum(contact.link == contact.link_detected for contact in links)
+    right = sum(contact.link_ok is True for contact in links)
     found = f"{len(seen)} of {len(armed)}" if metrics.missed is not None else str(len(seen))
     if not armed and not metrics.contacts:
         found = NONE
+    is_watched = any(section.kind == "detection" for section in metrics.sections) or bool(metrics.false_alarms)
     tiles = [
         ("model learned in", " · ".join(times_s) or NONE, "s"),
         ("contacts found", found, ""),
-        ("false alarms", NONE if metrics.false_alarms is None else str(metrics.false_alarms), ""),
+        ("false alarms", str(metrics.false_alarms) if is_watched and metrics.false_alarms is not None else NONE, ""),
         ("link named rightly", f"{right} of {len(links)}" if links else NONE, ""),
         ("found after, median", number_text(float(np.median(delays_ms)), 1) if delays_ms else NONE, "ms"),
     ]

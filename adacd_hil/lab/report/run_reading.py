@@ -1,156 +1,95 @@
 """A run read from its logs: the data that report and metrics need, in bounded memory.
 
-A log is read twice, whatever its length: once for the beginnings and ends of contacts and adaptations (`outline`), then
-piece by piece through the gatherers, which sum up all cycles and keep those that are drawn (`KeptCycles`). A stretch of
-a log is first widened by the outline of the whole log, so that it cuts no contact and no adaptation.
+A log is read once, front to back. Its cycles wait in memory until what happens around them is known; then the
+gatherers sum them up, and those that are drawn are kept. A stretch of a log must cut no contact, no reaction and no
+adaptation, so it takes a first reading of the log up to its end, which tells where these lie.
 
-A run of at most `FULL_CYCLES` cycles keeps all of them. A longer one keeps, besides the cycles of the outline:
+A run of at most `FULL_CYCLES` cycles keeps all of them. A longer one keeps:
 
 | of a long run | cycles that are kept |
 |---|---|
-| curves | the smallest and the largest value of each in `BUCKETS` buckets |
+| outline | the first and the last of every piece; those in which the state changes, the paper's scheme is armed or |
+| | disarmed, or a true contact begins, with their neighbours |
+| curves | the smallest and the largest value of each in at most `BUCKETS` buckets |
 | contacts | all from 0.15 s before to 0.6 s after the first `TRACED_CONTACTS` |
-| adaptations | all of the first `ADAPTATIONS` that last at most `ADAPTATION_CYCLES` |
-| times of the cycle | the smallest and the largest value of each in `TIME_BUCKETS` buckets |
-| noise | `_NOISE_STRETCHES` stretches of `_NOISE_CYCLES` cycles, by which the steps of the curves are chosen |
+| adaptations | the first `ADAPTATION_S` of the first `ADAPTATIONS` |
+| times of the cycle | the smallest and the largest value of each in at most `TIME_BUCKETS` buckets |
+| noise | `_NOISE_CYCLES` at the beginning of every `_NOISE_BUCKETS`-th bucket, by which the steps of the curves are |
+| | chosen |
+
+The outline suffices for sections, detections and contacts.
 """
 
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adacd_hil.lab.report.outline import Outline, SchemeRows, run_of_piece, settling_s, widen
 from adacd_hil.lab.report.page import ADAPTATIONS, TRACED_CONTACTS
 from adacd_hil.lab.report.traces import panels_of
 from adacd_hil.lab.score.evaluation import QUEUES, RunGatherer
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import (
     QUANTITIES,
+    AttemptBegins,
+    CertifiedStream,
+    CheckCounts,
     CycleColumns,
+    Cycles,
+    Mask,
+    MeasuredMotion,
     Milestones,
+    PaperStream,
     Progress,
     Run,
     StretchOfRun,
-    Truth,
     columns_of_series,
+    host_cycles,
+    is_realtime,
     settings_of,
     split_sections,
 )
-from adacd_hil.log.reader import LogStream, Piece, Series, check_states, start_of_log
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, contacts_of, start_of_log
+from adacd_hil.records import JOINTS, ContactReport, Request, SchemeState
+from adacd_hil.score import judge
 from adacd_hil.score.emulator_truth import (
     Rows,
     TruthTable,
     extreme_rows,
     foreign_truth,
+    host_truth,
     read_truth,
+    truth_rows,
 )
-from adacd_hil.score.judge import find_detections, true_contacts
+from adacd_hil.score.judge import find_detections
+from adacd_hil.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.score.metrics import Gathered, ReportSource
 from adacd_hil.score.wording import unjudged_sentence
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.terminal import one_line
 
+BUSY: Final = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.REACT, SchemeState.STOPPED)
+"""States that a stretch does not cut."""
+MARGIN_S: Final = 0.2
+"""Margin of a stretch before a contact or a reaction."""
 BUCKETS: Final = 2_500
 TIME_BUCKETS: Final = 4_000
-ADAPTATION_CYCLES: Final = 10_000
-_AROUND_S: Final = (0.15, 0.6)
-_AFTER_ADAPTATION: Final = 0.1
-"""Share of an adaptation's length that its figure shows after its end."""
-_ROOM: Final = 200_000
-"""Rows to allocate at first; most runs keep fewer."""
-_NOISE_STRETCHES: Final = 16
-_NOISE_CYCLES: Final = 500
-
-
-class KeptCycles:
-    """Keeps those cycles of a run that are drawn."""
-
-    def __init__(self, outline: Run, indexes: Rows, cycles: int, empty: Run, scheme: Series, full_cycles: int) -> None:
-        """`indexes`: places of the outline's cycles among the `cycles` cycles of the run. scheme: without records."""
-        self._indexes = indexes
-        self._cycles = cycles
-        self._bucket, self._time_bucket = (
-            1 if cycles <= full_cycles else -(-cycles // buckets) for buckets in (BUCKETS, TIME_BUCKETS)
-        )
-        self._rows = SchemeRows(scheme, _ROOM)
-        self._columns = [empty.timing]
-        self._windows = np.array(list(_windows(outline))).reshape(-1, 2)
-        self._noise_starts = np.linspace(0, cycles, _NOISE_STRETCHES, endpoint=False).astype(np.int64)
-        self._read = 0
-        self._timed = 0
-
-    def add_piece(self, scheme: Series, piece: Run) -> None:
-        """Choose from the next cycles: the records of /scheme, and the same as a run."""
-        self._add_times(piece.timing)
-        if len(scheme):
-            self._rows.add(scheme, self._chosen(piece))
-            self._read += len(scheme)
-
-    def _chosen(self, run: Run) -> Rows:
-        """Choose the rows of a piece that are kept."""
-        count, first = run.cycle.size, self._read
-        if self._bucket == 1:
-            return np.arange(count)
-        is_kept = np.zeros(count, np.bool_)
-        is_kept[[0, -1]] = True
-        here = self._indexes[np.searchsorted(self._indexes, first) : np.searchsorted(self._indexes, first + count)]
-        is_kept[here - first] = True
-        time_s = run.time_s()
-        for start_s, end_s in self._windows[(self._windows[:, 0] <= time_s[-1]) & (self._windows[:, 1] >= time_s[0])]:
-            is_kept[np.searchsorted(time_s, start_s) : np.searchsorted(time_s, end_s, side="right")] = True
-        for start in self._noise_starts.tolist():
-            is_kept[max(start - first, 0) : max(start + _NOISE_CYCLES - first, 0)] = True
-        is_kept[extreme_rows(_curves(run), _bucket_starts(first, count, self._bucket))] = True
-        return np.flatnonzero(is_kept)
-
-    def _add_times(self, columns: CycleColumns) -> None:
-        if not len(columns):
-            return
-        starts = _bucket_starts(self._timed, len(columns), self._time_bucket)
-        names = (*(quantity.column for quantity in QUANTITIES), *QUEUES.values(), "overruns")
-        series = [columns[name].astype(np.float64) for name in names if name in columns]
-        self._columns.append(columns.rows(extreme_rows(series, starts)))
-        self._timed += len(columns)
-
-    def run(self, outline: Run) -> Run:
-        """Give the run with the cycles that were kept."""
-        timing = CycleColumns.joined(self._columns)
-        kept = self._rows.fill(outline)
-        return replace(kept, timing=timing, all_cycles=self._cycles, bucket=self._bucket)
-
-
-def _bucket_starts(before: int, count: int, bucket: int) -> Rows:
-    """Give the rows of a piece at which buckets begin. before: rows before the piece."""
-    return np.unique(np.append(0, np.arange(-before % bucket, count, bucket)))
-
-
-def _curves(run: Run) -> Iterator[Vector]:
-    """Give the curves that the report draws over the whole run."""
-    for panel in panels_of(run):
-        for trace in panel.traces:
-            yield trace.values
-
-
-def _windows(run: Run) -> Iterator[tuple[float, float]]:
-    """Give the stretches of time, s, of which every cycle is kept."""
-    onsets_s = [touch.onset_s for touch in true_contacts(run)] if run.truth is not None else []
-    found_s = [detection.detected_s for detection in find_detections(run)]
-    for at_s in (*onsets_s[:TRACED_CONTACTS], *found_s[:TRACED_CONTACTS]):
-        yield at_s - _AROUND_S[0], at_s + _AROUND_S[1]
-    adaptations = [section for section in split_sections(run) if section.kind == "adaptation"]
-    for section in adaptations[:ADAPTATIONS]:
-        if section.duration_s <= ADAPTATION_CYCLES * run.settings.bus.period_s:
-            yield section.start_s, section.end_s + _AFTER_ADAPTATION * section.duration_s
-
-
-RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events")
-"""Topics that a report reads."""
 FULL_CYCLES: Final = 150_000
 """Cycles that are kept and drawn one by one: 150 s at 1 kHz, about as many as are kept of hours."""
+ADAPTATION_S: Final = 10.0
+RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events")
+"""Topics that a report reads."""
+_AROUND_S: Final = (0.15, 0.6)
+_NOISE_BUCKETS: Final = 150
+_NOISE_CYCLES: Final = 500
+_WAITING: Final = 50_000
+"""Cycles that are gathered at a time."""
+_BEYOND_S: Final = 1.0
+"""How much longer than the settling time cycles wait: longer than two kept rows of a truth lie apart."""
 _MOST_DIGITS: Final = 18
 
 Bounds = tuple[int, int]
@@ -174,193 +113,515 @@ def read_run(
 ) -> ReadRun:
     """Read a log, or a stretch of it, and the emulator's truth if there is one. Raises LogError, ConfigError.
 
-    The truth of another run is left out, and is a problem of the source.
-    full_cycles: of a log with more, some are kept.
+    The truth of another run is left out, and is a problem of the source. Raises LogError also for a stretch without a
+    cycle. full_cycles: of a log with more, some are kept.
     """
     problem = "" if truth_path is None else foreign_truth(log_path, truth_path)
     truth = None if truth_path is None or problem else read_truth(truth_path)
-    reading = _Reading(log_path, truth, progress, problem)
+    stream = LogStream(log_path, RUN_TOPICS)
+    shell = _shell(stream, truth)
+    reading = RunReading(shell, stream.empty().series["/scheme"], truth, full_cycles)
     if stretch.is_whole:
-        return reading.gather(reading.outline(), full_cycles)
-    return reading.read_stretch(stretch, full_cycles)
-
-
-class _Reading:
-    """Reads one log, as often as it takes."""
-
-    def __init__(self, path: Path, truth: TruthTable | None, progress: Progress, truth_problem: str = "") -> None:
-        self._path = path
-        self._truth_problem = truth_problem
-        self._truth = truth
-        self._progress = progress
-        stream = LogStream(path, RUN_TOPICS)
-        self._empty = stream.empty()
-        self._scheme = self._empty.series["/scheme"]
-        self._shell = self._begin(stream)
-        self._read = stream  # that was last read to its end
-
-    def _begin(self, stream: LogStream) -> Run:
-        """Give a run without a cycle, with metadata and settings of the log."""
-        metadata = dict(stream.metadata)
-        if "arm.dbc" in stream.attachments:
-            metadata["dbc_sha256"] = hashlib.sha256(stream.attachments["arm.dbc"]).hexdigest()
-        if self._truth is not None:
-            emulator = self._truth.metadata.items()
-            metadata |= {
-                f"emulator_{key}": value for key, value in emulator if key not in (*metadata, CONFIG_DIGEST_KEY)
-            }
-        nothing = np.empty((0, JOINTS))
-        empty = Run(
-            cycle=np.empty(0, np.int64),
-            t_ns=np.empty(0, np.int64),
-            state=np.empty(0, np.uint8),
-            fault=np.empty(0, np.uint8),
-            tau_ext_hat=nothing,
-            tau_ext_hat_cad=nothing,
-            theta_hat=nothing,
-            threshold=nothing,
-            reports=(),
-            timing=columns_of_series(self._empty.series["/cycle"]),
-            truth=None,
-            settings=settings_of(self._path, stream.attachments),
-            metadata=metadata,
-            frames=None,
-            dropped=None,
-            log_start_ns=start_of_log(self._path),
-        )
-        return run_of_piece(self._scheme, empty)
-
-    def _pieces(self, doing: str, bounds_ns: Bounds | None = None) -> Iterator[tuple[LogStream, Piece]]:
-        """Read the log, or its part between two times."""
-        stream = LogStream(self._path, RUN_TOPICS)
-        cycles = 0
-        milestones = Milestones(lambda count: self._progress(f"{self._path}: {doing}, {count} cycles"))
-        for piece in stream:
-            check_states(piece.series["/scheme"])
-            cycles += len(piece.series["/scheme"])
-            milestones.reach(cycles)
-            if bounds_ns is None:
-                yield stream, piece
-                continue
-            times_ns = piece.series["/scheme"].t_ns
-            if times_ns.size and times_ns[0] >= bounds_ns[1]:
-                break
-            yield stream, _within(piece, bounds_ns, stream.epoch_ns)
-        self._read = stream
-
-    def _done(self, run: Run, gathered: Gathered) -> ReadRun:
-        """Add the ending, the problems and the counts of the log."""
-        stream, truth = self._read, self._truth
-        ending = stream.summary.get(ENDING_KEY, "")
-        if ending and ending not in PLANNED_ENDINGS:
-            run = replace(run, broken_off=one_line(ending))
-        of_truth = self._truth_problem or _unjudged(run)
-        problems = [stream.problem, "" if truth is None else truth.problem, of_truth]
-        is_complete = stream.is_complete and not of_truth and (truth is None or truth.is_complete)
-        source = ReportSource(self._path.name, "; ".join(filter(None, problems)), is_complete)
-        if run.stretch is None:
-            run = replace(run, frames=_count(stream.summary, "frames"), dropped=_count(stream.summary, "dropped"))
-        return ReadRun(run, gathered, source)
-
-    def outline(
-        self, bounds_ns: Bounds | None = None, shell: Run | None = None, until_ns: int | None = None
-    ) -> Outline:
-        """Find when contacts, adaptations and states begin and end, in all cycles or between two times.
-
-        shell: facts about the run that are known before, its truth included. until_ns: stop reading when
-        the log is past this time by the settling time, and the outline is idle since (`Outline.is_idle_since`).
-        """
-        outline = Outline(shell or self._shell, self._scheme, self._truth if shell is None else None)
-        settling_ns = round(settling_s(self._shell) * 1e9)
-        for stream, piece in self._pieces("looking for what happens", bounds_ns):
-            outline.add(stream, piece)
-            times_ns = piece.series["/scheme"].t_ns
-            if until_ns is None or not times_ns.size:
-                continue
-            before_ns = int(times_ns[-1]) - settling_ns
-            if before_ns > until_ns and outline.is_idle_since(before_ns):
-                break
-        return outline
-
-    def gather(self, outline: Outline, full_cycles: int, bounds_ns: Bounds | None = None) -> ReadRun:
-        """Pass all cycles, or those between two times, through the gatherers."""
-        run = outline.done()
-        shell = replace(run, truth=None, reports=(), events=())
-        indexes = np.concatenate([np.empty(0, np.int64), *outline.indexes])
-        kept = KeptCycles(run, indexes, outline.facts.cycles, self._shell, self._scheme, full_cycles)
-        sums = RunGatherer(run)
-        for _, piece in self._pieces("adding up", bounds_ns):
-            scheme = piece.series["/scheme"]
-            cycles = replace(run_of_piece(scheme, shell), timing=columns_of_series(piece.series["/cycle"]))
-            sums.add_piece(cycles)
-            kept.add_piece(scheme, cycles)
-        run = kept.run(run)
-        return self._done(run, sums.gathered(run))
-
-    def read_stretch(self, stretch: TimeWindow, full_cycles: int) -> ReadRun:
-        """Read a part of the log, widened to cut no contact and no adaptation.
-
-        Raises LogError for a part without a cycle.
-        """
-        start_ns = self._shell.log_start_ns
+        _read(stream, reading, progress)
+    else:
+        start_ns = shell.log_start_ns
         if start_ns is None:
-            raise LogError(f"log {self._path} has no message")
-        asked_ns = stretch.bounds_ns(start_ns)
-        run = self.outline(until_ns=asked_ns[1]).done()
-        zero_ns = run.zero_ns
-        asked_s = ((asked_ns[0] - zero_ns) * 1e-9, (asked_ns[1] - zero_ns) * 1e-9)
-        bounds_s = widen(run, *asked_s)
-        bounds_ns = (round(bounds_s[0] * 1e9) + zero_ns, round(bounds_s[1] * 1e9) + zero_ns)
-        found = TimeWindow(*((bound_ns - start_ns) * 1e-9 for bound_ns in bounds_ns))
-        begun_s = [d.detected_s for d in find_detections(run)]
-        if run.truth is not None:
-            begun_s = [touch.onset_s for touch in true_contacts(run)]
-        shell = replace(
-            self._shell,
-            motion_start_ns=zero_ns,
-            truth=_truth_within(run.truth, bounds_s),
-            stretch=StretchOfRun(
-                stretch, found, sum(at_s < bounds_s[0] for at_s in begun_s), (zero_ns - start_ns) * 1e-9
-            ),
-        )
-        read = self.gather(self.outline(bounds_ns, shell), full_cycles, bounds_ns)
-        if read.run.cycle.size == 0:
-            raise LogError(f"log {self._path} has no cycle from {stretch.start_s:g} to {stretch.end_s:g} s")
-        return read
+            raise LogError(f"log {log_path} has no message")
+        _read(stream, reading, progress, until_ns=stretch.bounds_ns(start_ns)[1])
+        shell, bounds_ns = _widened(reading.outline(), shell, stretch, start_ns)
+        stream = LogStream(log_path, RUN_TOPICS)
+        reading = RunReading(shell, stream.empty().series["/scheme"], None, full_cycles)
+        _read(stream, reading, progress, bounds_ns)
+    run, gathered = reading.finished()
+    if run.cycle.size == 0 and run.stretch is not None:
+        raise LogError(f"log {log_path} has no cycle from {stretch.start_s:g} to {stretch.end_s:g} s")
+    return _with_ending(run, gathered, stream, truth, problem)
 
 
-def _within(piece: Piece, bounds_ns: Bounds, epoch_ns: int) -> Piece:
-    """Give a piece's messages between two times, and all of its events."""
-    series = {}
-    for name, values in piece.series.items():
-        t_ns = values.t_ns
-        series[name] = Series(values.records[(t_ns >= bounds_ns[0]) & (t_ns < bounds_ns[1])], epoch_ns)
-    return piece._replace(series=series)
-
-
-def _truth_within(truth: Truth | None, bounds_s: tuple[float, float]) -> Truth | None:
-    """Give the rows of the truth between two times, s since motion start."""
-    if truth is None or truth.time_s is None:
-        return truth
-    rows = (truth.time_s >= bounds_s[0]) & (truth.time_s < bounds_s[1])
-    return replace(
-        truth,
-        cycle=truth.cycle[rows],
-        tau_ext=truth.tau_ext[rows],
-        contact_link=truth.contact_link[rows],
-        contact_index=truth.contact_index[rows],
-        force_N=None if truth.force_N is None else truth.force_N[rows],
-        time_s=truth.time_s[rows],
-        attempt=None if truth.attempt is None else truth.attempt[rows],
+def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
+    """Give a run without a cycle, with metadata and settings of the log."""
+    metadata = dict(stream.metadata)
+    if "arm.dbc" in stream.attachments:
+        metadata["dbc_sha256"] = hashlib.sha256(stream.attachments["arm.dbc"]).hexdigest()
+    if truth is not None:
+        told = {key: value for key, value in truth.metadata.items() if key not in (*metadata, CONFIG_DIGEST_KEY)}
+        metadata |= {f"emulator_{key}": value for key, value in told.items()}
+    nothing = np.empty((0, JOINTS))
+    return Run(
+        cycle=np.empty(0, np.int64),
+        t_ns=np.empty(0, np.int64),
+        state=np.empty(0, np.uint8),
+        fault=np.empty(0, np.uint8),
+        tau_ext_hat=nothing,
+        tau_ext_hat_cad=nothing,
+        theta_hat=nothing,
+        threshold=nothing,
+        reports=(),
+        timing=columns_of_series(stream.empty().series["/cycle"]),
+        truth=None,
+        settings=settings_of(stream.path, stream.attachments),
+        metadata=metadata,
+        frames=None,
+        dropped=None,
+        log_start_ns=start_of_log(stream.path),
     )
 
 
-def _unjudged(run: Run) -> str:
-    """Return a line with the number of detections outside the time of the recorded truth; "" for 0."""
-    return unjudged_sentence(sum(not detection.raised.is_known for detection in find_detections(run)))
+def _read(
+    stream: LogStream,
+    reading: "RunReading",
+    progress: Progress,
+    bounds_ns: Bounds | None = None,
+    until_ns: int | None = None,
+) -> None:
+    """Read a log: all, the part between two times, or as far as it takes to know what happens at a time."""
+    milestones = Milestones(lambda count: progress(f"{stream.path}: {count} cycles read"))
+    cycles = 0
+    for piece in stream:
+        scheme = piece.series["/scheme"]
+        check_states(scheme)
+        cycles += len(scheme)
+        milestones.reach(cycles)
+        series = piece.series
+        if bounds_ns is not None:
+            if len(scheme) and scheme.t_ns[0] >= bounds_ns[1]:
+                return
+            series = {name: _within(each, bounds_ns) for name, each in series.items()}
+        reading.add_piece(series, stream.events(piece))
+        if until_ns is not None and len(scheme) and reading.is_settled(until_ns, int(scheme.t_ns[-1])):
+            return
+
+
+def _within(series: Series, bounds_ns: Bounds) -> Series:
+    t_ns = series.t_ns
+    return series.part((t_ns >= bounds_ns[0]) & (t_ns < bounds_ns[1]))
+
+
+def _with_ending(
+    run: Run, gathered: Gathered, stream: LogStream, truth: TruthTable | None, truth_problem: str
+) -> ReadRun:
+    """Add the ending, the problems and the counts of the log."""
+    ending = stream.summary.get(ENDING_KEY, "")
+    if ending and ending not in PLANNED_ENDINGS:
+        run = replace(run, broken_off=one_line(ending))
+    unjudged = unjudged_sentence(sum(not detection.is_known for detection in find_detections(run)))
+    of_truth = truth_problem or unjudged
+    problems = [stream.problem, "" if truth is None else truth.problem, of_truth]
+    is_complete = stream.is_complete and not of_truth and (truth is None or truth.is_complete)
+    source = ReportSource(stream.path.name, "; ".join(filter(None, problems)), is_complete)
+    if run.stretch is None:
+        run = replace(run, frames=_count(stream.summary, "frames"), dropped=_count(stream.summary, "dropped"))
+    return ReadRun(run, gathered, source)
 
 
 def _count(summary: Mapping[str, str], key: str) -> int | None:
     """Return a number of the log's summary; None if it is missing (a cut file) or not a number (a damaged one)."""
     text = summary.get(key, "")
     return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
+
+
+class RunReading:
+    """One reading of a log, front to back."""
+
+    def __init__(self, shell: Run, empty: Series, truth: TruthTable | None, full_cycles: int) -> None:
+        """`shell`: a run with empty arrays: settings, metadata, and a truth on the host's cycles if there is one.
+
+        truth: rows whose cycle of the host is still to be found.
+        """
+        self._shell = shell
+        self._truth = truth
+        self._clock = None if truth is None else TruthClock(truth)
+        rows = shell.truth if truth is None else truth.rows
+        index = np.empty(0) if rows is None else rows.contact_index
+        self._is_onset = (index >= 0.0) & (np.concatenate(([-1.0], index))[:-1] != index)
+        self._rows = SchemeRows(empty)
+        self._times = ThinnedTimes(shell.timing, full_cycles)
+        self._sums = RunGatherer(shell.settings, not is_realtime(shell))
+        self._full_cycles = full_cycles
+        self._bucket = 1
+        self._settled = 0  # rows that have been gathered
+        self._last: tuple[int, bool] | None = None  # state of the row before, and whether the paper's scheme was armed
+        self._busy_ns = 0  # time of the last cycle in a state of `BUSY`, or of a later row of the truth
+        self._attempts = AttemptBegins()
+        self._reports: list[ContactReport] = []
+        self._events: list[LoggedEvent] = []
+        self._checks: list[CheckCounts] = []
+        self._finish_cycle: int | None = None  # of the first request to finish
+        self._zero_ns = shell.motion_start_ns
+        self._first_ns: int | None = None
+        self._last_cycle = -1
+
+    def add_piece(self, series: Mapping[str, Series], events: list[LoggedEvent]) -> None:
+        """Take in the next piece of the log."""
+        self._reports += [report for _, report in contacts_of(series["/contact"])]
+        self._events += events
+        self._checks += _checks_of(series["/frame_checks"])
+        scheme, columns = series["/scheme"], columns_of_series(series["/cycle"])
+        cycle, state = scheme.records["cycle"].astype(np.int64), scheme.records["state"]
+        self._sums.add_times(columns, cycle, state)
+        self._times.add_columns(columns)
+        if not len(scheme):
+            return
+        self._attempts.add(cycle, state)
+        self._add_facts(scheme, cycle, state)
+        rows = np.concatenate((self._edges(scheme), self._onset_rows(scheme, cycle)))
+        self._rows.add_records(scheme, rows[(rows >= 0) & (rows < len(scheme))])
+        self._last_cycle = int(cycle[-1])
+        if self._rows.count - self._settled > _WAITING:
+            beyond_ns = round((self._settling_s + _BEYOND_S) * 1e9)
+            self._settle(int(np.searchsorted(self._rows.column("t_ns"), scheme.t_ns[-1] - beyond_ns)))
+
+    def _add_facts(self, scheme: Series, cycle: Cycles, state: NDArray[np.uint8]) -> None:
+        if self._first_ns is None:
+            self._first_ns = int(scheme.t_ns[0])
+        adapting = np.flatnonzero(state == SchemeState.ADAPT)
+        if self._zero_ns is None and adapting.size:
+            self._zero_ns = int(scheme.t_ns[adapting[0]])
+        asked = np.flatnonzero(scheme.records["request"] == Request.FINISH)
+        if self._finish_cycle is None and asked.size:
+            self._finish_cycle = int(cycle[asked[0]])
+        busy = np.flatnonzero(np.isin(state, BUSY))
+        if busy.size:
+            self._busy_ns = max(self._busy_ns, int(scheme.t_ns[busy[-1]]))
+
+    def _edges(self, scheme: Series) -> Rows:
+        """List the first and last row and the rows beside changes of the state or of arming of the paper's scheme."""
+        state = scheme.records["state"].astype(np.int64)
+        is_armed = np.zeros(len(state), np.bool_)
+        if "paper_is_armed" in scheme.fields:
+            is_armed = scheme.records["paper_is_armed"] > 0.5
+        last_state, was_armed = self._last or (int(state[0]), bool(is_armed[0]))
+        self._last = int(state[-1]), bool(is_armed[-1])
+        changes = np.flatnonzero(np.diff(state, prepend=last_state))
+        switches = np.flatnonzero(np.diff(is_armed.astype(np.int8), prepend=np.int8(was_armed)))
+        ends = np.array([0, len(state) - 1])
+        return np.concatenate((ends, changes - 1, changes, changes + 1, switches - 1, switches))
+
+    def _onset_rows(self, scheme: Series, cycle: Cycles) -> Rows:
+        """List the rows in which true contacts begin, and the ones before them."""
+        if self._clock is not None:
+            rows, cycles = self._clock.place_rows(scheme, self._attempts.begins)
+            onsets = cycles[self._is_onset[rows]]
+            if rows.size:
+                self._busy_ns = max(self._busy_ns, int(self._clock.t_ns[rows].max()))
+        elif self._shell.truth is not None:
+            onsets = self._shell.truth.cycle[self._is_onset]
+            onsets = onsets[(onsets >= cycle[0]) & (onsets <= cycle[-1])]
+        else:
+            return np.empty(0, np.int64)
+        found = np.searchsorted(cycle, onsets)
+        return np.concatenate((found - 1, found))
+
+    @property
+    def _settling_s(self) -> float:
+        return SETTLING_TIME_CONSTANTS / self._rows.run(self._shell, slice(0)).a_rad_s
+
+    def is_settled(self, until_ns: int, last_ns: int) -> bool:
+        """Tell whether all that happens before a time is known: nothing has since the settling time before last_ns."""
+        before_ns = last_ns - round(self._settling_s * 1e9)
+        return before_ns > until_ns and self._busy_ns < before_ns
+
+    def outline(self) -> Run:
+        """Give the run so far, with the kept cycles and all that wait."""
+        zero_ns = next((t_ns for t_ns in (self._zero_ns, self._first_ns) if t_ns is not None), 0)
+        run = replace(
+            self._rows.run(self._shell),
+            reports=tuple(self._reports),
+            events=tuple(self._events),
+            finish_cycle=self._finish_cycle,
+            checks=_joined(self._checks),
+            motion_start_ns=zero_ns,
+        )
+        if self._truth is None or self._clock is None:
+            return run
+        time_s = np.asarray((self._clock.t_ns - zero_ns) * 1e-9, np.float64)
+        return replace(run, truth=host_truth(self._truth, self._attempts.begins, self._last_cycle, time_s))
+
+    def _settle(self, end: int) -> None:
+        """Gather the rows up to one, and keep of them those that are drawn."""
+        outline = self.outline()
+        shell = replace(self._shell, truth=None, motion_start_ns=outline.motion_start_ns)
+        self._sums.add_untouched(self._rows.run(shell, slice(self._settled, end)), outline)
+        first, cycles = self._settled, self._rows.cycles
+        self._settled = end
+        if cycles <= self._full_cycles or first == end:
+            return
+        bucket = _bucket_of(cycles, BUCKETS, self._bucket)
+        if bucket != self._bucket:
+            first, self._bucket = 0, bucket
+        self._rows.mark_kept(slice(first, end), _around(outline))
+        rows = slice(first, end)
+        index = self._rows.column("index")[rows]
+        is_kept = self._rows.column("is_kept")[rows] | (index % (_NOISE_BUCKETS * bucket) < _NOISE_CYCLES)
+        is_kept[_extremes_by_bucket(self._curves(shell, rows), index, bucket)] = True
+        self._settled -= self._rows.drop(first + np.flatnonzero(~is_kept))
+
+    def _curves(self, shell: Run, rows: slice) -> Iterator[NDArray[np.float64]]:
+        """Give the curves that the report draws over the whole run."""
+        for panel in panels_of(self._rows.run(shell, rows)):
+            for trace in panel.traces:
+                yield trace.values
+
+    def finished(self) -> tuple[Run, Gathered]:
+        """Return the run with the cycles that were kept, and the sums, at the end of the log."""
+        self._settle(self._rows.count)
+        run = self.outline()
+        gathered = self._sums.gathered(run)
+        timing = self._times.columns()
+        return replace(run, timing=timing, all_cycles=self._rows.cycles, bucket=self._bucket), gathered
+
+
+def _bucket_of(cycles: int, most: int, bucket: int) -> int:
+    """Double the size of buckets until there are at most so many."""
+    while cycles > most * bucket:
+        bucket *= 2
+    return bucket
+
+
+def _extremes_by_bucket(curves: Iterator[NDArray[np.float64]], index: Cycles, bucket: int) -> Rows:
+    """Choose of every bucket of cycles, by their index, the rows in which a curve is smallest and largest."""
+    return extreme_rows(curves, np.flatnonzero(np.diff(index // bucket, prepend=-1)))
+
+
+def _around(run: Run) -> list[Bounds]:
+    """Give the stretches of time of which every cycle is kept."""
+    onsets_s = [(contact.onset_ns - run.zero_ns) * 1e-9 for contact in judge.contacts_of(run)]
+    found_s = [(detection.t_ns - run.zero_ns) * 1e-9 for detection in find_detections(run)]
+    around = [
+        (at_s - _AROUND_S[0], at_s + _AROUND_S[1]) for at_s in (*onsets_s[:TRACED_CONTACTS], *found_s[:TRACED_CONTACTS])
+    ]
+    adaptations = [section for section in split_sections(run) if section.kind == "adaptation"]
+    around += [(each.start_s, min(each.end_s, each.start_s + ADAPTATION_S)) for each in adaptations[:ADAPTATIONS]]
+    return [(run.zero_ns + round(start_s * 1e9), run.zero_ns + round(end_s * 1e9)) for start_s, end_s in around]
+
+
+_CHECKS: Final = "_checks"
+"""How the field of a device's counts in /frame_checks ends."""
+
+
+def _checks_of(series: Series) -> list[CheckCounts]:
+    """Take the counts out of a piece of /frame_checks, if it has any."""
+    devices = tuple(name.removesuffix(_CHECKS) for name in series.fields if name.endswith(_CHECKS))
+    if not len(series) or not devices:
+        return []
+    counts = np.stack([series[device + _CHECKS].astype(np.int64) for device in devices], axis=1)
+    return [CheckCounts(devices, series["cycle"].astype(np.int64), counts)]
+
+
+def _joined(parts: list[CheckCounts]) -> CheckCounts | None:
+    if not parts:
+        return None
+    cycle = np.concatenate([part.cycle for part in parts])
+    return CheckCounts(parts[0].devices, cycle, np.concatenate([part.counts for part in parts]))
+
+
+class TruthClock:
+    """Finds the host's time of each row of the truth, as the log is read: between the cycles that it lies between."""
+
+    def __init__(self, truth: TruthTable) -> None:
+        assert truth.rows.attempt is not None
+        self._cycle, self._attempt = truth.rows.cycle, truth.rows.attempt
+        self.t_ns = np.zeros(len(self._cycle), np.int64)
+        self._pending = np.arange(len(self._cycle))
+        self._before: tuple[int, int] | None = None  # cycle and time of the last row before the piece
+
+    def place_rows(self, scheme: Series, begins: Cycles) -> tuple[Rows, Cycles]:
+        """Place the rows of the truth that fall into a piece of the log; return these rows and their cycles.
+
+        begins: first cycle of each attempt so far.
+        """
+        cycle, t_ns = scheme.records["cycle"].astype(np.int64), scheme.t_ns
+        pending = self._pending
+        known = host_cycles(self._cycle[pending], self._attempt[pending], begins)
+        is_told = (self._attempt[pending] < len(begins)) & (known <= cycle[-1])
+        rows, cycles = pending[is_told], known[is_told]
+        self.t_ns[rows] = self._times_ns(cycles, cycle, t_ns)
+        self._pending = pending[~is_told]
+        self._before = int(cycle[-1]), int(t_ns[-1])
+        return rows, cycles
+
+    def _times_ns(self, wanted: Cycles, cycle: Cycles, t_ns: Cycles) -> Cycles:
+        if self._before is not None:
+            cycle, t_ns = np.append(self._before[0], cycle), np.append(self._before[1], t_ns)
+        since_ns = np.interp(wanted, cycle, (t_ns - t_ns[0]).astype(np.float64))
+        return np.asarray(t_ns[0] + np.rint(since_ns).astype(np.int64))
+
+
+class ThinnedTimes:
+    """The columns of /cycle: all of them, or of a long run those with extremes."""
+
+    def __init__(self, empty: CycleColumns, full_cycles: int) -> None:
+        self._parts = [empty]
+        self._index = [np.empty(0, np.int64)]
+        self._full_cycles = full_cycles
+        self._bucket = 1
+        self._cycles = 0
+        self._waiting = 0
+
+    def add_columns(self, columns: CycleColumns) -> None:
+        """Take in the next cycles."""
+        if not len(columns):
+            return
+        self._parts.append(columns)
+        self._index.append(np.arange(self._cycles, self._cycles + len(columns)))
+        self._cycles += len(columns)
+        self._waiting += len(columns)
+        if self._waiting > _WAITING:
+            self._thin()
+
+    def _thin(self) -> None:
+        waiting, self._waiting = self._waiting, 0
+        if self._cycles <= self._full_cycles or not waiting:
+            return
+        bucket = _bucket_of(self._cycles, TIME_BUCKETS, self._bucket)
+        kept = 0 if bucket != self._bucket else 1  # parts that have been thinned
+        self._bucket = bucket
+        columns, index = CycleColumns.joined(self._parts[kept:]), np.concatenate(self._index[kept:])
+        names = (*(quantity.column for quantity in QUANTITIES), *QUEUES.values(), "overruns")
+        series = (columns[name].astype(np.float64) for name in names if name in columns)
+        rows = _extremes_by_bucket(series, index, bucket)
+        columns, index = columns.rows(rows), index[rows]
+        self._parts = [CycleColumns.joined([*self._parts[:kept], columns])]
+        self._index = [np.concatenate([*self._index[:kept], index])]
+
+    def columns(self) -> CycleColumns:
+        """Return the columns that were kept."""
+        self._thin()
+        return CycleColumns.joined(self._parts)
+
+
+_PLAIN: Final = ("state", "fault", "contact_joints", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
+_MOTION: Final = ("q", "dq", "tau_J")
+_CERTIFIED: Final = ("tau_ext_bank", "threshold_bank", "theta_further", "theta_std", "promotions")
+_PAPER: Final = ("paper_is_armed", "paper_tau_ext_hat", "paper_threshold")
+_ROOM: Final = 1 << 16
+"""Rows to allocate at first."""
+
+
+class SchemeRows:
+    """Rows of /scheme, gathered piece by piece: only the fields that a report reads.
+
+    One block of memory holds them: columns that are gathered apart and joined at the end need the memory twice, and
+    fragment it. `index`: place among all cycles that were read; `is_kept`: never dropped.
+    """
+
+    def __init__(self, empty: Series) -> None:
+        self.count = 0
+        self.cycles = 0
+        """All that were read, of which `count` are here."""
+        self._begin(empty)
+
+    def _begin(self, scheme: Series) -> None:
+        """Make room for rows of such fields."""
+        names = [name for name in ("cycle", *_PLAIN, *_MOTION, *_CERTIFIED, *_PAPER) if name in scheme.fields]
+        own = [("t_ns", np.dtype(np.int64)), ("index", np.dtype(np.int64)), ("is_kept", np.dtype(np.bool_))]
+        fields = [*own, *((name, scheme.records.dtype[name]) for name in names)]
+        self._names = names
+        self._rows = np.empty(_ROOM, np.dtype(fields, align=True))
+
+    def add_records(self, scheme: Series, kept: Rows) -> None:
+        """Take in a piece. kept: its rows that are never dropped."""
+        if self.count == 0:
+            self._begin(scheme)  # only a record shows the fields of a log
+        end = self.count + len(scheme)
+        if end > len(self._rows):
+            more = np.empty(max(end, 2 * len(self._rows)), self._rows.dtype)
+            more[: self.count] = self._rows[: self.count]
+            self._rows = more
+        here = self._rows[self.count : end]
+        here["t_ns"] = scheme.t_ns
+        here["index"] = np.arange(self.cycles, self.cycles + len(scheme))
+        here["is_kept"] = False
+        here["is_kept"][kept] = True
+        for name in self._names:
+            here[name] = scheme.records[name]
+        self.count = end
+        self.cycles += len(scheme)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """Return a column (n,)."""
+        return self._rows[name][: self.count]
+
+    def mark_kept(self, rows: slice, around_ns: list[Bounds]) -> None:
+        """Mark those of some rows that lie within some times as never to be dropped."""
+        t_ns, is_kept = self.column("t_ns")[rows], self.column("is_kept")[rows]
+        for start_ns, end_ns in around_ns:
+            is_kept[np.searchsorted(t_ns, start_ns) : np.searchsorted(t_ns, end_ns, side="right")] = True
+
+    def drop(self, rows: Rows) -> int:
+        """Drop some rows; return how many."""
+        left = np.delete(self._rows[: self.count], rows)
+        self.count = len(left)
+        self._rows[: self.count] = left
+        return len(rows)
+
+    def run(self, shell: Run, rows: slice = slice(None)) -> Run:
+        """Give a run with all or some of these rows, else as `shell`."""
+        columns = {name: self.column(name)[rows] for name in ("t_ns", *self._names)}
+        return replace(shell, **_arrays(columns, shell.settings))
+
+
+def _arrays(columns: dict[str, NDArray[Any]], settings: Settings) -> dict[str, Any]:
+    """Give the fields of a run."""
+    arrays: dict[str, Any] = {name: columns[name] for name in _PLAIN}
+    arrays |= {"cycle": columns["cycle"].astype(np.int64), "t_ns": columns["t_ns"]}
+    arrays["motion"] = MeasuredMotion(*(columns[name] for name in _MOTION))
+    if "tau_ext_bank" in columns:
+        shape = (-1, settings.channel_count, JOINTS)
+        arrays["certified"] = CertifiedStream(
+            tau_ext=columns["tau_ext_bank"].reshape(shape),
+            threshold=columns["threshold_bank"].reshape(shape),
+            theta_further=columns["theta_further"],
+            theta_std=columns["theta_std"],
+            promotions=columns["promotions"],
+        )
+    if "paper_is_armed" in columns:
+        arrays["beside"] = PaperStream(
+            is_armed=columns["paper_is_armed"] > 0.5,
+            tau_ext_hat=columns["paper_tau_ext_hat"],
+            threshold=columns["paper_threshold"],
+        )
+    return arrays
+
+
+def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[Run, Bounds]:
+    """Extend a stretch as little as needed to cut no contact and no adaptation.
+
+    run: has the cycles in which contacts and adaptations begin or end. Returns what is known of the stretch before it
+    is read, and its bounds.
+    """
+    zero_ns = run.zero_ns
+    first_s, last_s = ((bound_ns - zero_ns) * 1e-9 for bound_ns in stretch.bounds_ns(start_ns))
+    busy = sorted(_busy(run))
+    for begin_s, end_s in reversed(busy):
+        if begin_s < first_s < end_s:
+            first_s = begin_s
+    for begin_s, end_s in busy:
+        if begin_s < last_s < end_s:
+            last_s = end_s
+    bounds_ns = (round(first_s * 1e9) + zero_ns, round(last_s * 1e9) + zero_ns)
+    begun_ns = [contact.onset_ns for contact in judge.contacts_of(run)]
+    if run.truth is None:
+        begun_ns = [detection.t_ns for detection in find_detections(run)]
+    known = StretchOfRun(
+        stretch,
+        TimeWindow(*((bound_ns - start_ns) * 1e-9 for bound_ns in bounds_ns)),
+        sum(at_ns < bounds_ns[0] for at_ns in begun_ns),
+        (zero_ns - start_ns) * 1e-9,
+    )
+    truth = run.truth
+    if truth is not None and truth.time_s is not None:
+        truth = truth_rows(truth, (truth.time_s >= first_s) & (truth.time_s < last_s))
+    return replace(shell, motion_start_ns=zero_ns, truth=truth, stretch=known), bounds_ns
+
+
+def _busy(run: Run) -> Iterator[tuple[float, float]]:
+    """Yield start and end of each true contact and each stretch in a state of `BUSY`, margins included, s."""
+    time_s, later_s = run.time_s(), SETTLING_TIME_CONSTANTS / run.a_rad_s
+    is_busy: Mask = np.concatenate(([False], np.isin(run.state, BUSY), [False]))
+    edges = np.flatnonzero(is_busy[1:] != is_busy[:-1])
+    for first, end in edges.reshape(-1, 2).tolist():
+        yield float(time_s[first]) - MARGIN_S, float(time_s[min(end, len(time_s) - 1)]) + later_s
+    for contact in judge.contacts_of(run):
+        assert contact.time_s is not None
+        yield float(contact.time_s[0]) - MARGIN_S, float(contact.time_s[-1]) + later_s

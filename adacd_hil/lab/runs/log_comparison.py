@@ -18,25 +18,18 @@ from numpy.typing import NDArray
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
-from adacd_hil.records import SchemeState
+from adacd_hil.records import ContactReport, SchemeState
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.settings.configuration import Settings, changed_keys
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.setting_keys import changed_keys
 
 _TOPICS: Final = ("/scheme", "/cycle", "/contact")
 _TIMES: Final = ("lateness_ns", "feedback_ns", "command_ns", "compute_ns", "slack_ns")
 _NOT_METADATA: Final = ("epoch_ns",)
 
 
-class ComparedContact(NamedTuple):
-    """The last report of a contact; time since motion start."""
-
-    time_s: float
-    link: int
-    level: int
-    kind: int
-    tau_ext_peak: tuple[float, ...]
-    force_N: float
-    location: int = 0  # records.Location: the meaning of force_N
+Contact = tuple[float, ContactReport]
+"""When a contact was found, s since motion start, and its last report, with the log's own numbers for its enums."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +42,7 @@ class RunDigest:
     problem: str
     cycles: int
     states: list[tuple[float, str]]
-    contacts: list[ComparedContact]
+    contacts: list[Contact]
     parameters: dict[str, list[float]]
     timing_us: dict[str, dict[str, float]]
 
@@ -64,7 +57,7 @@ class RunReader:
         self.settings = settings_of(path, self._stream.attachments)
         self.cycles = 0
         self._states: list[tuple[float, str]] = []
-        self._contacts: dict[int, ComparedContact] = {}
+        self._contacts: dict[int, Contact] = {}
         self._parameters: dict[str, list[float]] = {}
         self._times = {name: Distribution() for name in _TIMES}
         self._bounds: tuple[int, int] | None = None
@@ -116,7 +109,7 @@ class RunReader:
             cycles = self._wanted(piece.series["/cycle"])
             for name in _TIMES:
                 if name in cycles.fields:
-                    self._times[name].add(cycles.records[name] / 1e3)
+                    self._times[name].add_values(cycles.records[name] / 1e3)
             yield records
 
     def _keep_parameters(self, record: Any) -> None:
@@ -127,18 +120,9 @@ class RunReader:
         """Keep the last report of each contact, with the time of its first one."""
         key = int(record["cycle"])
         before = self._contacts.get(key)
-        names = record.dtype.names or ()
-        told = ("level", "kind", "force_N", "location")
-        level, kind, force, location = (record[name].item() if name in names else 0 for name in told)
-        self._contacts[key] = ComparedContact(
-            time_s if before is None else before.time_s,
-            int(record["link"]),
-            int(level),
-            int(kind),
-            tuple(record["tau_ext_peak"].tolist()),
-            float(force),
-            int(location),
-        )
+        there = [name for name in ContactReport._fields if name in (record.dtype.names or ())]
+        report = ContactReport(**{name: record[name].tolist() for name in there})
+        self._contacts[key] = (time_s if before is None else before[0], report)
 
     def digest(self) -> RunDigest:
         """Return the digest, once everything has been read."""
@@ -155,7 +139,7 @@ class RunReader:
             self._stream.problem,
             self.cycles,
             self._states,
-            sorted(self._contacts.values()),
+            sorted(self._contacts.values(), key=lambda contact: contact[0]),
             self._parameters,
             timing,
         )
@@ -204,7 +188,7 @@ class FieldDifference(NamedTuple):
         return self._asdict() | {"largest": self.largest if math.isfinite(self.largest) else None}
 
 
-ContactPair = tuple[ComparedContact | None, ComparedContact | None]
+ContactPair = tuple[Contact | None, Contact | None]
 """A contact in both runs, or in one."""
 
 
@@ -253,9 +237,16 @@ class LogComparison:
             "cycles": self.cycles,
             "only": list(self.only),
             "fields": [field.as_json() for field in self.fields],
-            "contacts": [{"first": a and a._asdict(), "second": b and b._asdict()} for a, b in self.contacts],
+            "contacts": [{"first": _contact_json(a), "second": _contact_json(b)} for a, b in self.contacts],
             "notes": list(self.notes),
         }
+
+
+def _contact_json(contact: Contact | None) -> dict[str, Any] | None:
+    if contact is None:
+        return None
+    names = ("link", "level", "kind", "tau_ext_peak", "force_N", "location")
+    return {"time_s": contact[0], **{name: getattr(contact[1], name) for name in names}}
 
 
 class _Differences:
@@ -375,16 +366,16 @@ def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
     return next((rows for rows in stream if len(rows)), None)
 
 
-def match_contacts(first: list[ComparedContact], second: list[ComparedContact]) -> list[ContactPair]:
+def match_contacts(first: list[Contact], second: list[Contact]) -> list[ContactPair]:
     """Match detections by time, the nearest ones first; others stand alone. In order of time."""
-    order = sorted(range(len(second)), key=lambda k: second[k].time_s)
-    times_s = [second[k].time_s for k in order]
+    order = sorted(range(len(second)), key=lambda k: second[k][0])
+    times_s = [second[k][0] for k in order]
     distances = []
     for i, a in enumerate(first):
-        for place in range(bisect_left(times_s, a.time_s - MATCH_S), len(order)):
-            if times_s[place] - a.time_s > MATCH_S:
+        for place in range(bisect_left(times_s, a[0] - MATCH_S), len(order)):
+            if times_s[place] - a[0] > MATCH_S:
                 break
-            distances.append((abs(a.time_s - times_s[place]), i, order[place]))
+            distances.append((abs(a[0] - times_s[place]), i, order[place]))
     partner: dict[int, int] = {}
     taken: set[int] = set()
     for distance, i, k in sorted(distances):
@@ -393,4 +384,4 @@ def match_contacts(first: list[ComparedContact], second: list[ComparedContact]) 
             taken.add(k)
     pairs: list[ContactPair] = [(a, second[partner[i]] if i in partner else None) for i, a in enumerate(first)]
     pairs += [(None, b) for k, b in enumerate(second) if k not in taken]
-    return sorted(pairs, key=lambda pair: min(each.time_s for each in pair if each is not None))
+    return sorted(pairs, key=lambda pair: min(each[0] for each in pair if each is not None))

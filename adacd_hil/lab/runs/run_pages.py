@@ -8,7 +8,6 @@ from urllib.parse import quote
 
 import numpy as np
 
-from adacd_hil.lab.drawing import SIGMAS, Drawing, HistoryPanel, history_figure
 from adacd_hil.lab.report.page import Heading, Table, make_table, render_page
 from adacd_hil.lab.report.traces import Trace, TracePanel, Track, pack_tracks
 from adacd_hil.lab.runs.run_summary import BROKEN, RunSummary
@@ -17,7 +16,8 @@ from adacd_hil.lab.runs.run_trend import Trend
 from adacd_hil.records import JOINTS
 
 INDEX_NAME: Final = "index.html"
-_MARGIN: Final = "Margin: smallest threshold over residual"
+_SIGMAS: Final = 2.0
+"""Half the width of the band around a value, in deviations of the certificate."""
 _FINEST: Final = 1e-5
 _SHORTEST_S: Final = 60.0
 """An eighth of the shortest part of a trend that is shown."""
@@ -87,35 +87,15 @@ def _track_of(trend: Trend, name: str) -> Track:
     for number, each in enumerate(trend.quantities):
         traces = []
         for joint in range(JOINTS):
-            colour, value, spread = f"joint{joint + 1}", each.values[dated, joint], SIGMAS * each.std[dated, joint]
+            colour, value, spread = f"joint{joint + 1}", each.values[dated, joint], _SIGMAS * each.std[dated, joint]
             traces.append(Trace(f"joint {joint + 1}", value, _FINEST, colour))
             if np.isfinite(spread).any():
                 traces.append(Trace("from", value - spread, _FINEST, colour, is_dashed=True))
                 traces.append(Trace("to", value + spread, _FINEST, colour, is_dashed=True))
         panels.append(TracePanel(f"{name}-{number}", each.title, "", tuple(traces)))
     margin = (Trace("run", trend.margins[dated, 0], _FINEST, "beside"),)
-    panels.append(TracePanel(f"{name}-margin", _MARGIN, "×", margin, levels=(1.0,)))
+    panels.append(TracePanel(f"{name}-margin", "Margin: smallest threshold over residual", "×", margin, levels=(1.0,)))
     return Track(name, np.array(at_s, np.float64), tuple(panels))
-
-
-def draw_trend(trend: Trend, name: str = "trend") -> Drawing | None:
-    """Draw thresholds, friction, offsets and margins over the dates of the runs; None with fewer than two dates."""
-    dated = [row for row, run in enumerate(trend.runs) if run.started is not None]
-    if len(dated) < 2:
-        return None
-    joints = ("joint 1", "joint 2")
-    places = {id(trend.runs[row]): place for place, row in enumerate(dated)}
-    panels = []
-    for each in trend.quantities:
-        marks = tuple(sorted({places[id(change.run)] for change in each.changes if id(change.run) in places}))
-        panels.append(HistoryPanel(each.title, joints, each.values[dated], each.std[dated], marks))
-    margins = trend.margins[dated]
-    panels.append(HistoryPanel(_MARGIN, ("run",), margins, margins * float("nan"), level=1.0))
-    dates = [run.started.replace(tzinfo=None).isoformat() for run in trend.runs if run.started is not None]
-    caption = (
-        "Bars: two deviations of the certificate. Dashed: a change beyond what explains it. Dotted: a margin of 1."
-    )
-    return history_figure(dates, panels, name, trend.arm, caption)
 
 
 def _changes_table(trend: Trend) -> Table:

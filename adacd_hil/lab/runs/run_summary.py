@@ -6,8 +6,6 @@ from the log's index and its events; `judged` reads the whole log.
 
 Friction and torque offsets are those of the first certificate that no payload was announced for, thresholds those of
 the watching after the first adaptation. Friction is at `FRICTION_AT_RAD_S`; offsets have the configuration's included.
-A log of an earlier version has no certificate in numbers: then friction is F_c + speed F_v, and its deviation the
-largest that those of F_c and F_v leave, whatever their correlation.
 
 Torques in Nm, a value per joint.
 """
@@ -304,7 +302,6 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
     armed = [contact for contact in table["contacts"] if _flag(contact["is_armed"])]
     false_alarms = table["false_alarms"]
     has_truth = false_alarms is not None
-    model = _first_model(summary, table)
     return dataclasses.replace(
         summary,
         status=GOOD if is_good else NOT_GOOD,
@@ -315,10 +312,7 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
         found=sum(contact["detected_s"] is not None for contact in armed),
         expected=len(armed) if has_truth else None,
         false_alarms=int(false_alarms) if has_truth else None,
-        friction_Nm=model.friction_Nm,
-        friction_std_Nm=model.friction_std_Nm,
-        offset_Nm=model.offset_Nm,
-        offset_std_Nm=model.offset_std_Nm,
+        **_first_model(table),
     )
 
 
@@ -355,35 +349,14 @@ def _configured_threshold(settings: Settings | None) -> Pair | None:
     return None if settings is None else settings.detector.threshold_Nm
 
 
-class _Model(NamedTuple):
-    """The first model of a run: its friction and its torque offsets, with their deviations."""
-
-    friction_Nm: Pair | None = None
-    friction_std_Nm: Pair | None = None
-    offset_Nm: Pair | None = None
-    offset_std_Nm: Pair | None = None
-
-
-def _first_model(summary: RunSummary, table: Mapping[str, Any]) -> _Model:
-    """Take the first certificate, as the log has it in numbers, else the parameters of the first adaptation."""
+def _first_model(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Give friction and offsets of the first certificate without a payload, else what the paper's scheme identified."""
     certified, section = table["certified"], _first_adaptation(table)
     if certified is None:
-        return _Model(_identified_friction(table["parameters"], section))
-    own = [each for each in certified.get("certificates", ()) if not _flag(each["is_payload"])]
-    if own:
-        names = ("friction_Nm", "friction_std_Nm", "offset_Nm", "offset_std_Nm")
-        return _Model(*(_pair(own[0][name][_AT if name.startswith("friction") else slice(None)]) for name in names))
-    estimates = {} if section is None else certified["estimates"].get(section, {})
-    coulomb, coulomb_std = _estimated(estimates, "F_c")
-    viscous, viscous_std = _estimated(estimates, "F_v")
-    offset, offset_std = _estimated(estimates, "offset")
-    if coulomb is None or viscous is None or coulomb_std is None or viscous_std is None:
-        return _Model()
-    model = _Model(_at_speed(coulomb, viscous), _at_speed(coulomb_std, viscous_std))
-    if offset is None or summary.settings is None:
-        return model
-    configured = summary.settings.arm.torque_offset_Nm
-    return model._replace(offset_Nm=(offset[0] + configured[0], offset[1] + configured[1]), offset_std_Nm=offset_std)
+        return {"friction_Nm": _identified_friction(table["parameters"], section)}
+    own = [each for each in certified["certificates"] if not _flag(each["is_payload"])]
+    names = ("friction_Nm", "friction_std_Nm", "offset_Nm", "offset_std_Nm") if own else ()
+    return {name: _pair(own[0][name][_AT if name.startswith("friction") else slice(None)]) for name in names}
 
 
 def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> Pair | None:
@@ -392,19 +365,10 @@ def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> 
         return None
     values = {name: _number(pair[1]) for name, pair in parameters[section].items()}
     coulomb, viscous = ([values[f"{name}{joint}"] for joint in (1, 2)] for name in ("F_c", "F_v"))
-    return None if None in coulomb or None in viscous else _at_speed(_pair(coulomb), _pair(viscous))
-
-
-def _at_speed(coulomb: Pair, viscous: Pair) -> Pair:
-    return coulomb[0] + FRICTION_AT_RAD_S * viscous[0], coulomb[1] + FRICTION_AT_RAD_S * viscous[1]
-
-
-def _estimated(estimates: Mapping[str, Any], name: str) -> tuple[Pair | None, Pair | None]:
-    """Give an estimate of each joint and its deviation."""
-    found = [estimates.get(f"{name}{joint}") for joint in (1, 2)]
-    if any(each is None or each["value"] is None or each["std"] is None for each in found):
-        return None, None
-    return _pair([each["value"] for each in found if each]), _pair([each["std"] for each in found if each])
+    if None in coulomb or None in viscous:
+        return None
+    (c1, c2), (v1, v2) = _pair(coulomb), _pair(viscous)
+    return c1 + FRICTION_AT_RAD_S * v1, c2 + FRICTION_AT_RAD_S * v2
 
 
 def _number(value: Any) -> float | None:

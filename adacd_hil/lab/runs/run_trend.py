@@ -24,7 +24,7 @@ from adacd_hil.lab.runs.run_table import in_order
 from adacd_hil.log.logged_run import EMBEDDED
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify.evidence import LAST_SIGMAS
-from adacd_hil.settings.configuration import changed_keys
+from adacd_hil.settings.setting_keys import changed_keys
 
 THRESHOLD_SHARE: Final = 0.4
 """Eight demos that differed in their seeds only had thresholds up to 27 % apart, 2026-11-25."""

@@ -29,19 +29,16 @@ from adacd_hil.log.logged_run import (
     split_sections,
 )
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
-from adacd_hil.scheme.contact.contact_report import KIND_S
 from adacd_hil.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
 from adacd_hil.score.judge import (
-    LoggedDetection,
+    Detection,
     Score,
-    TouchWindow,
-    TruthTouch,
+    TrueContact,
     channels_at,
+    contacts_of,
     find_detections,
-    ideal_response,
     judge_run,
     row_at,
-    true_contacts,
 )
 from adacd_hil.score.margins import UntouchedGatherer, evaluate_certified, last_row
 from adacd_hil.score.metrics import (
@@ -54,30 +51,33 @@ from adacd_hil.score.metrics import (
     TimeStatistics,
     TimingEvidence,
 )
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.scheme_settings import KIND_S
 
 
 class RunGatherer:
     """Sums up all cycles of a run, piece by piece, in bounded memory."""
 
-    def __init__(self, outline: Run) -> None:
-        """Take from `outline` when contacts, reactions and sections begin and end."""
-        self._untouched = UntouchedGatherer(outline)
-        self._data = CyclicDataGatherer(outline.settings)
-        self._timing = TimingGatherer(outline.settings.bus.period_us, not is_realtime(outline))
+    def __init__(self, settings: Settings, is_modelled: bool) -> None:
+        self._untouched = UntouchedGatherer(settings)
+        self._data = CyclicDataGatherer(settings)
+        self._timing = TimingGatherer(settings.bus.period_us, is_modelled)
         self._state = int(SchemeState.INIT)  # of the last cycle so far
 
-    def add_piece(self, piece: Run) -> None:
-        """Take the next cycles."""
-        reactions = find_reactions(piece.timing, piece.cycle, piece.state, self._state)
-        self._timing.add(piece.timing, reactions)
-        self._data.add(piece.timing, piece.cycle, piece.state)
-        self._untouched.add(piece)
-        if piece.state.size:
-            self._state = int(piece.state[-1])
+    def add_times(self, timing: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
+        """Take the times of the next cycles, and the states of the same cycles (k,)."""
+        self._timing.add_columns(timing, find_reactions(timing, cycle, state, self._state))
+        self._data.add_columns(timing, cycle, state)
+        if state.size:
+            self._state = int(state[-1])
+
+    def add_untouched(self, piece: Run, outline: Run) -> None:
+        """Take the next cycles; outline: see `adacd_hil.score.margins`."""
+        self._untouched.add_untouched(piece, outline)
 
     def gathered(self, run: Run) -> Gathered:
         """Sum up. run: has the cycles in which the state changes."""
-        return Gathered(self._untouched.gathered(), self._timing.evidence(), self._data.data(run))
+        return Gathered(self._untouched.untouched(run), self._timing.evidence(), self._data.data(run))
 
 
 def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
@@ -86,14 +86,14 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     gathered: the sums over all cycles; None: the run has all of its cycles.
     """
     if gathered is None:
-        gatherer = RunGatherer(run)
-        gatherer.add_piece(run)
+        gatherer = RunGatherer(run.settings, not is_realtime(run))
+        gatherer.add_times(run.timing, run.cycle, run.state)
+        gatherer.add_untouched(run, run)
         gathered = gatherer.gathered(run)
-    touches = true_contacts(run)
     detections = find_detections(run)
-    score = judge_run(run, touches, detections)
+    score = judge_run(run, contacts_of(run), detections)
     sections = split_sections(run)
-    contacts = list_contacts(run, sections, touches, detections, score)
+    contacts = list_contacts(run, sections, detections, score)
     residuals = gathered.untouched.residuals
     evidence = evaluate_certified(run, sections, gathered.untouched)
     adaptation_s = {
@@ -103,9 +103,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     }
     has_truth = run.truth is not None
     false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
-    missed = score.missed
-    faults, causes, data = find_faults(run), find_causes(run), gathered.data
-    payload_kg = _payloads(run, sections)
+    faults, payload_kg = find_faults(run), _payloads(run, sections)
     return Metrics(
         sections=sections,
         adaptation_s=adaptation_s,
@@ -113,19 +111,21 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         contacts=contacts,
         false_alarms=len(false_s) if has_truth else None,
         false_alarms_s=false_s if has_truth else None,
-        missed=missed if has_truth else None,
+        missed=score.missed if has_truth else None,
         parameters=_parameters(run, sections),
         payload_kg=payload_kg,
         fault=faults[0].reason if faults else None,
         fault_s=faults[0].at_s if faults else None,
-        cycle=cycle_statistics(run, gathered.timing.cycles),
+        cycle=_cycle_statistics(run, gathered.timing.cycles),
         timing=gathered.timing,
-        data=data,
+        data=gathered.data,
         frames=run.frames,
         dropped=run.dropped,
         evidence=evidence,
         paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
-        findings=list_findings(run, sections, score, adaptation_s, payload_kg, evidence, faults, causes, data),
+        findings=list_findings(
+            run, sections, score, contacts, adaptation_s, payload_kg, evidence, faults, find_causes(run), gathered.data
+        ),
         armed_false_alarms=score.armed_false_alarms if has_truth else None,
     )
 
@@ -169,7 +169,7 @@ def _payload_at(run: Run, cycle: int) -> float | None:
     return None if run.truth is None or row is None else float(run.truth.payload_kg[row])
 
 
-def cycle_statistics(run: Run, count: int) -> CycleStatistics:
+def _cycle_statistics(run: Run, count: int) -> CycleStatistics:
     """Give the statistics of all cycles, `count` of them, those before motion start included."""
     return CycleStatistics(
         count=count,
@@ -180,32 +180,28 @@ def cycle_statistics(run: Run, count: int) -> CycleStatistics:
 
 
 def list_contacts(
-    run: Run,
-    sections: tuple[Section, ...],
-    touches: tuple[TruthTouch, ...],
-    detections: tuple[LoggedDetection, ...],
-    score: Score,
+    run: Run, sections: tuple[Section, ...], detections: tuple[Detection, ...], score: Score
 ) -> tuple[ReportedContact, ...]:
     """List the true contacts with the detection that found each; without the truth the detections."""
     if run.truth is None:
         return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
-    raised = {detection.raised.t_ns: detection for detection in detections}
+    raised = {detection.t_ns: detection for detection in detections}
     return tuple(
-        _contact(run, sections, touch, judged, None if judged.detected_ns is None else raised[judged.detected_ns])
-        for touch, judged in zip(touches, score.contacts, strict=True)
+        _contact(run, sections, contact, None if contact.detected_ns is None else raised[contact.detected_ns])
+        for contact in score.contacts
     )
 
 
-def _reported(detection: LoggedDetection | None) -> dict[str, Any]:
+def _reported(run: Run, detection: Detection | None) -> dict[str, Any]:
     """Give the fields of a contact that the reports of its detection have."""
     if detection is None:
         return {}
-    said: dict[str, Any] = {"detected_s": detection.detected_s}
-    last = detection.final or detection.alarm
-    if detection.alarm is None or last is None:
+    said: dict[str, Any] = {"detected_s": (detection.t_ns - run.zero_ns) * 1e-9}
+    first, last = detection.first, detection.last
+    if first is None or last is None:
         return said
     said |= {
-        "link_at_alarm": detection.alarm.link,
+        "link_at_alarm": first.link,
         "link_detected": last.link,
         "direction": last.direction,
         "tau_ext_peak_hat_Nm": last.tau_ext_peak,
@@ -241,56 +237,67 @@ def _state_at(run: Run, time_s: float) -> SchemeState:
     return SchemeState(run.state[max(row_at(run, time_s) - 1, 0)])
 
 
-def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: LoggedDetection) -> ReportedContact:
+def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: Detection) -> ReportedContact:
+    reported = _reported(run, detection)
     return ReportedContact(
         number=number,
-        section=section_at(sections, detection.detected_s),
-        state=_state_at(run, detection.detected_s).name,
+        section=section_at(sections, reported["detected_s"]),
+        state=_state_at(run, reported["detected_s"]).name,
         is_armed=True,
-        **_reported(detection),
+        **reported,
     )
 
 
 def _contact(
-    run: Run, sections: tuple[Section, ...], touch: TruthTouch, judged: TouchWindow, detection: LoggedDetection | None
+    run: Run, sections: tuple[Section, ...], contact: TrueContact, detection: Detection | None
 ) -> ReportedContact:
-    truth = run.truth
+    truth, time_s = run.truth, contact.time_s
     assert truth is not None
-    rows = slice(touch.first, touch.last + 1)
-    tau_ext = truth.tau_ext[rows]
-    since_s = run.truth_time_s(rows) - touch.onset_s
-    delay_s = detection.detected_s - touch.onset_s if detection else math.inf
+    assert time_s is not None
+    onset_s, touched = float(time_s[0]), slice(contact.rows)
+    tau_ext, since_s = contact.tau_ext[touched], time_s[touched] - onset_s
+    reported = _reported(run, detection)
+    delay_s = reported["detected_s"] - onset_s if reported else math.inf
     # The host sees samples up to the detection for the delay, up to the end of the window for the rest.
     until_alarm = np.abs(tau_ext[since_s <= delay_s]).max(axis=0)
     is_seen = since_s <= delay_s + _window_s(run)
-    until_final = tau_ext[is_seen]
-    channels = channels_at(run, touch.onset_s)
+    until_final, links = _touches(run, onset_s, onset_s + delay_s + _window_s(run) if reported else float(time_s[-1]))
+    channels = channels_at(run, onset_s)
     steps_s = [delay for channel in channels if (delay := channel.step_delay_s(until_alarm)) is not None]
-    is_over = [np.abs(ideal_response(run, touch, channel)) > channel.threshold for channel in channels]
+    responses = [channel.respond(contact.tau_ext, contact.cycle, run.settings.bus.period_s) for channel in channels]
+    is_over = [np.abs(response) > channel.threshold for response, channel in zip(responses, channels, strict=True)]
     over = np.flatnonzero(np.any(is_over, axis=(0, 2)))
-    ideal_ms = None
-    if over.size:
-        crossing = touch.first + int(over[0])
-        ideal_ms = float(run.truth_time_s(slice(crossing, crossing + 1))[0] - touch.onset_s) * 1e3
     peak = until_final[np.argmax(np.abs(until_final), axis=0), range(JOINTS)]
-    reported = _reported(detection)
     return ReportedContact(
-        number=judged.number,
-        section=section_at(sections, touch.onset_s),
-        state=_state_at(run, touch.onset_s).name,
-        link=judged.link,
-        onset_s=touch.onset_s,
-        end_s=touch.end_s,
-        is_armed=judged.is_armed,
-        delay_ms=judged.delay_ms,
+        number=contact.number,
+        section=section_at(sections, onset_s),
+        state=_state_at(run, onset_s).name,
+        link=contact.link,
+        onset_s=onset_s,
+        end_s=float(time_s[-1]),
+        is_armed=contact.is_armed,
+        delay_ms=contact.delay_ms,
         law_ms=min(steps_s) * 1e3 if steps_s else None,
-        ideal_ms=ideal_ms,
+        ideal_ms=float(time_s[over[0]] - onset_s) * 1e3 if over.size else None,
+        link_ok=None if reported.get("link_detected") is None else reported["link_detected"] in links,
         direction_ok=_is_direction_right(reported.get("direction"), until_final.sum(axis=0)),
         tau_ext_Nm=(float(peak[0]), float(peak[1])),
         torque_error_ratio=_torque_ratio(reported.get("tau_ext_peak_hat_Nm"), peak),
-        true_force_N=None if truth.force_N is None else float(truth.force_N[rows][is_seen].max()),
+        true_force_N=None if contact.force_N is None else float(contact.force_N[touched][is_seen].max()),
         **reported,
     )
+
+
+def _touches(run: Run, from_s: float, until_s: float) -> tuple[Vector, Cycles]:
+    """Give the true torque (k, 2) and the touched link (k,) of all contacts between two times.
+
+    A second person who joins is in the report of the contact before.
+    """
+    assert run.truth is not None
+    time_s = run.truth_time_s()
+    rows = slice(np.searchsorted(time_s, from_s), np.searchsorted(time_s, until_s, side="right"))
+    is_touched = run.truth.contact_index[rows] >= 0.0
+    return run.truth.tau_ext[rows][is_touched], run.truth.contact_link[rows][is_touched].astype(np.int64)
 
 
 def _window_s(run: Run) -> float:
@@ -343,14 +350,14 @@ class TimingGatherer:
         self._last: dict[str, int] = {}  # value of each running count
         self._reactions: Distribution | None = None
 
-    def add(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
-        """Add the next cycles. reactions: see `collect_evidence`."""
+    def add_columns(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
+        """Add the next cycles. reactions: those in which the state becomes REACT (n,); None without states."""
         self._cycles += len(columns)
         for quantity in QUANTITIES:
             self._add_times(quantity, columns)
         for name, column in QUEUES.items():
             if column in columns and not self._is_modelled:  # lockstep has no queues
-                self._depths.setdefault(name, Distribution(self._exact)).add(columns[column])
+                self._depths.setdefault(name, Distribution(self._exact)).add_values(columns[column])
         if "data_age" in columns:
             ages = np.bincount(np.minimum(columns["data_age"], OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
             self._ages = ages if self._ages is None else self._ages + ages
@@ -361,13 +368,13 @@ class TimingGatherer:
                 self._last[name] = int(columns[name][-1])
         if reactions is not None and (compute_us := columns.times_us(COMPUTE)) is not None:
             self._reactions = self._reactions or Distribution(self._exact)
-            self._reactions.add(compute_us[reactions])
+            self._reactions.add_values(compute_us[reactions])
 
     def _add_times(self, quantity: Quantity, columns: CycleColumns) -> None:
         values_us = columns.times_us(quantity)
         if values_us is None or (self._is_modelled and quantity is LATENESS):  # lockstep has no grid to be late on
             return
-        self._times.setdefault(quantity.name, Distribution(self._exact)).add(values_us)
+        self._times.setdefault(quantity.name, Distribution(self._exact)).add_values(values_us)
         found = log_histogram(values_us)
         before = self._histograms.get(quantity.name)
         self._histograms[quantity.name] = found if before is None else before.joined(found)
@@ -400,12 +407,10 @@ class TimingGatherer:
         return Count(total, total * PER_CYCLES / self._cycles if self._cycles else None)
 
 
-def collect_evidence(
-    columns: CycleColumns, period_us: float, is_modelled: bool, reactions: NDArray[np.bool_] | None = None
-) -> TimingEvidence:
-    """Sum up the columns. reactions: the cycles in which the state becomes REACT (n,); None without states."""
+def collect_evidence(columns: CycleColumns, period_us: float, is_modelled: bool) -> TimingEvidence:
+    """Sum up the columns of a log that has no states."""
     gatherer = TimingGatherer(period_us, is_modelled)
-    gatherer.add(columns, reactions)
+    gatherer.add_columns(columns)
     return gatherer.evidence()
 
 

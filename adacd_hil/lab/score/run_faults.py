@@ -83,7 +83,7 @@ class CyclicDataGatherer:
         self._worst = 0.0
         self._present = (0, 0, -1)  # of the window under way: cycles, incomplete ones, the last cycle's number
 
-    def add(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
+    def add_columns(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
         """Add the next cycles. cycle, state: those of /scheme (k,)."""
         is_powered = np.isin(state, _POWERED)
         self._cycles += int(np.count_nonzero(is_powered))

@@ -39,6 +39,7 @@ def list_findings(
     run: Run,
     sections: tuple[Section, ...],
     score: Score,
+    contacts: tuple[ReportedContact, ...],
     adaptation_s: dict[str, float | None],
     payload_kg: dict[str, float | None],
     evidence: CertifiedEvidence | None,
@@ -53,8 +54,11 @@ def list_findings(
     done = "identified" if evidence is None else "certified"
     identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
     found = score_sentence(score)
+    has_wrong = score.missed > 0 or (run.truth is not None and bool(score.false_alarms))
     if run.truth is None:
         found = f"{number_of(len(score.false_alarms), 'detection')}, whose truth is not recorded"
+    elif not has_wrong and not score.contacts and all(section.kind != "detection" for section in sections):
+        found = "the arm was not watched for contacts"
     if evidence is not None and not evidence.is_anchored:
         identified += ", with torque offsets that nothing anchors"
     beside = ""
@@ -65,8 +69,10 @@ def list_findings(
     grave += evidence.revoked if is_revoked(evidence) else ()
     if is_margin_below_1(evidence):
         grave.append(f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}")
-    has_wrong = score.missed > 0 or (run.truth is not None and bool(score.false_alarms))
     findings = [*(Finding(text, True) for text in grave), Finding(found, has_wrong)]
+    misread = [contact for contact in contacts if contact.link_ok is False or contact.direction_ok is False]
+    if misread:
+        findings.append(Finding(f"link or direction of {number_of(len(misread), 'contact')} is wrong", True))
     if adaptation_s or run.stretch is None:  # a part of a run need not have any
         findings.append(Finding(identified, not adaptation_s or None in adaptation_s.values()))
     findings += [Finding(beside), Finding(data_text(data), bool(data.excesses))]
@@ -298,9 +304,9 @@ def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str
         return (NONE,) * 11
     times_s = list(beside.adaptation_s.values())
     frozen = [beside.frozen_residual_max_Nm[label] for label in detections]
-    armed = [contact for contact in beside.contacts if contact.is_armed]
-    found = [contact for contact in armed if contact.detected_s is not None]
-    seen = [contact.detected_s for contact in beside.contacts if contact.detected_s is not None]
+    armed = [contact for contact in beside.contacts if contact["is_armed"]]
+    delays_ms = [contact["delay_ms"] for contact in armed if contact["delay_ms"] is not None]
+    seen = [contact["detected_s"] for contact in beside.contacts if contact["detected_s"] is not None]
     return (
         _seconds(times_s, 0),
         _seconds(times_s, 1),
@@ -309,8 +315,8 @@ def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str
         _residual_text(frozen, 1),
         *same[1:],
         f"{seen[0]:.2f} s" if seen else NONE,
-        NONE if beside.missed is None else found_text(len(found), len(armed)),
-        _median_text([contact.delay_ms for contact in found if contact.delay_ms is not None]),
+        NONE if beside.missed is None else found_text(len(delays_ms), len(armed)),
+        _median_text(delays_ms),
         NONE if beside.false_alarms is None else str(beside.false_alarms),
     )
 

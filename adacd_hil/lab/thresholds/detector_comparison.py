@@ -17,8 +17,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
-from adacd_hil.lab.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
-from adacd_hil.lab.thresholds.recorded_thresholds import BLOCK_S, Statistics
+from adacd_hil.lab.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError
+from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, calibrate_all
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import detectors
 
@@ -105,19 +105,19 @@ class Comparison:
         return head, rows
 
 
-def step_shape(samples: int, onset_s: float, lag_s: float, period_s: float) -> Vector:
+def step_shape(samples: int, onset_s: float, period_s: float) -> Vector:
     """Return a unit step of external torque as it appears in the stream (samples,), `onset_s` after sample 0.
 
     The stream is the mean over the interval that ends with the sample.
     """
     t = np.arange(-1, samples) * period_s - onset_s
-    x = np.maximum(2.0 * t / max(lag_s, 1e-9), 0.0)
+    x = np.maximum(2.0 * t / LOOP_LAG_S, 0.0)
     # the integral of 1 - (1 + x) e^-x over t
-    impulse = 0.5 * max(lag_s, 1e-9) * (x - 2.0 + (x + 2.0) * np.exp(-x))
+    impulse = 0.5 * LOOP_LAG_S * (x - 2.0 + (x + 2.0) * np.exp(-x))
     return np.asarray(np.diff(impulse) / period_s)
 
 
-def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _ONSETS, seed: int = 0) -> Comparison:
+def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _ONSETS) -> Comparison:
     """Calibrate all detectors for one rate and measure their delays to steps added to the stream.
 
     Raises TooLittleMotionError if no detector can be calibrated or no stretch of motion is long enough.
@@ -130,7 +130,7 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
     starts = starts[bad[starts + before + after] == bad[starts]]
     if starts.size == 0:
         raise TooLittleMotionError(f"no contact-free stretch is as long as {WARM_UP_S + HORIZON_S:g} s")
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     chosen = starts[np.sort(generator.integers(0, starts.size, onsets))]
     phases_s = generator.uniform(0.0, period_s, onsets)
     ratios = np.stack(
@@ -157,24 +157,6 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
     return Comparison(rate_per_h, statistics.hours, _ROC_RATES_PER_H, tuple(rows), missing)
 
 
-def calibrate_all(statistics: Statistics, rate_per_h: float) -> tuple[dict[str, DetectorCalibration], tuple[str, ...]]:
-    """Calibrate each detector; also return those whose tail can't be fitted.
-
-    Raises TooLittleMotionError if no tail can be fitted.
-    """
-    found: dict[str, DetectorCalibration] = {}
-    missing: list[str] = []
-    for name, places in statistics.settings.detectors.items():
-        try:
-            found[name] = calibrate_detector(statistics.peaks[:, list(places), :], BLOCK_S, rate_per_h)
-        except TooLittleMotionError as error:
-            missing.append(name)
-            problem = error
-    if not found:
-        raise problem
-    return found, tuple(missing)
-
-
 def _ratios(
     statistics: Statistics,
     found: dict[str, DetectorCalibration],
@@ -189,7 +171,7 @@ def _ratios(
     largest = np.zeros((len(found), len(starts), after, JOINTS))
     for k, (start, phase_s) in enumerate(zip(starts.tolist(), phases_s.tolist(), strict=True)):
         z = statistics.z[start : start + before + after].copy()
-        z[before:] += torque_Nm * step_shape(after, phase_s, LOOP_LAG_S, period_s)[:, None]
+        z[before:] += torque_Nm * step_shape(after, phase_s, period_s)[:, None]
         held_Nm = statistics.held_Nm[start : start + before + after]
         shown = detectors.DetectorBank(statistics.settings, statistics.weights, period_s).take(z, held_Nm)
         for place, (name, calibrated) in enumerate(found.items()):

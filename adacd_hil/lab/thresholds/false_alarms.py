@@ -24,10 +24,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.special import boxcox, inv_boxcox
 
+from adacd_hil.lab.signal_noise import low_pass
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 
+BLOCK_S: Final = 0.1
 CLUSTER_S: Final = 0.5
 """Values above a threshold that are closer in time than this are one alarm."""
 FITTED_CLUSTERS: Final = (25, 400)
@@ -36,6 +39,7 @@ _SHAPES: Final = (-0.5, 0.25)
 """Bounds of xi. Encoder counts and friction are bounded, so most tails end; a heavier tail than the upper bound has not
 been seen on contact-free motion and would make every extrapolation infinite."""
 _RESAMPLES: Final = 400
+_CONFIDENCE: Final = 0.95
 _BISECTIONS: Final = 60
 _S_PER_H: Final = 3600.0
 
@@ -44,12 +48,12 @@ class TooLittleMotionError(LogError):
     """The recorded motion is too short for the figure; the message names the missing amount."""
 
 
-def clusters(peaks: Vector, level: float, block_s: float) -> Vector:
+def clusters(peaks: Vector, level: float) -> Vector:
     """Return the largest value of each alarm above `level` (m,), of block maxima (B,); NaN blocks don't count."""
     above = np.flatnonzero(np.nan_to_num(peaks, nan=-np.inf) > level)
     if above.size == 0:
         return np.zeros(0)
-    starts = np.flatnonzero(np.r_[True, np.diff(above) * block_s > CLUSTER_S])
+    starts = np.flatnonzero(np.r_[True, np.diff(above) * BLOCK_S > CLUSTER_S])
     return np.asarray(np.maximum.reduceat(peaks[above], starts))
 
 
@@ -67,20 +71,21 @@ class Tail:
 
     def rate_at(self, threshold: float) -> float:
         """Return the predicted alarms per hour at a threshold not below the level."""
-        x = max(threshold - self.level, 0.0) / self.scale
-        if abs(self.shape) < 1e-9:
-            return self.rate_per_h * math.exp(-x)
-        inner = 1.0 + self.shape * x
-        return self.rate_per_h * math.pow(inner, -1.0 / self.shape) if inner > 0.0 else 0.0
+        return float(_rates(threshold - self.level, self.scale, self.shape, self.rate_per_h))
 
     def threshold_at(self, rate_per_h: float) -> float:
         """Return the threshold of a rate not above that of the level."""
-        ratio = self.rate_per_h / rate_per_h
-        if ratio <= 1.0:
-            return self.level
-        if abs(self.shape) < 1e-9:
-            return self.level + self.scale * math.log(ratio)
-        return self.level + self.scale / self.shape * (math.pow(ratio, self.shape) - 1.0)
+        return self.level + float(_excesses(rate_per_h, self.scale, self.shape, self.rate_per_h))
+
+
+def _rates(excess: float, scale: Vector | float, shape: Vector | float, rate_per_h: Vector | float) -> Vector:
+    """Return the alarms per hour of tails at an excess over their level; 0 beyond the end of a tail."""
+    return np.asarray(np.nan_to_num(rate_per_h / inv_boxcox(max(excess, 0.0) / scale, shape)))
+
+
+def _excesses(wanted_per_h: float, scale: Vector | float, shape: Vector | float, rate_per_h: Vector | float) -> Vector:
+    """Return the excess over their level at which tails have the wanted rate."""
+    return np.asarray(scale * boxcox(np.maximum(rate_per_h / wanted_per_h, 1.0), shape))
 
 
 def _moments_fit(excesses: Vector) -> tuple[Vector, Vector]:
@@ -95,26 +100,26 @@ def _moments_fit(excesses: Vector) -> tuple[Vector, Vector]:
     return np.maximum(first * (1.0 - shape), 1e-300), shape
 
 
-def counted_hours(peaks: Vector, block_s: float) -> float:
+def counted_hours(peaks: Vector) -> float:
     """Return the time of the block maxima (B,), without the NaN blocks, h."""
-    return float(np.count_nonzero(~np.isnan(peaks))) * block_s / _S_PER_H
+    return float(np.count_nonzero(~np.isnan(peaks))) * BLOCK_S / _S_PER_H
 
 
-def threshold_by_count(peaks: Vector, block_s: float, alarms: float) -> float:
+def threshold_by_count(peaks: Vector, alarms: float) -> float:
     """Find the lowest threshold with at most that many alarms in the recording."""
     low, high = float(np.nanmin(peaks)), float(np.nanmax(peaks))
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        if clusters(peaks, middle, block_s).size > alarms:
+        if clusters(peaks, middle).size > alarms:
             low = middle
         else:
             high = middle
     return high
 
 
-def fit_tail(peaks: Vector, block_s: float) -> Tail:
+def fit_tail(peaks: Vector) -> Tail:
     """Fit the tail of block maxima (B,). Raises TooLittleMotionError with fewer than 25 clusters to fit."""
-    hours = counted_hours(peaks, block_s)
+    hours = counted_hours(peaks)
     least, most = FITTED_CLUSTERS
     if hours * _S_PER_H < 4.0 * least * CLUSTER_S or float(np.nanmax(peaks)) <= float(np.nanmin(peaks)):
         raise TooLittleMotionError(
@@ -126,7 +131,7 @@ def fit_tail(peaks: Vector, block_s: float) -> Tail:
     levels = np.sort(peaks[~np.isnan(peaks)])[::-1]
     level, found = math.inf, np.zeros(0)
     for place in np.unique(np.geomspace(least, min(levels.size - 1, 40 * wanted), 16).astype(int)):
-        deeper = clusters(peaks, float(levels[place]), block_s)
+        deeper = clusters(peaks, float(levels[place]))
         if found.size < deeper.size <= wanted:
             level, found = float(levels[place]), deeper
     if found.size < least // 2:
@@ -147,32 +152,25 @@ class TailCalibration:
     tail: Tail
 
 
-def calibrate(
-    peaks: Vector, block_s: float, rate_per_h: float, confidence: float = 0.95, seed: int = 0
-) -> TailCalibration:
+def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
     """Find the threshold for a rate, with one-sided confidence bounds, from block maxima (B,).
 
     Raises TooLittleMotionError.
     """
-    tail = fit_tail(peaks, block_s)
-    generator = np.random.default_rng(seed)
+    tail = fit_tail(peaks)
     if rate_per_h >= tail.rate_per_h:
         alarms = rate_per_h * tail.hours
-        threshold = threshold_by_count(peaks, block_s, alarms)
+        threshold = threshold_by_count(peaks, alarms)
         deviation = 1.6448536269514722 * math.sqrt(alarms)
-        bound = threshold_by_count(peaks, block_s, max(alarms - deviation, 0.0))
+        bound = threshold_by_count(peaks, max(alarms - deviation, 0.0))
         return TailCalibration(threshold, bound, rate_per_h, (alarms + deviation) / tail.hours, False, tail)
+    generator = np.random.default_rng(0)
     threshold = tail.threshold_at(rate_per_h)
-    excesses = clusters(peaks, tail.level, block_s) - tail.level
-    drawn = np.sort(generator.choice(excesses, (_RESAMPLES, tail.count)), axis=1)
-    scales, shapes = _moments_fit(drawn)
-    rates = generator.poisson(tail.count, _RESAMPLES) / tail.hours
-    others = [
-        Tail(tail.level, float(scale), float(shape), max(float(rate), 1e-9), tail.hours, tail.count, tail.largest)
-        for scale, shape, rate in zip(scales, shapes, rates, strict=True)
-    ]
-    bound = float(np.quantile([other.threshold_at(rate_per_h) for other in others], confidence))
-    rate_bound = float(np.quantile([other.rate_at(threshold) for other in others], confidence))
+    excesses = clusters(peaks, tail.level) - tail.level
+    fits = _moments_fit(np.sort(generator.choice(excesses, (_RESAMPLES, tail.count)), axis=1))
+    rates = np.maximum(generator.poisson(tail.count, _RESAMPLES) / tail.hours, 1e-9)
+    bound = tail.level + float(np.quantile(_excesses(rate_per_h, *fits, rates), _CONFIDENCE))
+    rate_bound = float(np.quantile(_rates(threshold - tail.level, *fits, rates), _CONFIDENCE))
     return TailCalibration(
         threshold, max(bound, threshold), rate_per_h, max(rate_bound, rate_per_h), rate_per_h * tail.hours < 1.0, tail
     )
@@ -185,85 +183,24 @@ class DetectorCalibration:
     thresholds: Vector  # (channels, n)
     calibration: TailCalibration  # of the largest ratio of statistic to threshold; `threshold` is 1
 
-    def ratio(self, peaks: Vector) -> Vector:
-        """Return the largest ratio of statistic to threshold per block (B,), of block maxima (B, channels, n)."""
-        return largest_ratio(peaks, self.thresholds)
-
 
 def largest_ratio(peaks: Vector, thresholds: Vector) -> Vector:
     """Divide block maxima (B, channels, n) by thresholds (channels, n); return the largest of each block (B,)."""
     return np.asarray((peaks / thresholds).max(axis=(1, 2)))
 
 
-def calibrate_detector(
-    peaks: Vector, block_s: float, rate_per_h: float, confidence: float = 0.95
-) -> DetectorCalibration:
+def calibrate_detector(peaks: Vector, rate_per_h: float) -> DetectorCalibration:
     """Find the thresholds of a detector, which alarms on any channel and joint; peaks (B, channels, n).
 
     Raises TooLittleMotionError.
     """
     share = rate_per_h / (peaks.shape[1] * peaks.shape[2])
     thresholds = np.array(
-        [
-            [calibrate(peaks[:, row, i], block_s, share, confidence).threshold for i in range(peaks.shape[2])]
-            for row in range(peaks.shape[1])
-        ]
+        [[calibrate(peaks[:, row, i], share).threshold for i in range(peaks.shape[2])] for row in range(peaks.shape[1])]
     )
-    together = calibrate(largest_ratio(peaks, thresholds), block_s, rate_per_h, confidence)
+    together = calibrate(largest_ratio(peaks, thresholds), rate_per_h)
     thresholds *= together.threshold
-    return DetectorCalibration(thresholds, calibrate(largest_ratio(peaks, thresholds), block_s, rate_per_h, confidence))
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """A predicted rate, and the rate counted in held-out motion."""
-
-    predicted_per_h: float
-    counted: int
-    hours: float
-
-    @property
-    def measured_per_h(self) -> float:
-        """Counted alarms per hour."""
-        return self.counted / self.hours
-
-
-@dataclass(frozen=True)
-class ThresholdSource:
-    """One cause of a threshold's height."""
-
-    name: str
-    peak_Nm: float  # threshold that this cause alone would need
-
-    def __str__(self) -> str:
-        return f"{self.name} {self.peak_Nm:.4f} Nm"
-
-
-def resolution(values: Vector) -> float:
-    """Return the step of a quantised series (n,): its smallest difference of two values, 0 if it never changes."""
-    steps = np.diff(np.unique(values))
-    steps = steps[steps > 1e-9 * max(float(np.abs(values).max()), 1e-300)]
-    return float(steps.min()) if steps.size else 0.0
-
-
-def white_noise(values: Vector) -> float:
-    """Estimate the standard deviation of white noise on a smooth series (n,) by its second differences; robust."""
-    second = np.diff(values, 2)
-    return float(np.median(np.abs(second - np.median(second))) / 0.6744897501960817 / math.sqrt(6.0))
-
-
-def impulse_response(poles_rad_s: Sequence[float], period_s: float) -> Vector:
-    """Return the response (L,) of cascaded low-passes to one sample of 1, until it has decayed."""
-    length = int(12.0 / min(poles_rad_s, default=math.inf) / period_s) + 2
-    response = np.zeros(length)
-    response[0] = 1.0
-    for pole in poles_rad_s:
-        decay = math.exp(-pole * period_s)
-        state = 0.0
-        for k in range(length):
-            state = response[k] + decay * (state - response[k])
-            response[k] = state
-    return response
+    return DetectorCalibration(thresholds, calibrate(largest_ratio(peaks, thresholds), rate_per_h))
 
 
 def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[float, float]:
@@ -271,7 +208,9 @@ def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[
 
     The second is in Nm per kg m² rad/s. The stream takes the mean of two torques minus lag times their slope.
     """
-    h = np.r_[impulse_response(poles_rad_s, period_s), 0.0]
+    impulse = np.zeros(int(12.0 / min(poles_rad_s, default=math.inf) / period_s) + 3)  # until it has decayed
+    impulse[0] = 1.0
+    h = low_pass(impulse, poles_rad_s, period_s)
     before = np.r_[0.0, h[:-1]]
     torque = h * (0.5 - lag_s / period_s) + before * (0.5 + lag_s / period_s)
     return float(np.linalg.norm(torque)), float(np.linalg.norm(h - before) / period_s)
@@ -281,20 +220,6 @@ def peak_factor(rate_per_h: float, bandwidth_rad_s: float) -> float:
     """Return the number of standard deviations that Gaussian noise of a bandwidth exceeds so often (Rice's formula)."""
     crossings_per_h = 2.0 * bandwidth_rad_s / (2.0 * math.pi) * _S_PER_H
     return math.sqrt(2.0 * math.log(max(crossings_per_h / rate_per_h, math.e)))
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Causes of the threshold of one low-pass channel and joint, largest first, for a wanted rate."""
-
-    sources: tuple[ThresholdSource, ...]
-    achievable_Nm: float
-    """Threshold with an exact model, lag and friction: all noise and resolution together."""
-
-    @property
-    def limit(self) -> str:
-        """Name of the largest cause."""
-        return self.sources[0].name
 
 
 @dataclass(frozen=True)
@@ -319,8 +244,11 @@ def find_limits(
     period_s: float,
     lag_s: float,
     rate_per_h: float,
-) -> Limits:
+) -> tuple[dict[str, float], float]:
     """Split the threshold of a low-pass channel of one joint by its causes, from contact-free motion (N,).
+
+    Returns the threshold that each cause alone would need, Nm, and the threshold with an exact model, lag and friction:
+    all noise and resolution together.
 
     Random causes count with the height that Gaussian noise exceeds at the wanted rate. The rest of the stream while the
     joint moves is model error. An error of the lag counts with the steepest torque, one of the friction as it is;
@@ -337,29 +265,16 @@ def find_limits(
         "torque LSB": torque * sensing.torque_LSB_Nm / math.sqrt(12.0),
         "velocity LSB": momentum * sensing.mass_row_kg_m2 * sensing.velocity_LSB_rad_s / math.sqrt(12.0),
     }
-    unexplained = max(mean_square(x) - sum(rms_Nm**2 for rms_Nm in random.values()), 0.0)
+    unexplained = max(mean_square(x) - math.hypot(*random.values()) ** 2, 0.0)
     random["velocity noise"] = min(momentum * sensing.momentum_noise_Nms, math.sqrt(unexplained))
-    model = math.sqrt(max(unexplained - random["velocity noise"] ** 2, 0.0))
-    sources = [ThresholdSource(name, factor * rms_Nm) for name, rms_Nm in random.items()]
-    achievable = math.sqrt(sum(source.peak_Nm**2 for source in sources))
-    sources += [
-        ThresholdSource("model", factor * model),
-        ThresholdSource("lag", abs(sensing.lag_error_s) * float(np.abs(slope).max())),
-        ThresholdSource("friction", abs(sensing.friction_error_Nm)),
-    ]
-    return Limits(tuple(sorted(sources, key=lambda source: -source.peak_Nm)), achievable)
+    causes = {name: factor * rms_Nm for name, rms_Nm in random.items()} | {
+        "model": factor * math.sqrt(max(unexplained - random["velocity noise"] ** 2, 0.0)),
+        "lag": abs(sensing.lag_error_s) * float(np.abs(slope).max()),
+        "friction": abs(sensing.friction_error_Nm),
+    }
+    return causes, factor * math.hypot(*random.values())
 
 
 def mean_square(x: Vector) -> float:
     """Return the mean square of a series (n,), 0 for an empty one."""
     return float(x @ x) / max(x.size, 1)
-
-
-def low_pass(u: Vector, poles_rad_s: Sequence[float], period_s: float) -> Vector:
-    """Filter a series (n,) by cascaded low-passes that start at rest."""
-    from scipy.signal import lfilter  # takes half a second to load, and only this function needs it
-
-    for pole in poles_rad_s:
-        decay = math.exp(-pole * period_s)
-        u = np.asarray(lfilter([1.0 - decay], [1.0, -decay], u))
-    return u

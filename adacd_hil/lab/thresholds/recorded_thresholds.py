@@ -13,9 +13,10 @@ from typing import Final
 
 import numpy as np
 
+from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
 from adacd_hil.lab.thresholds.false_alarms import (
-    Limits,
-    Prediction,
+    BLOCK_S,
+    DetectorCalibration,
     Sensing,
     TooLittleMotionError,
     calibrate_detector,
@@ -23,10 +24,8 @@ from adacd_hil.lab.thresholds.false_alarms import (
     counted_hours,
     find_limits,
     gains,
-    low_pass,
+    largest_ratio,
     mean_square,
-    resolution,
-    white_noise,
 )
 from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, read_motion, sample_of, torque_streams
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
@@ -36,7 +35,6 @@ from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.model.regressor import mass_matrix
 from adacd_hil.settings.schema import setting
 
-BLOCK_S: Final = 0.1
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
 """Corner frequency below which the model's errors exceed the noise."""
@@ -59,7 +57,7 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
         )
         top[i] = -float(explained @ by)
         # the noise of the torque has a slope, too, which is not in the stream
-        bottom[i] = float(by @ by) - by.size * (slope_gain * white_noise(motion.tau_J[:, i])) ** 2
+        bottom[i] = float(by @ by) - by.size * (slope_gain * float(white_noise(motion.tau_J[:, i]))) ** 2
     if not (bottom > 0.0).any():
         return detectors.VELOCITY_LAG_S, np.full(JOINTS, detectors.VELOCITY_LAG_S)
     known = np.maximum(bottom, 0.0)
@@ -85,7 +83,7 @@ class Statistics:
     @property
     def hours(self) -> float:
         """Contact-free time, h."""
-        return counted_hours(self.peaks[:, 0, 0], BLOCK_S)
+        return counted_hours(self.peaks[:, 0, 0])
 
 
 def run_detectors(
@@ -176,77 +174,71 @@ class Thresholds:
     channels: tuple[ChannelRow, ...] = setting(meaning="their channels")
 
 
+def calibrate_all(statistics: Statistics, rate_per_h: float) -> tuple[dict[str, DetectorCalibration], tuple[str, ...]]:
+    """Calibrate each detector; also return those whose tail can't be fitted.
+
+    Raises TooLittleMotionError if no tail can be fitted.
+    """
+    found: dict[str, DetectorCalibration] = {}
+    missing: list[str] = []
+    for name, places in statistics.settings.detectors.items():
+        try:
+            found[name] = calibrate_detector(statistics.peaks[:, list(places), :], rate_per_h)
+        except TooLittleMotionError as error:
+            missing.append(name)
+            problem = error
+    if not found:
+        raise problem
+    return found, tuple(missing)
+
+
 def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence[str] = ()) -> Thresholds:
     """Calibrate all detectors. Raises TooLittleMotionError."""
-    rows, channels, missing = [], [], []
-    problem: TooLittleMotionError | None = None
+    calibrated, missing = calibrate_all(statistics, rate_per_h)
+    rows, channels = [], []
     limits = channel_limits(statistics, rate_per_h)
-    is_extrapolated = False
-    for name, places in statistics.settings.detectors.items():
-        peaks = statistics.peaks[:, list(places), :]
-        try:
-            found = calibrate_detector(peaks, BLOCK_S, rate_per_h)
-        except TooLittleMotionError as error:
-            problem = error
-            missing.append(name)
-            continue
-        check = check_prediction(peaks)
-        is_extrapolated = is_extrapolated or found.calibration.is_extrapolated
-        rows.append(
-            DetectorRow(
-                name,
-                found.calibration.rate_bound_per_h,
-                found.calibration.bound / found.calibration.threshold,
-                None if check is None else check.predicted_per_h,
-                None if check is None else check.measured_per_h,
-            )
-        )
-        for row, place in enumerate(places):
-            split = limits.get(statistics.settings.channels[place], ())
-            channels.append(
-                ChannelRow(
-                    name,
-                    statistics.settings.channels[place],
-                    tuple(found.thresholds[row].tolist()),
-                    tuple(limit.limit for limit in split),
-                    tuple(limit.achievable_Nm for limit in split),
-                )
-            )
-    if problem is not None and not rows:
-        raise problem
+    for name, found in calibrated.items():
+        places, calibration = statistics.settings.detectors[name], found.calibration
+        check = check_prediction(statistics.peaks[:, list(places), :]) or (None, None)
+        rows.append(DetectorRow(name, calibration.rate_bound_per_h, calibration.bound / calibration.threshold, *check))
+        for threshold, place in zip(found.thresholds.tolist(), places, strict=True):
+            channel = statistics.settings.channels[place]
+            limit, achievable_Nm = limits.get(channel, ((), ()))
+            channels.append(ChannelRow(name, channel, tuple(threshold), limit, achievable_Nm))
     return Thresholds(
         rate_per_h=rate_per_h,
         hours=statistics.hours,
-        is_extrapolated=is_extrapolated,
+        is_extrapolated=any(found.calibration.is_extrapolated for found in calibrated.values()),
         lag_s=statistics.lag_s,
         logs=tuple(logs),
-        missing=tuple(missing),
+        missing=missing,
         detectors=tuple(rows),
         channels=tuple(channels),
     )
 
 
-def check_prediction(peaks: Vector) -> Prediction | None:
+def check_prediction(peaks: Vector) -> tuple[float, float] | None:
     """Calibrate a detector on every other tenth of the motion, and count its alarms in the rest.
 
-    The rate is such that the rest has enough alarms. None if half of the motion is too short.
+    Returns the predicted rate, such that the rest has enough alarms, and the counted one, per hour. None if half of the
+    motion is too short.
     """
     tenth = -(-len(peaks) // 10)
     is_first = np.arange(len(peaks)) // tenth % 2 == 0
     seen, held_out = peaks.copy(), peaks.copy()
     seen[~is_first] = np.nan
     held_out[is_first] = np.nan
-    hours = counted_hours(held_out[:, 0, 0], BLOCK_S)
+    hours = counted_hours(held_out[:, 0, 0])
     try:
         rate = _CHECKED_ALARMS / hours
-        found = calibrate_detector(seen, BLOCK_S, rate)
+        found = calibrate_detector(seen, rate)
     except (TooLittleMotionError, ZeroDivisionError):
         return None
-    return Prediction(rate, clusters(found.ratio(held_out), 1.0, BLOCK_S).size, hours)
+    return rate, clusters(largest_ratio(held_out, found.thresholds), 1.0).size / hours
 
 
-def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple[Limits, ...]]:
-    """Split the thresholds of the low-pass channels by their causes; per channel a tuple over the joints."""
+def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple[tuple[str, ...], tuple[float, ...]]]:
+    """Return, per low-pass channel, the largest cause of its threshold and what an exact model needs, per joint."""
     settings, motion, free = statistics.settings, statistics.motion, statistics.is_free
     places = np.flatnonzero(free)
     masses = np.array([mass_matrix(motion.q[k], motion.theta[k]) for k in places[:: max(1, places.size // 200)]])
@@ -260,7 +252,7 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
         velocity_LSB = resolution(motion.dq[free, i])
         # the slope of the velocity's noise dominates single samples: no other part is as fast
         torque_gain, momentum_gain = gains((), motion.period_s, statistics.lag_s)
-        noise = white_noise(motion.tau_J[free, i])
+        noise = float(white_noise(motion.tau_J[free, i]))
         fast = mean_square(statistics.z[free, i][moves]) - (torque_gain * noise) ** 2
         rest = fast / momentum_gain**2 - (float(largest[i]) * velocity_LSB) ** 2 / 12.0
         sensing.append(
@@ -274,25 +266,25 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
                 friction_error_Nm=float(x @ direction) / max(float(direction @ direction), 1e-300),
             )
         )
-    more = (settings.smoothing_rad_s,)
-    kinds: tuple[tuple[str, tuple[float, ...]], ...] = (("first-order", ()), ("smoothed", more))
-    return {
-        f"{kind} {cutoff:g}": tuple(
-            find_limits(
-                statistics.z[free, i],
-                motion.tau_J[free, i],
-                statistics.held_Nm[free, i],
-                sensing[i],
-                (cutoff, *poles),
-                motion.period_s,
-                statistics.lag_s,
-                rate_per_h,
-            )
-            for i in range(JOINTS)
-        )
-        for kind, poles in kinds
-        for cutoff in settings.cutoff_rad_s
-    }
+    limits: dict[str, tuple[tuple[str, ...], tuple[float, ...]]] = {}
+    for kind, more in (("first-order", ()), ("smoothed", (settings.smoothing_rad_s,))):
+        for cutoff in settings.cutoff_rad_s:
+            split = [
+                find_limits(
+                    statistics.z[free, i],
+                    motion.tau_J[free, i],
+                    statistics.held_Nm[free, i],
+                    sensing[i],
+                    (cutoff, *more),
+                    motion.period_s,
+                    statistics.lag_s,
+                    rate_per_h,
+                )
+                for i in range(JOINTS)
+            ]
+            largest_causes = tuple(max(causes, key=lambda name: causes[name]) for causes, _ in split)
+            limits[f"{kind} {cutoff:g}"] = largest_causes, tuple(achievable for _, achievable in split)
+    return limits
 
 
 def thresholds_of_logs(

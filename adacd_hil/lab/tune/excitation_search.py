@@ -88,14 +88,6 @@ class ExcitationLimits(NamedTuple):
         return {name: np.degrees(limit).tolist() for name, limit in degrees} | {"torque_Nm": torque}
 
 
-class Motion(NamedTuple):
-    """A motion of both joints, (n, 2) each."""
-
-    q: Vector
-    dq: Vector
-    ddq: Vector
-
-
 @compiled
 def _fill_regressors(q: Vector, dq: Vector, ddq: Vector, level_rad: float, W: Vector) -> None:
     for n in range(W.shape[0]):
@@ -153,8 +145,7 @@ class Search:
         motion = self.move(np.array(excitation.cosine), np.array(excitation.sine))
         W = self._regressors(motion)
         smallest, largest, inertia = self._shown(W)
-        peaks = [np.abs(part).max(axis=0) for part in motion]
-        travel, velocity, acceleration = (np.degrees(peak) for peak in peaks)
+        travel, velocity, acceleration = np.degrees(np.abs(motion).max(axis=1))
         return Figures(
             smallest,
             largest / max(smallest, _SMALLEST),
@@ -224,23 +215,25 @@ class Search:
             np.column_stack((-sine @ order, sine)),
         )
 
-    def move(self, cosine: Vector, sine: Vector) -> Motion:
-        """Return the motion (N, 2) over the period: that of `control.excitation`, at all times at once."""
+    def move(self, cosine: Vector, sine: Vector) -> Vector:
+        """Return q, dq and ddq (3, N, 2) over the period: the motion of `control.excitation`, at all times at once."""
         cosine, sine = (self._amplitude * part.T for part in (cosine, sine))
         rate = self._rad_s[:, np.newaxis]
-        return Motion(
-            -self._amplitude + (self._cosine - 1.0) @ cosine + self._sine @ sine,
-            self._cosine @ (rate * sine) - self._sine @ (rate * cosine),
-            -self._cosine @ (rate**2 * cosine) - self._sine @ (rate**2 * sine),
+        return np.array(
+            (
+                -self._amplitude + (self._cosine - 1.0) @ cosine + self._sine @ sine,
+                self._cosine @ (rate * sine) - self._sine @ (rate * cosine),
+                -self._cosine @ (rate**2 * cosine) - self._sine @ (rate**2 * sine),
+            )
         )
 
-    def _regressors(self, motion: Motion) -> Vector:
+    def _regressors(self, motion: Vector) -> Vector:
         """Return the regressors of the dynamic parameters (N, 2, base)."""
-        W = np.empty((len(motion.q), JOINTS, self._base))
-        _fill_regressors(*motion, self._level_rad, W)
+        W = np.empty((motion.shape[1], JOINTS, self._base))
+        _fill_regressors(motion[0], motion[1], motion[2], self._level_rad, W)
         return W
 
-    def _used(self, motion: Motion, W: Vector) -> list[Vector]:
+    def _used(self, motion: Vector, W: Vector) -> list[Vector]:
         """Return which part of each limit is used, (N, 2) each."""
         parts = [np.abs(value) / limit for value, limit in zip(motion, self.limits[:3], strict=True)]
         return parts if self._theta is None else [*parts, np.abs(W @ self._theta) / self.limits.torque_Nm]
@@ -272,7 +265,7 @@ class Search:
         W = self._regressors(motion)
         over = sum(float(np.mean(np.maximum(used - 1.0, 0.0) ** 2)) for used in self._used(motion, W))
         for joint, column in enumerate((F_C1, F_C2)):
-            W[:, joint, column] = np.tanh(motion.dq[:, joint] / _SMOOTH_RAD_S)
+            W[:, joint, column] = np.tanh(motion[1, :, joint] / _SMOOTH_RAD_S)
         smallest, largest, inertia = (max(value, _SMALLEST) for value in self._shown(W))
         return _cost_of(smallest, largest / smallest, inertia) + penalty * over
 

@@ -34,8 +34,9 @@ from adacd_hil.remedies import install_command
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay
-from adacd_hil.settings.configuration import Settings, apply_settings, keep_facts, load_settings
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.setting_keys import apply_settings, keep_facts
 from adacd_hil.wire.codec import CodecError
 
 Changes = tuple[tuple[str, str], ...]
@@ -248,7 +249,7 @@ class SweepStore:
             )
         return frozenset(keys)
 
-    def add(self, rows: Iterable[Values]) -> None:
+    def write_part(self, rows: Iterable[Values]) -> None:
         """Write a part."""
         path = self._parts / f"{self._next:06d}.parquet"
         self._next += 1
@@ -338,12 +339,12 @@ def run_sweep(
             failures += sum(row["status"] != "ok" for row in found)
             now_ns = clock.now_ns()
             if now_ns - written_ns >= _WRITE_NS:
-                store.add(rows)
+                store.write_part(rows)
                 rows, written_ns = [], now_ns
                 progress(_describe(computed, wanted, failures, (now_ns - begin_ns) * 1e-9))
     finally:
         if rows:
-            store.add(rows)
+            store.write_part(rows)
     elapsed_s = (clock.now_ns() - begin_ns) * 1e-9
     progress(_describe(computed, wanted, failures, elapsed_s))
     return SweepOutcome(computed, plan.size - wanted, failures, elapsed_s)
@@ -391,7 +392,7 @@ class _Flights:
             try:
                 future = self._workers.submit(self._work, task)
             except BrokenExecutor:  # a worker died before it had work
-                self._workers.restart()
+                self._workers.replace_dead()
                 future = self._workers.submit(self._work, task)
             self._flying[future] = task
         return bool(self._flying)
@@ -405,7 +406,7 @@ class _Flights:
     def _land_broken(self) -> Iterator[list[Values]]:
         """Take the tasks out of flight that ended as a worker died."""
         self._progress("a worker process has died: killed, or out of memory")
-        self._workers.restart()
+        self._workers.replace_dead()
         wait(self._flying)
         lost = [future for future in self._flying if isinstance(future.exception(), BrokenExecutor)]
         tasks = [self._flying.pop(future) for future in lost]

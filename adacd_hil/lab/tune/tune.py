@@ -13,7 +13,6 @@ show the share of contacts found against false alarms, and the delays.
 
 import json
 import math
-import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -53,9 +52,10 @@ from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay
 from adacd_hil.score.judge import least_rate_per_h
 from adacd_hil.score.wording import delay_figures, delays_phrase, number_of, rate_phrase, share_phrase
-from adacd_hil.settings.configuration import Settings, apply_settings, changed_keys, keep_facts, load_settings
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import builtin_names, to_toml
+from adacd_hil.settings.setting_keys import apply_settings, changed_keys, keep_facts
+from adacd_hil.settings.toml_files import builtin_names
 
 FARTHEST: Final = 100.0
 """Extrapolation beyond which filters and gains are not ranked: thresholds of equal ones differ by a factor of 4."""
@@ -200,7 +200,6 @@ def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
 def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settings) -> str:
     """Write a suggestion as TOML that `load_settings` reads."""
     own = tuning.logs[0].settings
-    table = tomllib.loads(to_toml(apply_settings(base, best.changes)))
     differing = [key for key in changed_keys(keep_facts(own, base), own) if key != "name"]
     lines = [*_provenance(tuning, best)]
     if differing:
@@ -209,11 +208,8 @@ def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settin
     sections: dict[str, list[str]] = {}
     if own.arm.profile != load_settings(base_name).arm.profile:
         sections["arm"] = [f"profile = {json.dumps(own.arm.profile)}"]
-    for key in changed_keys(base, apply_settings(base, best.changes)):
+    for key, (_, value) in changed_keys(base, apply_settings(base, best.changes)).items():
         section, _, last = key.rpartition(".")
-        value: Any = table
-        for part in key.split("."):
-            value = value[part]
         sections.setdefault(section, []).append(f"{last} = {value}")
     for section, entries in sections.items():
         text += ["", f"[{section}]", *entries]

@@ -26,8 +26,9 @@ from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.replay.replay import Watch, replay_many
 from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
-from adacd_hil.settings.configuration import Settings, apply_settings
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.setting_keys import apply_settings
 
 _FILTER_FACTORS: Final = (1.0, 0.5, 2.0, 4.0)
 _GAIN_FACTORS: Final = (1.0, 0.3, 3.0)
@@ -111,7 +112,7 @@ def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progr
 
 
 def _show_to(shown: "Sequence[ShownLog]") -> Watch:
-    return lambda place, ticks, batch: shown[place].take(ticks, batch)
+    return lambda place, ticks, batch: shown[place].take_stretch(ticks, batch)
 
 
 def name_of(changes: Mapping[str, str]) -> str:
@@ -141,7 +142,7 @@ class ShownLog:
         self._parts: dict[int, list[tuple[Vector, Vector]]] = {}  # by number of a window: since_s and statistic
         self._touches: dict[int, Touched] = {}
 
-    def take(self, ticks: Ticks, batch: SchemeBatch) -> None:
+    def take_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
         """Add a stretch; skips cycles that the log lacks."""
         rows = np.minimum(np.searchsorted(self._log.t_ns, ticks.t_ns), len(self._log.t_ns) - 1)
         known = np.flatnonzero(self._log.t_ns[rows] == ticks.t_ns)
@@ -204,16 +205,7 @@ def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: N
     """Run all detectors over logs. Raises LogError, TooLittleMotionError."""
     settings = detectors.DetectorBankSettings()
     statistics = run_detectors([log.motion for log in logs], settings, progress)
-    starts = np.cumsum([0, *(len(log.motion.is_free) for log in logs)])
-    places = np.minimum(np.arange(len(statistics.peaks)) * logs[0].block, starts[-1] - 1)
-    of_log = np.searchsorted(starts, places, side="right") - 1
-    is_chosen_on = np.array(
-        [
-            log.is_chosen_on[min((place - starts[k]) // log.block, len(log.is_chosen_on) - 1)]
-            for place, k in zip(places.tolist(), of_log.tolist(), strict=True)
-            for log in (logs[k],)
-        ]
-    )
+    is_chosen_on = chosen_blocks(logs)
     touches: dict[str, list[Touched]] = {name: [] for name in settings.detectors}
     for log in logs:
         for touched in _touches(log, statistics):
@@ -224,6 +216,12 @@ def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: N
         Observed(name, statistics.peaks[:, list(rows), :], is_chosen_on, tuple(touches[name]) if has_truth else None)
         for name, rows in settings.detectors.items()
     ]
+
+
+def chosen_blocks(logs: Sequence[TunedLog]) -> NDArray[np.bool_]:
+    """Tell of each block of the logs' joined motion whether thresholds are chosen on it, by its first cycle (B,)."""
+    chosen = [np.repeat(log.is_chosen_on, log.block)[: len(log.motion.is_free)] for log in logs]
+    return np.concatenate(chosen)[:: logs[0].block]
 
 
 def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
 from adacd_hil.lab.thresholds.false_alarms import (
+    BLOCK_S,
     TailCalibration,
     TooLittleMotionError,
     calibrate_detector,
@@ -29,16 +30,16 @@ from adacd_hil.lab.thresholds.false_alarms import (
     largest_ratio,
 )
 from adacd_hil.lab.thresholds.free_motion import APART_S, LoggedMotion, read_motion, schemes
-from adacd_hil.lab.thresholds.recorded_thresholds import BLOCK_S
 from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import AttemptBegins, Progress, host_span
 from adacd_hil.log.reader import Series
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.replay.log_source import LogSource
-from adacd_hil.score.emulator_truth import HostCycles, TrueContact, contacts_beside, windows_of
-from adacd_hil.score.judge import Times, TouchWindow, explained_until, rate_bound_per_h, share_bounds
+from adacd_hil.score.emulator_truth import HostCycles, contacts_beside, placed_contacts
+from adacd_hil.score.judge import Times, TrueContact, explained_until, rate_bound_per_h, share_bounds
 from adacd_hil.score.wording import delay_figures
-from adacd_hil.settings.configuration import Settings, changed_keys, keep_facts, load_settings
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.setting_keys import changed_keys, keep_facts
 
 Changes = dict[str, str]
 
@@ -165,7 +166,7 @@ def choose(observed: Observed, rate_per_h: float) -> Choice:
         raise TooLittleMotionError("no contact-free motion in the half that thresholds are chosen on")
     calibration = None
     try:
-        calibrated = calibrate_detector(first, BLOCK_S, rate_per_h)
+        calibrated = calibrate_detector(first, rate_per_h)
         calibration = calibrated.calibration
         thresholds = calibrated.thresholds * calibration.bound / calibration.threshold
     except TooLittleMotionError:
@@ -199,10 +200,10 @@ def _predicted(calibration: TailCalibration | None, factor: float) -> float | No
 
 
 def _count(peaks: Vector, touches: tuple[Touched, ...] | None, thresholds: Vector) -> Found:
-    alarms = clusters(largest_ratio(peaks, thresholds), 1.0, BLOCK_S).size
+    alarms = clusters(largest_ratio(peaks, thresholds), 1.0).size
     delays = [delay_ms(touched, thresholds) for touched in touches or ()]
     return Found(
-        counted_hours(peaks[:, 0, 0], BLOCK_S),
+        counted_hours(peaks[:, 0, 0]),
         int(alarms),
         None if touches is None else len(touches),
         tuple(delay for delay in delays if delay is not None),
@@ -222,7 +223,6 @@ class Window(NamedTuple):
     """The rows [first, last] of a log in which a true contact explains an alarm, see `score.judge`."""
 
     number: int
-    link: int
     first: int
     last: int
     is_armed: bool  # in MONITOR at its onset
@@ -282,7 +282,7 @@ def _tunable(settings: Settings) -> Settings:
 def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeWindow, progress: Progress) -> TunedLog:
     own = LogSource(path).settings
     parts = _Index()
-    motion = read_motion(path, stretch, progress, parts.add)
+    motion = read_motion(path, stretch, progress, parts.add_scheme)
     index = parts.joined()
     truth = contacts_beside(path, progress)
     blocks = -(-len(index.t_ns) // round(BLOCK_S / motion.period_s))
@@ -292,12 +292,10 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeW
     if truth is not None:
         begins = _begins(motion, parts)
         contacts = [
-            contact
-            for contact in _on_cycles(truth.contacts, begins)
-            if stretch.is_whole or index.cycle[0] <= contact.onset
+            contact for contact in _on_cycles(truth[0], begins) if stretch.is_whole or index.cycle[0] <= contact.onset
         ]
-        windows = _windows(windows_of(contacts, index, own), index.t_ns, None if count == 1 else place)
-        is_free = motion.is_free & host_span(truth.span, np.array(begins)).covers(index.cycle)
+        windows = _windows(placed_contacts(contacts, index, own), index.t_ns, None if count == 1 else place)
+        is_free = motion.is_free & host_span(truth[1], np.array(begins)).covers(index.cycle)
         apart = round(APART_S / motion.period_s)
         for window in windows:
             is_free[max(window.first - apart, 0) : window.last + apart] = False
@@ -315,7 +313,7 @@ class _Index:
         self.attempts = AttemptBegins()
         self._cycle, self._t_ns, self._before, self._threshold = array("q"), array("q"), array("B"), array("d")
 
-    def add(self, scheme: Series) -> None:
+    def add_scheme(self, scheme: Series) -> None:
         """Add the next piece of /scheme."""
         self.attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
         self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
@@ -351,7 +349,7 @@ def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterat
             yield contact.counted_from(begins[contact.attempt])
 
 
-def _windows(touches: Sequence[TouchWindow], t_ns: Times, place: int | None) -> tuple[Window, ...]:
+def _windows(touches: Sequence[TrueContact], t_ns: Times, place: int | None) -> tuple[Window, ...]:
     """Give the rows of contacts. place: of the log; None for a single log."""
     onsets_ns = np.array([touch.onset_ns for touch in touches], np.int64)
     until_ns = explained_until(onsets_ns, np.array([touch.forgotten_ns for touch in touches], np.int64))
@@ -360,7 +358,6 @@ def _windows(touches: Sequence[TouchWindow], t_ns: Times, place: int | None) -> 
     return tuple(
         Window(
             number=touch.number,
-            link=touch.link,
             first=first,
             last=max(last, first),
             is_armed=touch.is_armed,

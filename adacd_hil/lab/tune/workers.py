@@ -18,7 +18,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing import forkserver
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.log.log_files import LogError
@@ -44,22 +44,8 @@ class TlsFiles(NamedTuple):
 NO_FILES = TlsFiles()
 
 
-class Workers(Protocol):
-    """Processes that compute, wherever they are."""
-
-    @property
-    def room(self) -> int:
-        """How many tasks may be with them at a time."""
-
-    def submit(self, work: Callable[..., Any], task: Any) -> "Future[Any]":
-        """Begin a task. Its future, or this call, raises BrokenExecutor when a process has died."""
-
-    def restart(self) -> None:
-        """Begin anew after a process has died."""
-
-
 @contextlib.contextmanager
-def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple[str, ...] = ()) -> Iterator[Workers]:
+def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple[str, ...] = ()) -> Iterator["Workers"]:
     """Give the workers of a Dask scheduler at an address, or, if that is empty, `count` processes of this machine.
 
     preload: modules that the processes import before their first task.
@@ -104,7 +90,7 @@ class DaskWorkers:
         future: Future[Any] = self._executor.submit(work, task)
         return future
 
-    def restart(self) -> None:
+    def replace_dead(self) -> None:
         """Leave the restart to the scheduler."""
 
 
@@ -124,10 +110,10 @@ class ProcessWorkers:
         return ProcessPoolExecutor(self.room, self._context, initializer=_begin)
 
     def submit(self, work: Callable[..., Any], task: Any) -> "Future[Any]":
-        """Begin a task."""
+        """Begin a task. Its future, or this call, raises BrokenExecutor when a process has died."""
         return self._pool.submit(work, task)
 
-    def restart(self) -> None:
+    def replace_dead(self) -> None:
         """Begin anew after a process has died."""
         self.end()
         self._pool = self._open()
@@ -144,6 +130,10 @@ class ProcessWorkers:
             process.join(max(0.0, (latest_ns - clock.now_ns()) * 1e-9))
             process.kill()
         self._pool.shutdown()
+
+
+Workers = DaskWorkers | ProcessWorkers
+"""Processes that compute, wherever they are. room: tasks that may be with them at a time."""
 
 
 @contextlib.contextmanager

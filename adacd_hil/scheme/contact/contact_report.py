@@ -34,6 +34,7 @@ from adacd_hil.scheme.contact import localisation
 from adacd_hil.scheme.contact.course import CourseMemory
 from adacd_hil.scheme.detect.external_torque import ONSET_FRACTION
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.scheme_settings import KIND_S
 
 LINK_S = 0.01
 """Time from detection until the link is decided."""
@@ -236,8 +237,6 @@ def _pair(values: Vector) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
-KIND_S = 0.1
-"""Time from detection to the decision of the kind."""
 END_S = 0.01
 """The remaining torque is the mean over this time at the end of the window."""
 LEFT = 0.18

@@ -1,4 +1,4 @@
-"""Doctor's diagnosis, and its checks of the host: kernel, CAN interface, permissions, scheduler.
+"""Doctor's diagnosis, its checks of the configuration, and of the host: kernel, CAN interface, permissions, scheduler.
 
 A diagnosis is a table of named checks, run in order, each with a reason and a remedy. A check is skipped if a check
 that it needs has failed, so that a bad bus is not used further.
@@ -12,8 +12,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
+from adacd_hil.control.configuration_check import oddities, profile_guesses
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeGrant, isolated_cpus
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.setting_keys import KnownKey, in_words, known_keys, value_of
 from adacd_hil.wire.bus import BusError
 from adacd_hil.wire.can_interface import CANFD_MTU, InterfaceState, can_interfaces
 
@@ -116,6 +119,43 @@ def summarise(findings: Sequence[Finding]) -> str:
     """Count the outcomes in one line."""
     counts = {status: sum(finding.status is status for finding in findings) for status in Status}
     return ", ".join(f"{count} {status.value}" for status, count in counts.items())
+
+
+def configuration_checks(settings: Settings) -> list[Check[Settings]]:
+    """Return doctor's checks of a configuration: its likely mistakes, and one check for each guessed value."""
+    known = known_keys()
+    guesses = [key for key in settings.assumed if key in known]
+    return [
+        Check("settings", check_settings),
+        *(Check(f"`{key}`", _asking_for(known[key])) for key in guesses),
+        *(Check(f"`{key}`", _asking_for_profile(value)) for key, value in profile_guesses(settings).items()),
+    ]
+
+
+def check_settings(settings: Settings) -> CheckOutcome:
+    """Check the configuration for likely mistakes."""
+    odd = oddities(settings)
+    if odd:
+        return warning("; ".join(odd), "correct the configuration; `adacd-hil config check` looks at it without a bus")
+    return ok(f"configuration {settings.name}")
+
+
+def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
+    def ask(settings: Settings) -> CheckOutcome:
+        value = value_of(settings, known.key)
+        text = "nothing is given" if value is None else f"{in_words(value)} is a guess"
+        remedy = f"measure it or look it up, write it, and take `{known.key}` off `assumed`"
+        return warning(f"{text}: {known.meaning}", remedy)
+
+    return ask
+
+
+def _asking_for_profile(value: float) -> Callable[[Settings], CheckOutcome]:
+    def ask(_: Settings) -> CheckOutcome:
+        remedy = "look it up or measure it, write it into that profile, and take the key off its `assumed`"
+        return warning(f"{value:.10g} is a guess", remedy)
+
+    return ask
 
 
 QUEUE_FRAMES = 10

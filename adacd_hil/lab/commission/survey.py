@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.device_setup import Slave
+from adacd_hil.lab.commission.traffic import Talk, Traffic, listen
 from adacd_hil.wire.bus import Bus, Frame, Tap
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID
@@ -23,7 +24,6 @@ from adacd_hil.wire.dbc_decoder import DbcDecoder, MessageDecoder
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 from adacd_hil.wire.frame_time import LoadMeter
-from adacd_hil.wire.traffic import Talk, Traffic, listen
 
 LISTEN_S = 1.5
 """Default time to listen: longer than the usual heartbeat and status periods of up to 1 s."""
@@ -164,7 +164,7 @@ def survey(
 def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
     """Return the nodes that sent frames, ascending by node id."""
     found: dict[int, Node] = {}
-    for is_sent, frame in tap.take():
+    for is_sent, frame in tap.take_passed():
         function, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
         if is_sent or frame.is_error or frame.can_id > MAX_STANDARD_ID or node_id == 0:
             continue
@@ -398,7 +398,7 @@ class BusView:
         """Note that this computer has lost frames: counters that jump now are no device's fault."""
         for entry in self._entries.values():
             if entry.receiver is not None:
-                entry.receiver.restart()
+                entry.receiver.restart_sequence()
 
     def snapshot(self, t_ns: int, node_id: int | None = None) -> Snapshot:
         """Sum up at `t_ns`; with `node_id`, only that node's part of it."""

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 from rig import CODEC, Rig
 
-from adacd_hil.device.survey import Survey, compare, expected_nodes, function_name, message_name, survey
+from adacd_hil.lab.commission.survey import Survey, compare, expected_nodes, function_name, message_name, survey
 
 
 def look(rig: Rig, duration_s: float = 1.5) -> Survey:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from adacd_hil.device.survey import BusView, MessageView, Snapshot
+from adacd_hil.lab.commission.survey import BusView, MessageView, Snapshot
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import load_codec
 
