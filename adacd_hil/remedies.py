@@ -1,75 +1,34 @@
 """Remedies in error messages: the nearest known name, the command that installs an extra."""
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from difflib import SequenceMatcher
 from pathlib import Path
 
-_LONGEST = 64
-_SLIPS = ((3, 0), (8, 1), (12, 2))
-"""(length, slips): a shorter word may differ by so many slips: a letter added, lost or changed, or two swapped."""
-_MOST_SLIPS = 3
+_SHORTEST, _LONGEST = 2, 64
+"""Letters of a word that is compared with names."""
+_LIKE = 0.66
+"""Least share of common letters of a word and the name that is meant: `amr` and `arm` have 0.67, `Kx` and `Kp` 0.5."""
 
 
 def nearest_name(word: str, known: Iterable[str]) -> str | None:
-    """Return the known name that differs from `word` by a few slips in each of its dotted parts, or by its ending.
+    """Return the known name that is most like `word` in each of its dotted parts; None if none is like it.
 
-    Case is ignored. Units may be missing: `threshold` stands for `threshold_Nm`. Of several names the nearest is
-    returned, of equally near ones the first; None when no name is near.
+    Case is ignored. Units may be missing: `threshold` stands for `threshold_Nm`. Of equally near names the first is
+    returned.
     """
-    if len(word) > _LONGEST:
+    if not _SHORTEST <= len(word) <= _LONGEST:
         return None
-    found = [(slips, name) for name in known if (slips := _slips_in_parts(word, name)) is not None]
-    return min(found, key=lambda pair: pair[0])[1] if found else None
+    found = ((_likeness(word.casefold(), name.casefold()), name) for name in known)
+    likeness, name = max(found, key=lambda pair: pair[0], default=(0.0, ""))
+    return name if likeness >= _LIKE else None
 
 
-def _slips_in_parts(word: str, name: str) -> int | None:
-    parts = [part.split(".") for part in (word.casefold(), name.casefold())]
+def _likeness(word: str, name: str) -> float:
+    parts = word.split("."), name.split(".")
     if len(parts[0]) != len(parts[1]):
-        return None
-    slips = [_slips(*pair) for pair in zip(*parts, strict=True)]
-    return sum(count for count in slips if count is not None) if None not in slips else None
-
-
-def _slips(word: str, name: str) -> int | None:
-    """Count the slips between a word and a name; None when they are too many. An ending too few or too many is one."""
-    pairs = [(word, name, 0)]
-    pairs += [(word, form, 1) for form in _without_ending(name)]
-    pairs += [(form, name, 1) for form in _without_ending(word)]
-    counts = [ending + slips for *pair, ending in pairs if (slips := _distance(*pair)) <= _allowed(*pair)]
-    shorter, longer = sorted((word, name), key=len)
-    if longer.startswith(shorter) and _SLIPS[0][0] <= len(shorter) and len(longer) <= 2 * len(shorter):
-        counts.append(1 + _MOST_SLIPS)
-    return min(counts, default=None)
-
-
-def _allowed(word: str, name: str) -> int:
-    shorter = min(len(word), len(name))
-    return next((slips for length, slips in _SLIPS if shorter < length), _MOST_SLIPS)
-
-
-def _without_ending(name: str) -> Iterator[str]:
-    """Yield the name without its last parts between underscores, as long as at least half of it is left."""
-    while "_" in name:
-        shorter = name.rpartition("_")[0]
-        if 2 * len(shorter) < len(name):
-            return
-        name = shorter
-        yield name
-
-
-def _distance(word: str, name: str) -> int:
-    """Count the least letters to insert, delete, replace or exchange with the next (optimal string alignment)."""
-    before: list[int] = []
-    last = list(range(len(name) + 1))
-    for row, letter in enumerate(word, start=1):
-        this = [row]
-        for column, other in enumerate(name, start=1):
-            cost = min(last[column] + 1, this[-1] + 1, last[column - 1] + (letter != other))
-            if row > 1 and column > 1 and letter == name[column - 2] and word[row - 2] == other:
-                cost = min(cost, before[column - 2] + 1)
-            this.append(cost)
-        before, last = last, this
-    return last[-1]
+        return 0.0
+    return min(SequenceMatcher(None, *pair).ratio() for pair in zip(*parts, strict=True))
 
 
 _SOURCE_TREE = Path(__file__).resolve().parent.parent

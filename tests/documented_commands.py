@@ -28,7 +28,7 @@ from adacd_hil.device.profile import ProfileSettings, load_profile
 from adacd_hil.given_path import WrittenPath
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.settings.configuration import Settings, load_settings
-from adacd_hil.settings.schema import ConfigError, find_problems, parse
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.setting_keys import apply_settings, parse_changes, parse_variations
 from adacd_hil.wire.codec import CodecError, load_codec
 from firmware_sim.cli.emulator_main import cli as emulator_cli
@@ -470,7 +470,11 @@ def _values_refused(key: str, value: Any) -> Complaints:
     for section in _all_sections():
         if key not in {field.name for field in dataclasses.fields(section)}:
             continue
-        about = [line for line in find_problems(section, {key: value}) if f"`{key}" in line]
+        try:
+            parse(section, {key: value})
+            return []
+        except ConfigError as error:
+            about = [line for line in error.problems if f"`{key}" in line]
         if not about:
             return []
         complaints += about

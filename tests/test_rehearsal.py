@@ -1,8 +1,7 @@
 """The emulator plays the arm of the configuration that the host reads, and what a truth says otherwise."""
 
+import contextlib
 import dataclasses
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,7 +37,6 @@ sensor_node = [21, 22]
 contract = ""
 """
 SHORT = "lasts_s = 0.4\n"
-HOST = "from adacd_hil.cli.main import main; main()"
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +47,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def rehearse(folder: Path, name: str, *words: str) -> tuple[int, str]:
-    """Play a short demo of the arm; return the exit status, and what was said on stderr."""
-    command = ["demo", "--config", "my-arm.toml", "--scenario", "short.toml", "--out", name, *words]
-    ran = subprocess.run(
-        [sys.executable, "-c", HOST, *command], cwd=folder, capture_output=True, text=True, check=False
-    )
-    return ran.returncode, ran.stderr
+def rehearse(folder: Path, name: str, *words: str, scenario: str = "short.toml") -> tuple[int, str]:
+    """Play a demo of the arm; return the exit status and the text on stderr."""
+    command = ["demo", "--config", "my-arm.toml", "--scenario", scenario, "--out", name, *words]
+    with contextlib.chdir(folder):
+        ran = CliRunner().invoke(cli, command)
+    return ran.exit_code, ran.stderr
 
 
 @pytest.mark.slow
@@ -66,12 +63,9 @@ def test_an_arm_of_init_is_certified_and_all_its_touches_are_found(
     written = CliRunner().invoke(cli, ["init", *describe(tmp_path)])
     assert written.exit_code == 0, written.output
     (tmp_path / "touches.toml").write_text(touches(len(LINKS)))
-    words = ["--config", "my-arm.toml", "--scenario", "touches.toml", "--out", "played"]
-    ran = subprocess.run(
-        [sys.executable, "-c", HOST, "demo", *words], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert ran.returncode == 0, ran.stderr
-    assert "model certified" in ran.stderr
+    status, said = rehearse(tmp_path, "played", scenario="touches.toml")
+    assert status == 0, said
+    assert "model certified" in said
     run, gathered, _ = read_run(tmp_path / "played" / "run.mcap", tmp_path / "played" / "truth.mcap")
     judged = evaluate(run, gathered)
     assert (len(judged.contacts), judged.missed, judged.false_alarms) == (len(LINKS), 0, 0)

@@ -16,12 +16,12 @@ from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, deviatio
 NAMES = builtin_scenarios()
 GROUPS = {"experiment", "people", "mechanics", "measurement", "faults", "minutes"}
 PLAYED = (
-    "clamped-lower-arm-link1",
     "blow-chest",
+    "wrong-node-id",
+    "clamped-lower-arm-link1",
     "dropped-payload",
     "power-loss-and-return",
     "one-percent-loss",
-    "wrong-node-id",
 )
 """One of each way to end that a short run can have."""
 SHORT_TOML = """
@@ -34,25 +34,21 @@ contacts = 0
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_scenario_says_in_a_line_what_happens_and_belongs_to_a_group(name: str) -> None:
+def test_a_scenario_says_what_happens_and_what_a_host_makes_of_it_and_survives_being_written(
+    name: str, tmp_path: Path
+) -> None:
     scenario = load_scenario(name)
     assert scenario.name == name
     assert scenario.about.endswith(".")
     assert scenario.group in GROUPS
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_scenario_says_what_a_healthy_host_makes_of_it(name: str) -> None:
-    assert load_scenario(name).expect is not None
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("write", [to_toml, to_short_toml])
-def test_a_scenario_that_is_written_and_read_again_is_the_same(name: str, write, tmp_path: Path) -> None:
-    scenario = load_scenario(name)
+    assert scenario.expect is not None
+    assert scenario.expect_certified != scenario.expect  # it is there because it is another
+    things = (*scenario.contacts, *scenario.bodies, *scenario.hands, *scenario.walls, *scenario.payloads)
+    assert [thing.at_s for thing in things if thing.at_s >= scenario.lasts_s] == []
     path = tmp_path / "written.toml"
-    path.write_text(write(scenario), encoding="utf-8")
-    assert load_scenario(str(path)) == scenario
+    for write in (to_toml, to_short_toml):
+        path.write_text(write(scenario), encoding="utf-8")
+        assert load_scenario(str(path)) == scenario
 
 
 def test_awkward_text_survives_being_written(tmp_path: Path) -> None:
@@ -67,20 +63,12 @@ def test_no_two_scenarios_are_about_the_same() -> None:
     assert len(set(abouts)) == len(abouts)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_fault_befalls_some_scenario(kind: str) -> None:
-    assert kind in {row.kind for name in NAMES for row in load_scenario(name).faults}
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_contact_that_counts_comes_while_the_run_lasts(name: str) -> None:
-    scenario = load_scenario(name)
-    things = (*scenario.contacts, *scenario.bodies, *scenario.hands, *scenario.walls, *scenario.payloads)
-    assert [thing.at_s for thing in things if thing.at_s >= scenario.lasts_s] == []
+def test_every_kind_of_fault_befalls_some_scenario() -> None:
+    assert {row.kind for name in NAMES for row in load_scenario(name).faults} >= set(KINDS)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", long_but(1, PLAYED))
+@pytest.mark.parametrize("name", long_but(2, PLAYED))
 def test_a_run_of_it_comes_to_what_it_expects(name: str, tmp_path: Path) -> None:
     cast = resolve("paper", name, None, None)
     outcome = outcome_of(*run_embedded(cast, "lockstep", tmp_path))
@@ -99,12 +87,6 @@ def test_a_certified_host_comes_to_what_is_expected_of_it(name: str, tmp_path: P
     assert expected is not None
     assert expected != cast.scenario.expect
     assert deviations(expected, outcome) == ()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_an_expectation_of_a_certified_host_is_there_because_it_is_another(name: str) -> None:
-    scenario = load_scenario(name)
-    assert scenario.expect_certified != scenario.expect
 
 
 def test_the_user_of_a_scenario_only_acknowledges_and_finishes() -> None:

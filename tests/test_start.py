@@ -52,13 +52,13 @@ import sys
 from adacd_hil.cli.main import main
 class Failing:
     def find_spec(self, name, path, target=None):
-        if name == "matplotlib":
+        if name == "numpy":
             try:
                 raise {cause}
             except BaseException as error:
                 raise ImportError("initialization failed") from error
 sys.meta_path.insert(0, Failing())
-sys.argv[1:] = ["report", "none.mcap"]
+sys.argv[1:] = ["config", "docs", "arm"]
 main()
 """
 

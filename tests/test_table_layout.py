@@ -51,6 +51,7 @@ def test_each_part_begins_with_what_tells_rows_apart() -> None:
         "a    x     222222222222",
         "a    y                4",
     ]
+    assert fit_table(lines, (2, 3), 23, names=2)[4] == "who  what           two"  # just enough
     assert fit_table(lines, (2, 3), 20, names=2)[0] == "who  what"  # no room for them beside the numbers
 
 

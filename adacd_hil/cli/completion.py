@@ -4,7 +4,7 @@ Modules are imported at their first use: a shell waits for each answer.
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from click import Context, Parameter
@@ -16,31 +16,23 @@ _FILE = "file"
 _MOST_RUNS = 30
 
 
-def complete_configuration(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete built-in configurations and TOML files."""
-    from adacd_hil.settings.toml_files import builtin_names
+def _complete_toml(package: str, folder: str) -> Callable[[Context, Parameter, str], list[CompletionItem]]:
+    """Return a completion of the TOML files in a package's folder by name, and of others by path."""
 
-    return [*_starting(builtin_names(), incomplete), *_toml_files(incomplete)]
+    def complete(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
+        from importlib import resources
 
+        from adacd_hil.settings.toml_files import toml_names
 
-def complete_scenario(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete built-in scenarios and TOML files."""
-    from importlib import resources
+        names = toml_names(resources.files(package) / folder)
+        return [*_starting(names, incomplete), *_toml_files(incomplete)]
 
-    from adacd_hil.settings.toml_files import toml_names
-
-    names = toml_names(resources.files("firmware_sim") / "scenarios")
-    return [*_starting(names, incomplete), *_toml_files(incomplete)]
+    return complete
 
 
-def complete_truth(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete built-in truths and TOML files."""
-    from importlib import resources
-
-    from adacd_hil.settings.toml_files import toml_names
-
-    names = toml_names(resources.files("firmware_sim") / "truths")
-    return [*_starting(names, incomplete), *_toml_files(incomplete)]
+complete_configuration = _complete_toml("adacd_hil", "configs")
+complete_scenario = _complete_toml("firmware_sim", "scenarios")
+complete_truth = _complete_toml("firmware_sim", "truths")
 
 
 def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:

@@ -1,6 +1,5 @@
 """`adacd-hil`: the commands. Each one parses its options, calls one function, and prints the result."""
 
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
@@ -20,8 +19,9 @@ from adacd_hil.cli.options import (
     on_bus,
     run_folder_option,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, complain, show
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, complain
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
+from adacd_hil.remedies import pip_command
 from adacd_hil.terminal import is_interrupted, one_line, open_terminals
 
 if TYPE_CHECKING:
@@ -83,10 +83,7 @@ def run(
     from adacd_hil.cli.commands.run_command import as_text, next_of_run, run_on_bus
 
     result, code = run_on_bus(connection, clock, out, tare, live, history, scenario, without_anchor)
-    if as_json:
-        print(json.dumps(result, indent=2))
-    else:
-        show(as_text(result), *next_of_run(result))
+    answer(as_json, result, as_text(result), *next_of_run(result))
     return code
 
 
@@ -139,7 +136,17 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except OSError as error:  # help that can't be written
         code = complain(error)
     except ImportError as error:
-        if not is_interrupted(error):
-            raise
-        code = complain(KeyboardInterrupt())
+        code = complain(KeyboardInterrupt() if is_interrupted(error) else _missing(error))
     sys.exit(code)
+
+
+def _missing(error: ImportError) -> Exception:
+    """Return an error that names a missing package of others and the command that installs it, else the error itself.
+
+    `run`, `replay` and `config` need fewer packages than the commands of the lab.
+    """
+    package = (error.name or "").partition(".")[0]
+    if not isinstance(error, ModuleNotFoundError) or package in ("", "adacd_hil", "firmware_sim"):
+        return error
+    line = f"package {package} is not installed, which this command needs: {pip_command()} install {package}"
+    return CommandError(line, ExitCode.USAGE)

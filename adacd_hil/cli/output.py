@@ -7,7 +7,6 @@ import contextlib
 import errno
 import functools
 import itertools
-import json
 import os
 import shlex
 import shutil
@@ -23,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
+from adacd_hil.plain_values import json_text
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import fold, in_line, one_line, painted, terminal_columns, write_result, write_screen
 
@@ -149,12 +149,12 @@ def show(text: str, *next_commands: str) -> None:
     suggest(*next_commands)
 
 
-def answer(as_json: bool, described: Any, text: str) -> None:
-    """Print a result: `described` as JSON for machines, or the text for people."""
+def answer(as_json: bool, described: Any, text: str, *next_commands: str) -> None:
+    """Print a result: `described` as JSON for machines, or the text for people with suggested commands."""
     if as_json:
-        print(json.dumps(described, indent=2))
+        print(json_text(described))
     else:
-        show(text)
+        show(text, *next_commands)
 
 
 def suggest(*next_commands: str) -> None:

@@ -9,7 +9,7 @@ from adacd_hil.control.motions import motion_problems
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
 from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
-from adacd_hil.settings.schema import ConfigError, find_problems, parse
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.setting_keys import explain_unknown, known_keys, value_of
 from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.wire.budget import describe_excess
@@ -37,12 +37,9 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
     """Return all errors and likely mistakes of a configuration."""
     try:
         layers = configuration_layers(name_or_file, profile)
+        settings = parse(Settings, resolved_table(layers))
     except ConfigError as error:
-        return ConfigurationFindings([str(error)], [], None)
-    table = resolved_table(layers)
-    if problems := find_problems(Settings, table):
-        return ConfigurationFindings(problems, [], None)
-    settings = parse(Settings, table)
+        return ConfigurationFindings([*error.problems], [], None)
     if problems := motion_problems(settings):
         return ConfigurationFindings([*problems, *_radians(settings)], [], None)
     if problems := _device_problems(settings):

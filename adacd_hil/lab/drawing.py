@@ -4,7 +4,6 @@ Drawn with matplotlib's object interface on a white ground.
 """
 
 import io
-import json
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.file_access import replace_files
 from adacd_hil.log.log_files import failing_as
+from adacd_hil.plain_values import json_text
 from adacd_hil.records import Vector
 
 COLOURS: Final = {
@@ -96,7 +96,7 @@ def paper_svg(drawing: Drawing) -> str:
 
 def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings: Iterable[Drawing]) -> tuple[Path, ...]:
     """Write NAME.json, and each drawing as PNG and SVG, into a folder. Raises LogError when they can't be written."""
-    contents: dict[str, bytes | str] = {f"{name}.json": json.dumps(described, indent=2, allow_nan=False) + "\n"}
+    contents: dict[str, bytes | str] = {f"{name}.json": json_text(described) + "\n"}
     for drawing in drawings:
         contents |= {f"{drawing.name}.png": drawing.png(), f"{drawing.name}.svg": paper_svg(drawing)}
     with failing_as(f"report in {out_dir} can't be written"):

@@ -155,10 +155,10 @@ class TimeWindow(NamedTuple):
         first_ns, end_ns = (start_ns + round(min(max(bound_s, -_CENTURY_S), _CENTURY_S) * 1e9) for bound_s in self)
         return first_ns, end_ns
 
-    def as_json(self) -> dict[str, float | None]:
-        """Return its bounds, s; None where it is not bounded."""
-        bounds = (("from_s", self.start_s), ("until_s", self.end_s))
-        return {name: bound_s if math.isfinite(bound_s) else None for name, bound_s in bounds}
+    @property
+    def named_bounds(self) -> dict[str, float]:
+        """Its bounds by the names that results have for them, s; infinite where it is not bounded."""
+        return {"from_s": self.start_s, "until_s": self.end_s}
 
 
 WHOLE = TimeWindow()

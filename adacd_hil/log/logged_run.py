@@ -156,7 +156,7 @@ class AttemptBegins:
         self._begins: list[int] = []
         self._was_beginning: bool | None = None  # None before the first cycle
 
-    def add(self, cycle: NDArray[Any], state: NDArray[np.uint8]) -> None:
+    def add_cycles(self, cycle: NDArray[Any], state: NDArray[np.uint8]) -> None:
         """Take in the next cycles (k,), k > 0."""
         is_beginning = np.isin(state, _BEGINNING)
         if self._was_beginning is None and not is_beginning[0]:

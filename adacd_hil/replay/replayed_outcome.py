@@ -370,10 +370,10 @@ def as_json(found: Replay) -> dict[str, Any]:
         if found.score is None
         else [found.time_s(alarm.t_ns) for alarm in found.score.false_alarms],
         "missed": None if found.score is None else found.score.missed,
-        "adaptation_s": list(found.adaptation_s),
+        "adaptation_s": found.adaptation_s,
         "threshold_Nm": [value for value in found.sight.threshold_Nm if math.isfinite(value)],
-        "smallest_push_Nm": list(found.sight.push_Nm),
-        "parameters": {name: value if math.isfinite(value) else None for name, value in found.parameters.items()},
+        "smallest_push_Nm": found.sight.push_Nm,
+        "parameters": found.parameters,
         "states": [
             {
                 "cycle": each.cycle,

@@ -7,7 +7,7 @@ Values nearer to 0 than 2^-30 count as 0, sizes from 2^63 on as infinite; NaN is
 """
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,16 +38,11 @@ class LogHistogram(NamedTuple):
         """Add the counts of another one with the same bins."""
         return LogHistogram(self.edges, self.counts + other.counts, self.below + other.below, self.above + other.above)
 
-    def as_json(self) -> dict[str, Any]:
-        """Return it in plain values; empty bins at both ends are left out."""
+    def trimmed(self) -> "LogHistogram":
+        """Return the histogram without the empty bins at both ends."""
         filled = np.flatnonzero(self.counts)
         first, end = (int(filled[0]), int(filled[-1]) + 1) if filled.size else (0, 0)
-        return {
-            "edges": self.edges[first : end + 1].tolist(),
-            "counts": self.counts[first:end].tolist(),
-            "below": self.below,
-            "above": self.above,
-        }
+        return self._replace(edges=self.edges[first : end + 1], counts=self.counts[first:end])
 
 
 def log_histogram(values: Values) -> LogHistogram:

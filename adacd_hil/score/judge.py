@@ -226,23 +226,26 @@ class StreamJudge:
     """Judges a statistic that is compared with a threshold sample by sample but raises no alarm, piece by piece.
 
     The first sample over the threshold that is about a contact finds it. Samples about no contact are a false alarm;
-    a sample no more than `pause_ns` after the one before belongs to the same false alarm. contacts: those that begin
-    before the end of the samples so far, and are known until then; each call may have more of them.
+    a sample no more than `pause_ns` after the one before belongs to the same false alarm.
     """
 
     def __init__(self, pause_ns: int) -> None:
         self._pause_ns = pause_ns
-        self._found: dict[int, int] = {}
+        self._found: dict[int, int] = {}  # by the contact's number
         self._false: list[Detection] = []
         self._last_ns: int | None = None  # of the last sample that no contact explains
 
     def add_samples(
         self, contacts: Sequence[TrueContact], t_ns: Times, is_over: NDArray[np.bool_], is_judged: NDArray[np.bool_]
     ) -> None:
-        """Judge the next samples (n,). is_judged: where an alarm that no contact explains counts as false."""
+        """Judge the next samples (n,). is_judged: where an alarm that no contact explains counts as false.
+
+        contacts: in order, those at least that begin before the last sample and aren't forgotten before the first.
+        """
         rows = np.flatnonzero(is_over)
         about = owners(t_ns[rows], *_bounds(contacts))
-        self._found = _first(about.tolist(), t_ns[rows].tolist()) | self._found
+        first = _first(about.tolist(), t_ns[rows].tolist())
+        self._found = {contacts[place].number: at_ns for place, at_ns in first.items()} | self._found
         false_ns = t_ns[rows[(about < 0) & is_judged[rows]]]
         begins = begins_of(false_ns, self._pause_ns, self._last_ns)
         self._false += [Detection(at_ns, True) for at_ns in false_ns[begins].tolist()]
@@ -250,8 +253,9 @@ class StreamJudge:
             self._last_ns = int(false_ns[-1])
 
     def score(self, contacts: Sequence[TrueContact]) -> Score:
-        """Judge all samples so far."""
-        return Score(_judged(contacts, self._found), tuple(self._false))
+        """Judge all samples so far; contacts: all of them."""
+        judged = (replace(contact, detected_ns=self._found.get(contact.number)) for contact in contacts)
+        return Score(tuple(judged), tuple(self._false))
 
 
 def _bounds(contacts: Sequence[TrueContact]) -> tuple[Times, Times]:
@@ -360,15 +364,20 @@ def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueConta
     return tuple(found)
 
 
+def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
+    """Find the true contacts of a run, with the times of their rows."""
+    truth = run.truth
+    if truth is None or run.cycle.size == 0:
+        return ()
+    if truth.time_s is None:
+        truth = replace(truth, time_s=run.time_of_s(truth.cycle))
+    return true_contacts(truth, run.first_contact)
+
+
 def contacts_of(run: Run) -> tuple[TrueContact, ...]:
     """Find the true contacts of a run, on its clock, with the thresholds and the filter of its own scheme."""
-    if run.truth is None or run.cycle.size == 0:
-        return ()
-    truth = run.truth if run.truth.time_s is not None else replace(run.truth, time_s=run.time_of_s(run.truth.cycle))
     armed = run.state == SchemeState.MONITOR
-    return tuple(
-        placed_in(run, contact, run.a_rad_s, None, armed) for contact in true_contacts(truth, run.first_contact)
-    )
+    return tuple(placed_in(run, contact, run.a_rad_s, None, armed) for contact in timed_contacts(run))
 
 
 def placed_in(run: Run, contact: TrueContact, a_rad_s: float, threshold: Vector | None, armed: Mask) -> TrueContact:

@@ -31,7 +31,7 @@ from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.detect import margin as detect_margin
 from adacd_hil.scheme.model.filter_bank import channels_of
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.score.judge import StreamJudge, TrueContact, contacts_of, find_detections, placed_in
+from adacd_hil.score.judge import StreamJudge, TrueContact, find_detections, placed_in, timed_contacts
 from adacd_hil.score.metrics import (
     Beside,
     CertifiedEvidence,
@@ -79,7 +79,8 @@ class BesideGatherer:
             is_judged = outline.truth.span.covers(piece.cycle)
         if outline.finish_cycle is not None:
             is_judged &= piece.cycle < outline.finish_cycle
-        self._judge.add_samples(self._contacts(outline, sections), piece.t_ns, over, is_judged)
+        since_s = float(time_s[0]) - SETTLING_TIME_CONSTANTS / self._a_rad_s
+        self._judge.add_samples(self._contacts(outline, sections, since_s), piece.t_ns, over, is_judged)
         for section in sections:
             if section.start_s > time_s[-1]:
                 break
@@ -97,13 +98,17 @@ class BesideGatherer:
                 values = stream.tau_ext_hat[rows][free[rows] & armed[rows]]
                 self._largest[section.label] = larger(self._largest.get(section.label), values)
 
-    def _contacts(self, run: Run, sections: Sequence[Section]) -> list[TrueContact]:
-        """Place the true contacts on the clock of a run, as the paper's scheme has them."""
+    def _contacts(self, run: Run, sections: Sequence[Section], since_s: float = -np.inf) -> list[TrueContact]:
+        """Place the true contacts that end since a time on the clock of a run, as the paper's scheme has them."""
         assert run.beside is not None
         time_s = run.time_s()
         armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
         threshold = np.array(run.settings.detector.threshold_Nm)
-        return [placed_in(run, contact, self._a_rad_s, threshold, armed) for contact in contacts_of(run)]
+        return [
+            placed_in(run, contact, self._a_rad_s, threshold, armed)
+            for contact in timed_contacts(run)
+            if contact.time_s is not None and contact.time_s[-1] >= since_s
+        ]
 
     def beside(self, run: Run, sections: Sequence[Section]) -> Beside:
         """Sum up all cycles; run: the outline of all of them."""
@@ -283,7 +288,7 @@ class UntouchedGatherer:
             around = [(found.t_ns - settling_ns, found.t_ns + settling_ns) for found in find_detections(outline)]
         else:
             zero_ns = outline.zero_ns
-            spans_s = [contact.time_s[[0, -1]] for contact in contacts_of(outline) if contact.time_s is not None]
+            spans_s = [contact.time_s[[0, -1]] for contact in timed_contacts(outline) if contact.time_s is not None]
             around = [(zero_ns + round(a * 1e9), zero_ns + round(b * 1e9) + settling_ns) for a, b in spans_s]
             if truth.span is not None:
                 free &= truth.span.covers(piece.cycle)

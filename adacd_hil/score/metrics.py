@@ -77,8 +77,8 @@ class TimingEvidence:
     queues_bytes: Mapping[str, Mapping[str, float] | None]
     counts: Mapping[str, Count | None]
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the evidence in plain values."""
+    def by_key(self) -> dict[str, Any]:
+        """Return the evidence by the keys of report.json."""
         times = {name: found for name, found in self.times.items() if found is not None}
         absent = dict.fromkeys(self.times)
         reaction = self.reaction
@@ -86,12 +86,12 @@ class TimingEvidence:
             "is_modelled": self.is_modelled,
             "period_us": self.period_us,
             "cycles": self.cycles,
-            "times_us": {**absent, **{name: dict(found.percentiles) for name, found in times.items()}},
+            "times_us": {**absent, **{name: found.percentiles for name, found in times.items()}},
             "reaction_us": None if reaction is None else {"count": reaction.count, **reaction.percentiles},
-            "data_age_cycles": None if self.data_age is None else list(self.data_age),
-            "queues_bytes": {name: None if depth is None else dict(depth) for name, depth in self.queues_bytes.items()},
-            "counts": {name: None if count is None else count._asdict() for name, count in self.counts.items()},
-            "histograms_us": {**absent, **{name: found.histogram.as_json() for name, found in times.items()}},
+            "data_age_cycles": self.data_age,
+            "queues_bytes": self.queues_bytes,
+            "counts": self.counts,
+            "histograms_us": {**absent, **{name: found.histogram.trimmed() for name, found in times.items()}},
         }
 
 
@@ -135,11 +135,6 @@ class CyclicData:
     aged: float | None
     devices: dict[str, DeviceShares]
     excesses: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it in plain values."""
-        devices = {name: vars(shares) for name, shares in self.devices.items()}
-        return {**vars(self), "devices": devices, "excesses": list(self.excesses)}
 
 
 @dataclass(frozen=True)

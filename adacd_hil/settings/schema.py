@@ -14,7 +14,14 @@ from adacd_hil.remedies import nearest_name
 
 
 class ConfigError(ValueError):
-    """A setting that can't be used; the message is one line: key, value, bound, unit."""
+    """Settings that can't be used. The message is the first problem, one line: key, value, bound, unit.
+
+    problems: all of them, a line each.
+    """
+
+    def __init__(self, *problems: str) -> None:
+        super().__init__(*problems[:1])
+        self.problems = problems
 
 
 class DetectorError(ConfigError):
@@ -55,69 +62,57 @@ Section = TypeVar("Section")
 def parse(section: type[Section], table: dict[str, Any], where: str = "") -> Section:
     """Make a `section` from a TOML table.
 
-    Raises ConfigError for an unknown key, a missing key, a wrong type or a value outside its bounds.
+    Raises ConfigError with every unknown key, missing key, wrong type and value outside its bounds; of a list of plain
+    values the first. Conditions on several keys are checked only if each key is valid by itself; the first violation is
+    reported.
     """
-    problems: list[ConfigError] = []
-    made = _read_section(section, table, where, problems)
-    if problems:
-        raise problems[0]
-    return typing.cast(Section, made)
-
-
-def find_problems(section: type[Any], table: dict[str, Any]) -> list[str]:
-    """List every reason for which `parse` would refuse a table, a line each.
-
-    Conditions on several keys are checked only if each key is valid by itself; the first violation is reported.
-    """
-    problems: list[ConfigError] = []
-    _read_section(section, table, "", problems)
-    return [str(problem) for problem in problems]
-
-
-def _read_section(section: type[Any], table: dict[str, Any], where: str, problems: list[ConfigError]) -> Any:
-    """Make a section, or add its problems to the list and return None."""
-    fields = {field.name: field for field in dataclasses.fields(section)}
+    fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, section))}
     hints = typing.get_type_hints(section)
-    found = [ConfigError(_unknown(key, fields, where)) for key in table if key not in fields]
+    problems = [_unknown(key, fields, where) for key in table if key not in fields]
     values = {}
     for name, field in fields.items():
         if name in table:
-            values[name] = _read_value(hints[name], table[name], f"{where}{name}", field.metadata, found)
+            try:
+                values[name] = _read_value(hints[name], table[name], f"{where}{name}", field.metadata)
+            except ConfigError as error:
+                problems += error.problems
         elif _is_required(field):
-            found.append(ConfigError(f"missing key `{where}{name}`"))
-    problems += found
-    if found:
-        return None
+            problems.append(f"missing key `{where}{name}`")
+    if problems:
+        raise ConfigError(*problems)
     place = where.rstrip(".")
     try:
         return section(**values)
     except ConfigError as error:
-        problems.append(error if place in str(error) else ConfigError(f"`{place}`: {error}"))
+        if place in str(error):
+            raise
+        raise ConfigError(f"`{place}`: {error}") from None
     except ValueError as error:
-        problems.append(ConfigError(f"{place}: {error}" if place else str(error)))
-    return None
+        raise ConfigError(f"{place}: {error}" if place else str(error)) from None
 
 
-def _read_value(hint: Any, value: Any, key: str, metadata: Any, problems: list[ConfigError]) -> Any:
-    """Convert a value to its type, or add its problems to the list; of a list of plain values only the first."""
+def _read_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
+    """Convert a value to its type. Raises ConfigError."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         hint = next(option for option in typing.get_args(hint) if option is not type(None))
-    try:
-        if dataclasses.is_dataclass(hint):
-            if not isinstance(value, dict):
-                raise ConfigError(f"`{key}` = {value!r} must be a table")
-            return _read_section(typing.cast(type[Any], hint), value, f"{key}.", problems)
-        if typing.get_origin(hint) is not tuple:
-            return _parse_scalar(hint, value, key, metadata)
-        hints = _element_hints(hint, value, key)
-    except ConfigError as error:
-        problems.append(error)
-        return None
-    found: list[ConfigError] = []
-    pairs = enumerate(zip(hints, value, strict=True))
-    items = tuple(_read_value(element, item, f"{key}[{index}]", metadata, found) for index, (element, item) in pairs)
-    problems += found if any(map(dataclasses.is_dataclass, hints)) else found[:1]
-    return items
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise ConfigError(f"`{key}` = {value!r} must be a table")
+        return parse(typing.cast(type[Any], hint), value, f"{key}.")
+    if typing.get_origin(hint) is not tuple:
+        return _parse_scalar(hint, value, key, metadata)
+    items: list[Any] = []
+    problems: list[str] = []
+    for index, (element, item) in enumerate(zip(_element_hints(hint, value, key), value, strict=True)):
+        try:
+            items.append(_read_value(element, item, f"{key}[{index}]", metadata))
+        except ConfigError as error:
+            if not dataclasses.is_dataclass(element):
+                raise
+            problems += error.problems
+    if problems:
+        raise ConfigError(*problems)
+    return tuple(items)
 
 
 def _unknown(key: str, known: Iterable[str], where: str) -> str:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from adacd_hil.settings.schema import ConfigError, find_problems
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_short_toml, to_toml
 from adacd_hil.wire.codec import Codec
 from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS, FaultPlan
@@ -50,14 +50,11 @@ def check(file: str, codec: Codec) -> ScenarioFinding:
         table = read_table(file)
     except ConfigError as error:
         return ScenarioFinding(file, (str(error).removeprefix(f"scenario {file}").removeprefix(":").strip(),))
-    problems = find_problems(Scenario, table)
-    if problems:
-        return ScenarioFinding(file, tuple(problems))
-    scenario = load_scenario(file)
     try:
+        scenario = parse(Scenario, table)
         FaultPlan(scenario.faults, scenario.seed, PLANNED_PERIOD_NS, codec)
     except ConfigError as error:
-        return ScenarioFinding(file, (str(error),))
+        return ScenarioFinding(file, error.problems)
     return ScenarioFinding(file, (), _checked(scenario, codec))
 
 

@@ -97,7 +97,7 @@ def test_what_is_found_begins_at_rest_in_the_corner(found: ExcitationSettings) -
 
 def test_what_is_found_keeps_the_limits(search: Search, found: ExcitationSettings) -> None:
     figures = search.figures(found)
-    for name, limits in search.limits.as_json().items():
+    for name, limits in search.limits.by_figure().items():
         for value, limit in zip(getattr(figures, name), limits, strict=True):
             assert value <= limit * (1.0 + TOLERANCE)
 
@@ -123,7 +123,7 @@ def test_without_a_model_of_the_arm_torque_has_no_limit_and_the_lag_no_column(se
     settings = small_settings()
     blind = Search(dataclasses.replace(settings, arm=dataclasses.replace(settings.arm, cad_theta=())))
     figures = blind.figures(blind.present)
-    assert (figures.torque_Nm, blind.limits.as_json()["torque_Nm"]) == (None, None)
+    assert (figures.torque_Nm, blind.limits.by_figure()["torque_Nm"]) == (None, None)
     assert figures.excitation_Nm2s >= search.figures(search.present).excitation_Nm2s
 
 

@@ -274,7 +274,7 @@ def test_the_truth_of_an_attempt_waits_for_its_first_cycle():
 def test_an_attempt_that_begins_in_two_pieces_begins_once():
     attempts = AttemptBegins()
     for cycles, state in (([0, 1], SchemeState.INIT), ([2, 3], SchemeState.COMMISSION), ([4], SchemeState.ENABLE)):
-        attempts.add(np.array(cycles), np.full(len(cycles), state, np.uint8))
+        attempts.add_cycles(np.array(cycles), np.full(len(cycles), state, np.uint8))
     assert attempts.begins.tolist() == [0]
 
 

@@ -127,6 +127,7 @@ def test_other_settings_stand_beside_the_original(log: Path) -> None:
         (("--config", "papper"), "did you mean 'paper'?"),
         (("--set", "bus.period_us=2000"), "`bus.period_us` made the numbers of the log; a replay can't change it"),
         (("--vary", "arm.torque_offset_Nm=0.1,0.2"), "`arm.torque_offset_Nm` made the numbers of the log"),
+        (("--set", "devices.drive_node=[5, 6]"), "`devices.drive_node` made the numbers of the log"),
     ],
 )
 def test_settings_that_cant_be_used_end_with_status_2(log: Path, arguments: tuple[str, ...], line: str) -> None:

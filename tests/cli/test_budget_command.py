@@ -1,8 +1,6 @@
 """The budget command: its verdict as exit status, its table, its JSON, its complaints."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -188,7 +186,6 @@ ARM = (Path(__file__).parents[2] / "dbc" / "arm.dbc").read_text()
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        (2 * ARM, "message Nmt is defined more than once"),
         (200 * ARM, "message Nmt is defined more than once"),
         (ARM.replace(" Drive2Emcy:", " Drive1Emcy:"), "message Drive1Emcy is defined more than once"),
         (
@@ -204,14 +201,13 @@ ARM = (Path(__file__).parents[2] / "dbc" / "arm.dbc").read_text()
             "1029 messages are more than 1000",
         ),
     ],
-    ids=["twice", "200 times", "a name", "an identifier", "too many"],
+    ids=["200 times", "a name", "an identifier", "too many"],
 )
 def test_messages_that_are_defined_twice_or_too_many_are_one_line(text: str, line: str, tmp_path: Path) -> None:
     path = tmp_path / "x.dbc"
     path.write_text(text)
-    command = [sys.executable, "-c", "from adacd_hil.cli.main import main; main()", "budget", "--dbc", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert (done.returncode, done.stdout) == (USAGE, "")
+    done = budget("--dbc", str(path))
+    assert (done.exit_code, done.stdout) == (USAGE, "")
     (complaint,) = done.stderr.splitlines()
     assert complaint.startswith(f"adacd-hil: DBC {path}: ")
     assert line in complaint

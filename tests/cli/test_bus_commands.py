@@ -1,4 +1,4 @@
-"""Bad input to the commands that work on a bus: one line, a documented exit status, nothing on stdout."""
+"""What `run` names before it looks for an arm."""
 
 from pathlib import Path
 from typing import NoReturn
@@ -10,59 +10,10 @@ from adacd_hil.cli.commands import run_command
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import CommandError
 
-COMMANDS = ("scan", "commtest", "monitor")
-
 
 def call(*arguments: str) -> tuple[int, str, list[str]]:
     result = CliRunner().invoke(cli, arguments)
     return result.exit_code, result.stdout, result.stderr.splitlines()
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("-i", "socketcan", "-c", "can77"), "can77"),
-        (("-i", "sockecan", "-c", "x"), "did you mean 'socketcan'?"),
-        (("-i", "udp_multicast", "-c", "239.0.0.1"), "echoes own frames"),
-    ],
-)
-def test_a_bus_that_cant_be_opened_is_one_line(command: str, arguments: tuple[str, ...], line: str) -> None:
-    found, stdout, stderr = call(command, *arguments)
-    (complaint,) = stderr
-    assert (found, stdout) == (5, "")
-    assert line in complaint
-
-
-@pytest.mark.parametrize("command", [*COMMANDS, "doctor"])
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("--config", "papper"), "did you mean 'paper'?"),
-        (("--config", "none.toml"), "configuration none.toml does not exist"),
-        (("--dbc", "none.dbc"), "none.dbc: No such file"),
-    ],
-)
-def test_a_configuration_that_cant_be_used_is_one_line(command: str, arguments: tuple[str, ...], line: str) -> None:
-    found, stdout, stderr = call(command, "-i", "virtual", "-c", "x", *arguments)
-    (complaint,) = stderr
-    assert (found, stdout) == (2, "")
-    assert line in complaint
-
-
-@pytest.mark.parametrize("command", [*COMMANDS, "doctor"])
-def test_a_profile_that_does_not_exist_is_usage(command: str) -> None:
-    status, stdout, stderr = call(command, "-i", "virtual", "-c", "x", "--profile", "Q")
-    assert (status, stdout) == (2, "")
-    assert "'Q' is not one of 'P', 'S', 'M'" in stderr[-1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", ["scan", "commtest"])
-def test_an_empty_bus_ends_with_devices_missing(command: str) -> None:
-    status, _, stderr = call(command, "-i", "virtual", "-c", "empty", "--seconds", "0.1")
-    assert status == 5
-    assert not any("Traceback" in line for line in stderr)
 
 
 class NoSession:

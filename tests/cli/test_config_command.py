@@ -63,6 +63,7 @@ def test_all_errors_are_told_at_once(tmp_path: Path) -> None:
     path.write_text(
         "[arm]\nlink_length_m = [350, 300]\nrated_torque = [12, 6]\n[bus]\nperiod_us = 1\n"
         "[certified]\nsigmas = 5.0\n[safety]\ncommission_cycles = 200\n"
+        "[operator]\nscript = [{ at_s = -1, request = 'finsh' }, { request = 'finish' }]\n"
     )
     result = config("check", str(path))
     assert result.exit_code == USAGE
@@ -72,8 +73,12 @@ def test_all_errors_are_told_at_once(tmp_path: Path) -> None:
         "error: `arm.link_length_m[0]` = 350.0 m is above 5 m; 350 mm are 0.35 m",
         "error: `bus.period_us` = 1 µs is below 500 µs; 1 ms are 1000 µs",
         "error: unknown key `certified.sigmas`; its successor is `certified.noise_sigmas` and `certified.model_sigmas`",
+        "error: `operator.script[0].at_s` = -1.0 s is below 0 s",
+        "error: `operator.script[0].request` = 'finsh' must be one of payload, payload_changed, finish; "
+        "did you mean 'finish'?",
+        "error: missing key `operator.script[1].at_s`",
         "error: unknown key `safety.commission_cycles`; its successor is `safety.commission_s`",
-        "5 errors, 0 warnings",
+        "8 errors, 0 warnings",
     ]
 
 

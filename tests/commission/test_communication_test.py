@@ -34,17 +34,13 @@ def commands(rig: Rig) -> set[tuple[int, int]]:
     return {tuple(map(int, COMMAND.decode_values(frame.data))) for frame in rig.sent if frame.can_id in COMMANDS}
 
 
-def test_an_undisturbed_connection_is_good_and_complete() -> None:
-    report, fault = run(Rig(is_wall=True))
+def test_an_undisturbed_connection_is_good_and_complete_and_asks_the_drives_for_no_voltage() -> None:
+    rig = Rig(is_wall=True)
+    report, fault = run(rig)
+    assert commands(rig) == {(0x0000, 0)}
     assert (report.cycles, report.complete, report.overruns) == (200, 200, 0)
     assert (report.verdict, report.share, fault) == (Verdict.GOOD, 1.0, FaultReason.NONE)
     assert [device.ages[0] for device in report.devices.values()] == [200] * 4
-
-
-def test_the_drives_are_never_asked_for_more_than_no_voltage() -> None:
-    rig = Rig(is_wall=True)
-    run(rig)
-    assert commands(rig) == {(0x0000, 0)}
 
 
 def test_enabled_drives_get_no_torque_and_are_disabled_at_the_end() -> None:

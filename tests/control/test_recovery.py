@@ -1,11 +1,13 @@
 """After a fault: latched until it is acknowledged, then everything from the beginning, at the present position."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from rig import ENABLE_OPERATION, TROUBLE_CYCLE, SessionRig, controlwords, torques_from
 
+from adacd_hil.control.session import SessionSummary
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.wire.bus import BusError, Frame
@@ -32,13 +34,35 @@ def messages(log: RunLog, name: str) -> list[str]:
     return [entry.event.message for entry in log.events if entry.event.name == name]
 
 
-def test_an_acknowledged_fault_begins_again_with_the_first_check(tmp_path: Path) -> None:
-    summary, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
+class Recovered(NamedTuple):
+    """A run whose fault was acknowledged; `fault`, `first`, `adapt`: rows of FAULT, of the first and of ADAPT after."""
+
+    summary: SessionSummary
+    log: RunLog
+    fault: int
+    first: int
+    adapt: int
+
+
+@pytest.fixture(scope="module")
+def recovered(tmp_path_factory: pytest.TempPathFactory) -> Recovered:
+    summary, log = faulting_rig(tmp_path_factory.mktemp("recovered"), acknowledge_faults=1).run()
+    state = log.scheme["state"]
+    fault = int(np.flatnonzero(state == SchemeState.FAULT)[0])
+    first, adapt = (
+        fault + int(np.flatnonzero(is_it)[0])
+        for is_it in (state[fault:] != SchemeState.FAULT, state[fault:] == SchemeState.ADAPT)
+    )
+    return Recovered(summary, log, fault, first, adapt)
+
+
+def test_an_acknowledged_fault_begins_again_with_the_first_check(recovered: Recovered) -> None:
+    summary = recovered.summary
     assert summary.recoveries == 1
     assert summary.result is not None
     assert summary.result.fault is FaultReason.NONE
     way_up = [SchemeState.COMMISSION, SchemeState.ENABLE, SchemeState.ADAPT]
-    assert states(log) == [*way_up, SchemeState.FAULT, *way_up]
+    assert states(recovered.log) == [*way_up, SchemeState.FAULT, *way_up]
 
 
 def test_a_fault_that_nobody_acknowledges_ends_the_run(tmp_path: Path) -> None:
@@ -58,33 +82,24 @@ def test_the_second_fault_is_latched_when_one_may_be_acknowledged(tmp_path: Path
     assert (summary.recoveries, states(log)[-1]) == (1, SchemeState.FAULT)
 
 
-def test_after_a_recovery_there_is_no_torque_until_the_drives_are_enabled_again(tmp_path: Path) -> None:
-    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
-    state = log.scheme["state"]
-    fault = int(np.flatnonzero(state == SchemeState.FAULT)[0])
-    second_adapt = fault + int(np.flatnonzero(state[fault:] == SchemeState.ADAPT)[0])
-    quiet = slice(log.scheme.t_ns[fault], log.scheme.t_ns[second_adapt])
+def test_after_a_recovery_there_is_no_torque_until_the_drives_are_enabled_again(recovered: Recovered) -> None:
+    log = recovered.log
+    quiet = slice(log.scheme.t_ns[recovered.fault], log.scheme.t_ns[recovered.adapt])
     command = log.decoded["Drive1Command"]
     is_quiet = (command.t_ns >= quiet.start) & (command.t_ns < quiet.stop)
     assert np.count_nonzero(is_quiet) > 200
     assert np.count_nonzero(command["target_torque"][is_quiet]) == 0
 
 
-@pytest.mark.long
-def test_the_arm_is_enabled_where_it_is_with_zero_torque_first(tmp_path: Path) -> None:
-    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
-    state = log.scheme["state"]
-    fault = int(np.flatnonzero(state == SchemeState.FAULT)[0])
-    start = fault + int(np.flatnonzero(state[fault:] == SchemeState.ADAPT)[0])
+def test_the_arm_is_enabled_where_it_is_with_zero_torque_first(recovered: Recovered) -> None:
+    log, start = recovered.log, recovered.adapt
     np.testing.assert_allclose(log.control["q_d"][start], log.scheme["q"][start], atol=1e-4)
     assert np.abs(log.control["tau_c"][start]).max() < 0.2
     assert np.degrees(np.abs(log.scheme["q"][start])).max() > 5.0  # not the place where the run began
 
 
-@pytest.mark.long
-def test_the_bus_is_emptied_before_the_devices_are_booted_again(tmp_path: Path) -> None:
-    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
-    assert messages(log, "recovery") == ["fault acknowledged", "transmit queue emptied"]
+def test_the_bus_is_emptied_before_the_devices_are_booted_again(recovered: Recovered) -> None:
+    assert messages(recovered.log, "recovery") == ["fault acknowledged", "transmit queue emptied"]
 
 
 @pytest.mark.long
@@ -104,26 +119,19 @@ def test_a_bus_that_fails_in_operation_is_emptied_at_once_and_comes_back_after_a
     assert controlwords(log)[-40] == ENABLE_OPERATION
 
 
-@pytest.mark.long
-def test_what_the_devices_said_before_the_recovery_is_not_taken_for_fresh(tmp_path: Path) -> None:
-    rig = faulting_rig(tmp_path, acknowledge_faults=1)
-    _, log = rig.run()
-    state = log.scheme["state"]
-    fault = int(np.flatnonzero(state == SchemeState.FAULT)[0])
-    first = fault + int(np.flatnonzero(state[fault:] != SchemeState.FAULT)[0])
-    assert state[first] == SchemeState.COMMISSION
+def test_what_the_devices_said_before_the_recovery_is_not_taken_for_fresh(recovered: Recovered) -> None:
+    log, first = recovered.log, recovered.first
+    assert log.scheme["state"][first] == SchemeState.COMMISSION
     assert log.cycle["frames_missing"][log.cycle["cycle"] == log.scheme["cycle"][first]] == [0]
 
 
-def test_torque_flows_again_after_the_recovery(tmp_path: Path) -> None:
-    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
-    last_cycle = int(log.cycle["cycle"][-1])
-    assert np.any(torques_from(log, last_cycle - 1500) != 0)
+def test_torque_flows_again_after_the_recovery(recovered: Recovered) -> None:
+    last_cycle = int(recovered.log.cycle["cycle"][-1])
+    assert np.any(torques_from(recovered.log, last_cycle - 1500) != 0)
 
 
-@pytest.mark.long
-def test_the_time_of_the_wait_is_not_lived_through_twice(tmp_path: Path) -> None:
-    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
+def test_the_time_of_the_wait_is_not_lived_through_twice(recovered: Recovered) -> None:
+    log = recovered.log
     (acknowledged,) = [entry.t_ns for entry in log.events if entry.event.message == "fault acknowledged"]
     gap = int(np.argmax(np.diff(log.cycle.t_ns)))
     assert log.cycle.t_ns[gap] < acknowledged <= log.cycle.t_ns[gap + 1]

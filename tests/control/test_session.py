@@ -2,10 +2,10 @@
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from long_cases import long_but
 from rig import (
     CODEC,
     DISABLE_VOLTAGE,
@@ -18,8 +18,11 @@ from rig import (
     torques_from,
 )
 
+from adacd_hil.control.cycle import RunResult
 from adacd_hil.control.gate import GateFlag
-from adacd_hil.lab.live.live_view import LiveAddress
+from adacd_hil.control.session import SessionSummary
+from adacd_hil.lab.live.live_view import LiveView
+from adacd_hil.log.reader import RunLog
 from adacd_hil.log.robot_description import ROBOT_NAME
 from adacd_hil.log.viewer_layout import LAYOUT_NAME
 from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState
@@ -30,21 +33,111 @@ from adacd_hil.wire.e2e import E2eStatus
 pytestmark = pytest.mark.slow
 
 
-def test_a_run_that_nothing_disturbs_ends_parked_and_disabled(tmp_path: Path) -> None:
-    summary, log = SessionRig(tmp_path).run()
-    assert summary.result is not None
-    assert (summary.result.fault, summary.result.is_interrupted, summary.error) == (FaultReason.NONE, False, "")
+class Ended(NamedTuple):
+    """A run that several tests read."""
+
+    summary: SessionSummary
+    log: RunLog
+
+    @property
+    def result(self) -> RunResult:
+        assert self.summary.result is not None
+        return self.summary.result
+
+    def messages(self, name: str) -> list[str]:
+        return [entry.event.message for entry in self.log.events if entry.event.name == name]
+
+
+LOST, ALIEN, CORRUPT, PASSIVE = (TROUBLE_CYCLE + 100 * k for k in range(4))
+
+
+@pytest.fixture(scope="module")
+def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Ended:
+    """Play a run with two lost torques, an odd EMCY, a corrupt torque, and a controller that is error passive."""
+    rig = SessionRig(tmp_path_factory.mktemp("disturbed"))
+
+    def tamper(cycle: int, can_id: int, data: bytes) -> bytes | None:
+        if can_id == 0x184 and cycle in (LOST, LOST + 1):
+            return None
+        is_hit = can_id == 0x183 and cycle == CORRUPT
+        return bytes((*data[:5], data[5] ^ 0x40)) if is_hit else data
+
+    rig.tamper = tamper
+    rig.before_sync[ALIEN] = lambda: rig.bus.deliver(0x081, b"\x01\x02\x03")
+    error_passive = bytes((0, 0x20, 0, 0, 0, 0, 130, 0))
+    rig.before_sync[PASSIVE] = lambda: rig.bus.deliver(0x204, error_passive, is_error=True)
+    return Ended(*rig.run())
+
+
+def test_a_disturbed_run_ends_parked_and_disabled_without_a_fault(disturbed: Ended) -> None:
+    result, log = disturbed.result, disturbed.log
+    assert (result.fault, result.is_interrupted, disturbed.summary.error) == (FaultReason.NONE, False, "")
     assert controlwords(log)[-1] == DISABLE_VOLTAGE
     assert np.abs(log.scheme["dq"][-1]).max() < 0.01
 
 
-def test_the_gate_is_closed_until_the_arm_is_enabled(tmp_path: Path) -> None:
-    _, log = SessionRig(tmp_path).run()
+def test_the_gate_is_closed_until_the_arm_is_enabled(disturbed: Ended) -> None:
+    log = disturbed.log
     assert np.count_nonzero(log.control["tau_c"][:ENABLED_CYCLE]) == 0
     assert set(log.control["gate_flags"][:ENABLED_CYCLE].tolist()) == {int(GateFlag.CLOSED)}
 
 
-@pytest.mark.parametrize("can_id", long_but(1, [0x183, 0x181, 0x182, 0x184]))
+def test_error_frames_are_in_the_log_in_words(disturbed: Ended) -> None:
+    (said,) = [entry.event for entry in disturbed.log.events if entry.event.name == "bus"]
+    assert (said.level, said.message) == (
+        "warning",
+        "error passive (sending); error counters: sending 130, receiving 0",
+    )
+
+
+def test_a_frame_that_is_not_what_its_identifier_says_is_dropped_and_counted(disturbed: Ended) -> None:
+    assert disturbed.messages("frame checks")[-1] == "1 frames dropped that are not what their identifier says"
+
+
+def test_corrupted_torque_frames_count_as_lost_and_change_no_value(disturbed: Ended) -> None:
+    log = disturbed.log
+    assert log.cycle["frames_missing"][CORRUPT] == 1
+    (tally,) = [line for line in disturbed.messages("frame checks") if line.startswith("Sensor1: ")]
+    assert "1 WRONG_CRC" in tally
+    assert "1 OK_SOME_LOST" in tally
+    assert log.scheme["tau_J"][CORRUPT][0] == log.scheme["tau_J"][CORRUPT - 1][0]
+
+
+def test_the_log_counts_what_the_checks_said_of_each_frame(disturbed: Ended) -> None:
+    log, is_missed = disturbed.log, E2eStatus.NO_NEW_DATA
+    checks = log.topics["/frame_checks"]
+    assert checks["sensor2_checks"][:, is_missed].tolist()[:3] == [0, 0, 2]
+    assert checks["sensor2_checks"][-1, is_missed] == 2
+    assert checks["sensor1_checks"][-1, is_missed] == 0
+    cycles = log.cycle["cycle"][-1] + 21  # the cycles of disabling, too
+    assert checks["sensor1_checks"][-1, E2eStatus.OK] == cycles - 2  # the corrupt one, and the next, OK_SOME_LOST
+
+
+@pytest.fixture(scope="module")
+def silenced(tmp_path_factory: pytest.TempPathFactory) -> Ended:
+    """Play a run that lacks a torque for 20 cycles."""
+    rig = SessionRig(tmp_path_factory.mktemp("silenced"))
+    gap = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 20)
+    rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle in gap else data
+    return Ended(*rig.run())
+
+
+def test_after_a_fault_there_is_no_torque_on_the_wire_and_drives_are_stopped(silenced: Ended) -> None:
+    log = silenced.log
+    assert silenced.result.fault is FaultReason.DATA_AGE
+    assert np.any(torques_from(log, ENABLED_CYCLE)[:700] != 0)
+    assert np.count_nonzero(torques_from(log, TROUBLE_CYCLE + 3)) == 0
+    assert set(controlwords(log)[TROUBLE_CYCLE + 4 : -21].tolist()) == {QUICK_STOP}
+
+
+def test_a_fault_comes_after_the_age_budget_and_is_latched_though_the_data_come_back(silenced: Ended) -> None:
+    state = silenced.log.scheme["state"]
+    assert int(np.argmax(state == SchemeState.FAULT)) == TROUBLE_CYCLE + 3
+    assert set(state[TROUBLE_CYCLE + 3 :].tolist()) == {int(SchemeState.FAULT)}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("can_id", [0x181, 0x182, 0x184])
 def test_a_device_that_falls_silent_faults_the_run_after_its_age_budget(tmp_path: Path, can_id: int) -> None:
     rig = SessionRig(tmp_path)
     rig.tamper = lambda cycle, i, data: None if i == can_id and cycle >= TROUBLE_CYCLE else data
@@ -65,88 +158,6 @@ def test_a_device_whose_heartbeat_stops_faults_the_run_and_is_named(tmp_path: Pa
     assert TROUBLE_CYCLE + 150 < first <= TROUBLE_CYCLE + 260  # 2.5 periods of 100 ms after the last one
     (reason,) = [entry.event.message for entry in log.events if "-> FAULT" in entry.event.message]
     assert "Sensor1 (node 3): no heartbeat for" in reason
-
-
-@pytest.mark.long
-def test_error_frames_are_in_the_log_in_words(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-    error_passive = bytes((0, 0x20, 0, 0, 0, 0, 130, 0))
-    rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x204, error_passive, is_error=True)
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.NONE
-    (said,) = [entry.event for entry in log.events if entry.event.name == "bus"]
-    assert (said.level, said.message) == (
-        "warning",
-        "error passive (sending); error counters: sending 130, receiving 0",
-    )
-
-
-def test_a_frame_that_is_not_what_its_identifier_says_is_dropped_and_counted(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-    rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x081, b"\x01\x02\x03")
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.NONE
-    said = [entry.event.message for entry in log.events if entry.event.name == "frame checks"]
-    assert said[-1] == "1 frames dropped that are not what their identifier says"
-
-
-def test_after_a_fault_there_is_no_torque_on_the_wire_and_drives_are_stopped(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-    rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle >= TROUBLE_CYCLE else data
-    _, log = rig.run()
-    assert np.any(torques_from(log, ENABLED_CYCLE)[:700] != 0)
-    assert np.count_nonzero(torques_from(log, TROUBLE_CYCLE + 3)) == 0
-    assert set(controlwords(log)[TROUBLE_CYCLE + 4 : -21].tolist()) == {QUICK_STOP}
-
-
-def test_a_fault_is_latched_though_the_data_come_back(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-    gap = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 20)
-    rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle in gap else data
-    _, log = rig.run()
-    assert set(log.scheme["state"][TROUBLE_CYCLE + 3 :].tolist()) == {int(SchemeState.FAULT)}
-
-
-def test_two_lost_torque_frames_are_forgiven(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-    gap = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 2)
-    rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle in gap else data
-    summary, _ = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.NONE
-
-
-@pytest.mark.long
-def test_corrupted_torque_frames_count_as_lost_and_change_no_value(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-
-    def corrupt(cycle: int, can_id: int, data: bytes) -> bytes:
-        is_hit = can_id == 0x183 and cycle == TROUBLE_CYCLE
-        return bytes((*data[:5], data[5] ^ 0x40)) if is_hit else data
-
-    rig.tamper = corrupt
-    _, log = rig.run()
-    assert log.cycle["frames_missing"][TROUBLE_CYCLE] == 1
-    (tally,) = [entry.event.message for entry in log.events if entry.event.message.startswith("Sensor1: ")][-1:]
-    assert "1 WRONG_CRC" in tally
-    assert "1 OK_SOME_LOST" in tally
-    assert log.scheme["tau_J"][TROUBLE_CYCLE][0] == log.scheme["tau_J"][TROUBLE_CYCLE - 1][0]
-
-
-@pytest.mark.long
-def test_the_log_counts_what_the_checks_said_of_each_frame(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-    lost = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 2)
-    rig.tamper = lambda cycle, i, data: None if i == 0x184 and cycle in lost else data
-    _, log = rig.run()
-    checks = log.topics["/frame_checks"]
-    is_missed = E2eStatus.NO_NEW_DATA
-    assert checks["sensor2_checks"][:, is_missed].tolist()[:3] == [0, 0, 2]
-    assert checks["sensor2_checks"][-1, is_missed] == 2
-    assert checks["sensor1_checks"][-1, is_missed] == 0
-    assert checks["sensor1_checks"][-1, E2eStatus.OK] == log.cycle["cycle"][-1] + 21  # the cycles of disabling, too
 
 
 def test_an_interrupt_parks_the_arm_before_the_drives_are_disabled(tmp_path: Path) -> None:
@@ -201,7 +212,7 @@ def test_the_log_says_which_drive_faulted_and_why(tmp_path: Path) -> None:
 def test_viewers_find_the_arm_and_a_layout_in_the_log_and_beside_it_and_the_address(tmp_path: Path) -> None:
     rig = SessionRig(tmp_path, finish_s=0.3)
     said: list[str] = []
-    rig.session.live, rig.session.progress = LiveAddress("127.0.0.1", 0), said.append
+    rig.session.live, rig.session.progress = LiveView("127.0.0.1", 0), said.append
     summary, log = rig.run()
     assert summary.log.is_complete
     for name in (ROBOT_NAME, LAYOUT_NAME):

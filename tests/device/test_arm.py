@@ -166,9 +166,9 @@ def test_a_drive_that_never_moved_up_is_no_fault_but_one_that_dropped_is_describ
 
 
 def test_a_joint_beyond_its_limits_is_described_with_value_and_bound() -> None:
-    devices = Devices({"sign": [1, -1]})
+    devices = Devices({"sign": [1, -1], "zero_deg": [10.0, 0.0]})
     devices.arm.synchronise(0, 0, 1)
-    devices.send("Drive1Feedback", np.radians(75.2), np.radians(250.0) - 1e-3)
+    devices.send("Drive1Feedback", np.radians(85.2), np.radians(250.0) - 1e-3)
     devices.send("Drive2Feedback", np.radians(119.9), np.radians(301.0))
     assert describe_excess(devices.arm) == [
         "joint 1: position 75.20 deg, ±75 deg allowed",
@@ -188,15 +188,29 @@ def test_a_position_of_more_than_a_revolution_asks_for_gear_and_zero() -> None:
 
 
 def test_signals_that_are_too_old_are_described_with_age_and_limit() -> None:
-    devices = Devices()
-    devices.arm.synchronise(0, 0, 1)
-    devices.answer()
-    devices.arm.synchronise(4, 0, 4)
-    devices.answer(without=("Drive2Feedback", "Sensor1Torque"))
-    assert describe_faults(devices.arm) == [
-        "Drive2: position, velocity 4 cycles old, 3 allowed",
-        "Sensor1: torque 4 cycles old, 3 allowed",
+    said = []
+    for age in (3, 4):
+        devices = Devices()
+        devices.arm.synchronise(0, 0, 1)
+        devices.answer()
+        devices.arm.synchronise(age, 0, age)
+        devices.answer(without=("Drive2Feedback", "Sensor1Torque"))
+        said.append(describe_faults(devices.arm))
+    assert said == [
+        [],
+        ["Drive2: position, velocity 4 cycles old, 3 allowed", "Sensor1: torque 4 cycles old, 3 allowed"],
     ]
+
+
+def test_a_frame_with_the_same_counter_is_counted_as_repeated_and_answers_nothing() -> None:
+    devices = Devices()
+    can_id, sender = CODEC.message("Sensor1Torque").can_id, CODEC.message("Sensor1Torque").sender()
+    data = sender.protect(CODEC.message("Sensor1Torque").encode(1.5))
+    for cycle in range(3):
+        devices.arm.synchronise(cycle, 0, 1)
+        devices.arm.accept(Frame(can_id, data, 0))
+    assert devices.arm.repeats == [0, 0, 2, 0]
+    assert devices.arm.sensors[0].sample_cycle == 0
 
 
 @pytest.mark.parametrize(("cycle", "fault"), [(250, FaultReason.NONE), (251, FaultReason.DATA_AGE)])

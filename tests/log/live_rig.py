@@ -12,6 +12,7 @@ from reference_writer import MemorySink
 from adacd_hil.lab.live.client import LiveClient, LiveMessage
 from adacd_hil.lab.live.feed import LiveFeed
 from adacd_hil.lab.live.live_view import LiveView
+from adacd_hil.lab.live.scene import Shape
 from adacd_hil.log.recording.log_file import McapFile
 from adacd_hil.log.recording.packet import ROOM, pack_cycle, pack_event
 from adacd_hil.log.recording.packet_writer import PacketWriter
@@ -23,7 +24,7 @@ from adacd_hil.wire.codec_columns import plain_tables
 EPOCH_NS = 1_700_000_000_000_000_000
 URDF = '<robot name="a"/>'
 LINK_LENGTH_M = (0.35, 0.30)
-SETUP = LiveView("127.0.0.1", 0, URDF, LINK_LENGTH_M)
+SETUP = LiveView("127.0.0.1", 0, robot_description=URDF, shape=Shape(LINK_LENGTH_M))
 LAST = Event("info", "test", "last")
 
 

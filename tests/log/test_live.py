@@ -235,7 +235,7 @@ def test_a_port_that_is_taken_is_named_and_leaves_no_log(tmp_path):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        live = LiveView("127.0.0.1", port, URDF, LINK_LENGTH_M)
+        live = LiveView("127.0.0.1", port)
         with pytest.raises(LogError, match=rf"can't listen on 127\.0\.0\.1:{port}: .*in use"):
             Recorder(tmp_path / "run.mcap", messages=CODEC.messages.values(), live=live)
     assert list(tmp_path.iterdir()) == []

@@ -17,7 +17,7 @@ from adacd_hil.cli.main import cli
 from adacd_hil.cli.options import live_options
 from adacd_hil.lab.cli.live_monitor import TOPICS, LiveMonitor, as_text
 from adacd_hil.lab.live.client import LiveMessage, live_client
-from adacd_hil.lab.live.live_view import LiveAddress
+from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.log.types.message_types import payload_dtype
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import (
@@ -269,9 +269,9 @@ def test_the_options_say_where_and_who():
     given = ["--live", "--live-port", "0", "--live-host", "::1", "--live-viewers", "3", "--live-name", "arm.example"]
     origins = ["--live-origin", "https://View.example:8443/", "--live-origin", "viewer-app://"]
     found = CliRunner().invoke(command, [*given, *origins]).stdout
-    assert found == f"{LiveAddress('::1', 0, ('https://view.example:8443', 'viewer-app://'), ('arm.example',), 3)}\n"
+    assert found == f"{LiveView('::1', 0, ('https://view.example:8443', 'viewer-app://'), ('arm.example',), 3)}\n"
     assert CliRunner().invoke(command, []).stdout == "None\n"
-    assert CliRunner().invoke(command, ["--live"]).stdout == f"{LiveAddress('127.0.0.1', 8765, (), (), 8)}\n"
+    assert CliRunner().invoke(command, ["--live"]).stdout == f"{LiveView('127.0.0.1', 8765, (), (), 8)}\n"
 
 
 @pytest.mark.parametrize("origin", ["view.example", "*", "https://view.example/page", "https://a b", "", "null"])

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import dataclasses
 import gc
 import json
 import os
@@ -16,7 +17,7 @@ from typing import NamedTuple
 
 import pytest
 from hang import HANG_S
-from live_rig import EPOCH_NS, LINK_LENGTH_M, SETUP, URDF, Feed, receive_until_last, setup_of
+from live_rig import EPOCH_NS, SETUP, Feed, receive_until_last, setup_of
 from recorded_run import CODEC, feed, make_run, start
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -25,7 +26,7 @@ from adacd_hil.lab.live import server as server_module
 from adacd_hil.lab.live.admission import FULL, NOTICES, Admission
 from adacd_hil.lab.live.client import live_client
 from adacd_hil.lab.live.feed import ServerSetup
-from adacd_hil.lab.live.live_setup import LiveSetup
+from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.server import listen, make_server, url_of
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.ring import Ring, RingReader
@@ -36,8 +37,8 @@ OLD = "foxglove.websocket.v1"
 CHANNEL_IDS = {channel.id: channel.id for channel in run_channels(7, tuple(CODEC.messages.values()))}
 
 
-def live_setup(**changes) -> LiveSetup:
-    return LiveSetup(**{**vars(SETUP), **changes})
+def live_setup(**changes) -> LiveView:
+    return dataclasses.replace(SETUP, **changes)
 
 
 @pytest.fixture
@@ -317,6 +318,26 @@ def test_the_servers_time_is_offered_and_is_that_of_the_log(fed):
     assert all(abs(stamp_ns - time_ns) < 20_000_000 for stamp_ns, time_ns in stamps_ns[1:])
 
 
+def test_of_many_short_messages_the_latest_wait_for_a_slow_viewer():
+    sent = []
+
+    class Slow:
+        async def send(self, data):
+            sent.append(data)
+
+    async def send_waiting():
+        viewer = server_module.Viewer(Slow())
+        for number in range(3000):
+            viewer.put(str(number))
+        sending = asyncio.create_task(viewer.send_all())
+        while not viewer.is_served:
+            await asyncio.sleep(0)
+        sending.cancel()
+
+    asyncio.run(send_waiting())
+    assert sent == [str(number) for number in range(3000 - 1024, 3000)]
+
+
 def test_a_viewer_can_end_a_subscription_and_begin_it_again(fed):
     with opened(fed.live.url) as viewer:
         channels = ask(viewer, "/events", "/robot_description")
@@ -551,8 +572,9 @@ def test_the_port_is_free_while_the_last_viewers_say_goodbye(monkeypatch, unstar
 
 
 @pytest.mark.parametrize("steps", range(5))
-def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarted):
+def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarted, monkeypatch):
     """It comes so many steps of the server's loop after the end was said."""
+    monkeypatch.setattr(server_module, "LINGER_S", 0.1)
     server, listening, address, writer = unstarted
 
     async def meet():
@@ -575,7 +597,7 @@ def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarte
 
 
 def test_an_address_of_version_6_is_written_so_that_it_can_be_opened():
-    setup = LiveSetup("::1", 0, URDF, LINK_LENGTH_M)
+    setup = live_setup(host="::1")
     with socket.socket(socket.AF_INET6) as listening:
         try:
             listening.bind(("::1", 0))

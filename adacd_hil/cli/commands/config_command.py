@@ -1,13 +1,12 @@
 """`adacd-hil config`: effective settings and their origins, errors and likely mistakes, the meaning of a key."""
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from adacd_hil.cli.completion import complete_configuration, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, set_option
-from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, format_table, show
+from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table
 from adacd_hil.given_path import CommandGroup
 from adacd_hil.terminal import in_line
 
@@ -48,10 +47,9 @@ def show_settings(
     rows = effective(name, profile, changes, keys)
     if is_changed:
         rows = [row for row in rows if row["value"] != row["default"]]
-    if as_json:
-        print(json.dumps(rows, indent=2))
-    elif rows:
-        show(format_table(("key", "value", "from"), [(row["key"], row["value"], row["origin"]) for row in rows]))
+    if rows or as_json:
+        table = [(row["key"], row["value"], row["origin"]) for row in rows]
+        answer(as_json, rows, format_table(("key", "value", "from"), table))
     return ExitCode.OK
 
 
@@ -89,15 +87,13 @@ def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCod
     from adacd_hil.control.configuration_check import examine_configuration
 
     findings = {name: examine_configuration(name, profile) for name in names}
-    if as_json:
-        described = {name: {"errors": found.errors, "warnings": found.warnings} for name, found in findings.items()}
-        print(json.dumps(described, indent=2))
-    else:
-        for name, found in findings.items():
-            for kind, lines in (("error", found.errors), ("warning", found.warnings)):
-                for line in lines:
-                    show(f"{in_line(name)}: {kind}: {in_line(line)}")
-            show(f"{in_line(name)}: {counted(len(found.errors), 'error')}, {counted(len(found.warnings), 'warning')}")
+    described = {name: {"errors": found.errors, "warnings": found.warnings} for name, found in findings.items()}
+    lines = []
+    for name, found in findings.items():
+        lines += [f"{name}: error: {line}" for line in found.errors]
+        lines += [f"{name}: warning: {line}" for line in found.warnings]
+        lines.append(f"{name}: {counted(len(found.errors), 'error')}, {counted(len(found.warnings), 'warning')}")
+    answer(as_json, described, "\n".join(map(in_line, lines)))
     return ExitCode.USAGE if any(found.errors for found in findings.values()) else ExitCode.OK
 
 
@@ -111,15 +107,14 @@ def docs(keys: tuple[str, ...], as_json: bool) -> ExitCode:
         _list_groups(as_json)
         return ExitCode.OK
     rows = _chosen(keys)
-    if as_json:
-        described = [{name: getattr(row, name) for name in ("key", "default", "bounds", "meaning")} for row in rows]
-        print(json.dumps(described, indent=2))
-    elif len(rows) == 1:
+    head = ("key", "default", "bounds", "meaning")
+    table = [(row.key, row.default, row.bounds, row.meaning) for row in rows]
+    text = format_table(head, table)
+    if len(rows) == 1:
         (row,) = rows
-        show(f"{row.key}\n  {row.meaning}\n  default: {row.default}" + (f"\n  bounds: {row.bounds}" * bool(row.bounds)))
-    else:
-        table = [(row.key, row.default, row.bounds, row.meaning) for row in rows]
-        show(format_table(("key", "default", "bounds", "meaning"), table))
+        bounds = f"\n  bounds: {row.bounds}" if row.bounds else ""
+        text = f"{row.key}\n  {row.meaning}\n  default: {row.default}{bounds}"
+    answer(as_json, [dict(zip(head, cells, strict=True)) for cells in table], text)
     return ExitCode.OK
 
 
@@ -130,11 +125,8 @@ def _list_groups(as_json: bool) -> None:
         {"group": name or "(top)", "keys": sum(1 for _ in keys_of(section, "")), "meaning": meaning}
         for name, section, meaning in sections()
     ]
-    if as_json:
-        print(json.dumps(groups, indent=2))
-    else:
-        rows = [(group["group"], str(group["keys"]), group["meaning"]) for group in groups]
-        show(format_table(("group", "keys", "meaning"), rows, right=(1,)))
+    rows = [tuple(map(str, group.values())) for group in groups]
+    answer(as_json, groups, format_table(("group", "keys", "meaning"), rows, right=(1,)))
 
 
 def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":

@@ -1,6 +1,5 @@
 """`adacd-hil replay`: feeds a log to arm and scheme again; compares the result with the log or other settings."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,7 +7,7 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, set_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, format_table, quoted, show
+from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table, quoted
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.progress_lines import Progress
@@ -90,19 +89,17 @@ def replay(
             )
             for path in logs
         ]
-    if as_json:
-        print(json.dumps([_as_json(*result, shown, stretch) for result in results], indent=2, allow_nan=False))
-    else:
-        text = "\n\n".join(_as_text(*result, shown, stretch) for result in results)
-        show(text, *_next(logs[0], has_changes=bool(changes or vary or config)))
+    described = [_as_json(*result, shown, stretch) for result in results]
+    text = "\n\n".join(_as_text(*result, shown, stretch) for result in results)
+    answer(as_json, described, text, _next(logs[0], has_changes=bool(changes or vary or config)))
     codes = [_code(replays) for _, replays, _ in results]
     return max(codes, key=[ExitCode.OK, ExitCode.PARTIAL, ExitCode.FAILURE].index)
 
 
-def _next(given: Path, has_changes: bool) -> tuple[str, ...]:
+def _next(given: Path, has_changes: bool) -> str:
     if has_changes:
-        return (f"adacd-hil sweep {quoted(given)} --vary KEY=A,B,C   # many values at once",)
-    return (f"adacd-hil replay {quoted(given)} --set certified.noise_sigmas=8   # and with another setting?",)
+        return f"adacd-hil sweep {quoted(given)} --vary KEY=A,B,C   # many values at once"
+    return f"adacd-hil replay {quoted(given)} --set certified.noise_sigmas=8   # and with another setting?"
 
 
 _Result = tuple[Path, "list[Replay]", list[str]]
@@ -233,8 +230,8 @@ def _as_json(
 
     own = replays[0]
     return {
-        "log": str(path),
-        **stretch.as_json(),
+        "log": path,
+        **stretch.named_bounds,
         "identical": own.is_identical,
         "cycles": own.cycles,
         "compared": own.compared,
@@ -243,8 +240,8 @@ def _as_json(
         "tolerance": own.tolerance,
         "mismatch_count": own.mismatch_count,
         "mismatched_fields": own.mismatched_fields,
-        "mismatches": [mismatch._asdict() for mismatch in own.mismatches[:shown]],
-        "notes": list(own.notes),
+        "mismatches": own.mismatches[:shown],
+        "notes": own.notes,
         "original": as_json(own),
         "variants": [
             {"name": name, "settings": changed_keys(own.settings, found.settings), **as_json(found)}

@@ -1,6 +1,5 @@
 """Communication test: cycles at zero torque for a while, and a verdict on the connection."""
 
-import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from adacd_hil.log.logged_run import QUANTITIES
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.log.types.topics import ChannelId, pack_cycle
+from adacd_hil.plain_values import plain_values
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.score.distribution import bar_chart, doubling_bins
@@ -192,8 +192,8 @@ def describe(report: CommunicationReport, settings: Settings, scheduler: str) ->
         "scheduler": scheduler,
         "load_percent": round(report.load_percent, 2),
         "warnings": _warnings(report, scheduler),
-        "devices": {name: dataclasses.asdict(device) for name, device in report.devices.items()},
-        "timing": evidence.as_json(),
+        "devices": {name: vars(device) for name, device in report.devices.items()},
+        "timing": plain_values(evidence.by_key()),
         "bins_us": {
             quantity.name: [
                 {"below": None if bound == float("inf") else bound, "count": count}

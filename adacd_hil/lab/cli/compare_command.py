@@ -1,13 +1,12 @@
 """`adacd-hil compare`: two logs beside each other."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import ExitCode, explained, format_table, show
+from adacd_hil.cli.output import ExitCode, answer, explained, format_table
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.progress_lines import Progress
@@ -41,11 +40,8 @@ def compare(first: Path, others: tuple[Path, ...], as_json: bool, stretch: "Time
 
     with Progress() as progress:
         found = [compare_logs(log_in(first), log_in(other), progress, stretch) for other in others]
-    if as_json:
-        tables = [each.as_json() for each in found]
-        print(json.dumps(tables[0] if len(tables) == 1 else tables, indent=2))
-    else:
-        show("\n\n".join(map(_as_text, found)))
+    tables = [each.by_key() for each in found]
+    answer(as_json, tables[0] if len(tables) == 1 else tables, "\n\n".join(map(_as_text, found)))
     if not all(each.is_same for each in found):
         return ExitCode.FAILURE
     return ExitCode.PARTIAL if any(each.notes for each in found) else ExitCode.OK

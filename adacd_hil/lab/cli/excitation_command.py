@@ -1,6 +1,5 @@
 """The search for an excitation: the command's work and its table."""
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import NamedTuple
@@ -8,6 +7,7 @@ from typing import NamedTuple
 from adacd_hil.cli.output import CommandError, ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.tune.excitation_search import ExcitationLimits, Figures, NoExcitationError, Search
+from adacd_hil.plain_values import json_text
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings
@@ -58,18 +58,19 @@ def as_toml(outcome: ExcitationOutcome) -> str:
 
 def as_json(outcome: ExcitationOutcome) -> str:
     """Return the search's result as JSON."""
-    named = {
-        "present": None if outcome.present is None else dataclasses.asdict(outcome.present),
-        "found": dataclasses.asdict(outcome.found),
-        "limits": outcome.limits.as_json(),
-        "excitation": dataclasses.asdict(outcome.excitation),
-    }
-    return json.dumps(named, indent=2, allow_nan=False)
+    return json_text(
+        {
+            "present": outcome.present,
+            "found": outcome.found,
+            "limits": outcome.limits.by_figure(),
+            "excitation": outcome.excitation,
+        }
+    )
 
 
 def as_text(outcome: ExcitationOutcome) -> str:
     """Format the figures as a table, joint 1 / joint 2."""
-    limits = outcome.limits.as_json()
+    limits = outcome.limits.by_figure()
     rows = [
         (
             label,

@@ -1,6 +1,5 @@
 """`adacd-hil history`: the certificates of an arm's runs."""
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,7 +38,7 @@ def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
         if is_anothers(plot, _PNG):
             raise CommandError(f"--plot {plot} is there already and no PNG; give another name", ExitCode.USAGE)
         replace_file(plot, _as_png(found))
-    answer(as_json, dataclasses.asdict(found), _as_text(found))
+    answer(as_json, found, _as_text(found))
     return ExitCode.OK
 
 

@@ -1,6 +1,5 @@
 """`adacd-hil identify`: a model of another lab's arm from its recordings, and contacts in them."""
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,9 +7,10 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table, quoted, show
+from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table, quoted, show
 from adacd_hil.file_access import place_file, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.plain_values import json_text
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.toml_files import toml_value
 from adacd_hil.terminal import in_line
@@ -81,10 +81,7 @@ def identify(
         if out is not None:
             _write(found, out)
             progress(f"pictures in {out}")
-    if as_json:
-        print(json.dumps(found.as_json(), indent=2))
-    else:
-        show(_as_text(found), *_next(found, map_path, recordings[0]))
+    answer(as_json, found.by_key(), _as_text(found), *_next(found, map_path, recordings[0]))
     return ExitCode.OK if found.is_explained else ExitCode.PARTIAL
 
 
@@ -126,7 +123,7 @@ def _write(found: "Identified", out: Path) -> None:
     from adacd_hil.lab.offline.recording_identification import draw_watched
 
     out.mkdir(parents=True, exist_ok=True)
-    replace_file(out / "identify.json", json.dumps(found.as_json(), indent=2))
+    replace_file(out / "identify.json", json_text(found.by_key()))
     names = ["test", *(f"watch{index + 1}" for index in range(len(found.watched)))]
     for name, watched in zip(names, (found.test, *found.watched), strict=True):
         replace_file(out / f"{name}.png", draw_watched(found, watched, name).png())

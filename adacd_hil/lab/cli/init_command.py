@@ -1,6 +1,5 @@
 """Init: writes the configuration of the user's arm from bus, URDF, log and answers, and marks guesses."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.lab.cli.interview import Interview
+from adacd_hil.plain_values import json_text
 from adacd_hil.terminal import in_line
 
 
@@ -109,7 +109,7 @@ def init(
         if not as_json:
             show(doctor_command.as_text(findings))
     if as_json:
-        print(json.dumps(summary, indent=2))
+        print(json_text(summary))
     else:
         suggest(*next_of_init(str(out), bus))
     return code

@@ -1,6 +1,5 @@
 """Commands of the lab that are one function each: each parses its options, calls one function, prints the result."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -20,7 +19,7 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, answer, checked_place, explained, print_and_write, show
+from adacd_hil.cli.output import EPILOG, ExitCode, answer, checked_place, explained, print_and_write
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
@@ -83,10 +82,7 @@ def demo(
     from adacd_hil.lab.cli.demo_command import next_of_report, play
 
     report, code = play(config, scenario, profile, seed, clock, out, live, truth)
-    if as_json:
-        print(json.dumps(report.as_json(), indent=2))
-    else:
-        show(report.as_text(), *next_of_report(report.html_path))
+    answer(as_json, report.as_json(), report.as_text(), *next_of_report(report.html_path))
     return code
 
 
@@ -115,7 +111,7 @@ def tare(
     from adacd_hil.lab.cli.tare_command import tare_on_bus
 
     result = tare_on_bus(connection, clock, out, poses, seconds, auto_zero)
-    answer(as_json, result.as_json(), result.as_text())
+    answer(as_json, {"file": result.path, "backup": result.backup, **vars(result.tare)}, result.as_text())
     return ExitCode.OK
 
 
@@ -137,10 +133,7 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Ti
     from adacd_hil.lab.cli.report_command import report_logs
 
     reports, code = report_logs(logs, out, stretch)
-    if as_json:
-        print(json.dumps(in_json(reports), indent=2))
-    else:
-        show("\n\n".join(entry.as_text() for entry in reports))
+    answer(as_json, in_json(reports), "\n\n".join(entry.as_text() for entry in reports))
     return code
 
 

@@ -1,7 +1,6 @@
 """The live view in a terminal: state, residuals against their thresholds, parameters, contacts, events."""
 
 import contextlib
-import json
 import math
 import struct
 import sys
@@ -18,6 +17,7 @@ from adacd_hil.lab.cli.monitor_command import Screen
 from adacd_hil.lab.live.client import LiveClient, LiveMessage, live_client
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import unpack_log
+from adacd_hil.plain_values import json_text
 from adacd_hil.records import (
     GRAVITY_PARAMETER_NAMES,
     JOINT_NAMES,
@@ -160,7 +160,7 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
                         screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
         with _understood():
             described = {"url": url} | monitor.describe()
-    screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))
+    screen.end(json_text(described) if as_json else fold(as_text(described), terminal_columns()))
     return ExitCode.OK
 
 

@@ -1,6 +1,5 @@
 """`adacd-hil log`: logs at a glance, checked, recovered, cut and exported, with the text printed of them."""
 
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +9,7 @@ import click
 
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table, show
+from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
@@ -49,10 +48,8 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     from adacd_hil.log.log_info import read_info
 
     found = [read_info(path) for path in find_logs(logs)]
-    if as_json:
-        print(json.dumps([info_as_json(entry) for entry in found], indent=2))
-    else:
-        show("\n\n".join(info_as_text(entry) for entry in found))
+    described = [{**vars(entry), "duration_s": entry.duration_s} for entry in found]
+    answer(as_json, described, "\n\n".join(map(info_as_text, found)))
     return ExitCode.PARTIAL if any(entry.problems for entry in found) else ExitCode.OK
 
 
@@ -68,10 +65,7 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     from adacd_hil.lab.logs.check.log_check import check_log, find_logs
 
     checked = [check_log(path, _tell) for path in find_logs(logs)]
-    if as_json:
-        print(json.dumps([check_as_json(entry) for entry in checked], indent=2))
-    else:
-        show("\n".join(check_as_text(entry) for entry in checked))
+    answer(as_json, checked, "\n".join(map(check_as_text, checked)))
     if any(entry.errors for entry in checked):
         return ExitCode.FAILURE
     return ExitCode.PARTIAL if any(entry.warnings for entry in checked) else ExitCode.OK
@@ -93,8 +87,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     from adacd_hil.lab.logs.recover import recover as recover_log
 
     recovery = recover_log(log, out, _tell)
-    as_table = recovery_as_json(recovery)
-    answer(as_json, as_table, recovery_as_text(recovery))
+    answer(as_json, _recovery(recovery), recovery_as_text(recovery))
     return ExitCode.PARTIAL if recovery.losses.is_any else ExitCode.OK
 
 
@@ -132,7 +125,7 @@ def cut(
             raise CommandError("--contact excludes --from and --until", ExitCode.USAGE)
         stretch = find_contact(log, contact, around_s)
     done = cut_log(log, out or default_out(log), stretch, topics, _tell)
-    result = {"out": str(done.out), **stretch.as_json(), "messages": done.messages}
+    result = {"out": done.out, **stretch.named_bounds, "messages": done.messages}
     answer(as_json, result, in_line(f"{done.out}: {done.messages} messages"))
     return ExitCode.OK
 
@@ -147,12 +140,6 @@ def merge(logs: tuple[str, ...]) -> ExitCode:  # noqa: ARG001
         "LOG` of the MCAP command line makes one file of them, `adacd-hil log cut LOG` one file of a log's parts",
         ExitCode.USAGE,
     )
-
-
-def info_as_json(info: "LogInfo") -> dict[str, Any]:
-    """Return the information as a dictionary for JSON."""
-    topics = [topic._asdict() for topic in info.topics]
-    return {**vars(info), "path": str(info.path), "duration_s": info.duration_s, "topics": topics}
 
 
 def info_as_text(info: "LogInfo") -> str:
@@ -193,12 +180,6 @@ def _bytes(count: int | None) -> str:
     return "–" if count is None else str(count)
 
 
-def check_as_json(check: "LogCheck") -> dict[str, Any]:
-    """Return the findings as a dictionary for JSON."""
-    findings = [finding._asdict() for finding in check.findings]
-    return {**check._asdict(), "path": str(check.path), "findings": findings}
-
-
 def check_as_text(check: "LogCheck") -> str:
     """Format the findings for people, and their number."""
     lines = []
@@ -213,12 +194,11 @@ def check_as_text(check: "LogCheck") -> str:
     return "\n".join(in_line(line) for line in lines)
 
 
-def recovery_as_json(recovery: "LogRecovery") -> dict[str, Any]:
-    """Return saved and lost data as a dictionary for JSON."""
+def _recovery(recovery: "LogRecovery") -> dict[str, Any]:
     losses = recovery.losses
     return {
-        "path": str(recovery.path),
-        "out": str(recovery.out),
+        "path": recovery.path,
+        "out": recovery.out,
         "messages": recovery.messages,
         "attachments": recovery.attachments,
         "metadata": recovery.metadata,
@@ -310,8 +290,7 @@ def export(
         _tell(f"warning: {summary.problem}")
     lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
     text = "\n".join(lines) or in_line(f"nothing to export: {decoder.path.name} knows no frame of {log.name}")
-    files = {str(path): rows for path, rows in summary.rows.items()}
-    answer(as_json, {"files": files, "text": text, "problem": summary.problem}, text)
+    answer(as_json, {"files": summary.rows, "text": text, "problem": summary.problem}, text)
     return ExitCode.PARTIAL if summary.problem else ExitCode.OK
 
 

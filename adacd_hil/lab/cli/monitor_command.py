@@ -1,6 +1,5 @@
 """Monitor: a live table of the traffic on a bus. Listens only."""
 
-import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.lab.commission.survey import BusView, MessageView, Snapshot
 from adacd_hil.lab.commission.traffic import receive_until
+from adacd_hil.plain_values import json_text
 from adacd_hil.terminal import fold, moves_cursor, plain, terminal_columns, write_screen
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
@@ -31,23 +31,16 @@ class Screen:
     """Output of tables: redrawn in place on a terminal, one after the other elsewhere."""
 
     def __init__(self, is_terminal: bool, write: Callable[[str], None]) -> None:
-        self._is_terminal = is_terminal
-        self._write = write
-
-    @property
-    def is_redrawn(self) -> bool:
+        self.is_redrawn = is_terminal
         """Whether a table replaces the previous one."""
-        return self._is_terminal
-
-    @property
-    def redraw_s(self) -> float:
+        self.redraw_s = REDRAW_S if is_terminal else PLAIN_S
         """Time between two tables."""
-        return REDRAW_S if self._is_terminal else PLAIN_S
+        self._write = write
 
     def draw_table(self, text: str) -> None:
         """Show a table, cut to the terminal; `end` shows the whole one."""
         text = plain(text)
-        if not self._is_terminal:
+        if not self.is_redrawn:
             self._write(text + "\n\n")
             return
         columns, rows = shutil.get_terminal_size()
@@ -58,7 +51,7 @@ class Screen:
 
     def end(self, text: str) -> None:
         """Show the last table."""
-        self._write((_HOME + _CLEAR_BELOW if self._is_terminal else "") + plain(text) + "\n")
+        self._write((_HOME + _CLEAR_BELOW if self.is_redrawn else "") + plain(text) + "\n")
 
 
 class Monitor:
@@ -140,7 +133,7 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
                         screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
             finally:  # the last table is printed even if the bus fails
                 described = monitor.describe()
-                screen.end(json.dumps(described, indent=2) if as_json else fold(as_text(described), terminal_columns()))
+                screen.end(json_text(described) if as_json else fold(as_text(described), terminal_columns()))
     return ExitCode.OK
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, format_table, show
+from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.progress_lines import Progress
@@ -136,10 +135,8 @@ def runs(
             run_table.write_parquet(found, parquet_path)
         if html_path is not None:
             run_table.write_result(_page(found, html_path), html_path)
-    if as_json:
-        print(json.dumps({"folder": str(folder), "runs": run_table.as_json(found)}, indent=2, allow_nan=False))
-    else:
-        show(_as_text(found))
+    described = [{column.name: column.value(run) for column in run_table.COLUMNS} for run in found]
+    answer(as_json, {"folder": folder, "runs": described}, _as_text(found))
     return _code(found)
 
 
@@ -176,10 +173,8 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
         made = trends(found, share)
         if out is not None:
             write_result(trend_page(made), out)
-    if as_json:
-        print(json.dumps({"folder": str(folder), "arms": [each.as_json() for each in made]}, indent=2))
-    else:
-        show("\n\n".join(_trend_text(each) for each in made) or "no run")
+    described = {"folder": folder, "arms": [each.by_key() for each in made]}
+    answer(as_json, described, "\n\n".join(map(_trend_text, made)) or "no run")
     return _code(found)
 
 

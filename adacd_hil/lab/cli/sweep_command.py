@@ -1,6 +1,5 @@
 """`adacd-hil sweep`: logs or scenarios, settings and seeds, every combination, on all processors or a Dask cluster."""
 
-import json
 import os
 import shlex
 import tempfile
@@ -12,7 +11,7 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, counted, explained, show
+from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.progress_lines import Progress
@@ -105,7 +104,7 @@ def sweep(
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
         table = store.join(plan.row_keys(), about)
     result = {
-        "table": str(table),
+        "table": table,
         "rows": plan.size,
         "computed": outcome.computed,
         "found_done": outcome.found,
@@ -115,18 +114,15 @@ def sweep(
     }
     verdict = f"{plan.size - outcome.failed} of {plan.size} rows are there"
     lines = [verdict, *(in_line(f"{key}: {value}") for key, value in result.items())]
-    if as_json:
-        print(json.dumps(result, indent=2))
-    else:
-        show("\n".join(lines), *_next(table, outcome.failed))
+    answer(as_json, result, "\n".join(lines), _next(table, outcome.failed))
     return ExitCode.PARTIAL if outcome.failed else ExitCode.OK
 
 
-def _next(table: Path, failed: int) -> tuple[str, ...]:
+def _next(table: Path, failed: int) -> str:
     if failed:
-        return ("the same command again: it computes what failed",)
+        return "the same command again: it computes what failed"
     read = f"import pandas; print(pandas.read_parquet({str(table)!r}))"
-    return (f"python -c {shlex.quote(read)}   # or any other reader of Parquet",)
+    return f"python -c {shlex.quote(read)}   # or any other reader of Parquet"
 
 
 def _plan(

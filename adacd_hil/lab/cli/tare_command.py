@@ -5,7 +5,6 @@ import signal
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
 from adacd_hil.cli.output import CommandError, ExitCode
@@ -28,11 +27,6 @@ class StoredTare:
     tare: Tare
     path: Path
     backup: Path | None
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the tare as a dictionary for JSON."""
-        backup = None if self.backup is None else str(self.backup)
-        return {"file": str(self.path), "backup": backup, **dataclasses.asdict(self.tare)}
 
     def as_text(self) -> str:
         """Format the tare for people."""

@@ -1,13 +1,12 @@
 """Thresholds from recorded motion, for the command `thresholds`."""
 
-import dataclasses
-import json
 from pathlib import Path
 
 from adacd_hil.cli.output import format_table
 from adacd_hil.lab.thresholds.detector_comparison import Comparison, compare_detectors
 from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
 from adacd_hil.log.log_files import WHOLE, TimeWindow, log_in
+from adacd_hil.plain_values import json_text
 from adacd_hil.progress_lines import Progress
 
 
@@ -23,10 +22,8 @@ def find(
 
 def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:
     """Return thresholds and comparison as JSON."""
-    content = dataclasses.asdict(thresholds)
-    if comparison is not None:
-        content["comparison"] = comparison.as_json()
-    return json.dumps(content, indent=2, allow_nan=False)
+    content = vars(thresholds)
+    return json_text(content if comparison is None else content | {"comparison": comparison.by_key()})
 
 
 def as_text(thresholds: Thresholds, comparison: Comparison | None) -> str:

@@ -1,6 +1,5 @@
 """`adacd-hil tune`: thresholds, filter and gain found from logs, as a configuration with its provenance."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +20,7 @@ from adacd_hil.cli.output import (
 )
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
+from adacd_hil.plain_values import json_text
 from adacd_hil.progress_lines import Progress
 from adacd_hil.terminal import in_line
 
@@ -65,6 +65,7 @@ def tune(
     """
     from adacd_hil.lab.tune.tune import base_of, suggested_toml
     from adacd_hil.lab.tune.tune import tune as find
+    from adacd_hil.lab.tune.tune_roc import tuning_by_key
     from adacd_hil.replay.log_source import LogSource
 
     paths = [log_in(given) for given in logs]
@@ -74,7 +75,7 @@ def tune(
         base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
         with Progress() as progress:
             found = find(paths, rate_per_h, config, progress, stretch)
-        text = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
+        text = json_text(tuning_by_key(found)) if as_json else _as_text(found)
         if base is None or found.best is None:
             print(text) if as_json else show(text, *_next(paths[0], found, None))
         else:

@@ -23,7 +23,6 @@ from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 from adacd_hil.wire.dbc_decoder import DbcDecoder, MessageDecoder
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
-from adacd_hil.wire.frame_time import LoadMeter
 
 LISTEN_S = 1.5
 """Default time to listen: longer than the usual heartbeat and status periods of up to 1 s."""
@@ -373,6 +372,8 @@ class BusView:
         """Begin at `t_ns`; the bit rates in bit/s are for the load."""
         self.frames = 0
         self._codec = codec
+        from adacd_hil.wire.frame_time import LoadMeter  # imports the compiler, which takes a second: `scan` has no use
+
         self._load = LoadMeter(bitrate, data_bitrate, t_ns)
         self._entries: dict[int, _Entry] = {}
         self._error_frames = 0

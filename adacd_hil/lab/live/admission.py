@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from http import HTTPStatus
 from typing import NamedTuple
 
-from adacd_hil.lab.live.live_setup import LiveSetup
+from adacd_hil.lab.live.live_view import LiveView
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Two names of one protocol on the wire: of viewers since 2025, and of earlier ones."""
@@ -71,7 +71,7 @@ def normal_origin(origin: str) -> str:
 class Admission:
     """The rules of one run."""
 
-    def __init__(self, setup: LiveSetup) -> None:
+    def __init__(self, setup: LiveView) -> None:
         """Allow the origins and names of `setup`, besides the viewers' own pages and this machine's own names."""
         self._origins = {*VIEWER_ORIGINS, *map(normal_origin, setup.origins)}
         own = socket.gethostname().lower()

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.lab.live.live_setup import LiveSetup
+from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.scene import (
     DESCRIPTION_TOPIC,
     SCENE,
@@ -33,7 +33,6 @@ from adacd_hil.lab.live.scene import (
     TRANSFORMS,
     TRANSFORMS_TOPIC,
     Entity,
-    Shape,
     draw_contact,
     draw_joints,
     pack_scene,
@@ -70,7 +69,7 @@ class Batch(NamedTuple):
 class ServerSetup(NamedTuple):
     """live: where; setup: of the log; ids: the file's number of each channel; start_ns: before the first record."""
 
-    live: LiveSetup
+    live: LiveView
     setup: WriterSetup
     ids: dict[int, int]
     start_ns: int
@@ -101,7 +100,7 @@ RING_BYTES = 8 * 1024 * 1024
 class LiveFeed:
     """Records for the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
 
-    def __init__(self, live: LiveSetup, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> None:
+    def __init__(self, live: LiveView, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> None:
         """Start the process, and wait until it listens where `live` says. Raises LogError.
 
         ids: the file's number of each channel, by ours. start_ns: log time before the first record.
@@ -235,11 +234,11 @@ class Shown(NamedTuple):
 class LiveTopics:
     """The topics that are served. `latest_ns`: log time of the latest record; before the first, of the beginning."""
 
-    def __init__(self, setup: LiveSetup, channels: Iterable[LogChannel], ids: dict[int, int], start_ns: int) -> None:
+    def __init__(self, setup: LiveView, channels: Iterable[LogChannel], ids: dict[int, int], start_ns: int) -> None:
         """`ids`: the file's number of each channel, by ours. `start_ns`: log time before the first record."""
         channels = tuple(channels)
         self.latest_ns = start_ns
-        self._shape = Shape(setup.link_length_m, setup.tilt_rad, setup.level_rad)
+        self._shape = setup.shape
         self._decimators = {ids[channel.id]: Decimator(rate_of(channel.topic)) for channel in channels}
         self._scene_decimator = Decimator(rate_of(SCENE_TOPIC))
         self._joint_states, self._scheme, self._contact = (

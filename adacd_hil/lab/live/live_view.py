@@ -1,43 +1,48 @@
-"""The live view of a run, as commands ask for it and as the log's writer opens it."""
+"""The live view of a run, as commands ask for it, the session completes it and the log's writer opens it."""
 
+import dataclasses
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
-from adacd_hil.lab.live.admission import normal_origin
-from adacd_hil.lab.live.feed import LiveFeed
-from adacd_hil.lab.live.live_setup import LiveSetup
+from adacd_hil.lab.live.scene import Shape
 from adacd_hil.log.log_files import MOST_VIEWERS
-from adacd_hil.log.recording.processes import WriterSetup
-from adacd_hil.settings.configuration import Settings
+
+if TYPE_CHECKING:
+    from adacd_hil.lab.live.feed import LiveFeed
+    from adacd_hil.log.recording.processes import WriterSetup
+    from adacd_hil.settings.configuration import Settings
 
 
 @dataclass(frozen=True)
-class LiveView(LiveSetup):
-    """A live view that the writer opens in its process."""
+class LiveView:
+    """Address of a live view (port 0: any free one), admitted viewers, and the arm that it draws.
 
-    def open(self, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> LiveFeed:
-        """Start the process that serves it. Raises LogError."""
-        return LiveFeed(self, setup, ids, start_ns)
-
-
-class LiveAddress(NamedTuple):
-    """Address and admitted viewers of the live view; port 0: any free one. The rest as in LiveSetup."""
+    origins, names: of web pages that may watch, and of this machine, besides those of lab/live/admission.py.
+    most_viewers: at a time. robot_description: a URDF.
+    """
 
     host: str
     port: int
     origins: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     most_viewers: int = MOST_VIEWERS
+    robot_description: str = ""
+    shape: Shape = Shape((0.0, 0.0))
 
-    def server(self, settings: Settings, robot: str) -> LiveView:
-        """Return the live view of an arm; robot: its URDF."""
-        host, port, origins, names, most_viewers = self
-        tilt_rad, level_rad, length_m = settings.tilt_rad, settings.level_rad, settings.arm.link_length_m
-        return LiveView(host, port, robot, length_m, tilt_rad, level_rad, origins, names, most_viewers)
+    def server(self, settings: "Settings", robot: str) -> "LiveView":
+        """Return the view of an arm; robot: its URDF."""
+        shape = Shape(settings.arm.link_length_m, settings.tilt_rad, settings.level_rad)
+        return dataclasses.replace(self, robot_description=robot, shape=shape)
+
+    def open(self, setup: "WriterSetup", ids: dict[int, int], start_ns: int) -> "LiveFeed":
+        """Start the process that serves it. Raises LogError."""
+        from adacd_hil.lab.live.feed import LiveFeed
+
+        return LiveFeed(self, setup, ids, start_ns)
 
 
-def live_address(
-    host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int
-) -> LiveAddress:
-    """Return the place of a live view. Raises ValueError for an invalid origin."""
-    return LiveAddress(host, port, tuple(map(normal_origin, origins)), names, most_viewers)
+def live_address(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> LiveView:
+    """Return the live view at a place, for any arm. Raises ValueError for an invalid origin."""
+    from adacd_hil.lab.live.admission import normal_origin
+
+    return LiveView(host, port, tuple(map(normal_origin, origins)), names, most_viewers)

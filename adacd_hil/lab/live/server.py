@@ -44,7 +44,7 @@ from adacd_hil.lab.live.admission import (
     ViewerRefusal,
 )
 from adacd_hil.lab.live.feed import LiveTopics, ServerSetup, Shown, unpack_batch
-from adacd_hil.lab.live.live_setup import LiveSetup
+from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.processes import read_setup
 from adacd_hil.log.recording.ring import RingReader, split
@@ -122,7 +122,7 @@ class Viewer:
 class LiveServer:
     """Serves the batches of a ring, as long as the writer is there."""
 
-    def __init__(self, setup: LiveSetup, topics: LiveTopics, ring: RingReader, writer: socket.socket) -> None:
+    def __init__(self, setup: LiveView, topics: LiveTopics, ring: RingReader, writer: socket.socket) -> None:
         self._setup = setup
         self._topics = topics
         self._known = {channel["id"] for channel in topics.advertised}
@@ -378,13 +378,13 @@ def _no_logger() -> logging.Logger:
     return logger
 
 
-def listen(setup: LiveSetup) -> socket.socket:
+def listen(setup: LiveView) -> socket.socket:
     """Open the listening socket: the first address that the host stands for. Raises OSError."""
     family, _, _, _, address = socket.getaddrinfo(setup.host, setup.port, type=socket.SOCK_STREAM)[0]
     return socket.create_server(address[:2], family=family, backlog=128)
 
 
-def url_of(setup: LiveSetup, listening: socket.socket) -> str:
+def url_of(setup: LiveView, listening: socket.socket) -> str:
     """Return the URL for viewers."""
     host = f"[{setup.host}]" if ":" in setup.host else setup.host
     return f"ws://{host}:{listening.getsockname()[1]}"

@@ -6,7 +6,6 @@ those of its margin, from noise and the parameters' covariance. Thresholds of ot
 error that the test shows.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,37 +87,43 @@ class Identified(Fitted):
         """Share (n,) of each joint's torque that the model explains in the test; nan without torque."""
         return np.array([joint.share for joint in self.verdict.joints])
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the result as a dictionary for JSON."""
-        names, certificate = self.model.parameter_names, self.certificate
+    def by_key(self) -> dict[str, Any]:
+        """Return the result by the keys of identify.json."""
+        names, certificate, verdict = self.model.parameter_names, self.certificate, self.verdict
         return {
             "parameters": {
                 name: {"value": value, "std": std}
-                for name, value, std in zip(names, self.estimate.theta.tolist(), self.deviation.tolist(), strict=True)
+                for name, value, std in zip(names, self.estimate.theta, self.deviation, strict=True)
             },
             "fit_s": self.fit_s,
             "period_s": self.settings.period_s,
-            "noise_Nm": list(self.settings.noise_Nm),
+            "noise_Nm": self.settings.noise_Nm,
             "velocity_noise_rad_s": self.settings.velocity_noise_rad_s,
             "test": {
                 "seconds": self.test.recording.duration_s,
-                "verdict": self.verdict.as_json(),
-                "margin": _finite(certificate.margin),
-                "margins": dict(zip(self.joint_names, map(_finite, certificate.margins.tolist()), strict=True)),
-                "explained": dict(zip(self.joint_names, map(_finite, self.explained.tolist()), strict=True)),
-                "residual_rms_Nm": certificate.residual_rms_Nm.tolist(),
-                "residual_max_Nm": certificate.residual_max_Nm.tolist(),
-                "lack_Nm": certificate.lack_Nm.tolist(),
+                "verdict": {
+                    "is_explained": verdict.is_explained,
+                    "headline": verdict.headline,
+                    "reasons": verdict.reasons,
+                    "remarks": verdict.remarks,
+                    "next": verdict.remedy,
+                },
+                "margin": certificate.margin,
+                "margins": dict(zip(self.joint_names, certificate.margins, strict=True)),
+                "explained": dict(zip(self.joint_names, self.explained, strict=True)),
+                "residual_rms_Nm": certificate.residual_rms_Nm,
+                "residual_max_Nm": certificate.residual_max_Nm,
+                "lack_Nm": certificate.lack_Nm,
             },
-            "left_out": {str(path): list(notes) for path, notes in self.notes.items()},
+            "left_out": self.notes,
             "watched": [
                 {
-                    "recording": str(watched.recording.path),
-                    "contacts": [contact._asdict() for contact in watched.contacts],
+                    "recording": watched.recording.path,
+                    "contacts": watched.contacts,
                     "touches": watched.touches,
                     "missed": watched.missed,
                     "false_contacts": watched.false_contacts,
-                    "delays_s": list(watched.delays_s),
+                    "delays_s": watched.delays_s,
                 }
                 for watched in self.watched
             ],
@@ -163,11 +168,6 @@ def identify(
         test=watch(model, settings, estimate, np.zeros(model.joints), tested),
         watched=tuple(watch(model, settings, estimate, certificate.lack_Nm, recording) for recording in watched),
     )
-
-
-def _finite(value: float) -> float | None:
-    """Return a number as JSON can hold it."""
-    return value if math.isfinite(value) else None
 
 
 def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:

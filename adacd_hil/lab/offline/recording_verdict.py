@@ -18,7 +18,7 @@ more than noise; the verdict then names the smallest contact that still shows.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -77,16 +77,6 @@ class Verdict:
 
     def __repr__(self) -> str:
         return f"<Verdict: {self.headline}>"
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the verdict as a dictionary for JSON."""
-        return {
-            "is_explained": self.is_explained,
-            "headline": self.headline,
-            "reasons": list(self.reasons),
-            "remarks": list(self.remarks),
-            "next": self.remedy,
-        }
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,11 @@
 It draws no figure, so that lists of runs read it quickly; the keys are described in `adacd_hil.score.metrics`.
 """
 
-import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any, Final
 
-import numpy as np
-
 from adacd_hil.log.logged_run import StretchOfRun
+from adacd_hil.plain_values import plain_values
 from adacd_hil.score.metrics import CertifiedEvidence, Metrics, ReportSource
 
 JSON_NAME: Final = "report.json"
@@ -24,7 +21,7 @@ def report_json(
 ) -> dict[str, Any]:
     """Give the content of report.json; the keys are described in `adacd_hil.score.metrics`."""
     fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
-    plain: dict[str, Any] = _plain(
+    plain: dict[str, Any] = plain_values(
         {
             "schema": SCHEMA,
             "verdict": metrics.verdict,
@@ -32,13 +29,10 @@ def report_json(
             "time_zero": "first cycle in ADAPT (motion start)",
             "adaptation_s": metrics.adaptation_s,
             "sections": {
-                section.label: {**dataclasses.asdict(section), "duration_s": section.duration_s}
-                for section in metrics.sections
+                section.label: {**vars(section), "duration_s": section.duration_s} for section in metrics.sections
             },
-            "frozen_residual_max_Nm": {
-                label: dataclasses.asdict(residual) for label, residual in metrics.frozen_residual_max_Nm.items()
-            },
-            "contacts": [dataclasses.asdict(contact) for contact in metrics.contacts],
+            "frozen_residual_max_Nm": metrics.frozen_residual_max_Nm,
+            "contacts": metrics.contacts,
             "false_alarms": metrics.false_alarms,
             "false_alarms_s": metrics.false_alarms_s,
             "false_alarm_bound_per_h": metrics.false_alarm_bound_per_h,
@@ -47,9 +41,9 @@ def report_json(
             "payload_kg": metrics.payload_kg,
             "certified": None if metrics.evidence is None else _evidence_json(metrics.evidence),
             "fault": fault,
-            "cycle": dataclasses.asdict(metrics.cycle),
-            "timing": metrics.timing.as_json(),
-            "data": metrics.data.as_json(),
+            "cycle": metrics.cycle,
+            "timing": metrics.timing.by_key(),
+            "data": metrics.data,
             "log": {
                 "name": source.log_name,
                 "frames": metrics.frames,
@@ -58,9 +52,10 @@ def report_json(
                 "problem": source.problem,
             },
             "stretch": None if stretch is None else _stretch_json(stretch),
-            "paper": [row._asdict() for row in metrics.paper],
+            "paper": metrics.paper,
             "run": dict(sorted(metadata.items())),
-        }
+        },
+        _DIGITS,
     )
     return plain
 
@@ -78,17 +73,4 @@ def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
 
 def _evidence_json(evidence: CertifiedEvidence) -> dict[str, Any]:
     """Give the evidence of the certified scheme; the keys are described in `adacd_hil.score.margins`."""
-    certificates = [certificate._asdict() for certificate in evidence.certificates]
-    margin = evidence.smallest_margin
-    return {**dataclasses.asdict(evidence), "smallest_margin": margin, "certificates": certificates}
-
-
-def _plain(value: Any) -> Any:
-    """Make a value of JSON's types: numbers with six digits, null for infinity and NaN."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float | np.floating):
-        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
-    return value
+    return {**vars(evidence), "smallest_margin": evidence.smallest_margin}

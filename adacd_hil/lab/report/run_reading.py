@@ -55,7 +55,6 @@ from adacd_hil.log.logged_run import (
 )
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, contacts_of, start_of_log
 from adacd_hil.records import JOINTS, ContactReport, Request, SchemeState
-from adacd_hil.score import judge
 from adacd_hil.score.emulator_truth import (
     Rows,
     TruthTable,
@@ -65,7 +64,7 @@ from adacd_hil.score.emulator_truth import (
     read_truth,
     truth_rows,
 )
-from adacd_hil.score.judge import find_detections
+from adacd_hil.score.judge import find_detections, timed_contacts
 from adacd_hil.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.score.metrics import Gathered, ReportSource
 from adacd_hil.score.wording import unjudged_sentence
@@ -262,7 +261,7 @@ class RunReading:
         self._times.add_columns(columns)
         if not len(scheme):
             return
-        self._attempts.add(cycle, state)
+        self._attempts.add_cycles(cycle, state)
         self._add_facts(scheme, cycle, state)
         rows = np.concatenate((self._edges(scheme), self._onset_rows(scheme, cycle)))
         self._rows.add_records(scheme, rows[(rows >= 0) & (rows < len(scheme))])
@@ -385,7 +384,7 @@ def _extremes_by_bucket(curves: Iterator[NDArray[np.float64]], index: Cycles, bu
 
 def _around(run: Run) -> list[Bounds]:
     """Give the stretches of time of which every cycle is kept."""
-    onsets_s = [(contact.onset_ns - run.zero_ns) * 1e-9 for contact in judge.contacts_of(run)]
+    onsets_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
     found_s = [(detection.t_ns - run.zero_ns) * 1e-9 for detection in find_detections(run)]
     around = [
         (at_s - _AROUND_S[0], at_s + _AROUND_S[1]) for at_s in (*onsets_s[:TRACED_CONTACTS], *found_s[:TRACED_CONTACTS])
@@ -600,13 +599,13 @@ def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[
         if begin_s < last_s < end_s:
             last_s = end_s
     bounds_ns = (round(first_s * 1e9) + zero_ns, round(last_s * 1e9) + zero_ns)
-    begun_ns = [contact.onset_ns for contact in judge.contacts_of(run)]
+    begun_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
     if run.truth is None:
-        begun_ns = [detection.t_ns for detection in find_detections(run)]
+        begun_s = [(detection.t_ns - zero_ns) * 1e-9 for detection in find_detections(run)]
     known = StretchOfRun(
         stretch,
         TimeWindow(*((bound_ns - start_ns) * 1e-9 for bound_ns in bounds_ns)),
-        sum(at_ns < bounds_ns[0] for at_ns in begun_ns),
+        sum(at_s < first_s for at_s in begun_s),
         (zero_ns - start_ns) * 1e-9,
     )
     truth = run.truth
@@ -622,6 +621,6 @@ def _busy(run: Run) -> Iterator[tuple[float, float]]:
     edges = np.flatnonzero(is_busy[1:] != is_busy[:-1])
     for first, end in edges.reshape(-1, 2).tolist():
         yield float(time_s[first]) - MARGIN_S, float(time_s[min(end, len(time_s) - 1)]) + later_s
-    for contact in judge.contacts_of(run):
+    for contact in timed_contacts(run):
         assert contact.time_s is not None
         yield float(contact.time_s[0]) - MARGIN_S, float(contact.time_s[-1]) + later_s

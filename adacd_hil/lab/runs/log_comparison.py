@@ -183,10 +183,6 @@ class FieldDifference(NamedTuple):
     cycles: int
     largest: float
 
-    def as_json(self) -> dict[str, Any]:
-        """Return plain values for JSON; `largest` is None if it is infinite."""
-        return self._asdict() | {"largest": self.largest if math.isfinite(self.largest) else None}
-
 
 ContactPair = tuple[Contact | None, Contact | None]
 """A contact in both runs, or in one."""
@@ -215,11 +211,11 @@ class LogComparison:
         """Whether both runs decided the same in the same cycles."""
         return not self.fields and self.only == (0, 0)
 
-    def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
+    def by_key(self) -> dict[str, Any]:
+        """Return it by the keys of `compare --json`."""
         runs = [
             {
-                "log": str(run.path),
+                "log": run.path,
                 "cycles": run.cycles,
                 "problem": run.problem,
                 "states": run.states,
@@ -229,16 +225,16 @@ class LogComparison:
             for run in (self.first, self.second)
         ]
         return {
-            **self.stretch.as_json(),
+            **self.stretch.named_bounds,
             "runs": runs,
             "is_same": self.is_same,
             "settings": self.settings,
             "metadata": self.metadata,
             "cycles": self.cycles,
-            "only": list(self.only),
-            "fields": [field.as_json() for field in self.fields],
+            "only": self.only,
+            "fields": self.fields,
             "contacts": [{"first": _contact_json(a), "second": _contact_json(b)} for a, b in self.contacts],
-            "notes": list(self.notes),
+            "notes": self.notes,
         }
 
 

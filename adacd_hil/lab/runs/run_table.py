@@ -151,11 +151,6 @@ def certificate_text(run: RunSummary) -> str:
     return f"{state}{when}" + (f", {given} in all" if given > 1 and state == CERTIFIED else "")
 
 
-def as_json(runs: Sequence[RunSummary]) -> list[dict[str, Any]]:
-    """Give a table for each run, a list where there is a value for each joint."""
-    return [{column.name: column.value(run) for column in COLUMNS} for run in runs]
-
-
 def _flat(column: Column) -> list[str]:
     """Name a column, or those of each joint."""
     if not column.joints:

@@ -80,25 +80,25 @@ class Trend:
         """The quantities that may have changed."""
         return self.thresholds, self.friction, self.offsets
 
-    def as_json(self) -> dict[str, Any]:
-        """Give values, deviations and changes by quantity; null where not known."""
+    def by_key(self) -> dict[str, Any]:
+        """Return values, deviations and changes by quantity, by the keys of `trend --json`; NaN where not known."""
         names = [run.name for run in self.runs]
         return {
             "arm": self.arm,
             "runs": names,
             "started": [None if run.started is None else run.started.isoformat() for run in self.runs],
             "left_out": [{"run": run.name, "status": run.status, "verdict": run.verdict} for run in self.left_out],
-            "margin": _plain(self.margins),
+            "margin": _rows(self.margins),
             **{
                 each.name: {
-                    "values": _plain(each.values),
-                    "std": _plain(each.std),
+                    "values": _rows(each.values),
+                    "std": _rows(each.std),
                     "changes": [_change_json(change) for change in each.changes],
                 }
                 for each in self.quantities
             },
             "thresholds_last_changed": self.sentence,
-            "drift": list(self.further),
+            "drift": self.further,
         }
 
 
@@ -244,10 +244,9 @@ def _when(run: RunSummary) -> str:
     return f"run {run.name}{date}"
 
 
-def _plain(values: Vector) -> list[Any]:
-    """Give rows as lists, a plain number where a row has one; null where not known."""
-    rows = [[value if math.isfinite(value) else None for value in row] for row in values.tolist()]
-    return [row[0] for row in rows] if values.shape[1] == 1 else rows
+def _rows(values: Vector) -> Vector:
+    """Return rows, a number where a row has one."""
+    return values[:, 0] if values.shape[1] == 1 else values
 
 
 def _change_json(change: TrendChange) -> dict[str, Any]:

@@ -66,27 +66,18 @@ class Comparison:
             scores.setdefault(row.detector, []).extend(np.log(delays).tolist())
         return tuple(sorted(scores, key=lambda name: sum(scores[name]) / len(scores[name])))
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the table as a dictionary for JSON; an infinite delay is null."""
+    def by_key(self) -> dict[str, Any]:
+        """Return the table by the keys of comparison.json."""
         return {
             "rate_per_h": self.rate_per_h,
             "hours": self.hours,
-            "steps_Nm": list(STEPS_NM),
+            "steps_Nm": STEPS_NM,
             "roc_step_Nm": ROC_STEP_NM,
             "roc_within_s": ROC_WITHIN_S,
-            "roc_rates_per_h": list(self.rates_per_h),
-            "ranking": list(self.ranking),
-            "missing": list(self.missing),
-            "rows": [
-                {
-                    "detector": row.detector,
-                    "joint": row.joint,
-                    "delay_ms": [delay if math.isfinite(delay) else None for delay in row.delay_ms],
-                    "found": list(row.found),
-                    "roc": list(row.roc),
-                }
-                for row in self.rows
-            ],
+            "roc_rates_per_h": self.rates_per_h,
+            "ranking": self.ranking,
+            "missing": self.missing,
+            "rows": self.rows,
         }
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
@@ -234,4 +225,4 @@ def draw_comparison(comparison: Comparison) -> Drawing:
 
 def write_comparison(comparison: Comparison, out_dir: Path) -> tuple[Path, ...]:
     """Write detectors.json, .png and .svg into a folder. Raises LogError if they can't be written."""
-    return write_figures(out_dir, NAME, comparison.as_json(), [draw_comparison(comparison)])
+    return write_figures(out_dir, NAME, comparison.by_key(), [draw_comparison(comparison)])

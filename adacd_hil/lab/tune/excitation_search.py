@@ -81,7 +81,7 @@ class ExcitationLimits(NamedTuple):
     acceleration_rad_s2: Vector
     torque_Nm: Vector
 
-    def as_json(self) -> dict[str, list[float] | None]:
+    def by_figure(self) -> dict[str, list[float] | None]:
         """Give the limits by the names of `Figures`, in their units; None: no limit."""
         degrees = zip(("travel_deg", "velocity_deg_s", "acceleration_deg_s2"), self[:3], strict=True)
         torque = self.torque_Nm.tolist() if np.all(np.isfinite(self.torque_Nm)) else None

@@ -45,6 +45,7 @@ from adacd_hil.lab.tune.tune_roc import (
     choose,
     free_hours,
     read_logs,
+    tuning_by_key,
 )
 from adacd_hil.log.log_files import WHOLE, TimeWindow
 from adacd_hil.log.logged_run import Progress
@@ -346,4 +347,4 @@ def write_tuning(tuning: Tuning, out_dir: Path) -> tuple[Path, ...]:
     drawings = [draw_roc(tuning)]
     if tuning.candidates[0].choice.chosen.contacts:
         drawings.append(draw_delays(tuning))
-    return write_figures(out_dir, "tune", tuning.as_json(), drawings)
+    return write_figures(out_dir, "tune", tuning_by_key(tuning), drawings)

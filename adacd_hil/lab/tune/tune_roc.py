@@ -106,13 +106,12 @@ class Found(NamedTuple):
         """The 95 % interval of the share of contacts that is found."""
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
-    def as_json(self) -> dict[str, Any]:
-        """Return plain values for JSON; unknown values are null."""
-        bound = self.rate_bound_per_h
+    def by_key(self) -> dict[str, Any]:
+        """Return it by the keys of tune.json."""
         plain: dict[str, Any] = {
             "hours": self.hours,
             "false_alarms": self.alarms,
-            "rate_bound_per_h": bound if math.isfinite(bound) else None,
+            "rate_bound_per_h": self.rate_bound_per_h,
             "contacts": self.contacts,
         }
         if self.contacts is None:
@@ -315,7 +314,7 @@ class _Index:
 
     def add_scheme(self, scheme: Series) -> None:
         """Add the next piece of /scheme."""
-        self.attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+        self.attempts.add_cycles(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
         self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
         self._t_ns.frombytes(scheme.t_ns.tobytes())
         self._before.frombytes(scheme["previous_state"].astype(np.uint8).tobytes())
@@ -337,7 +336,7 @@ def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
     if motion.bounds_ns is not None:
         attempts = AttemptBegins()
         for scheme in schemes(motion.path, (EVER_NS[0], motion.bounds_ns[1])):
-            attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+            attempts.add_cycles(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
     begins: list[int] = attempts.begins.tolist()
     return begins
 
@@ -389,18 +388,6 @@ class TuningOutcome:
     delays_ms: tuple[float, ...]
     armed_false_alarms: int
 
-    def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
-        return {
-            "adaptations": len(self.adaptation_s),
-            "unfinished": self.unfinished,
-            "adaptation_s": list(self.adaptation_s),
-            "missed": self.missed,
-            "false_alarms": self.false_alarms,
-            "monitored_h": self.hours,
-            "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(self.delays_ms), strict=True)),
-        }
-
 
 @dataclass(frozen=True)
 class Candidate:
@@ -411,16 +398,6 @@ class Candidate:
     choice: Choice
     outcome: TuningOutcome
     problems: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
-        return {
-            "name": self.name,
-            "changes": self.changes,
-            "problems": list(self.problems),
-            "thresholds": choice_as_json(self.choice),
-            "replayed": self.outcome.as_json(),
-        }
 
 
 @dataclass(frozen=True)
@@ -440,43 +417,64 @@ class Tuning:
         """Whether the other half shows the wanted rate: its upper 95 % bound is not above it."""
         return self.best is not None and self.best.choice.checked.rate_bound_per_h <= self.rate_per_h
 
-    def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
-        return {
-            "rate_per_h": self.rate_per_h,
-            "is_shown": self.is_shown,
-            "logs": [
-                {
-                    "path": str(log.path),
-                    "sha256": log.digest,
-                    "free_h": free_hours(log),
-                    "contacts": None if log.windows is None else len(log.windows),
-                }
-                for log in self.logs
-            ],
-            "own": self.own.as_json(),
-            "suggested": None if self.best is None else self.best.as_json(),
-            "candidates": [candidate.as_json() for candidate in self.candidates],
-            "detectors": [choice_as_json(choice) | {"name": choice.name} for choice in self.detectors],
-            "notes": list(self.notes),
-            "limits": LIMITS,
-        }
-
 
 def free_hours(log: TunedLog) -> float:
     """Return the contact-free time while the arm monitored, h."""
     return float(log.motion.is_free.sum()) * log.motion.period_s / 3600.0
 
 
-def choice_as_json(choice: Choice) -> dict[str, Any]:
-    """Give thresholds and their ROC in plain values."""
+def tuning_by_key(found: Tuning) -> dict[str, Any]:
+    """Return the result by the keys of tune.json."""
+
+    def candidate(each: Candidate) -> dict[str, Any]:
+        return {
+            "name": each.name,
+            "changes": each.changes,
+            "problems": each.problems,
+            "thresholds": _choice(each.choice),
+            "replayed": _outcome(each.outcome),
+        }
+
     return {
-        "thresholds": choice.thresholds.tolist(),
+        "rate_per_h": found.rate_per_h,
+        "is_shown": found.is_shown,
+        "logs": [
+            {
+                "path": log.path,
+                "sha256": log.digest,
+                "free_h": free_hours(log),
+                "contacts": None if log.windows is None else len(log.windows),
+            }
+            for log in found.logs
+        ],
+        "own": _outcome(found.own),
+        "suggested": None if found.best is None else candidate(found.best),
+        "candidates": [candidate(each) for each in found.candidates],
+        "detectors": [_choice(choice) | {"name": choice.name} for choice in found.detectors],
+        "notes": found.notes,
+        "limits": LIMITS,
+    }
+
+
+def _outcome(outcome: TuningOutcome) -> dict[str, Any]:
+    return {
+        "adaptations": len(outcome.adaptation_s),
+        "unfinished": outcome.unfinished,
+        "adaptation_s": outcome.adaptation_s,
+        "missed": outcome.missed,
+        "false_alarms": outcome.false_alarms,
+        "monitored_h": outcome.hours,
+        "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(outcome.delays_ms), strict=True)),
+    }
+
+
+def _choice(choice: Choice) -> dict[str, Any]:
+    return {
+        "thresholds": choice.thresholds,
         "method": choice.method,
-        "chosen_on": choice.chosen.as_json(),
-        "checked_on": choice.checked.as_json(),
+        "chosen_on": choice.chosen.by_key(),
+        "checked_on": choice.checked.by_key(),
         "roc": [
-            {"factor": factor, "predicted_per_h": predicted} | found.as_json()
-            for factor, found, predicted in choice.roc
+            {"factor": factor, "predicted_per_h": predicted} | found.by_key() for factor, found, predicted in choice.roc
         ],
     }
