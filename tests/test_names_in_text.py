@@ -26,8 +26,9 @@ ELSEWHERE = {
     *("position_NAME", "velocity_NAME", "effort_NAME"),  # NAME stands for a joint's
     *("can_logger", "can_logconvert", "duckdb"),
     *("some/module.py", "some/test.py", "Coverage.py"),
+    *("amr", "Kx"),  # mistyped names
 }
-"""Placeholders, and other programs' names."""
+"""Placeholders, names of other programs, and examples of mistakes."""
 _NAME = re.compile(r"`([A-Za-z_]\w*(?:\.(?!py`|md`)[A-Za-z_]\w*)*)(?:\(\))?`")
 _MODULE = re.compile(r"(?<![\w/.-])((?:[\w-]+/)*[\w-]+\.py)\b")
 _NUMBERED = re.compile(r"_\d+(_|$)")
