@@ -185,7 +185,7 @@ def test_two_syncs_without_command_are_forgiven_and_hold_the_torque_and_the_thir
     assert host.state_bits() == REACTION
     frames = host.take()
     assert (0x081, emergency(0x8250, 2, 6)) in frames
-    assert host.read(1, 0x603F) == 0x8250
+    assert (host.read(1, 0x603F), host.read(1, 0x6071)) == (0x8250, 0)
     status = next(data for can_id, data in frames if can_id == 0x281)
     assert struct.unpack("<HbhH", status)[3] == 0x8250
 

@@ -81,6 +81,19 @@ def test_power_brings_a_device_back_as_it_was_delivered(node):
     assert len(host.taken(0x180 + node)) == 1
 
 
+def test_emergencies_that_waited_and_the_history_are_gone_with_the_power():
+    host = enabled_host({(1, 0x1015, 0): 1000})
+    host.put(0x201, b"\0")  # wrong length, right length: two messages, of which the second must wait
+    host.command(ENABLE)
+    assert errors(host, 1) == [0x8210]
+    host.bench.devices[0].power_off(host.bench.now_ns)
+    host.bench.devices[0].power_on(host.bench.now_ns)
+    assert host.read(1, 0x1003) == 0
+    poll(host)
+    pass_ms(host, 200)
+    assert errors(host, 1) == []
+
+
 def test_a_reset_of_power_restarts_the_time_in_emergencies():
     host = enabled_host()
     pass_ms(host, 500)
@@ -155,6 +168,9 @@ def test_a_drive_that_fails_faults_with_its_code_and_says_so():
     assert host.read(1, 0x603F) == ERROR
     assert host.read(1, 0x1003, 1) == ERROR
     assert drive.torque_Nm == 0.0
+    host.wait_until_at_rest()
+    drive.fail(0x4310, host.bench.now_ns)
+    assert (host.state_bits(1), host.read(1, 0x603F)) == (FAULT, ERROR)  # the first one counts
 
 
 def test_a_drive_says_by_its_own_clock_when_it_lost_its_commands_with_sync():

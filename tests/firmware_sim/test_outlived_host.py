@@ -9,6 +9,7 @@ from bench_host import (
     FAULT,
     PERIOD_NS,
     RESET_COMMUNICATION,
+    STOP,
     BenchHost,
     patient_host,
     quiet_scenario,
@@ -171,3 +172,11 @@ def test_the_emulator_outlives_its_host(clock_mode, beat, is_once):
         assert bench.is_at_rest
         assert clock.now_ns() < 400 * MS  # the heartbeat's 250 ms, and what notices it
         assert rows[-1][1] - rows[49][1] < 1_000 * MS
+
+
+def test_once_by_the_clock_ends_no_sooner_than_the_arm_is_at_rest():
+    script = [*enabling_script(50, 300), (51, 0x000, bytes([STOP, 0]))]
+    _, bench, clock = serve(script, 4_000, "wall", is_once=True)
+    assert [drive.state.value for drive in bench.drives] == ["fault"] * 2
+    assert bench.is_at_rest
+    assert clock.now_ns() < 1_500 * MS

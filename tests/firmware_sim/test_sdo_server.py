@@ -130,6 +130,8 @@ def test_segments_that_are_not_as_long_as_announced_are_aborted(host, segment, c
 def test_segments_of_an_unannounced_size_must_fit_the_object(host):
     ask(host, frame(0x20, 0x6040))
     assert ask(host, bytes([0x0D, 1])) == aborted(0x6040, 0, WRONG_LENGTH)
+    ask(host, frame(0x20, 0x6040))
+    assert ask(host, bytes([0x00, 1, 2, 3, 4, 5, 6, 7])) == aborted(0x6040, 0, LONG)  # and more would follow
 
 
 def test_an_expedited_write_without_a_size_takes_the_objects_length(host):
