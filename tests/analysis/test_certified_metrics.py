@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_made_run import A, C, M, P, R, S, contact_report, make_certified_run, make_run, react, touch
+from hand_made_run import FIRST_CYCLE, A, C, M, P, R, S, contact_report, make_certified_run, make_run, react, touch
 
 from adacd_hil.lab.report.page import paper_cells, paper_head
 from adacd_hil.lab.report.report_files import Report
@@ -181,6 +181,13 @@ def test_a_false_alarm_of_the_papers_scheme_counts_once():
     run.beside.tau_ext_hat[4900:4910, 1] = 0.2
     run.beside.tau_ext_hat[5100:5500] = 0.5  # while the payload is changed
     assert beside(run).false_alarms_s == pytest.approx((2.95, 4.85))
+
+
+@pytest.mark.parametrize(("row", "false_alarms"), [(8990, 1), (9000, 0)])
+def test_while_the_arm_parks_at_the_end_the_papers_scheme_raises_no_false_alarm(row, false_alarms):
+    run = make_certified_run(finish_cycle=FIRST_CYCLE + 9000)
+    run.beside.tau_ext_hat[row : row + 5, 0] = 0.2
+    assert beside(run).false_alarms == false_alarms
 
 
 def test_the_papers_residual_counts_where_it_is_armed():

@@ -22,7 +22,7 @@ from hand_made_run import (
 )
 
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.log.logged_run import columns_of_records, section_label, split_sections
+from adacd_hil.log.logged_run import Span, columns_of_records, section_label, split_sections
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.score.judge import detection_delay_s, filtered
 
@@ -369,6 +369,14 @@ def test_the_residual_leaves_out_the_parking_at_the_end(row, counts):
     assert (residual(run, "E")[0] == 0.09) is counts
 
 
+@pytest.mark.parametrize(("row", "counts"), [(1499, False), (1500, True), (4000, True), (4001, False)])
+def test_the_residual_leaves_out_what_the_truth_does_not_cover(row, counts):
+    run = make_run()
+    run = replace(run, truth=replace(run.truth, span=Span(FIRST_CYCLE + 1500, FIRST_CYCLE + 4000)))
+    run.tau_ext_hat[row] = (1.0, 1.0)
+    assert (residual(run) == (1.0, 1.0)) is counts
+
+
 def test_the_residual_leaves_out_a_stop():
     run = make_run((A, 1000), (M, 1000), (R, 100), (S, 3000), (M, 1000))
     run.tau_ext_hat[4000] = (1.0, 1.0)
@@ -541,6 +549,12 @@ def faulted():
 )
 def test_the_verdict_says_how_it_went(run, verdict):
     assert evaluate(run).verdict.replace("; no cyclic data was late or lost", "") == verdict
+
+
+def test_a_contact_of_a_run_that_never_watched_is_told():
+    run = make_run((A, 1000))
+    touch(run, 500, 50, (5.0, 0.0))
+    assert "1 more while it was not watched" in evaluate(run).verdict
 
 
 def test_a_verdict_ends_with_what_was_late_or_lost():
