@@ -135,7 +135,7 @@ class _InfoView:
         self._contact_cycles: dict[int, int] = {}  # level, by the cycle of the contact
 
     def take(self, path: Path, file: IO[bytes]) -> None:
-        """Take in a file."""
+        """Read one file of the log; add its counts."""
         self._info.ending = ""
         end = read_end(file)
         statistics = None

@@ -182,7 +182,7 @@ class LogWalk:
         self.attachments = {**head.attachments, **self.attachments}
 
     def _missing(self, start: int, stop: int) -> list[str]:
-        """Say that parts are missing, if any."""
+        """Return a line that names the missing parts from start to stop - 1; none if there are none."""
         names = [part_path(self._path, number).name for number in sorted({start, stop - 1})] if start < stop else []
         return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
 

@@ -79,7 +79,7 @@ class Losses:
         return sum(hole.seconds for hole in self.holes)
 
     def describe(self) -> str:
-        """Describe the losses in words; "" without a loss. Gaps are named only beside the losses behind them."""
+        """Describe the losses in words; "" without a loss. Gaps in time alone, without lost data, are no loss."""
         messages = "an unknown number of messages" if self.messages is None else f"{self.messages} messages"
         head = [
             ("the end", self.is_cut),
@@ -99,7 +99,7 @@ class Losses:
         return ", ".join(word for word, is_said in (*head, holes, *tail) if is_said)
 
     def note(self, text: str) -> None:
-        """Tell of a damage."""
+        """Keep the text of a damage, of the first _NOTES."""
         if len(self.notes) < _NOTES:
             self.notes.append(text)
 

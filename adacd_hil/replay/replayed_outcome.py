@@ -84,7 +84,7 @@ class OutcomeGatherer:
         self._was_over = False
 
     def take(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Take in a stretch."""
+        """Gather states, contacts and detections of the next decided cycles."""
         count = len(batch.cycle)
         if count == 0:
             return

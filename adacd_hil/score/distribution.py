@@ -118,7 +118,7 @@ class Distribution:
         self._range = (np.inf, -np.inf)
 
     def add_values(self, values: Values) -> None:
-        """Take in values (k,)."""
+        """Add values (k,) to the distribution; nan is left out."""
         new = np.asarray(values, dtype=np.float64)
         new = new[~np.isnan(new)]
         if new.size == 0:

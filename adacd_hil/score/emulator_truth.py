@@ -114,7 +114,7 @@ class _TruthRows:
         self._waiting = np.zeros(0, _ROW)
 
     def add_records(self, truth: Series) -> None:
-        """Take in a piece."""
+        """Add the next cycles of the truth: models and contacts."""
         if not len(truth):
             return
         rows = self._rows(truth)

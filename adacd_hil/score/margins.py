@@ -256,7 +256,7 @@ class UntouchedGatherer:
         self._beside: BesideGatherer | None = None
 
     def add_untouched(self, piece: Run, outline: Run) -> None:
-        """Take in the next cycles."""
+        """Add the cycles without a touch to the residuals, margins and pushes of their sections."""
         if piece.cycle.size == 0:
             return
         time_s, end_s = piece.time_s(), float(outline.time_s()[-1])

@@ -114,7 +114,7 @@ class ProcessWorkers:
         return self._pool.submit(work, task)
 
     def replace_dead(self) -> None:
-        """Begin anew after a process has died."""
+        """Start new processes after one has died."""
         self.end()
         self._pool = self._open()
 

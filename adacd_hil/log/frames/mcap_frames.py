@@ -129,7 +129,7 @@ class McapFrames:
         self.problem = self.problem or problem
 
     def _read(self, file: IO[bytes], name: str) -> Iterator[NDArray[Any]]:
-        """Read a part."""
+        """Yield the frames of one file of the log in blocks; note damage."""
         self._schemas, self._sources = {}, {}
         summary = summary_of(file)  # for the case that the chunk that defines channels is damaged
         for item in read_blocks(file, name, block_bytes=1):
