@@ -8,7 +8,7 @@ from pathlib import Path
 _SHORTEST, _LONGEST = 2, 64
 """Letters of a word that is compared with names."""
 _LIKE = 0.66
-"""Least share of common letters of a word and the name that is meant: `amr` and `arm` have 0.67, `Kx` and `Kp` 0.5."""
+"""Least share of common letters of a word and the name that is meant: "amr" and "arm" have 0.67, "Kx" and "Kp" 0.5."""
 
 
 def nearest_name(word: str, known: Iterable[str]) -> str | None:
