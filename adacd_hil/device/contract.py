@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings, PlacedDevice, place_devices
+from adacd_hil.device.profile import EMCY_INHIBIT_100US, PdoSettings, PlacedDevice, place_devices
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -25,6 +25,7 @@ from adacd_hil.wire.contract_frames import (
     SYNC_ID,
     move_contract,
 )
+from adacd_hil.wire.e2e import PROFILES_BY_CODE
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
 
 COMPOSED_NAME = "contract.dbc"
@@ -201,7 +202,7 @@ def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
     profile, name = device.settings, device.name.upper()
     signals: list[_DbcSignal] = []
     if pdo.data_ids:
-        signals = [_DbcSignal(signal, bits) for signal, bits in HEADER_SIGNALS[profile.protection]]
+        signals = [_DbcSignal(signal, bits) for signal, bits in PROFILES_BY_CODE[profile.protection].signals]
         mapped = sum(device.variable(signal.name).bits for signal in device.header(pdo))
         if mapped != sum(signal.bits for signal in signals):
             raise ConfigError(f"device profile {device.profile.name}: header objects have {mapped} bits in all")
@@ -319,7 +320,7 @@ def _attribute_lines(message: _DbcMessage) -> Iterable[str]:
         yield f'BA_ "VFrameFormat" BO_ {message.can_id} {_FRAME_FORMATS.index("StandardCAN_FD")};'
     if message.protection:
         yield f'BA_ "E2EProfile" BO_ {message.can_id} "{message.protection}";'
-        if message.protection == "P02":
+        if PROFILES_BY_CODE[message.protection].is_id_list:
             yield f'BA_ "E2EDataIdList" BO_ {message.can_id} "{message.data_ids}";'
         else:
             yield f'BA_ "E2EDataId" BO_ {message.can_id} {int(message.data_ids, 16)};'

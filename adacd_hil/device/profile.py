@@ -24,6 +24,7 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.e2e import PROFILES_BY_CODE
 
 FEATURES = (
     "heartbeat_consumer",
@@ -41,12 +42,6 @@ device's time in ms.
 """
 EMCY_INHIBIT_100US = 100
 """0x1015 of every device that has it: one EMCY per device and 10 ms, so that a storm of errors can't take the bus."""
-HEADER_SIGNALS = {
-    "P02": (("e2e_crc", 8), ("e2e_counter", 4), ("e2e_status", 4)),
-    "P05": (("e2e_crc", 16), ("e2e_counter", 8), ("e2e_status", 8)),
-}
-"""Signals of the end-to-end header with their bits, per AUTOSAR profile."""
-_DATA_ID_DIGITS = {"P02": 32, "P05": 4}
 
 
 @dataclass(frozen=True)
@@ -226,7 +221,7 @@ class ProfileSettings:
     )
     serial: tuple[int, ...] = setting((), low=0, high=2**32 - 1, meaning="serial number of joint 1 and 2; none: any")
     contract_object: bool = setting(False, meaning="the device carries wire version and layout digest in 0x2000")
-    protection: str = setting("none", choices=("none", "P02", "P05"), meaning="AUTOSAR end-to-end profile")
+    protection: str = setting("none", choices=("none", *PROFILES_BY_CODE), meaning="AUTOSAR end-to-end profile")
     header: tuple[str, ...] = setting((), meaning="objects of the end-to-end header, in order")
     mapping: str = setting(
         "writable",
@@ -282,17 +277,16 @@ class ProfileSettings:
                 raise ValueError(f"pdo {pdo.message}: transmission = {pdo.transmission} must be 1, on every SYNC")
 
     def _check_protection(self) -> None:
-        headers = {"none": 0, "P02": 2, "P05": 3}
-        if len(self.header) != headers[self.protection]:
-            raise ValueError(
-                f"header has {len(self.header)} objects, {self.protection} takes {headers[self.protection]}"
-            )
+        profile = PROFILES_BY_CODE.get(self.protection)
+        objects = 0 if profile is None else profile.objects
+        if len(self.header) != objects:
+            raise ValueError(f"header has {len(self.header)} objects, {self.protection} takes {objects}")
         for pdo in self.pdo:
             if not pdo.data_ids:
                 continue
-            digits = _DATA_ID_DIGITS.get(self.protection)
-            if digits is None:
-                raise ValueError(f"pdo {pdo.message}: data_ids need protection P02 or P05")
+            if profile is None:
+                raise ValueError(f"pdo {pdo.message}: data_ids need protection {' or '.join(PROFILES_BY_CODE)}")
+            digits = 2 * profile.data_id_bytes
             if len(pdo.data_ids) != 2 or any(not _is_hex(text, digits) for text in pdo.data_ids):
                 raise ValueError(f"pdo {pdo.message}: data_ids must be two of {digits} hexadecimal digits")
 

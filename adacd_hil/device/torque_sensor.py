@@ -25,8 +25,6 @@ STATUS_BITS = 0x07
 _STATUSES = tuple(SensorStatus(bits) for bits in range(STATUS_BITS + 1))
 USABLE = tuple(status for status in _STATUSES if not status & SensorStatus.NOT_VALID)
 """Statuses with which a torque may be used; an overloaded one is a bound."""
-_STATUS_IN_HEADER = {0: None, 2: (1, 4), 4: (3, 0)}
-"""Byte and shift of the sender's status, by the length of the end-to-end header: none, Profile 2, Profile 5."""
 
 
 class TorqueSensor(CyclicDevice):
@@ -51,7 +49,7 @@ class TorqueSensor(CyclicDevice):
         self.torque_range_Nm = torque_range_Nm
         names = [signal.name for signal in message.values]
         self._status_at = names.index("status") if "status" in names else None
-        self.status_in_header = _STATUS_IN_HEADER[message.header_bytes]
+        self.status_in_header = None if message.profile is None else message.profile.status_place
         self._slow_status_at = -1 if self.status_message is None else self.status_message.place("status")
         self.values = (0.0,)
         """Torque, Nm, as the device gives it: its sign, its own auto-zero, not tared."""

@@ -20,12 +20,10 @@ from cantools.database.can import Database, Message, Signal
 from adacd_hil.file_access import read_input
 from adacd_hil.wire.codec_columns import MessageTable, SignalCodec
 from adacd_hil.wire.e2e import (
+    PROFILES,
+    E2eProfile,
     E2eReceiver,
     E2eSender,
-    Profile2Receiver,
-    Profile2Sender,
-    Profile5Receiver,
-    Profile5Sender,
     Protection,
 )
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
@@ -43,12 +41,6 @@ _MOST_MESSAGES = 1000
 """Most messages of a contract: its budget takes 3 s to compute, and four times that for twice as many."""
 WIRE_VERSION = "WireVersion"
 """The DBC attribute that marks a contract."""
-E2E_SIGNALS = ("e2e_crc", "e2e_counter", "e2e_status")
-_E2E_BITS = {
-    Protection.PROFILE_2: ((0, 8), (8, 4), (12, 4)),
-    Protection.PROFILE_5: ((0, 16), (16, 8), (24, 8)),
-}
-"""First bit and number of bits of each header signal."""
 
 
 class CodecError(ValueError):
@@ -61,11 +53,13 @@ class MessageCodec(MessageTable):
     def __init__(self, message: Message) -> None:
         _check_length(message)
         self.protection, self.data_ids = _protection(message)
-        """Protection of the frames; data ids: 16 bytes for Profile 2, two bytes, low first, for Profile 5."""
+        """Protection of the frames; data ids: a byte for each counter, or a number, its low byte first."""
+        self.profile = PROFILES.get(self.protection)
+        """Layout, sender and receiver of the end-to-end header; None without protection."""
         super().__init__(message.name, message.frame_id, message.length, _lay_out(message))
         self.senders: tuple[str, ...] = tuple(message.senders)
         self._struct = _container_struct(self.signals)
-        self.values = self.signals[len(E2E_SIGNALS) if self.is_protected else 0 :]
+        self.values = self.signals[0 if self.profile is None else len(self.profile.signals) :]
         """The signals behind the end-to-end header."""
         # The hot path: values that each fill a container of their own need no shifting.
         is_plain = all(signal.mask == 0 for signal in self.values)
@@ -80,8 +74,8 @@ class MessageCodec(MessageTable):
 
     @property
     def header_bytes(self) -> int:
-        """Length of the end-to-end header in bytes: 0, 2 or 4."""
-        return self.protection.header_bytes
+        """Length of the end-to-end header in bytes; 0 without protection."""
+        return 0 if self.profile is None else self.profile.header_bytes
 
     @property
     def is_fd(self) -> bool:
@@ -97,19 +91,11 @@ class MessageCodec(MessageTable):
 
     def sender(self) -> E2eSender:
         """Make the end-to-end sender of this message; without protection it leaves frames unchanged."""
-        if self.protection is Protection.PROFILE_2:
-            return Profile2Sender(self.data_ids)
-        if self.protection is Protection.PROFILE_5:
-            return Profile5Sender(self.data_ids)
-        return E2eSender()
+        return E2eSender() if self.profile is None else self.profile.sender(self.data_ids)
 
     def receiver(self) -> E2eReceiver:
         """Make the end-to-end receiver of this message; without protection it accepts every frame as OK."""
-        if self.protection is Protection.PROFILE_2:
-            return Profile2Receiver(self.data_ids, self.length)
-        if self.protection is Protection.PROFILE_5:
-            return Profile5Receiver(self.data_ids, self.length)
-        return E2eReceiver()
+        return E2eReceiver() if self.profile is None else self.profile.receiver(self.data_ids, self.length)
 
     def encode(self, *values: float) -> bytearray:
         """Encode physical values in the order of `values`; the end-to-end header is left zero.
@@ -203,52 +189,57 @@ def _check_length(message: Message) -> None:
 
 
 def _protection(message: Message) -> tuple[Protection, bytes]:
-    """Read the attributes E2EProfile, E2EDataIdList (Profile 2; alone it means Profile 2) and E2EDataId (Profile 5)."""
+    """Read E2EProfile and the data ids, E2EDataIdList or E2EDataId; a list alone means Profile 2."""
     attributes = message.dbc.attributes if message.dbc else {}
     values = {name: attribute.value for name, attribute in attributes.items()}
     id_list = str(values.get("E2EDataIdList", ""))
-    profile = str(values.get("E2EProfile", "")) or ("P02" if id_list else "")
+    code = str(values.get("E2EProfile", "")) or (Protection.PROFILE_2.value if id_list else "")
     try:
-        protection = Protection(profile)
+        protection = Protection(code)
     except ValueError:
-        raise CodecError(f"{message.name}: E2EProfile = {profile!r} is none of '', 'P02', 'P05'") from None
-    if protection is Protection.PROFILE_2:
-        data_ids = _data_id_list(message.name, id_list)
-    elif protection is Protection.PROFILE_5:
-        data_ids = _data_id(message.name, values.get("E2EDataId"))
-    elif "E2EDataId" in values:
-        raise CodecError(f"{message.name}: E2EDataId without E2EProfile")
-    else:
+        known = ", ".join(repr(each.value) for each in Protection)
+        raise CodecError(f"{message.name}: E2EProfile = {code!r} is none of {known}") from None
+    if protection is Protection.NONE:
+        if "E2EDataId" in values:
+            raise CodecError(f"{message.name}: E2EDataId without E2EProfile")
         return protection, b""
-    _check_header(message, protection)
+    profile = PROFILES[protection]
+    if profile.is_id_list:
+        data_ids = _data_id_list(message.name, id_list, profile.data_id_bytes)
+    else:
+        data_ids = _data_id(message.name, code, values.get("E2EDataId"), profile.data_id_bytes)
+    _check_header(message, code, profile)
     return protection, data_ids
 
 
-def _data_id_list(name: str, text: str) -> bytes:
+def _data_id_list(name: str, text: str, count: int) -> bytes:
     try:
         ids = bytes.fromhex(text)
     except ValueError:
         raise CodecError(f"{name}: E2EDataIdList = {text!r} is not hexadecimal") from None
-    if len(ids) != 16:
-        raise CodecError(f"{name}: E2EDataIdList has {len(ids)} bytes, 16 expected")
+    if len(ids) != count:
+        raise CodecError(f"{name}: E2EDataIdList has {len(ids)} bytes, {count} expected")
     return ids
 
 
-def _data_id(name: str, value: float | str | None) -> bytes:
+def _data_id(name: str, code: str, value: float | str | None, size: int) -> bytes:
     if value is None:
-        raise CodecError(f"{name}: E2EProfile P05 without E2EDataId")
-    if not isinstance(value, int) or not 0 <= value <= 0xFFFF:
-        raise CodecError(f"{name}: E2EDataId = {value!r} is no integer of 0..65535")
-    return value.to_bytes(2, "little")
+        raise CodecError(f"{name}: E2EProfile {code} without E2EDataId")
+    most = (1 << 8 * size) - 1
+    if not isinstance(value, int) or not 0 <= value <= most:
+        raise CodecError(f"{name}: E2EDataId = {value!r} is no integer of 0..{most}")
+    return value.to_bytes(size, "little")
 
 
-def _check_header(message: Message, protection: Protection) -> None:
-    first = _in_order(message)[: len(E2E_SIGNALS)]
-    places = tuple((signal.name, (signal.start, signal.length), signal.is_signed) for signal in first)
-    bits = _E2E_BITS[protection]
-    if places != tuple((name, place, False) for name, place in zip(E2E_SIGNALS, bits, strict=True)):
-        header = ", ".join(f"{name} ({length} bits)" for name, (_, length) in zip(E2E_SIGNALS, bits, strict=True))
-        raise CodecError(f"{message.name}: a message protected by {protection.value} begins with unsigned {header}")
+def _check_header(message: Message, code: str, profile: E2eProfile) -> None:
+    start, wanted = 0, []
+    for name, bits in profile.signals:
+        wanted.append((name, start, bits, False))
+        start += bits
+    first = _in_order(message)[: len(wanted)]
+    if [(signal.name, signal.start, signal.length, signal.is_signed) for signal in first] != wanted:
+        header = ", ".join(f"{name} ({bits} bits)" for name, bits in profile.signals)
+        raise CodecError(f"{message.name}: a message protected by {code} begins with unsigned {header}")
 
 
 def _in_order(message: Message) -> list[Signal]:
@@ -334,8 +325,9 @@ class Codec:
 def _describe(messages: dict[str, MessageCodec]) -> str:
     lines = []
     for message in sorted(messages.values(), key=lambda message: message.can_id):
-        profile = "P05 " if message.protection is Protection.PROFILE_5 else ""  # the list of 16 ids says Profile 2
-        lines.append(f"{message.can_id:x} {message.name} {message.length} {profile}{message.data_ids.hex()}")
+        # A list of ids alone says Profile 2, as in a DBC.
+        code = "" if message.protection in (Protection.NONE, Protection.PROFILE_2) else f"{message.protection.value} "
+        lines.append(f"{message.can_id:x} {message.name} {message.length} {code}{message.data_ids.hex()}")
         lines.extend(
             f" {s.name} {s.container} {s.shift} {s.mask} {s.raw_low} {s.scale!r} {s.offset!r}" for s in message.signals
         )

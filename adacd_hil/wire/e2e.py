@@ -11,8 +11,10 @@ Source: AUTOSAR FO PRS E2E Protocol, specifications of E2E Profile 2 and Profile
 """
 
 from binascii import crc_hqx
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from typing import Final
 
 _POLYNOMIAL_8 = 0x2F
 _COUNTER_MASK_2 = 0x0F
@@ -46,17 +48,27 @@ def crc16(data: bytes | bytearray, data_id: bytes) -> int:
     return crc_hqx(data_id, crc_hqx(data[2:], 0xFFFF))
 
 
+def sign_profile_2(frame: bytearray, counter: int, data_ids: bytes) -> None:
+    """Write Profile 2's counter 0…15 into a frame, and the CRC that goes with it; the sender's status stays."""
+    frame[1] = (frame[1] & 0xF0) | counter
+    frame[0] = crc8(frame, data_ids[counter])
+
+
+def sign_profile_5(frame: bytearray, counter: int, data_id: bytes) -> None:
+    """Write Profile 5's counter 0…255 into a frame, and the CRC that goes with it; the sender's status stays."""
+    frame[2] = counter
+    frame[:2] = crc16(frame, data_id).to_bytes(2, "little")
+
+
 class Protection(Enum):
-    """How a message's frames are protected; the values are those of the DBC attribute `E2EProfile`."""
+    """How a message's frames are protected; the values are those of the DBC attribute `E2EProfile`.
+
+    `PROFILES` has the layout, sender and receiver of each.
+    """
 
     NONE = ""
     PROFILE_2 = "P02"
     PROFILE_5 = "P05"
-
-    @property
-    def header_bytes(self) -> int:
-        """Length of the header in bytes."""
-        return {Protection.NONE: 0, Protection.PROFILE_2: 2, Protection.PROFILE_5: 4}[self]
 
 
 _LAST_VALID = 1  # OK_SOME_LOST: a plain number, since looking it up costs more than the comparison
@@ -122,8 +134,7 @@ class Profile2Sender(E2eSender):
         """Fill in the header of `frame` (bytes 0 and low nibble of 1) and return it as bytes."""
         counter = self._counter
         self._counter = (counter + 1) & _COUNTER_MASK_2
-        frame[1] = (frame[1] & 0xF0) | counter
-        frame[0] = crc8(frame, self._data_ids[counter])
+        sign_profile_2(frame, counter, self._data_ids)
         return bytes(frame)
 
 
@@ -137,11 +148,9 @@ class Profile5Sender(E2eSender):
 
     def protect(self, frame: bytearray) -> bytes:
         """Fill in the header of `frame` (bytes 0 to 2) and return it as bytes."""
-        frame[2] = self._counter
-        self._counter = (self._counter + 1) & _COUNTER_MASK_5
-        crc = crc16(frame, self._data_id)
-        frame[0] = crc & 0xFF
-        frame[1] = crc >> 8
+        counter = self._counter
+        self._counter = (counter + 1) & _COUNTER_MASK_5
+        sign_profile_5(frame, counter, self._data_id)
         return bytes(frame)
 
 
@@ -326,3 +335,72 @@ class Profile5Receiver(_SequenceReceiver):
             self._missing += 1
             return E2eStatus.REPEATED
         return self._accept(delta) if delta <= self._tolerance.max_delta else self._lose_sequence()
+
+
+@dataclass(frozen=True)
+class E2eProfile:
+    """A profile: everything that its frames, devices and contracts need to know; a new one is a row of `PROFILES`.
+
+    crc_bits, counter_bits, status_bits: the header's signals in this order, from bit 0 on. objects: of a device's
+    dictionary that carry the header. data_id_bytes: of one message; is_id_list: a list by counter, in the DBC attribute
+    `E2EDataIdList`, else a number, in `E2EDataId`. sender, receiver: made of the data ids, and the frame's length.
+    sign: writes a counter and its CRC into a frame.
+    """
+
+    crc_bits: int
+    counter_bits: int
+    status_bits: int
+    objects: int
+    data_id_bytes: int
+    is_id_list: bool
+    sender: Callable[[bytes], E2eSender]
+    receiver: Callable[[bytes, int], E2eReceiver]
+    sign: Callable[[bytearray, int, bytes], None]
+
+    @property
+    def header_bytes(self) -> int:
+        """Length of the header."""
+        return (self.crc_bits + self.counter_bits + self.status_bits) // 8
+
+    @property
+    def signals(self) -> tuple[tuple[str, int], ...]:
+        """Names of the header's signals with their numbers of bits, in order."""
+        return ("e2e_crc", self.crc_bits), ("e2e_counter", self.counter_bits), ("e2e_status", self.status_bits)
+
+    @property
+    def status_place(self) -> tuple[int, int]:
+        """Byte and shift of the sender's status."""
+        return divmod(self.crc_bits + self.counter_bits, 8)
+
+    def counter_of(self, frame: bytes) -> int:
+        """Return the counter of a frame."""
+        byte, shift = divmod(self.crc_bits, 8)
+        return frame[byte] >> shift & (1 << self.counter_bits) - 1
+
+
+PROFILES: Final = {
+    Protection.PROFILE_2: E2eProfile(
+        crc_bits=8,
+        counter_bits=4,
+        status_bits=4,
+        objects=2,  # counter and status share one
+        data_id_bytes=16,
+        is_id_list=True,
+        sender=Profile2Sender,
+        receiver=Profile2Receiver,
+        sign=sign_profile_2,
+    ),
+    Protection.PROFILE_5: E2eProfile(
+        crc_bits=16,
+        counter_bits=8,
+        status_bits=8,
+        objects=3,
+        data_id_bytes=2,
+        is_id_list=False,
+        sender=Profile5Sender,
+        receiver=Profile5Receiver,
+        sign=sign_profile_5,
+    ),
+}
+PROFILES_BY_CODE: Final = {protection.value: profile for protection, profile in PROFILES.items()}
+"""By the values of the DBC attribute `E2EProfile`."""

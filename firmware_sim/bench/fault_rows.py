@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
-from adacd_hil.wire.e2e import Protection, crc8, crc16
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
 from firmware_sim.scenario.faults import NODES, FaultSettings
@@ -125,24 +124,17 @@ def _flip(row: FaultRow, data: bytes) -> bytes:
 
 
 def _freeze_counter(row: FaultRow, message: MessageCodec | None, frames: Sent) -> Sent:
-    if message is None:
+    """Give frames of a protected message the counter of the first one, and the CRC that goes with it."""
+    if message is None or message.profile is None:
         return frames
-    return [
-        (delay_ns, _freeze(row, message, data) if len(data) == message.length else data) for delay_ns, data in frames
-    ]
-
-
-def _freeze(row: FaultRow, message: MessageCodec, data: bytes) -> bytes:
-    """Give a protected frame the counter of the first one, and the CRC that goes with it."""
-    frame = bytearray(data)
-    if message.protection is Protection.PROFILE_2:
-        counter = row.kept.setdefault(message.can_id, data[1] & 0x0F)
-        frame[1] = data[1] & 0xF0 | counter
-        frame[0] = crc8(frame, message.data_ids[counter])
-    else:
-        frame[2] = row.kept.setdefault(message.can_id, data[2])
-        frame[:2] = crc16(frame, message.data_ids).to_bytes(2, "little")
-    return bytes(frame)
+    changed = []
+    for delay_ns, data in frames:
+        frame = bytearray(data)
+        if len(data) == message.length:
+            counter = row.kept.setdefault(message.can_id, message.profile.counter_of(data))
+            message.profile.sign(frame, counter, message.data_ids)
+        changed.append((delay_ns, bytes(frame)))
+    return changed
 
 
 FRAME_CHANGES: dict[str, Callable[[FaultRow, MessageCodec | None, Sent], Sent]] = {

@@ -69,7 +69,8 @@ class TransmitPdo(PdoRecord):
         pdos, can_id, layout, reads, sender = self._pdos, self.can_id, self.layout, self._reads, self._sender
         send, header_bytes, length = pdos.send, layout.header_bytes, layout.length
         pack, pack_into = layout.packing.pack, layout.packing.pack_into
-        status_byte, status_shift = (1, 4) if header_bytes == 2 else (3, 0)
+        profile = None if self.message is None else self.message.profile
+        status_byte, status_shift = (0, 0) if profile is None else profile.status_place
 
         def send_protected() -> None:
             frame = bytearray(length)

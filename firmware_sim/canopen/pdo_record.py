@@ -163,14 +163,7 @@ class PdoRecord:
 
     def _has_data_ids(self, header_bytes: int) -> bool:
         message = self.message
-        return message is not None and message.is_protected and _header_bytes(message) == header_bytes
-
-
-def _header_bytes(message: MessageCodec) -> int:
-    """Return how many bytes a protected message's end-to-end header takes."""
-    header = message.signals[: len(message.signals) - len(message.values)]
-    sizes = {s.container: 1 if s.mask else (s.raw_high - s.raw_low).bit_length() // 8 for s in header}
-    return sum(sizes.values())
+        return message is not None and message.is_protected and message.header_bytes == header_bytes
 
 
 _HEADERS = {

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adacd_hil.wire.e2e import (
+    PROFILES,
     E2eReceiver,
     E2eSender,
     E2eStatus,
@@ -290,7 +291,10 @@ def test_only_ok_frames_may_be_used(status: E2eStatus, number: int, is_valid: bo
 
 
 def test_the_header_takes_what_the_profile_says() -> None:
-    assert [protection.header_bytes for protection in Protection] == [0, 2, 4]
+    assert {protection: profile.header_bytes for protection, profile in PROFILES.items()} == {
+        Protection.PROFILE_2: 2,
+        Protection.PROFILE_5: 4,
+    }
 
 
 @BOTH
