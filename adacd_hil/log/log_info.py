@@ -180,7 +180,7 @@ class _InfoView:
 
     def _take_whole(self, file: IO[bytes], end: FileEnd, statistics: Statistics) -> None:
         definitions = Definitions()
-        definitions.take(record for record in end.summary if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL))
+        definitions.add_records(end.summary)
         self._know(definitions)
         for channel, count in statistics.channel_message_counts.items():
             topic = definitions.channels[channel].topic if channel in definitions.channels else ""

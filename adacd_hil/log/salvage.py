@@ -154,7 +154,7 @@ class Salvage:
             return
         self.is_vouched = end.data_crc != 0 and end.data_crc == crc_of(file, 0, end.data_end)
         with contextlib.suppress(LogError):  # written wrong: of no use
-            self.definitions.take(record for record in end.summary if record.opcode in DEFINITIONS)
+            self.definitions.add_records(end.summary)
             for record in end.summary:
                 if record.opcode == Opcode.STATISTICS:
                     self._statistics = parse(record.opcode, record.body)
@@ -184,7 +184,7 @@ class Salvage:
             elif opcode == Opcode.MESSAGE:
                 self._left_out += 1
             elif opcode in DEFINITIONS and is_trusted:
-                self.definitions.take((record,))
+                self.definitions.add_record(record)
             elif opcode == Opcode.ATTACHMENT:
                 if not attachment_crc_fits(record, self.is_vouched or self._is_unchecked):
                     self._lose(record.offset, len(record.body), "attachment fails its CRC")
@@ -215,7 +215,7 @@ class Salvage:
         contents = read_contents(self._opening.open_checked(chunk))
         if not is_vouched and (contents.breaks or contents.strangers):
             raise ChunkError("has no CRC, and holds what is no message")
-        self.definitions.take(contents.definitions)
+        self.definitions.add_records(contents.definitions)
         if not self.is_vouched:
             self._chunk = contents, contents.entries
         if len(contents.log_times):

@@ -428,12 +428,16 @@ class Definitions:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
 
-    def take(self, records: Iterable[RawRecord]) -> None:
-        """Take in definitions. Raises LogError for one that makes no sense or contradicts an earlier one."""
+    def add_record(self, record: RawRecord) -> Schema | Channel:
+        """Add a definition. Raises LogError for one that makes no sense or contradicts an earlier one."""
+        definition: Schema | Channel = parse(record.opcode, record.body)
+        known: dict[int, Any] = self.schemas if isinstance(definition, Schema) else self.channels
+        if known.setdefault(definition.id, definition) != definition:
+            raise LogError(f"{type(definition).__name__.lower()} {definition.id} is defined in two ways")
+        return definition
+
+    def add_records(self, records: Iterable[RawRecord]) -> None:
+        """Add the definitions among some records. Raises LogError as `add_record` does."""
         for record in records:
-            known: dict[int, Schema] | dict[int, Channel] = self.channels
-            if record.opcode == Opcode.SCHEMA:
-                known = self.schemas
-            definition = parse(record.opcode, record.body)
-            if known.setdefault(definition.id, definition) != definition:
-                raise LogError(f"{type(definition).__name__.lower()} {definition.id} is defined in two ways")
+            if record.opcode in DEFINITIONS:
+                self.add_record(record)

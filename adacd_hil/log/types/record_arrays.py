@@ -8,11 +8,10 @@ cycle's, is higher than any before.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
@@ -30,20 +29,6 @@ _MOST_SMALL = 1 << 15
 """Topics whose slots go into 16 bits."""
 UNKNOWN, UNWANTED = -1, -2
 """Slots of channels that aren't gathered."""
-
-
-class Payload(NamedTuple):
-    """The layout of a topic's payloads. `has_tail`: they end in bytes, counted by the field `count`, that fill `data`.
-
-    Records of such payloads are padded with zeros to those with the longest tail.
-    """
-
-    dtype: "np.dtype[Any]"
-    has_tail: bool = False
-
-
-PayloadLayout = Callable[[Channel, Schema], Payload | None]
-"""Describes the payloads of a channel; None where their size varies otherwise."""
 
 
 def record_dtype(payload: "np.dtype[Any]") -> "np.dtype[Any]":
@@ -66,14 +51,11 @@ class Topic(NamedTuple):
     name: str
     type_name: str
     dtype: "np.dtype[Any] | None"  # of its records; None where their size varies
-    has_tail: bool
 
-    @classmethod
-    def of(cls, name: str, type_name: str, payload: Payload | None) -> "Topic":
-        """Describe a topic by its payloads."""
-        if payload is None:
-            return cls(name, type_name, None, has_tail=False)
-        return cls(name, type_name, record_dtype(payload.dtype), payload.has_tail)
+    @property
+    def has_tail(self) -> bool:
+        """Whether payloads end after so many bytes of `data` as `count` says. Their records are padded with zeros."""
+        return self.type_name == FD_FRAME.name
 
 
 def _frame_dtype(data_bytes: int) -> "np.dtype[Any]":
@@ -242,14 +224,14 @@ class _Rows:
             memory[: self.count] = self._memory[: self.count]
             self._memory = memory
 
-    def add(self, rows: NDArray[np.uint8]) -> None:
+    def add_rows(self, rows: NDArray[np.uint8]) -> None:
         """Add rows."""
         count = self.count + len(rows)
         self.make_room(count)
         self._memory[self.count : count] = rows
         self.count = count
 
-    def end(self) -> NDArray[np.uint8]:
+    def take_all(self) -> NDArray[np.uint8]:
         """Return all rows, and begin anew."""
         rows = self._memory[: self.count]
         self._memory = np.empty((self.count + self.count // _SPARE, rows.shape[1]), np.uint8)
@@ -260,14 +242,13 @@ class _Rows:
 class PieceBuilder:
     """Gathers messages; a topic's place in `topics` is its slot."""
 
-    def __init__(self, cycles: int, epoch_ns: int, has_frame_records: bool) -> None:
-        """Gather at most so many cycles at a time; of frames also the records if `has_frame_records`."""
+    def __init__(self, cycles: int, epoch_ns: int) -> None:
+        """Gather at most so many cycles at a time."""
         self.topics: list[Topic] = []
         self.wrong = 0
         """Messages that weren't as long as their schema says."""
         self._most_cycles = cycles
         self._epoch_ns = epoch_ns
-        self._has_frame_records = has_frame_records
         self._cycles = 0  # of the piece: how often the publish time has risen
         self._latest_ns = np.iinfo(np.int64).min
         self._rows: list[_Rows] = []
@@ -292,7 +273,7 @@ class PieceBuilder:
         with contextlib.suppress(MemoryError):  # the file may lie
             rows.make_room(min(rows.count + messages, self._most_cycles + self._most_cycles // _SPARE))
 
-    def add(self, contents: "Contents", messages: slice, slots: NDArray[np.int32]) -> Iterator[RawPiece]:
+    def add_messages(self, contents: "Contents", messages: slice, slots: NDArray[np.int32]) -> Iterator[RawPiece]:
         """Gather some messages of chunks, and give the pieces that are whole with them. slots (n,): of each message."""
         publish_ns = contents.publish_times[messages].view(np.int64)
         if not len(publish_ns):
@@ -304,20 +285,20 @@ class PieceBuilder:
         while cycles[-1] > self._most_cycles:
             stop = int(np.searchsorted(cycles, self._most_cycles, side="right"))
             self._gather(contents, messages.start + start, slots[start:stop])
-            yield self.end()
+            yield self.take_piece()
             cycles -= self._most_cycles
             start = stop
         self._gather(contents, messages.start + start, slots[start:])
         self._cycles = int(cycles[-1])
 
-    def end(self) -> RawPiece:
+    def take_piece(self) -> RawPiece:
         """Return the gathered records and payloads, and start a new piece."""
         records, payloads = {}, {}
         for topic, rows, texts in zip(self.topics, self._rows, self._payloads, strict=True):
             if topic.dtype is None:
                 payloads[topic.name] = texts
-            elif self._has_frame_records or not is_of_frames(topic):
-                records[topic.name] = rows.end()
+            elif not is_of_frames(topic):
+                records[topic.name] = rows.take_all()
         piece = RawPiece(records, joined_frames(self._frames), payloads)
         self._payloads = [[] for _ in self.topics]
         self._frames = []
@@ -339,11 +320,11 @@ class PieceBuilder:
                 continue
             is_right, rows = _rows_of(contents, starts[own], ends[own] - starts[own], topic)
             self.wrong += own.stop - own.start - len(rows)
-            if is_of_frames(topic) and len(rows):
+            if not is_of_frames(topic):
+                self._rows[slot].add_rows(rows)
+            elif len(rows):
                 places = order[own] if is_right is None else order[own][is_right]
                 frames.append((places, frames_of(rows.view(topic.dtype)[:, 0], topic, self._epoch_ns)))
-            if self._has_frame_records or not is_of_frames(topic):
-                self._rows[slot].add(rows)
         if frames:
             sequence = np.argsort(np.concatenate([places for places, _ in frames]))
             self._frames.append(reordered_frames(joined_frames([part for _, part in frames]), sequence))
