@@ -33,7 +33,6 @@ from adacd_hil.log.mcap.mcap_records import (
     CHANNEL_NUMBERS,
     DEFINITIONS,
     HEAD,
-    INDEX_ENTRY,
     Definitions,
     RawRecord,
     attachment_crc_fits,
@@ -55,15 +54,15 @@ _COUNTS = {"frames", "messages", "dropped"}
 _NOT_OF_HEAD = set(Opcode) - {Opcode.ATTACHMENT, Opcode.METADATA}
 
 
-class _Extras:
+class Extras:
     """Attachments and metadata of a file."""
 
     def __init__(self) -> None:
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
 
-    def take(self, record: RawRecord) -> None:
-        """Take in an attachment or metadata. Raises LogError for a damaged one."""
+    def add_record(self, record: RawRecord) -> None:
+        """Add an attachment or metadata. Raises LogError for a damaged one."""
         if record.opcode == Opcode.ATTACHMENT:
             attachment: Attachment = parse(record.opcode, record.body)
             if not attachment_crc_fits(record):
@@ -82,21 +81,21 @@ class _Part(NamedTuple):
     is_alone: bool
 
 
-def _read_head(path: Path) -> _Extras:
-    """Read the records before the messages. Raises LogError when the file can't be read or isn't MCAP."""
-    extras = _Extras()
+def read_head(path: Path) -> Extras:
+    """Read attachments and metadata up to those of the run. Raises LogError for an unreadable file, or no MCAP."""
+    extras = Extras()
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
         for record in walk(file, str(path), _NOT_OF_HEAD):
             if isinstance(record, RawRecord):
                 with contextlib.suppress(LogError):
-                    extras.take(record)
+                    extras.add_record(record)
             if RUN_METADATA in extras.metadata:
                 break
     return extras
 
 
 def _read_items(path: Path, is_ahead: bool = True) -> Iterator[Item]:
-    """Read a file from front to end; is_ahead: as for `read_blocks`. Raises LogError as `_read_head` does."""
+    """Read a file from front to end; is_ahead: as for `read_blocks`. Raises LogError as `read_head` does."""
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
         yield from read_blocks(file, str(path), is_ahead=is_ahead)
 
@@ -136,7 +135,7 @@ class LogWalk:
         for before, number in pairwise((-1, *parts)):
             self._plan += self._missing(before + 1, number)
             try:
-                head = _read_head(parts[number])
+                head = read_head(parts[number])
             except LogError as error:
                 first_error = first_error or error
                 self._plan.append(str(error))
@@ -146,7 +145,7 @@ class LogWalk:
             raise first_error
         self._last = max(parts)
 
-    def _plan_part(self, head: _Extras, part: _Part) -> None:
+    def _plan_part(self, head: Extras, part: _Part) -> None:
         metadata = head.metadata.get(RUN_METADATA, {})
         number = metadata.pop(PART_KEY, str(part.number))
         is_foreign = bool(self.metadata and metadata) and metadata != self.metadata
@@ -210,7 +209,7 @@ class _PartWalk:
     def __init__(
         self, path: Path, builder: PieceBuilder, layout: PayloadLayout, wanted: Collection[str] | None
     ) -> None:
-        self.extras = _Extras()
+        self.extras = Extras()
         self.problem = ""
         self.other_types: set[str] = set()
         """Topics that have another type than in the parts before."""
@@ -220,8 +219,7 @@ class _PartWalk:
         self._wanted = wanted
         self._definitions = Definitions()
         self._slots = np.full(CHANNEL_NUMBERS, UNKNOWN, np.int32)  # of each channel
-        self._summary = _summary(path)
-        self._counts = _message_counts(self._summary, path)
+        self._has_searched = False
 
     def _note(self, problem: str) -> None:
         self.problem = self.problem or problem
@@ -233,7 +231,7 @@ class _PartWalk:
                 yield from self._take_block(item)
             elif isinstance(item, RawRecord):
                 try:
-                    self.extras.take(item)
+                    self.extras.add_record(item)
                 except LogError:
                     self._note(f"damaged at byte {item.offset + HEAD.size}")
             else:
@@ -289,34 +287,16 @@ class _PartWalk:
         elif self._builder.topics[slot] != topic:
             self.other_types.add(topic.name)
             return UNWANTED
-        self._builder.expect(slot, self._counts.get(channel.id, 0))
         return slot
 
     def _search(self, channel: int) -> None:
         """Look for the definition of a channel in the summary: the one that came before its messages is damaged."""
-        for record in self._summary:
-            if record.opcode in DEFINITIONS:
-                with contextlib.suppress(LogError):
-                    self._define(record)
-        self._summary = []
+        if not self._has_searched:
+            self._has_searched = True
+            with contextlib.suppress(OSError, LogError), open_input(self._path) as file:
+                for record in summary_of(file):
+                    if record.opcode in DEFINITIONS:
+                        self._define(record)
         if self._slots[channel] == UNKNOWN:
             self._slots[channel] = UNWANTED
             self._note(f"messages of channel {channel}, which is not defined")
-
-
-def _summary(path: Path) -> list[RawRecord]:
-    """Read the summary of a file; return [] if it can't be read."""
-    with contextlib.suppress(OSError, LogError), open_input(path) as file:
-        return summary_of(file)
-    return []
-
-
-def _message_counts(summary: list[RawRecord], path: Path) -> dict[int, int]:
-    """Return how many messages each channel of a file has, by its statistics; {} if these can't be read."""
-    with contextlib.suppress(OSError, LogError):
-        most = path.stat().st_size // INDEX_ENTRY.itemsize  # each has an entry in an index
-        for record in summary:
-            if record.opcode == Opcode.STATISTICS:
-                counts: dict[int, int] = parse(record.opcode, record.body).channel_message_counts
-                return {channel: min(count, most) for channel, count in counts.items()}
-    return {}

@@ -37,7 +37,7 @@ from adacd_hil.log.types.record_arrays import (
     Topic,
     record_dtype,
 )
-from adacd_hil.log.types.topics import CONTACT, DECODED, run_channels, truth_channels
+from adacd_hil.log.types.topics import DECODED, contact_report, run_channels, truth_channels
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactReport,
@@ -270,10 +270,9 @@ def check_states(scheme: Series) -> None:
 def contacts_of(series: Series) -> list[LoggedContact]:
     """Return the reports of /contact. Raises LogError for an unknown level, kind, reaction or place."""
     contacts = []
-    members = [member for member in CONTACT.head if member.name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
         try:
-            report = ContactReport(**{member.name: member.value_of(record[member.name].tolist()) for member in members})
+            report = contact_report(record)
         except (ValueError, OverflowError) as error:  # "77 is not a valid ContactLevel"
             raise LogError(f"/contact has a report that this version does not know: {error}") from None
         contacts.append(LoggedContact(t_ns, report))

@@ -107,12 +107,6 @@ def test_the_names_of_values_stand_in_the_schema():
     assert "uint8 CHARGE_FULL=3\nuint8 charge  # charge: Charge\n" in text
 
 
-def test_what_is_packed_is_unpacked():
-    unpacked = BATTERY.unpack(battery(5))
-    assert unpacked == {"cycle": 5, "charge": Charge.FULL, "cell_V": (8.0, 2.0, 1.0)}
-    assert isinstance(unpacked["charge"], Charge)
-
-
 def test_fields_of_scheme_are_added_by_their_declaration(path):
     record(path, WIDER_SCHEME, scheme)
     log = read_log(path)

@@ -131,9 +131,11 @@ def cut(
         if not stretch.is_whole:
             raise CommandError("--contact excludes --from and --until", ExitCode.USAGE)
         stretch = find_contact(log, contact, around_s)
-    done = cut_log(log, out or default_out(log), stretch, topics, _tell)
-    result = {"out": str(done.out), **stretch.as_json(), "messages": done.messages}
-    answer(as_json, result, in_line(f"{done.out}: {done.messages} messages"))
+    out = out or default_out(log)
+    messages = cut_log(log, out, stretch, topics, _tell)
+    answer(
+        as_json, {"out": str(out), **stretch.as_json(), "messages": messages}, in_line(f"{out}: {messages} messages")
+    )
     return ExitCode.OK
 
 
@@ -229,7 +231,7 @@ def recovery_as_json(recovery: "LogRecovery") -> dict[str, Any]:
         "lost_chunks": losses.chunks,
         "lost_bytes": losses.bytes,
         "is_cut": losses.is_cut,
-        "holes_s": [hole.seconds for hole in losses.holes],
+        "holes_s": losses.holes_s,
         "missing_parts": losses.missing_parts,
         "notes": losses.notes,
     }

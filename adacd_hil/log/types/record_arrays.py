@@ -7,7 +7,6 @@ Messages are gathered by topic, piece by piece. A piece ends before the first me
 cycle's, is higher than any before.
 """
 
-import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,9 +21,6 @@ if TYPE_CHECKING:
     from adacd_hil.log.mcap.chunks import Contents
 
 
-_SPARE = 16
-_LARGE = 1 << 22
-"""Bytes from which numpy asks for large pages, which cost less; of them no more is used than is written to."""
 _MOST_SMALL = 1 << 15
 """Topics whose slots go into 16 bits."""
 UNKNOWN, UNWANTED = -1, -2
@@ -109,13 +105,17 @@ def frames_of(records: NDArray[Any], topic: Topic, epoch_ns: int) -> NDArray[Any
     """Make frames of the records of a topic of frames; epoch_ns: subtracted from the file's times."""
     kind = FRAME_TOPICS[topic.name]
     frames = np.empty(len(records), LONG_FRAME_DTYPE if kind.is_long else FRAME_DTYPE)
-    frames["t_ns"] = records["sec"].astype(np.int64) * 1_000_000_000 + records["nanosec"] - epoch_ns
-    frames["cycle_t_ns"] = records["publish_time"].astype(np.int64) - epoch_ns
+    fill_times(frames, records, epoch_ns)
     frames["is_tx"] = kind.is_tx
-    frames["length"] = records["len" if kind.is_long else "dlc"]
-    for name in ("can_id", "is_error", "data"):
+    for name in ("can_id", "length", "is_error", "data"):
         frames[name] = records[name]
     return frames
+
+
+def fill_times(frames: NDArray[Any], records: NDArray[Any], epoch_ns: int) -> None:
+    """Take the times of frames from the records of a topic; epoch_ns: subtracted from the file's times."""
+    frames["t_ns"] = records["sec"].astype(np.int64) * 1_000_000_000 + records["nanosec"] - epoch_ns
+    frames["cycle_t_ns"] = records["publish_time"].astype(np.int64) - epoch_ns
 
 
 def joined_frames(pieces: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -208,37 +208,6 @@ class RawPiece(NamedTuple):
     payloads: dict[str, list[bytes]]
 
 
-class _Rows:
-    """Rows of one size, in memory that has room for as many as were there before."""
-
-    def __init__(self, size: int) -> None:
-        self._memory = np.empty((0, size), np.uint8)
-        self.count = 0
-
-    def make_room(self, count: int) -> None:
-        """Have room for `count` rows in all."""
-        if count > len(self._memory):
-            size = self._memory.shape[1]
-            least = _LARGE // size + 1 if count * size > _LARGE // 4 else 0
-            memory = np.empty((max(count, len(self._memory) * 3 // 2, least), size), np.uint8)
-            memory[: self.count] = self._memory[: self.count]
-            self._memory = memory
-
-    def add_rows(self, rows: NDArray[np.uint8]) -> None:
-        """Add rows."""
-        count = self.count + len(rows)
-        self.make_room(count)
-        self._memory[self.count : count] = rows
-        self.count = count
-
-    def take_all(self) -> NDArray[np.uint8]:
-        """Return all rows, and begin anew."""
-        rows = self._memory[: self.count]
-        self._memory = np.empty((self.count + self.count // _SPARE, rows.shape[1]), np.uint8)
-        self.count = 0
-        return rows
-
-
 class PieceBuilder:
     """Gathers messages; a topic's place in `topics` is its slot."""
 
@@ -251,27 +220,21 @@ class PieceBuilder:
         self._epoch_ns = epoch_ns
         self._cycles = 0  # of the piece: how often the publish time has risen
         self._latest_ns = np.iinfo(np.int64).min
-        self._rows: list[_Rows] = []
+        self._rows: list[list[NDArray[np.uint8]]] = []
         self._payloads: list[list[bytes]] = []
         self._frames: list[NDArray[Any]] = []
 
     @property
     def is_empty(self) -> bool:
         """Whether no message has been gathered since the latest piece."""
-        return not (self._frames or any(rows.count for rows in self._rows) or any(self._payloads))
+        return not (self._frames or any(self._rows) or any(self._payloads))
 
     def add_topic(self, topic: Topic) -> int:
         """Gather one more topic; return its slot."""
         self.topics.append(topic)
-        self._rows.append(_Rows(topic.dtype.itemsize if topic.dtype is not None else 0))
+        self._rows.append([])
         self._payloads.append([])
         return len(self.topics) - 1
-
-    def expect(self, slot: int, messages: int) -> None:
-        """Make room for so many messages of a topic, as far as they go into one piece: growing is dear."""
-        rows = self._rows[slot]
-        with contextlib.suppress(MemoryError):  # the file may lie
-            rows.make_room(min(rows.count + messages, self._most_cycles + self._most_cycles // _SPARE))
 
     def add_messages(self, contents: "Contents", messages: slice, slots: NDArray[np.int32]) -> Iterator[RawPiece]:
         """Gather some messages of chunks, and give the pieces that are whole with them. slots (n,): of each message."""
@@ -298,7 +261,8 @@ class PieceBuilder:
             if topic.dtype is None:
                 payloads[topic.name] = texts
             elif not is_of_frames(topic):
-                records[topic.name] = rows.take_all()
+                records[topic.name] = np.concatenate((np.empty((0, topic.dtype.itemsize), np.uint8), *rows))
+                rows.clear()
         piece = RawPiece(records, joined_frames(self._frames), payloads)
         self._payloads = [[] for _ in self.topics]
         self._frames = []
@@ -321,7 +285,7 @@ class PieceBuilder:
             is_right, rows = _rows_of(contents, starts[own], ends[own] - starts[own], topic)
             self.wrong += own.stop - own.start - len(rows)
             if not is_of_frames(topic):
-                self._rows[slot].add_rows(rows)
+                self._rows[slot].append(rows)
             elif len(rows):
                 places = order[own] if is_right is None else order[own][is_right]
                 frames.append((places, frames_of(rows.view(topic.dtype)[:, 0], topic, self._epoch_ns)))

@@ -23,13 +23,14 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 | /truth | adacd_hil_msgs/msg/Truth | every cycle, in the emulator's own log; records.TRUTH_LAYOUT |
 """
 
-import itertools
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 from typing import Any
+
+import numpy as np
 
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import (
@@ -141,16 +142,6 @@ class OwnTopic:
             values = tuple(number for member, value in pairs for number in (value if member.size > 1 else (value,)))
         packed = self.body.pack(*values)
         return packed if block is None else packed + block.tobytes()
-
-    def unpack(self, body: bytes) -> dict[str, Any]:
-        """Unpack the head of a body. Raises struct.error when it is cut, ValueError for a value that has no name."""
-        numbers = iter(self.body.unpack_from(body))
-        return {
-            member.name: member.value_of(
-                itertools.islice(numbers, member.size) if member.size > 1 else next(numbers),
-            )
-            for member in self.head
-        }
 
 
 _CYCLE_NUMBER = Member("cycle", "uint64", meaning="number of the cycle")
@@ -356,9 +347,22 @@ def pack_contact(report: ContactReport) -> bytes:
     return CONTACT.pack(*(getattr(report, member.name) for member in CONTACT.head))
 
 
+def contact_report(record: Any) -> ContactReport:
+    """Read a report of a record of /contact, of which an older log has fewer fields.
+
+    Raises ValueError or OverflowError for a value that has no name.
+    """
+    members = [member for member in CONTACT.head if member.name in (record.dtype.names or ())]
+    return ContactReport(**{member.name: member.value_of(record[member.name].tolist()) for member in members})
+
+
 def unpack_contact(body: bytes) -> ContactReport:
-    """Unpack the body of /contact. Raises struct.error when it is cut, ValueError for a value that has no name."""
-    return ContactReport(**CONTACT.unpack(body))
+    """Unpack the body of /contact. Raises ValueError when it is cut, or for a value that has no name."""
+    head = bytes(_CONTACT_DTYPE.itemsize - CONTACT.body.size)
+    return contact_report(np.frombuffer(head + body, _CONTACT_DTYPE)[0])
+
+
+_CONTACT_DTYPE = CONTACT.channel().type.dtype
 
 
 def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:
