@@ -20,6 +20,6 @@ def write_frames(path):
     with path.open("wb") as file:
         writer = FrameWriter(file)
         for number, kind in enumerate(KINDS):
-            writer.write(RecordedFrame(**{"t_ns": 1_000_000 * number, "length": len(kind["data"]), **kind}))
+            writer.write_frame(RecordedFrame(**{"t_ns": 1_000_000 * number, "length": len(kind["data"]), **kind}))
         writer.finish()
     return path

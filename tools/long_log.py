@@ -208,7 +208,7 @@ class Writer:
         ids = np.array([self._file.ids.get(number, 0) for number in range(int(block.channels.max()) + 1)], np.uint16)
         ends = np.append(block.starts[1:], len(records))
         times_ns = words[block.starts + LOG_TIME]
-        self._file.add(records, ids[block.channels], times_ns, ends, np.array([len(ends)]))
+        self._file.add_messages(records, ids[block.channels], times_ns, ends, np.array([len(ends)]))
         self._part_ns = int(times_ns[0]) if self._part_ns is None else self._part_ns
         is_long = int(times_ns[-1]) - self._part_ns >= PART_S * SECOND_NS
         if is_long or self._file.record_bytes >= PART_BYTES:

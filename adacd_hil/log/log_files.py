@@ -6,7 +6,7 @@ A window of time in a log is given in s since the beginning of the log, its firs
 import math
 import platform
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -110,6 +110,15 @@ def parts_of(path: Path) -> dict[int, Path]:
         return find_parts(path) or {0: path}
     except OSError:
         return {0: path}
+
+
+def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[Path]:
+    """Name the parts of the log `path` that are missing; parts: the numbers found, ending: of the last one."""
+    last = max(parts)
+    missing = [number for number in range(last) if number not in parts]
+    if ending == CONTINUED:
+        missing.append(last + 1)
+    return [part_path(path, number) for number in missing]
 
 
 def summary_count(texts: Mapping[str, str], key: str) -> int:

@@ -3,6 +3,7 @@
 A file whose summary can't be trusted is read whole, as far as it is readable.
 """
 
+import contextlib
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -16,7 +17,6 @@ from mcap.records import Attachment, Channel, Metadata, Statistics
 
 from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import (
-    CONTINUED,
     DROPPED_KEY,
     ENDING_KEY,
     FIELDS_KEY,
@@ -25,10 +25,11 @@ from adacd_hil.log.log_files import (
     SUMMARY_METADATA,
     LogError,
     failing_as,
-    part_path,
+    missing_parts,
     parts_of,
     summary_count,
 )
+from adacd_hil.log.log_walk import read_head
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
 from adacd_hil.log.mcap.mcap_records import (
     MAGIC,
@@ -39,7 +40,6 @@ from adacd_hil.log.mcap.mcap_records import (
     parse,
     read_end,
     read_record,
-    scan,
 )
 from adacd_hil.log.payload_sizes import payload_size
 from adacd_hil.log.reader import LoggedEvent
@@ -105,15 +105,12 @@ def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
     info = LogInfo(path, files=len(parts))
     view = _InfoView(info, is_brief)
     is_mcap = False
-    missing = [part for part in range(max(parts)) if part not in parts]
     for part in parts.values():
         with failing_as(f"log {part} can't be read"), open_input(part) as file:
             info.size_bytes += part.stat().st_size
             is_mcap |= file.read(len(MAGIC)) == MAGIC
-            view.take(part, file)
-    if info.ending == CONTINUED:
-        missing.append(max(parts) + 1)
-    info.problems += [f"{part_path(path, part).name} is missing" for part in missing]
+            view.add_file(part, file)
+    info.problems += [f"{part.name} is missing" for part in missing_parts(path, parts, info.ending)]
     view.sum_up()
     if not (is_mcap or info.topics or info.attachments or info.metadata or info.summary):
         raise LogError(f"{path} is not an MCAP file")
@@ -134,7 +131,7 @@ class _InfoView:
         self._start_ns, self._end_ns = 2**64, 0
         self._contact_cycles: dict[int, int] = {}  # level, by the cycle of the contact
 
-    def take(self, path: Path, file: IO[bytes]) -> None:
+    def add_file(self, path: Path, file: IO[bytes]) -> None:
         """Read one file of the log; add its counts."""
         self._info.ending = ""
         end = read_end(file)
@@ -180,7 +177,7 @@ class _InfoView:
 
     def _take_whole(self, file: IO[bytes], end: FileEnd, statistics: Statistics) -> None:
         definitions = Definitions()
-        definitions.take(record for record in end.summary if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL))
+        definitions.add_records(end.summary)
         self._know(definitions)
         for channel, count in statistics.channel_message_counts.items():
             topic = definitions.channels[channel].topic if channel in definitions.channels else ""
@@ -205,7 +202,7 @@ class _InfoView:
 
     def _read_chunk(self, record: RawRecord, definitions: Definitions) -> None:
         try:
-            self._read(read_contents(self._opening.open_checked(parse(Opcode.CHUNK, record.body))), definitions)
+            self._read(read_contents(self._opening.open_chunk(parse(Opcode.CHUNK, record.body))), definitions)
         except ChunkError as error:
             self._info.problems.append(f"the chunk at byte {record.offset} {error}")
 
@@ -292,31 +289,14 @@ def _payloads(contents: Contents, channel: int) -> Iterator[bytes]:
 
 
 def attachment(path: Path, name: str) -> bytes | None:
-    """Return an attachment of an MCAP file by its name; None when no record before the first chunk has it."""
-    for record in _records_before_chunks(path):
-        if isinstance(record, Attachment) and record.name == name:
-            return record.data
+    """Return an attachment of an MCAP file by its name; None when the head of the file does not have it."""
+    with contextlib.suppress(LogError):  # the reader of the log reports damage
+        return read_head(path).attachments.get(name)
     return None
 
 
 def run_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of the run in an MCAP file; empty when no record before the first chunk has it."""
-    for record in _records_before_chunks(path):
-        if isinstance(record, Metadata) and record.name == RUN_METADATA:
-            return record.metadata
+    """Return the metadata of the run in an MCAP file; empty when the head of the file does not have it."""
+    with contextlib.suppress(LogError):
+        return read_head(path).metadata.get(RUN_METADATA, {})
     return {}
-
-
-def _records_before_chunks(path: Path) -> Iterator[Attachment | Metadata]:
-    """Yield the records before the first chunk, as far as they are sound: the reader of the log reports damage."""
-    try:
-        with open_input(path) as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                return
-            for record in scan(file):
-                if not isinstance(record, RawRecord) or record.opcode == Opcode.CHUNK:
-                    return
-                if record.opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
-                    yield parse(record.opcode, record.body)
-    except (OSError, LogError):
-        return

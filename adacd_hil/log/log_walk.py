@@ -6,10 +6,10 @@ error.
 
 import contextlib
 import operator
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -31,8 +31,9 @@ from adacd_hil.log.log_files import (
 from adacd_hil.log.mcap.chunks import Block, Item, read_blocks
 from adacd_hil.log.mcap.mcap_records import (
     CHANNEL_NUMBERS,
+    DEFINITIONS,
     HEAD,
-    INDEX_ENTRY,
+    Definitions,
     RawRecord,
     attachment_crc_fits,
     parse,
@@ -42,32 +43,26 @@ from adacd_hil.log.mcap.mcap_records import (
 from adacd_hil.log.types.record_arrays import (
     UNKNOWN,
     UNWANTED,
-    PayloadLayout,
     PieceBuilder,
     RawPiece,
     Topic,
+    record_dtype,
 )
 
+PayloadLayout = Callable[[Channel, Schema], "np.dtype[Any] | None"]
 _COUNTS = {"frames", "messages", "dropped"}
 _NOT_OF_HEAD = set(Opcode) - {Opcode.ATTACHMENT, Opcode.METADATA}
 
 
-class Definition(NamedTuple):
-    """A channel that a file defines."""
-
-    channel: Channel
-    schema: Schema
-
-
-class _Extras:
+class Extras:
     """Attachments and metadata of a file."""
 
     def __init__(self) -> None:
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
 
-    def take(self, record: RawRecord) -> None:
-        """Take in an attachment or metadata. Raises LogError for a damaged one."""
+    def add_record(self, record: RawRecord) -> None:
+        """Add an attachment or metadata. Raises LogError for a damaged one."""
         if record.opcode == Opcode.ATTACHMENT:
             attachment: Attachment = parse(record.opcode, record.body)
             if not attachment_crc_fits(record):
@@ -86,49 +81,29 @@ class _Part(NamedTuple):
     is_alone: bool
 
 
-def _read_head(path: Path) -> _Extras:
-    """Read the records before the messages. Raises LogError when the file can't be read or isn't MCAP."""
-    extras = _Extras()
+def read_head(path: Path) -> Extras:
+    """Read attachments and metadata up to those of the run. Raises LogError for an unreadable file, or no MCAP."""
+    extras = Extras()
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
         for record in walk(file, str(path), _NOT_OF_HEAD):
             if isinstance(record, RawRecord):
                 with contextlib.suppress(LogError):
-                    extras.take(record)
+                    extras.add_record(record)
             if RUN_METADATA in extras.metadata:
                 break
     return extras
 
 
 def _read_items(path: Path, is_ahead: bool = True) -> Iterator[Item]:
-    """Read a file from front to end; is_ahead: as for `read_blocks`. Raises LogError as `_read_head` does."""
+    """Read a file from front to end; is_ahead: as for `read_blocks`. Raises LogError as `read_head` does."""
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
         yield from read_blocks(file, str(path), is_ahead=is_ahead)
-
-
-class _Definitions:
-    """The channels that a file defines; a later definition replaces an earlier one."""
-
-    def __init__(self) -> None:
-        self._schemas: dict[int, Schema] = {}
-
-    def take(self, record: RawRecord) -> Definition | None:
-        """Take in a definition; return the channel, if it is one. Raises LogError for one that makes no sense."""
-        definition: Schema | Channel = parse(record.opcode, record.body)
-        if isinstance(definition, Schema):
-            self._schemas[definition.id] = definition
-            return None
-        return Definition(definition, self._schemas.get(definition.schema_id, Schema(0, b"", "", "")))
 
 
 class LogWalk:
     """The content of a log. `problem` names missing parts in one line, "" for a whole log."""
 
-    def __init__(
-        self,
-        path: Path,
-        layout: PayloadLayout,
-        topics: Collection[str] | None = None,
-    ) -> None:
+    def __init__(self, path: Path, topics: Collection[str] | None = None) -> None:
         """Find the parts of the log whose first is `path`; of the messages only those of `topics` are read if given.
 
         Raises LogError when no part of it can be read.
@@ -139,8 +114,7 @@ class LogWalk:
         self.parts = 0
         self.topics: dict[str, Topic] = {}
         """The requested topics that are defined in the parts walked so far."""
-        self._path = path
-        self._layout = layout
+        self.path = path
         self._wanted = topics
         self._plan: list[_Part | str] = []  # parts, and problems where they would be
         self._problems: list[str] = []
@@ -148,16 +122,20 @@ class LogWalk:
 
     @property
     def problem(self) -> str:
-        """Damaged and missing parts, as far as has been walked."""
+        """Damaged and missing parts in one line, as far as has been walked; "" for a whole log."""
         return "; ".join(self._problems)
 
+    def layout(self, channel: Channel, schema: Schema) -> "np.dtype[Any] | None":  # noqa: ARG002 (a subclass's)
+        """Describe the payloads of a channel; None: they are gathered as bytes."""
+        return None
+
     def _find_parts(self) -> None:
-        parts = parts_of(self._path)
+        parts = parts_of(self.path)
         first_error: LogError | None = None
         for before, number in pairwise((-1, *parts)):
             self._plan += self._missing(before + 1, number)
             try:
-                head = _read_head(parts[number])
+                head = read_head(parts[number])
             except LogError as error:
                 first_error = first_error or error
                 self._plan.append(str(error))
@@ -167,7 +145,7 @@ class LogWalk:
             raise first_error
         self._last = max(parts)
 
-    def _plan_part(self, head: _Extras, part: _Part) -> None:
+    def _plan_part(self, head: Extras, part: _Part) -> None:
         metadata = head.metadata.get(RUN_METADATA, {})
         number = metadata.pop(PART_KEY, str(part.number))
         is_foreign = bool(self.metadata and metadata) and metadata != self.metadata
@@ -183,25 +161,22 @@ class LogWalk:
 
     def _missing(self, start: int, stop: int) -> list[str]:
         """Return a line that names the missing parts from start to stop - 1; none if there are none."""
-        names = [part_path(self._path, number).name for number in sorted({start, stop - 1})] if start < stop else []
+        names = [part_path(self.path, number).name for number in sorted({start, stop - 1})] if start < stop else []
         return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
 
-    def pieces(
-        self, cycles: int, epoch_ns: int, has_frame_records: bool = False, is_ahead: bool = True
-    ) -> Iterator[RawPiece]:
+    def pieces(self, cycles: int, epoch_ns: int, is_ahead: bool = True) -> Iterator[RawPiece]:
         """Read the messages of all parts, so many cycles at a time; topics, summary and problems grow meanwhile.
 
-        epoch_ns: offset of the times in the file from those of frames; has_frame_records: of frames the records
-        are gathered, too; is_ahead: a thread opens chunks in advance.
+        epoch_ns: offset of the times in the file from those of frames; is_ahead: a thread opens chunks in advance.
         """
-        builder = PieceBuilder(cycles, epoch_ns, has_frame_records)
+        builder = PieceBuilder(cycles, epoch_ns)
         self._problems, self.summary, self.parts = [], {}, 0
         joined = -1
         for step in self._plan:
             if isinstance(step, str):
                 self._problems.append(step)
                 continue
-            walk = _PartWalk(step.path, builder, self._layout, self._wanted)
+            walk = _PartWalk(step.path, builder, self.layout, self._wanted)
             for piece in walk.pieces(is_ahead):
                 self.topics = {topic.name: topic for topic in builder.topics}
                 yield piece
@@ -218,7 +193,7 @@ class LogWalk:
         if joined == self._last and self.summary.get(ENDING_KEY) == CONTINUED:
             self._problems += self._missing(self._last + 1, self._last + 2)
         if not builder.is_empty:
-            yield builder.end()
+            yield builder.take_piece()
 
     def _sum_up(self, summary: dict[str, str]) -> None:
         both = self.summary.keys() & summary.keys() & _COUNTS
@@ -234,7 +209,7 @@ class _PartWalk:
     def __init__(
         self, path: Path, builder: PieceBuilder, layout: PayloadLayout, wanted: Collection[str] | None
     ) -> None:
-        self.extras = _Extras()
+        self.extras = Extras()
         self.problem = ""
         self.other_types: set[str] = set()
         """Topics that have another type than in the parts before."""
@@ -242,9 +217,8 @@ class _PartWalk:
         self._builder = builder
         self._layout = layout
         self._wanted = wanted
-        self._definitions = _Definitions()
+        self._definitions = Definitions()
         self._slots = np.full(CHANNEL_NUMBERS, UNKNOWN, np.int32)  # of each channel
-        self._counts = _message_counts(path)
         self._has_searched = False
 
     def _note(self, problem: str) -> None:
@@ -257,7 +231,7 @@ class _PartWalk:
                 yield from self._take_block(item)
             elif isinstance(item, RawRecord):
                 try:
-                    self.extras.take(item)
+                    self.extras.add_record(item)
                 except LogError:
                     self._note(f"damaged at byte {item.offset + HEAD.size}")
             else:
@@ -290,59 +264,39 @@ class _PartWalk:
             for channel in dict.fromkeys(channels[slots == UNKNOWN].tolist()):
                 self._search(channel)
             slots = self._slots[channels]
-        yield from self._builder.add(block.contents, messages, slots)
+        yield from self._builder.add_messages(block.contents, messages, slots)
 
     def _define(self, record: RawRecord | None) -> None:
         """Take in a definition. Raises LogError for an invalid one and for None."""
         if record is None:
             raise LogError("no record")
-        definition = self._definitions.take(record)
-        if definition is not None:
-            self._slots[definition.channel.id] = self._slot_of(definition)
+        definition = self._definitions.add_record(record)
+        if isinstance(definition, Channel):
+            self._slots[definition.id] = self._slot_of(definition)
 
-    def _slot_of(self, definition: Definition) -> int:
+    def _slot_of(self, channel: Channel) -> int:
         """Find the slot of a channel."""
-        channel, schema = definition
         if self._wanted is not None and channel.topic not in self._wanted:
             return UNWANTED
-        topic = Topic.of(channel.topic, schema.name, self._layout(channel, schema))
+        schema = self._definitions.schemas.get(channel.schema_id, Schema(0, b"", "", ""))
+        payload = self._layout(channel, schema)
+        topic = Topic(channel.topic, schema.name, None if payload is None else record_dtype(payload))
         slot = next((slot for slot, known in enumerate(self._builder.topics) if known.name == topic.name), None)
         if slot is None:
             slot = self._builder.add_topic(topic)
         elif self._builder.topics[slot] != topic:
             self.other_types.add(topic.name)
             return UNWANTED
-        self._builder.expect(slot, self._counts.get(channel.id, 0))
         return slot
 
     def _search(self, channel: int) -> None:
-        """Look for the definition of a channel in the whole file: the one that came before its messages is damaged."""
+        """Look for the definition of a channel in the summary: the one that came before its messages is damaged."""
         if not self._has_searched:
             self._has_searched = True
-            for definition in _defined_in(self._path):
-                self._slots[definition.channel.id] = self._slot_of(definition)
+            with contextlib.suppress(OSError, LogError), open_input(self._path) as file:
+                for record in summary_of(file):
+                    if record.opcode in DEFINITIONS:
+                        self._define(record)
         if self._slots[channel] == UNKNOWN:
             self._slots[channel] = UNWANTED
             self._note(f"messages of channel {channel}, which is not defined")
-
-
-def _message_counts(path: Path) -> dict[int, int]:
-    """Read how many messages each channel of a file has, by its statistics; return {} if these can't be read."""
-    with contextlib.suppress(OSError, LogError), open_input(path) as file:
-        most = path.stat().st_size // INDEX_ENTRY.itemsize  # each has an entry in an index
-        for record in summary_of(file):
-            if record.opcode == Opcode.STATISTICS:
-                counts: dict[int, int] = parse(record.opcode, record.body).channel_message_counts
-                return {channel: min(count, most) for channel, count in counts.items()}
-    return {}
-
-
-def _defined_in(path: Path) -> Iterator[Definition]:
-    """Read all definitions of a file."""
-    definitions = _Definitions()
-    for item in _read_items(path):
-        for record in item.contents.definitions if isinstance(item, Block) else ():
-            with contextlib.suppress(LogError):
-                definition = definitions.take(record)
-                if definition is not None:
-                    yield definition

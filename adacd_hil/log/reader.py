@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import DROPPED_KEY, EPOCH_KEY, FIELDS_KEY, LOST_KEY, LogError, log_in
 from adacd_hil.log.log_walk import LogWalk
-from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD, RECORD_HEAD_BYTES
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,
@@ -33,12 +32,12 @@ from adacd_hil.log.types.message_types import (
 )
 from adacd_hil.log.types.record_arrays import (
     FRAME_DTYPE,
+    FRAME_TOPICS,
     LONG_FRAME_DTYPE,
-    Payload,
     Topic,
-    is_of_frames,
+    record_dtype,
 )
-from adacd_hil.log.types.topics import CONTACT, DECODED, run_channels, truth_channels
+from adacd_hil.log.types.topics import DECODED, contact_report, run_channels, truth_channels
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactReport,
@@ -59,9 +58,9 @@ __all__ = [
 ]
 
 _KNOWN = {
-    CAN_FRAME.name: Payload(CAN_FRAME_DTYPE),
-    FD_FRAME.name: Payload(FD_FRAME_DTYPE, has_tail=True),
-    JOINT_STATE.name: Payload(JOINT_STATE_DTYPE),
+    CAN_FRAME.name: CAN_FRAME_DTYPE,
+    FD_FRAME.name: FD_FRAME_DTYPE,
+    JOINT_STATE.name: JOINT_STATE_DTYPE,
 }
 _EVERY_CYCLE = 1 << 62
 _NOT_FIELDS = ("record_length", "log_time", "publish_time", "sec", "nanosec")
@@ -112,23 +111,13 @@ class Series:
         offsets = [int(fields[name][1]) for name in self.fields if fields[name][0].base == np.dtype("<f8")]
         if not offsets:
             return np.empty((len(self), 0))
-        return self._rows()[:, min(offsets) :].copy().view(np.float64)
-
-    def payloads(self) -> bytes:
-        """Return the payloads of all messages, one after the other."""
-        rows = self._rows()
-        ends = self.records["record_length"] + RECORD_HEAD_BYTES
-        if (ends == self.records.dtype.itemsize).all():
-            return rows[:, MESSAGE_HEAD:].tobytes()
-        return b"".join(row[MESSAGE_HEAD:end].tobytes() for row, end in zip(rows, ends.tolist(), strict=True))
-
-    def _rows(self) -> NDArray[np.uint8]:
-        return np.ascontiguousarray(self.records).view(np.uint8).reshape(len(self), self.records.dtype.itemsize)
+        rows = np.ascontiguousarray(self.records).view(np.uint8).reshape(len(self), self.records.dtype.itemsize)
+        return rows[:, min(offsets) :].copy().view(np.float64)
 
 
 @dataclass(frozen=True)
 class RunLog:
-    """A log, all its parts as one. Topics that it lacks are empty."""
+    """A log, all its parts as one. Topics of ours that it lacks are empty; `frames` has the bus frames."""
 
     path: Path
     problem: str  # the missing parts, one line; "" for a whole file
@@ -178,10 +167,11 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
 
     A folder stands for the run's log in it, `run.mcap`. Raises LogError when the file doesn't exist or isn't MCAP.
     """
-    stream = LogStream(path, topics, _EVERY_CYCLE, has_every_topic=True)
-    piece = [stream.empty(), *stream][-1]
-    own = _own_topics(stream.metadata)
-    series = {name: values for name, values in piece.series.items() if name.startswith(DECODED) or name in own}
+    stream = LogStream(path, topics, _EVERY_CYCLE)
+    empty = stream.empty()
+    piece = [empty, *stream][-1]
+    read = {name: each for name, each in piece.series.items() if name.startswith(DECODED) or name in empty.series}
+    series = {**empty.series, **read}
     return RunLog(
         path=stream.path,
         problem=stream.problem,
@@ -202,32 +192,19 @@ def topic_bytes(path: str | Path, topic: str) -> bytes:
 
     path: as for `read_log`. Raises LogError when the file can't be read or lacks the topic.
     """
-    stream = LogStream(path, (topic,), _EVERY_CYCLE, has_every_topic=True)
-    found: list[bytes] = []
-    for piece in stream:
-        found += piece.payloads.get(topic, [])
-        found += [piece.series[topic].payloads()] if topic in piece.series else []
-    if topic not in stream.topics:
+    walk = LogWalk(log_in(path), (topic,))
+    found = [payload for piece in walk.pieces(_EVERY_CYCLE, 0) for payload in piece.payloads.get(topic, ())]
+    if topic not in walk.topics:
         raise LogError(f"log {path} has no topic {topic}")
     return b"".join(found)
 
 
-def _payload_layout(channel: Channel, schema: Schema, is_of_run: bool) -> Payload | None:
-    if schema.name == JOINT_STATE.name and not is_of_run:
-        return None  # others have any number of joints
-    try:
-        text = schema.data.decode("utf-8")
-    except UnicodeDecodeError:
-        return None
-    return _own_layout(MessageType(schema.name, text, tuple(channel.metadata.get(FIELDS_KEY, "").split())))
-
-
-def _own_layout(message_type: MessageType) -> Payload | None:
+def _own_layout(message_type: MessageType) -> "np.dtype[Any] | None":
     """Describe payloads as we write them; None where their size varies."""
     if message_type.name in _KNOWN:
         return _KNOWN[message_type.name]
     try:
-        return Payload(message_type.dtype)
+        return message_type.dtype
     except LogError:
         return None
 
@@ -240,12 +217,14 @@ def _number(metadata: Mapping[str, str], key: str, default: int) -> int:
 
 
 def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
-    """Describe our own topics in a log with such metadata. Raises LogError."""
+    """Describe our own topics but those of bus frames, in a log with such metadata. Raises LogError."""
     parameter_count = _number(metadata, "parameter_count", len(PARAMETER_NAMES))
-    channels = (*run_channels(parameter_count), *truth_channels())
-    return {
-        channel.topic: Topic.of(channel.topic, channel.type.name, _own_layout(channel.type)) for channel in channels
-    }
+    topics = {}
+    for channel in (*run_channels(parameter_count), *truth_channels()):
+        payload = None if channel.topic in FRAME_TOPICS else _own_layout(channel.type)
+        if payload is not None:
+            topics[channel.topic] = Topic(channel.topic, channel.type.name, record_dtype(payload))
+    return topics
 
 
 def _series_of(
@@ -286,10 +265,9 @@ def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
     Raises LogError for an unknown level, kind, reaction or place.
     """
     contacts = []
-    members = [member for member in CONTACT.head if member.name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
         try:
-            report = ContactReport(**{member.name: member.value_of(record[member.name].tolist()) for member in members})
+            report = contact_report(record)
         except (ValueError, OverflowError) as error:  # "77 is not a valid ContactLevel"
             raise LogError(f"/contact has a report that this version does not know: {error}") from None
         contacts.append((t_ns, report))
@@ -311,7 +289,7 @@ class Piece(NamedTuple):
     """Requested topics of varying size, such as /events."""
 
 
-class LogStream:
+class LogStream(LogWalk):
     """A log read once from front to back in constant memory, all parts as one.
 
     Damaged and missing parts are left out; `problem` names them.
@@ -323,53 +301,35 @@ class LogStream:
         topics: Collection[str] | None = None,
         cycles_per_piece: int = 5_000,
         is_ahead: bool = True,
-        has_every_topic: bool = False,
     ) -> None:
         """Begin to read the log whose first part is `path`, of the messages only those of `topics` when given.
 
         A folder stands for the run's log in it. is_ahead: a thread opens chunks ahead, for a caller without a thread of
-        its own for the reading. has_every_topic: pieces have series of bus frames, too, and empty ones of our own
-        topics outside the request. Raises LogError when no part of it can be read.
+        its own for the reading. Raises LogError when no part of it can be read.
         """
-        self.path = log_in(path)
-        self._walk = LogWalk(self.path, self._layout_of, topics)
+        super().__init__(log_in(path), topics)
         self.epoch_ns = _number(self.metadata, EPOCH_KEY, 0)
-        self._topics = topics
         self._cycles_per_piece = cycles_per_piece
         self._is_ahead = is_ahead
-        self._has_every_topic = has_every_topic
 
-    def _layout_of(self, channel: Channel, schema: Schema) -> Payload | None:
-        return _payload_layout(channel, schema, bool(self.metadata))
-
-    @property
-    def metadata(self) -> dict[str, str]:
-        """Of the run."""
-        return self._walk.metadata
-
-    @property
-    def attachments(self) -> dict[str, bytes]:
-        """The files that the run was made with, by name."""
-        return self._walk.attachments
+    def layout(self, channel: Channel, schema: Schema) -> "np.dtype[Any] | None":
+        """Describe the payloads of a channel; None where their size varies."""
+        if schema.name == JOINT_STATE.name and not self.metadata:
+            return None  # others have any number of joints
+        try:
+            text = schema.data.decode("utf-8")
+        except UnicodeDecodeError:
+            return None
+        return _own_layout(MessageType(schema.name, text, tuple(channel.metadata.get(FIELDS_KEY, "").split())))
 
     def empty(self) -> Piece:
-        """Return a piece without messages, with our own topics."""
-        return Piece(_series_of({}, {}, self._own_topics(), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
-
-    @property
-    def problem(self) -> str:
-        """Damaged and missing parts in one line, as far as has been read; "" for a whole log."""
-        return self._walk.problem
+        """Return a piece without messages, with all of our own topics."""
+        return Piece(_series_of({}, {}, _own_topics(self.metadata), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
 
     @property
     def is_complete(self) -> bool:
         """Whether all that was read is whole, no packet was dropped, and nothing was lost before a recovery."""
         return not self.problem and self.summary.get(DROPPED_KEY, "0") == "0" and LOST_KEY not in self.summary
-
-    @property
-    def summary(self) -> dict[str, str]:
-        """Frames, messages, dropped and ending, of the parts that have been read to their ends."""
-        return self._walk.summary
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
         """Unpack the events of a piece."""
@@ -379,36 +339,19 @@ class LogStream:
         payloads = piece.payloads.get("/events", ())
         return [LoggedEvent(log_time_ns(payload) - self.epoch_ns, unpack_log(payload)) for payload in payloads]
 
-    @property
-    def topics(self) -> Mapping[str, Topic]:
-        """The requested topics that are defined in the parts read so far."""
-        return self._walk.topics
-
-    @property
-    def parts(self) -> int:
-        """How many files have been read."""
-        return self._walk.parts
-
     def joint_states(self, piece: Piece) -> dict[str, list[bytes]]:
         """Return the payloads of joint states of others, by topic."""
-        found = self._walk.topics
+        found = self.topics
         return {name: each for name, each in piece.payloads.items() if found[name].type_name == JOINT_STATE.name}
 
-    def _own_topics(self) -> dict[str, Topic]:
-        """List those of our topics that pieces have series of."""
-        own = _own_topics(self.metadata)
-        if self._has_every_topic:
-            return own
-        return {
-            name: topic
-            for name, topic in own.items()
-            if not is_of_frames(topic) and (self._topics is None or name in self._topics)
-        }
-
     def __iter__(self) -> Iterator[Piece]:
-        own, walk = self._own_topics(), self._walk
-        for piece in walk.pieces(self._cycles_per_piece, self.epoch_ns, self._has_every_topic, self._is_ahead):
-            there = {name: each for name, each in walk.topics.items() if name in piece.records}
+        own = {
+            name: topic
+            for name, topic in _own_topics(self.metadata).items()
+            if self._wanted is None or name in self._wanted
+        }
+        for piece in self.pieces(self._cycles_per_piece, self.epoch_ns, self._is_ahead):
+            there = {name: each for name, each in self.topics.items() if name in piece.records}
             yield Piece(_series_of(piece.records, there, own, self.epoch_ns), piece.frames, piece.payloads)
 
 

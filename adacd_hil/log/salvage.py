@@ -13,7 +13,7 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -40,18 +40,6 @@ _NOTES = 20
 """Damages that are listed one by one."""
 
 
-class Hole(NamedTuple):
-    """A gap without messages: log times before and after."""
-
-    start_ns: int
-    end_ns: int
-
-    @property
-    def seconds(self) -> float:
-        """Length of the gap."""
-        return max(0, self.end_ns - self.start_ns) * 1e-9
-
-
 @dataclass
 class Losses:
     """The records that could not be saved. `messages`: None where their number is unknown."""
@@ -65,18 +53,13 @@ class Losses:
     is_cut: bool = False
     is_doubtful: bool = False  # the data section fails its CRC for no reason that was found: metadata may be wrong
     notes: list[str] = field(default_factory=list)
-    holes: list[Hole] = field(default_factory=list)
+    holes_s: list[float] = field(default_factory=list)  # lengths of the gaps between the saved messages
     missing_parts: list[str] = field(default_factory=list)
 
     @property
     def is_any(self) -> bool:
         """Whether anything is lost, or may be."""
         return bool(self.describe())
-
-    @property
-    def holes_s(self) -> float:
-        """Total length of the gaps between the saved messages."""
-        return sum(hole.seconds for hole in self.holes)
 
     def describe(self) -> str:
         """Describe the losses in words; "" without a loss. Gaps in time alone, without lost data, are no loss."""
@@ -93,17 +76,17 @@ class Losses:
             ("metadata may be wrong", self.is_doubtful),
         ]
         holes = (
-            f"{self.holes_s:.3f} s between what was saved",
-            self.holes and any(is_said for _, is_said in head + tail),
+            f"{sum(self.holes_s):.3f} s between what was saved",
+            self.holes_s and any(is_said for _, is_said in head + tail),
         )
         return ", ".join(word for word, is_said in (*head, holes, *tail) if is_said)
 
-    def note(self, text: str) -> None:
+    def add_note(self, text: str) -> None:
         """Keep the text of a damage, of the first _NOTES."""
         if len(self.notes) < _NOTES:
             self.notes.append(text)
 
-    def add(self, other: "Losses") -> None:
+    def add_losses(self, other: "Losses") -> None:
         """Add the losses of another file."""
         self.chunks += other.chunks
         self.bytes += other.bytes
@@ -114,9 +97,9 @@ class Losses:
         self.metadata += other.metadata
         self.is_cut |= other.is_cut
         self.is_doubtful |= other.is_doubtful
-        self.holes += other.holes
+        self.holes_s += other.holes_s
         for note in other.notes:
-            self.note(note)
+            self.add_note(note)
 
 
 class Salvage:
@@ -154,7 +137,7 @@ class Salvage:
             return
         self.is_vouched = end.data_crc != 0 and end.data_crc == crc_of(file, 0, end.data_end)
         with contextlib.suppress(LogError):  # written wrong: of no use
-            self.definitions.take(record for record in end.summary if record.opcode in DEFINITIONS)
+            self.definitions.add_records(end.summary)
             for record in end.summary:
                 if record.opcode == Opcode.STATISTICS:
                     self._statistics = parse(record.opcode, record.body)
@@ -184,7 +167,7 @@ class Salvage:
             elif opcode == Opcode.MESSAGE:
                 self._left_out += 1
             elif opcode in DEFINITIONS and is_trusted:
-                self.definitions.take((record,))
+                self.definitions.add_record(record)
             elif opcode == Opcode.ATTACHMENT:
                 if not attachment_crc_fits(record, self.is_vouched or self._is_unchecked):
                     self._lose(record.offset, len(record.body), "attachment fails its CRC")
@@ -212,10 +195,10 @@ class Salvage:
         is_vouched = self.is_vouched or chunk.uncompressed_crc != 0
         if not is_vouched and not self._is_unchecked:
             raise ChunkError("has no CRC, and that of the whole doesn't fit")
-        contents = read_contents(self._opening.open_checked(chunk))
+        contents = read_contents(self._opening.open_chunk(chunk))
         if not is_vouched and (contents.breaks or contents.strangers):
             raise ChunkError("has no CRC, and holds what is no message")
-        self.definitions.take(contents.definitions)
+        self.definitions.add_records(contents.definitions)
         if not self.is_vouched:
             self._chunk = contents, contents.entries
         if len(contents.log_times):
@@ -232,7 +215,7 @@ class Salvage:
         self.losses.unvouched += 0 if is_vouched else saved
         if len(contents.log_times):
             if self._is_hole:
-                self.losses.holes.append(Hole(self._latest_ns, int(contents.log_times.min())))
+                self.losses.holes_s.append(max(0, int(contents.log_times.min()) - self._latest_ns) * 1e-9)
             self._is_hole = not known.all()
             self._latest_ns = max(self._latest_ns, int(contents.log_times.max()))
         yield contents
@@ -249,10 +232,12 @@ class Salvage:
         stored = int.from_bytes(self._data_end.body, "little")
         if stored and stored != crc_of(file, 0, self._data_end.offset):
             self.losses.is_doubtful = True
-            self.losses.note(f"{self._path.name}: fails the CRC of the whole, nothing shows where: perhaps in metadata")
+            self.losses.add_note(
+                f"{self._path.name}: fails the CRC of the whole, nothing shows where: perhaps in metadata"
+            )
 
     def _lose(self, offset: int, size: int, reason: str) -> None:
-        self.losses.note(f"{self._path.name}: byte {offset}, {size} bytes: {reason}")
+        self.losses.add_note(f"{self._path.name}: byte {offset}, {size} bytes: {reason}")
         self.losses.bytes += size
         self._is_hole = True
         self._is_explained = True
@@ -262,7 +247,7 @@ class Salvage:
         losses, statistics = self.losses, self._statistics
         losses.is_cut = not self._has_data_end and not self._has_footer and statistics is None
         if losses.is_cut:
-            losses.note(f"{self._path.name}: cut, it has no end")
+            losses.add_note(f"{self._path.name}: cut, it has no end")
         if statistics is not None:
             losses.messages = max(0, statistics.message_count - self._saved_messages)
             losses.attachments = max(0, statistics.attachment_count - self._saved_attachments)

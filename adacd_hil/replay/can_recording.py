@@ -25,16 +25,8 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream, Piece, Series
-from adacd_hil.log.types.record_arrays import as_logged
-from adacd_hil.replay.log_source import (
-    FRAME_TOPICS,
-    NMT_ID,
-    RESET_COMMUNICATION,
-    CycleStretch,
-    LogSource,
-    Part,
-    Places,
-)
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS, as_logged
+from adacd_hil.replay.log_source import CycleStretch, LogSource, Part, Places, find_resets
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
@@ -98,7 +90,7 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording
     is_after = places > _complete(frames, sync, [codec.message(name).can_id for name in _CYCLIC])[since]
     if is_realtime:
         is_after |= offset_ns > FEEDBACK_SHARE * period_ns
-    resets = np.cumsum(_is_reset(frames))
+    resets = np.searchsorted(find_resets(frames), places, side="right")
     is_boot = resets > resets[sync][since]  # frames before the first SYNC of an attempt are read at once
     is_moved = is_after & ~frames["is_tx"] & (before >= 0) & ~is_boot
     numbers = np.concatenate(([number[0] - 1], number, [number[-1] + 1]))
@@ -107,11 +99,6 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording
     return CanRecording(
         frames[order], owner[order], number[since][order], offset_ns[order], number, t_ns, is_realtime, found.problem
     )
-
-
-def _is_reset(frames: NDArray[Any]) -> NDArray[np.bool_]:
-    is_nmt = frames["is_tx"] & (frames["can_id"] == NMT_ID) & ~frames["is_error"]
-    return np.asarray(is_nmt & (frames["data"][:, 0] == RESET_COMMUNICATION))
 
 
 def _of_busiest_channel(frames: NDArray[Any], sync_id: int) -> NDArray[Any]:
@@ -256,7 +243,7 @@ class RecordingAlone:
         recording = self._recording
         number, t_ns = recording.number, self._t_ns()
         frames = recording.in_time(number, t_ns, slice(None))
-        resets = np.flatnonzero(_is_reset(frames))
+        resets = find_resets(frames)
         rows = np.searchsorted(number, recording.owner[resets], side="right")
         begins = {row: place for row, place in zip(rows.tolist(), resets.tolist(), strict=True) if row < len(number)}
         self._is_headless = 0 not in begins

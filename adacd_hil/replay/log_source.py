@@ -17,6 +17,7 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import SHOWN, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
 from adacd_hil.log.types.topics import ARM
 from adacd_hil.records import CERTIFICATE_EVENTS, ArmBatch, ContactReport, SchemeState
 from adacd_hil.replay.logged_arms import has_arms, logged_arms
@@ -50,14 +51,6 @@ class CycleStretch(NamedTuple):
     scheme: Series | None
 
 
-class LogGap(NamedTuple):
-    """Cycles that the log lacks, before the one given."""
-
-    cycle: int
-    t_ns: int
-    missing: int
-
-
 class _Paired(NamedTuple):
     """The records of n cycles, in order: /scheme's, and /arm's or, of an older log, /cycle's."""
 
@@ -87,7 +80,8 @@ class AttemptSplitter:
     """
 
     def __init__(self, epoch_ns: int) -> None:
-        self.gaps: list[LogGap] = []
+        self.gaps: list[tuple[int, int]] = []
+        """A cycle, and how many the log lacks before it."""
         self.headless_cycles = 0
         """Cycles at the beginning of the log, of an attempt that had begun before: a replay can't start from them."""
         self.unpaired = 0
@@ -106,7 +100,7 @@ class AttemptSplitter:
         paired = self._pair(piece)
         frames = piece.frames
         if self._frames is not None:
-            frames = _join(self._frames, frames)
+            frames = joined_frames((self._frames, frames))
             self._frames = None
         t_ns = paired.other["publish_time"].astype(np.int64) - self._epoch_ns
         begins = self._begins(t_ns, paired, frames)
@@ -132,7 +126,7 @@ class AttemptSplitter:
     def _begins(self, t_ns: Places, paired: _Paired, frames: NDArray[Any]) -> list[tuple[int, int]]:
         """List the rows with which attempts begin, and the frame with which each does."""
         begins: dict[int, int] = {}
-        resets = _resets(frames)
+        resets = find_resets(frames)
         rows = np.searchsorted(t_ns, frames["cycle_t_ns"][resets])
         for row, place in zip(rows.tolist(), resets.tolist(), strict=True):
             begins[row] = place  # the last one, if the devices didn't answer to the first
@@ -182,7 +176,7 @@ class AttemptSplitter:
                 self._attempt += 1
             if is_gap[start]:
                 self._is_exact = False
-                self.gaps.append(LogGap(int(rows.number[start]), int(t_ns[start]), int(rows.missing[start])))
+                self.gaps.append((int(rows.number[start]), int(rows.missing[start])))
             if not self._has_begun:
                 self.headless_cycles += end - start
                 self._attempt = 0
@@ -238,17 +232,6 @@ class AttemptSplitter:
         return _Rows(number, np.maximum(periods, 1), missing)
 
 
-def _join(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
-    """Join frames of two lengths, in the layout of the longer."""
-    wider = max(first.dtype, second.dtype, key=lambda dtype: dtype.itemsize)
-    joined = np.zeros(len(first) + len(second), wider)
-    for part, frames in ((joined[: len(first)], first), (joined[len(first) :], second)):
-        for name in wider.names or ():
-            width = frames[name].shape[1:]
-            part[name][(slice(None), *map(slice, width))] = frames[name]
-    return joined
-
-
 def _sync_counters(frames: NDArray[Any]) -> NDArray[np.uint8]:
     is_sync = (frames["can_id"] == SYNC_ID) & ~frames["is_error"] & (frames["length"] > 0)
     return np.asarray(frames["data"][is_sync, 0])
@@ -261,13 +244,13 @@ def _skipped(counters: NDArray[np.uint8], last: int) -> int:
     return (int(counters[-1]) - 1 - last) % SYNC_OVERFLOW - counters.size
 
 
-def _resets(frames: NDArray[Any]) -> Places:
+def find_resets(frames: NDArray[Any]) -> Places:
+    """Find the host's resets of communication among frames."""
     is_nmt = frames["is_tx"] & (frames["can_id"] == NMT_ID) & ~frames["is_error"]
     places = np.flatnonzero(is_nmt)
     return np.asarray(places[frames["data"][places, 0] == RESET_COMMUNICATION])
 
 
-FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
 _TOPICS: Final = ("/scheme", "/contact", "/events")
 CYCLES_PER_PIECE: Final = 8_000
 _SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
@@ -357,9 +340,9 @@ class LogSource:
             notes.append(
                 f"{splitter.headless_cycles} cycles at its beginning can't be replayed: the attempt began before"
             )
-        for gap in splitter.gaps[:SHOWN]:
+        for cycle, missing in splitter.gaps[:SHOWN]:
             notes.append(
-                f"{gap.missing} cycles with their frames are missing before cycle {gap.cycle}: what follows in that "
+                f"{missing} cycles with their frames are missing before cycle {cycle}: what follows in that "
                 "attempt is replayed but can't be compared"
             )
         if len(splitter.gaps) > SHOWN:

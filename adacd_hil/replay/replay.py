@@ -16,7 +16,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,11 +85,8 @@ def replay_many(
     )
 
 
-class _DecodedPart(NamedTuple):
-    """A part of a log, and the states of each of its stretches, for each of the variants."""
-
-    part: Part
-    arms: list[list[ArmBatch]]
+_DecodedPart = tuple[Part, list[list[ArmBatch]]]
+"""A part of a log, and the states of each of its stretches, for each of the variants."""
 
 
 class _Player:
@@ -121,10 +118,10 @@ class _Player:
         ticks = stretch.ticks
         if stretch.is_begin:
             self._begin()
-            self.gatherer.begin(stretch.attempt, int(ticks.cycle[0]))
+            self.gatherer.begin_attempt(stretch.attempt, int(ticks.cycle[0]))
         batch = self._run(stretch, arms)
         events = self._pipeline.take_events()
-        self.gatherer.take(ticks, batch)
+        self.gatherer.add_stretch(ticks, batch)
         asked = None
         if self._asking is not None and stretch.requests is not None and stretch.is_exact:
             asked = self._asking.requests(ticks, batch)
@@ -165,7 +162,7 @@ class _Player:
         self._state = SchemeState.INIT
         self.attempts += 1
         if self._asking is not None:
-            self._asking.begin()
+            self._asking.begin_attempt()
 
     def _run(self, stretch: CycleStretch, arms: ArmBatch) -> SchemeBatch:
         """Run the scheme on a stretch; if its requests are unknown, the script makes them cycle by cycle."""
@@ -176,7 +173,7 @@ class _Player:
             request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)
             output = self._pipeline.step(arm_at(arms, row), request)
             if self._asking is not None:
-                self._asking.note(cycle, request, self._state, output.state)
+                self._asking.note_request(cycle, request, self._state, output.state)
             self._state = output.state
             outputs.append(output)
         return _columns(outputs)
@@ -260,7 +257,7 @@ def _decoded(source: ReplaySource, reader: "_ArmReader", end_ns: int) -> Generat
             is_over = bool(stretch.ticks.t_ns[-1] >= end_ns)
             if is_over:
                 break
-        yield _DecodedPart(part._replace(stretches=stretches), arms)
+        yield part._replace(stretches=stretches), arms
         if is_over:
             return
 
@@ -285,8 +282,8 @@ def _replay_part(
 ) -> int:
     """Replay a part; return its cycles."""
     exact: list[tuple[int, int]] = []
-    cycles, part = 0, decoded.part
-    for stretch, all_arms in zip(part.stretches, decoded.arms, strict=True):
+    cycles, (part, arms_of_part) = 0, decoded
+    for stretch, all_arms in zip(part.stretches, arms_of_part, strict=True):
         for mine, rows, is_told in _split(stretch, bounds_ns):
             for place, (player, arms) in enumerate(zip(players, all_arms, strict=True)):
                 batch = player.play(mine, _arms_of(arms, rows), part, is_told)
@@ -383,7 +380,7 @@ def _result(
 ) -> Replay:
     """Return a player's results from a time on."""
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source_notes)
-    gatherer.end()
+    gatherer.end_attempt()
     score = gatherer.score()
     score = None if score is None else score.since(first_ns)
     if in_loop := source.metadata.get("detectors", ""):
@@ -392,7 +389,7 @@ def _result(
         notes.append(unjudged)
     if comparison is not None:
         for cycle, t_ns, logged, asked in player.requests.unexplained:
-            comparison.add(Mismatch("/scheme", "request", "", cycle, t_ns, str(logged), str(asked)))
+            comparison.add_mismatch(Mismatch("/scheme", "request", "", cycle, t_ns, str(logged), str(asked)))
         if comparison.missing_fields:
             notes.append(f"/scheme lacks {', '.join(comparison.missing_fields)}, an older format")
     return Replay(

@@ -83,7 +83,7 @@ class OutcomeGatherer:
         self._crossings: list[int] = []  # times at which some joint crosses its threshold
         self._was_over = False
 
-    def take(self, ticks: Ticks, batch: SchemeBatch) -> None:
+    def add_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
         """Gather states, contacts and detections of the next decided cycles."""
         count = len(batch.cycle)
         if count == 0:
@@ -163,17 +163,17 @@ class OutcomeGatherer:
             self.adaptations.append(Adaptation(self._began[1], None, self.theta_hat))
             self._began = None
 
-    def begin(self, attempt: int, cycle: int) -> None:
+    def begin_attempt(self, attempt: int, cycle: int) -> None:
         """Begin an attempt, by its number in the run and its first cycle."""
-        self.end()
+        self.end_attempt()
         self._begins += [cycle] * (attempt + 1 - len(self._begins))  # also of those that a recording lacks
         if self._truth is not None:
             mine = (contact for contact in self._truth[0] if contact.attempt == attempt)
             self._contacts = [contact.counted_from(cycle) for contact in mine]
         self._was_over = False
 
-    def end(self) -> None:
-        """Take note that an attempt, or the log, has ended."""
+    def end_attempt(self) -> None:
+        """End an attempt, also with the log."""
         self._give_up()
         if self._kept:
             host = HostCycles(*map(np.concatenate, zip(*self._kept, strict=True)))

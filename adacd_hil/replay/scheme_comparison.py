@@ -134,7 +134,7 @@ class SchemeComparison:
             values = (_text(side[row, column].item()) for side in (logged, replayed))
             self._keep(Mismatch(topic, name, names[column], int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
 
-    def add(self, mismatch: Mismatch) -> None:
+    def add_mismatch(self, mismatch: Mismatch) -> None:
         """Count a mismatch that was found elsewhere."""
         self.count += 1
         self.fields[f"{mismatch.topic}.{mismatch.field}"] += 1
@@ -160,11 +160,11 @@ class SchemeComparison:
             theirs, ours = logged.get(t_ns), replayed.get(t_ns)
             if theirs is None or ours is None:
                 said = [("no report" if side is None else "a report") for side in (theirs, ours)]
-                self.add(Mismatch("/contact", "report", "", *where, *said))
+                self.add_mismatch(Mismatch("/contact", "report", "", *where, *said))
                 continue
             for field, place, there, here in _contact_values(theirs, ours):
                 if not self._is_same(there, here):
-                    self.add(Mismatch("/contact", field, place, *where, _text(there), _text(here)))
+                    self.add_mismatch(Mismatch("/contact", field, place, *where, _text(there), _text(here)))
 
     def _is_same(self, logged: float, replayed: float) -> bool:
         if struct.pack("<d", logged) == struct.pack("<d", replayed):
@@ -180,7 +180,7 @@ class SchemeComparison:
             name = ours.name if theirs is None else theirs.event.name
             t_ns = 0 if theirs is None else theirs.t_ns
             logged_text, replayed_text = _event_text(theirs and theirs.event), _event_text(ours)
-            self.add(Mismatch("/events", name, "", cycle, t_ns, logged_text, replayed_text))
+            self.add_mismatch(Mismatch("/events", name, "", cycle, t_ns, logged_text, replayed_text))
 
 
 def _event_text(event: Event | None) -> str:
@@ -259,7 +259,7 @@ class Asking:
         self._was_stopped = False
         self._kept = KeptRequest()
 
-    def begin(self) -> None:
+    def begin_attempt(self) -> None:
         """Begin another attempt."""
         self._enabled = None
         self._was_stopped = False
@@ -271,7 +271,7 @@ class Asking:
         carried = Request.NONE if elapsed_s is None else self._kept.take_carried()
         return carried or self._script.request(elapsed_s, state)
 
-    def note(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
+    def note_request(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
         """Note a request, the state before the cycle and the state after it."""
         self._kept.ask(request, previous)
         self._kept.serve((state,))

@@ -50,7 +50,7 @@ def test_of_states_of_the_arm_attempts_gaps_and_periods_are_as_they_say() -> Non
     assert [stretch.attempt for stretch in found] == [0, 0, 1, 1, 2]
     assert [stretch.is_begin for stretch in found] == [True, False, True, False, True]
     assert [stretch.is_exact for stretch in found] == [True, False, False, False, True]
-    assert [(gap.cycle, gap.missing) for gap in splitter.gaps] == [(9, 3), (20, 2)]
+    assert splitter.gaps == [(9, 3), (20, 2)]
 
 
 def test_of_states_of_the_arm_what_begins_in_the_middle_is_left_out() -> None:
@@ -81,8 +81,7 @@ def test_cycles_that_are_missing_are_a_gap_and_the_time_goes_on() -> None:
     before, after = splitter.split(piece([(0, 0, N, N), (1, 0, N, M), (9, 2, M, M), (10, 2, M, M)]))
     assert (before.is_exact, after.is_exact, after.is_begin) == (True, False, False)
     assert after.ticks.periods.tolist() == [8, 1]
-    assert [gap[0] for gap in splitter.gaps] == [9]
-    assert splitter.gaps[0].missing == 5
+    assert splitter.gaps == [(9, 5)]
 
 
 def test_a_reset_begins_an_attempt_also_at_the_border_of_pieces_and_before_longer_frames() -> None:
@@ -111,7 +110,7 @@ def test_a_begin_whose_first_cycles_are_missing_is_not_compared() -> None:
     (stretch,) = splitter.split(piece([(700, 0, M, M)], [(0, NMT, RESET)]))
     assert stretch.is_begin
     assert not stretch.is_exact
-    assert splitter.gaps[0].missing == 700
+    assert splitter.gaps == [(700, 700)]
 
 
 def test_what_begins_in_the_middle_is_left_out() -> None:

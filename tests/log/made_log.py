@@ -56,7 +56,7 @@ def make_log(
     target = MemoryTarget()
     file = ChunkedFile(target, library, profile)
     for name, data in attachments.items():
-        file.attach(Attachment(create_time=0, log_time=0, name=name, media_type="text/plain", data=data))
+        file.add_attachment(Attachment(create_time=0, log_time=0, name=name, media_type="text/plain", data=data))
     if run is not None:
         file.add_metadata("run", run)
     file.define_schema(Schema(id=1, name=TYPE.name, encoding="ros2msg", data=text.encode()))
@@ -68,7 +68,7 @@ def make_log(
             (channel, *times(number), number) for number in range(start, stop) for channel in range(1, len(topics) + 1)
         ]
         records = [message(channel, log, make_payload(number), publish) for channel, log, publish, number in rows]
-        file.add(
+        file.add_messages(
             np.frombuffer(b"".join(records), np.uint8),
             np.array([row[0] for row in rows], np.uint16),
             np.array([row[1] for row in rows], np.int64),

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
+from adacd_hil.log.reader import Series
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_arm, pack_contact, pack_control, pack_cycle, pack_scheme
 from adacd_hil.records import (
@@ -206,6 +208,12 @@ def record(path: Path, run: Run, **options) -> LogSummary:
     recorder = start(path, run, **options)
     feed(recorder, run.cycles)
     return recorder.close()
+
+
+def payloads(series: Series) -> bytes:
+    """Return the payloads of a topic of fixed size, one after the other."""
+    rows = np.ascontiguousarray(series.records).view(np.uint8).reshape(len(series), series.records.dtype.itemsize)
+    return rows[:, MESSAGE_HEAD:].tobytes()
 
 
 def wait_until_taken(recorder: Recorder) -> None:

@@ -7,6 +7,7 @@ import struct
 import pytest
 from made_log import kinds, make_log, message, payload, put_together, rechunk, take_apart
 from mcap.opcode import Opcode
+from recorded_run import payloads
 
 from adacd_hil.log import log_walk
 from adacd_hil.log.mcap import chunks as chunks_module
@@ -45,7 +46,7 @@ INDEXES = {
 def read(path, parts):
     path.write_bytes(put_together(parts))
     log = read_log(path)
-    return log.problem, {topic: series.payloads() for topic, series in log.topics.items()}
+    return log.problem, {topic: payloads(series) for topic, series in log.topics.items()}
 
 
 @pytest.fixture

@@ -141,7 +141,7 @@ def test_topics_of_strangers_become_files_of_their_own_in_the_folder(tmp_path):
     topics = ("/a/b", "/a_b", "/a\0b", "/../../x", "/", "/" + "é" * 300, "/\x1b]0;owned\x07")
     with Tables(tmp_path / "tables", "csv", {}) as tables:
         for topic in (*topics, *topics):
-            tables.write(topic, columns)
+            tables.add_rows(topic, columns)
     written = sorted(path.name for path in (tmp_path / "tables").iterdir())
     assert len(written) == len(topics)
     assert set(tables.rows.values()) == {4}

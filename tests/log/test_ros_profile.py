@@ -132,8 +132,8 @@ def test_frames_that_python_can_records_open_in_rosbags(tmp_path):
     path = tmp_path / "frames.mcap"
     with path.open("wb") as file:
         writer = FrameWriter(file)
-        writer.write(RecordedFrame(1_000_000, 0x123, b"\x01\x02", 2, channel="can0"))
-        writer.write(RecordedFrame(2_000_000, 0x124, bytes(12), 12, channel="can0", is_fd=True))
+        writer.write_frame(RecordedFrame(1_000_000, 0x123, b"\x01\x02", 2, channel="can0"))
+        writer.write_frame(RecordedFrame(2_000_000, 0x124, bytes(12), 12, channel="can0", is_fd=True))
         writer.finish()
     read = by_rosbags(path)
     assert read == by_mcap(path)

@@ -124,9 +124,9 @@ def cut(
         if not stretch.is_whole:
             raise CommandError("--contact excludes --from and --until", ExitCode.USAGE)
         stretch = find_contact(log, contact, around_s)
-    done = cut_log(log, out or default_out(log), stretch, topics, _tell)
-    result = {"out": done.out, **stretch.named_bounds, "messages": done.messages}
-    answer(as_json, result, in_line(f"{done.out}: {done.messages} messages"))
+    out = out or default_out(log)
+    messages = cut_log(log, out, stretch, topics, _tell)
+    answer(as_json, {"out": out, **stretch.named_bounds, "messages": messages}, in_line(f"{out}: {messages} messages"))
     return ExitCode.OK
 
 
@@ -209,7 +209,7 @@ def _recovery(recovery: "LogRecovery") -> dict[str, Any]:
         "lost_chunks": losses.chunks,
         "lost_bytes": losses.bytes,
         "is_cut": losses.is_cut,
-        "holes_s": [hole.seconds for hole in losses.holes],
+        "holes_s": losses.holes_s,
         "missing_parts": losses.missing_parts,
         "notes": losses.notes,
     }

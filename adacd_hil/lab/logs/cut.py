@@ -5,7 +5,6 @@ Times count from the first of them in the log. A log of which anything is lost i
 
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from mcap.records import Attachment
@@ -15,17 +14,8 @@ from adacd_hil.lab.logs.log_copy import LogCopy
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import CUT, RUN_METADATA, LogError, TimeWindow
 from adacd_hil.log.mcap.chunks import Contents
-from adacd_hil.log.reader import read_log
+from adacd_hil.log.reader import begin_of_log, read_log
 from adacd_hil.records import ContactReport
-
-
-class Cut(NamedTuple):
-    """The result of `cut`."""
-
-    path: Path
-    out: Path
-    stretch: TimeWindow
-    messages: int
 
 
 def default_out(path: Path) -> Path:
@@ -39,7 +29,7 @@ def find_contact(path: Path, contact: int, around_s: float) -> TimeWindow:
     begun = contacts_begun(log.contacts)
     if not 1 <= contact <= len(begun):
         raise LogError(f"log {path} has {len(begun)} contacts: there is no contact {contact}")
-    at_s = (begun[contact - 1] + log.epoch_ns - _start_ns(path)) * 1e-9
+    at_s = (begun[contact - 1] - begin_of_log(path)) * 1e-9
     return TimeWindow(at_s - around_s, at_s + around_s)
 
 
@@ -51,21 +41,14 @@ def contacts_begun(reports: Iterable[tuple[int, ContactReport]]) -> list[int]:
     return list(begun.values())
 
 
-def _start_ns(path: Path) -> int:
-    """Return the time of the first message."""
-    log = SalvagedLog(path)
-    contents = (item for item in log if not isinstance(item, Attachment) and len(item.starts))
-    return int(_times(log, next(contents))[0])
-
-
 def cut(
     path: Path,
     out: Path,
     stretch: TimeWindow,
     topics: Collection[str] = (),
     progress: Callable[[str], None] = lambda _: None,
-) -> Cut:
-    """Cut a stretch out of the log whose first part is `path`, of all topics or of `topics`.
+) -> int:
+    """Cut a stretch out of the log whose first part is `path`, of all topics or of `topics`; return its messages.
 
     Raises LogError when the log is damaged, when the stretch has no message, or when `out` is the log itself.
     """
@@ -75,14 +58,14 @@ def cut(
         bounds_ns: tuple[int, int] | None = None
         for item in log:
             if isinstance(item, Attachment):
-                copy.attach(item)
+                copy.add_attachment(item)
                 continue
             times = _times(log, item)
             if bounds_ns is None and len(times):
                 bounds_ns = stretch.bounds_ns(int(times[0]))
             first_ns, end_ns = bounds_ns or (0, 0)
             known |= {channel.topic for channel in log.definitions.channels.values()}
-            copy.add(item, (times >= first_ns) & (times < end_ns))
+            copy.add_messages(item, (times >= first_ns) & (times < end_ns))
         if losses := log.losses.describe():
             what = log.losses.notes[0] if log.losses.notes else f"{path} lacks {losses}"
             raise LogError(f"{what}: recover the log first")
@@ -91,7 +74,7 @@ def cut(
         if not copy.messages:
             raise LogError(f"log {path} has no message from {stretch.start_s:g} to {stretch.end_s:g} s")
         copy.finish(CUT, {"from_s": f"{stretch.start_s:.9g}", "until_s": f"{stretch.end_s:.9g}"})
-    return Cut(path, out, stretch, copy.messages)
+    return copy.messages
 
 
 def _times(log: SalvagedLog, contents: Contents) -> NDArray[np.int64]:

@@ -59,11 +59,11 @@ class LogCopy:
         """How many messages have been copied."""
         return self._file.messages
 
-    def attach(self, attachment: Attachment) -> None:
+    def add_attachment(self, attachment: Attachment) -> None:
         """Copy an attachment."""
-        self._file.attach(attachment)
+        self._file.add_attachment(attachment)
 
-    def add(self, contents: Contents, is_chosen: NDArray[np.bool_] | None = None) -> None:
+    def add_messages(self, contents: Contents, is_chosen: NDArray[np.bool_] | None = None) -> None:
         """Copy messages of a chunk, those of channels that aren't copied left out."""
         self._follow()
         numbers = self._numbers[contents.channels]
@@ -77,7 +77,7 @@ class LogCopy:
         records[starts + _CHANNEL] = channels & 0xFF
         records[starts + _CHANNEL + 1] = channels >> 8
         log_times = contents.log_times[is_taken].astype(np.int64)
-        self._file.add(records, channels, log_times, ends, np.empty(0, np.int64))
+        self._file.add_messages(records, channels, log_times, ends, np.empty(0, np.int64))
 
     def _follow(self) -> None:
         """Copy the metadata and define the channels that have become known."""

@@ -43,9 +43,9 @@ def recover(path: Path, out: Path | None = None, progress: Callable[[str], None]
     with LogCopy(out, log) as copy:
         for item in log:
             if isinstance(item, Attachment):
-                copy.attach(item)
+                copy.add_attachment(item)
             else:
-                copy.add(item)
+                copy.add_messages(item)
         copy.finish(RECOVERED, {"source_ending": log.ending, **_describe(log.losses)})
     return LogRecovery(path, out, copy.messages, len(log.attachments), len(log.metadata), log.losses)
 
@@ -58,6 +58,6 @@ def _describe(losses: Losses) -> dict[str, str]:
             "lost_chunks": str(losses.chunks),
             "lost_messages": "unknown" if losses.messages is None else str(losses.messages),
             "lost_bytes": str(losses.bytes),
-            "holes_s": f"{losses.holes_s:.3f}",
+            "holes_s": f"{sum(losses.holes_s):.3f}",
         }
     return described

@@ -1,20 +1,18 @@
 """The trusted records of all parts of a log, for `recover` and `cut`: see salvage.py."""
 
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 from pathlib import Path
 
 from mcap.records import Attachment, Metadata
 
 from adacd_hil.log.log_files import (
-    CONTINUED,
     DROPPED_KEY,
     ENDING_KEY,
     PART_KEY,
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
-    part_path,
+    missing_parts,
     parts_of,
     summary_count,
 )
@@ -65,10 +63,11 @@ class SalvagedLog:
                     has_messages |= len(item.starts) > 0 and bool(self.definitions.channels)
                     yield item
             else:
-                self.losses.add(salvage.losses)
+                self.losses.add_losses(salvage.losses)
         if not (has_messages or self.attachments or self.metadata):
             raise LogError(f"{self.path}: nothing to save")
-        self.losses.missing_parts = [*self._missing(), *foreign]
+        missing = missing_parts(self.path, self.parts, self.ending)
+        self.losses.missing_parts = [*(part.name for part in missing), *foreign]
 
     def _is_foreign(self, item: Metadata, is_vouched: bool) -> bool:
         """Tell whether a part is of another run: one damaged entry doesn't make it so."""
@@ -87,10 +86,3 @@ class SalvagedLog:
         elif item.name not in self.metadata:
             self.metadata[item.name] = item.metadata
             self._is_run_vouched |= is_vouched and item.name == RUN_METADATA
-
-    def _missing(self) -> Iterator[str]:
-        """Name the parts that are not there."""
-        for before, after in pairwise((-1, *self.parts)):
-            yield from (part_path(self.path, gap).name for gap in range(before + 1, after))
-        if self.ending == CONTINUED:
-            yield part_path(self.path, max(self.parts) + 1).name

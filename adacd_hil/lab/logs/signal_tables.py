@@ -5,7 +5,6 @@ cycle that it was logged with, by which tables are joined); a field of several n
 `tau_J_1`, `tau_J_2`. Booleans stay booleans, states and reasons are the numbers that the schemas name.
 """
 
-import contextlib
 import csv
 import errno
 import fnmatch
@@ -16,17 +15,14 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import ExitStack, closing
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, NamedTuple, Protocol
+from typing import IO, Any, NamedTuple
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from adacd_hil.file_access import is_anothers, open_input, replacing
+from adacd_hil.file_access import is_anothers, replacing
 from adacd_hil.log.frames.frame_log import open_frames
 from adacd_hil.log.log_files import LogError, failing_as
-from adacd_hil.log.mcap.chunks import ChunkError, Opening, read_contents
-from adacd_hil.log.mcap.mcap_records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
 from adacd_hil.log.types.joint_states import joint_state_columns
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS
@@ -89,16 +85,6 @@ def frame_columns(frames: NDArray[Any], decoder: DbcDecoder) -> Iterator[tuple[s
         yield message.name, columns
 
 
-class _Table(Protocol):
-    """A file of one table."""
-
-    def write(self, columns: Columns) -> None:
-        """Add rows."""
-
-    def close(self) -> None:
-        """End the file."""
-
-
 class Tables:
     """Files of tables in one folder, each begun when its first rows come; they appear when all are whole."""
 
@@ -110,14 +96,14 @@ class Tables:
         self._kind = kind
         self._metadata = dict(metadata)
         self._paths: dict[str, Path] = {}
-        self._tables: dict[str, _Table] = {}
+        self._tables: dict[str, _Csv | _Parquet] = {}
         self._files = ExitStack()
         if kind == "parquet":
             import_pyarrow()
         with failing_as(f"{folder} can't be made a folder"):
             folder.mkdir(parents=True, exist_ok=True)
 
-    def write(self, topic: str, columns: Columns) -> None:
+    def add_rows(self, topic: str, columns: Columns) -> None:
         """Add rows to the table of a topic; without rows, make an empty table. Raises LogError."""
         path = self._paths.get(topic) or self._path(topic)
         with failing_as(f"{path} can't be written"):
@@ -125,12 +111,12 @@ class Tables:
                 if is_anothers(path, _HEADS[self._kind]):  # as a recording may be, which is CSV, too
                     raise FileExistsError(errno.EEXIST, "what is there is no table of this command", str(path))
                 beside = self._files.enter_context(replacing(path))
-                table = _Csv(beside) if self._kind == "csv" else _Parquet(beside, self._metadata)
+                table: _Csv | _Parquet = _Csv(beside) if self._kind == "csv" else _Parquet(beside, self._metadata)
                 self._tables[topic] = self._files.enter_context(closing(table))
                 self.rows[path] = 0
-                self._tables[topic].write(columns)
+                self._tables[topic].add_rows(columns)
             elif len(columns["t_ns"]):
-                self._tables[topic].write(columns)
+                self._tables[topic].add_rows(columns)
         self.rows[path] += len(columns["t_ns"])
 
     def _path(self, topic: str) -> Path:
@@ -158,7 +144,7 @@ class _Csv:
         self._writer = csv.writer(self._file, lineterminator="\n")
         self._has_head = False
 
-    def write(self, columns: Columns) -> None:
+    def add_rows(self, columns: Columns) -> None:
         if not self._has_head:
             self._writer.writerow(columns)
             self._has_head = True
@@ -176,7 +162,7 @@ class _Parquet:
         self._writer: Any = None
         self._arrow, self._parquet = import_pyarrow()
 
-    def write(self, columns: Columns) -> None:
+    def add_rows(self, columns: Columns) -> None:
         table = self._arrow.table(dict(columns))
         if self._writer is None:
             schema = table.schema.with_metadata(self._metadata)
@@ -273,14 +259,14 @@ def _export_topics(
             others = stream.joint_states(piece)
             for topic, series in piece.series.items():
                 if topic in topics and topic not in others:
-                    tables.write(topic, series_columns(series, stream.epoch_ns))
+                    tables.add_rows(topic, series_columns(series, stream.epoch_ns))
             for topic, payloads in others.items():
                 for names, columns in joint_state_columns(payloads):
                     is_first = all(other != topic for other, _ in keys)
                     key = keys.setdefault((topic, names), topic if is_first else f"{topic}_{names[0]}_{len(keys)}")
-                    tables.write(key, columns)
+                    tables.add_rows(key, columns)
             if events := stream.events(piece):
-                tables.write(EVENTS.name, event_columns(events))
+                tables.add_rows(EVENTS.name, event_columns(events))
             progress(sum(tables.rows.values()))
         if not tables.rows and not stream.problem:
             raise LogError(f"{path} makes no table: messages of varying size are not exported: {', '.join(topics)}")
@@ -298,7 +284,7 @@ def _export_frames(
         for frames in pieces:
             for name, columns in frame_columns(frames, decoder):
                 if DECODED + name in chosen:
-                    tables.write(DECODED + name, columns)
+                    tables.add_rows(DECODED + name, columns)
             progress(sum(tables.rows.values()))
     notes = [
         f"{name}: of {count} frames only the signals that are in every frame are decoded: {reason}"
@@ -310,22 +296,7 @@ def _export_frames(
 
 
 def _topics(path: Path) -> list[str]:
-    """List the topics that the first chunk of an MCAP file defines. Raises LogError for any other file."""
-    topics: list[str] = []
-    with failing_as(f"log {path} can't be read"):
-        file = open_input(path)
-    with file:
-        if file.read(len(MAGIC)) != MAGIC:
-            raise LogError(f"{path} is not an MCAP file")
-        with contextlib.suppress(OSError, LogError, ChunkError):  # the reader of the log raises the reason
-            for record in scan(file):
-                if not isinstance(record, RawRecord):
-                    break
-                if record.opcode == Opcode.CHANNEL:
-                    topics.append(parse(record.opcode, record.body).topic)
-                elif record.opcode == Opcode.CHUNK:
-                    contents = read_contents(Opening().open_checked(parse(record.opcode, record.body)))
-                    channels = (found for found in contents.definitions if found.opcode == Opcode.CHANNEL)
-                    topics += [parse(channel.opcode, channel.body).topic for channel in channels]
-                    break
-    return list(dict.fromkeys(topics))
+    """List the topics that an MCAP file defines before its first messages. Raises LogError for any other file."""
+    stream = LogStream(path, is_ahead=False)
+    next(iter(stream), None)
+    return list(stream.topics)

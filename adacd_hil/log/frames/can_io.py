@@ -79,7 +79,7 @@ class McapWriter(BinaryIOMessageWriter):
 
     def on_message_received(self, msg: can.Message) -> None:
         """Write a message. Raises ValueError for a message that no CAN frame can have."""
-        self._writer.write(to_frame(msg))
+        self._writer.write_frame(to_frame(msg))
 
     def stop(self) -> None:
         """End the file; twice is once."""

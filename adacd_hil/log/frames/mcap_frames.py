@@ -19,7 +19,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, Metadata
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
@@ -37,18 +37,28 @@ from adacd_hil.log.log_files import (
 )
 from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS, LIBRARY
 from adacd_hil.log.mcap.chunks import Block, Contents, read_blocks
-from adacd_hil.log.mcap.mcap_records import HEAD, MAGIC, MESSAGE_HEAD, Problem, RawRecord, parse, summary_of
+from adacd_hil.log.mcap.mcap_records import (
+    DEFINITIONS,
+    HEAD,
+    MAGIC,
+    MESSAGE_HEAD,
+    Definitions,
+    Problem,
+    RawRecord,
+    parse,
+    summary_of,
+)
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
+    CAN_FRAME_DTYPE,
     ENCAPSULATION,
     END_OF_TIME_NS,
     FD_FRAME,
-    MAX_DATA,
+    FD_FRAME_DTYPE,
     pack_can_frame,
     pack_fd_frame,
 )
-from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE
-from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
+from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE, fill_times, record_dtype
 
 CHANNEL_KEY = "can_channel"
 RATE_SWITCH_KEY = "bit_rate_switch"
@@ -56,29 +66,10 @@ ERROR_STATE_KEY = "error_state_indicator"
 SENT = "to_can_bus"
 _HEAD_BYTES = MESSAGE_HEAD + len(ENCAPSULATION) + 12
 """Bytes of a record up to its frame_id."""
-_HEAD_DTYPE = np.dtype(
-    {
-        "names": ["publish_time", "sec", "nanosec"],
-        "formats": ["<u8", "<u4", "<u4"],
-        "offsets": [23, _HEAD_BYTES - 12, _HEAD_BYTES - 8],
-        "itemsize": _HEAD_BYTES,
-    }
-)
-_CLASSIC_DTYPE = np.dtype(
-    [
-        ("can_id", "<u4"),
-        ("is_remote", "u1"),
-        ("is_extended", "u1"),
-        ("is_error", "u1"),
-        ("length", "u1"),
-        ("data", "u1", (CLASSIC_BYTES,)),
-    ]
-)
-"""Fields after frame_id in can_msgs/msg/Frame."""
-_FD_DTYPE = np.dtype(
-    [("can_id", "<u4"), ("is_extended", "u1"), ("is_error", "u1"), ("length", "u1"), ("", "u1"), ("count", "<u4")]
-)
-"""Fields after frame_id in ros2_socketcan_msgs/msg/FdFrame, up to its data."""
+_FRAME_ID_BYTES = 8
+"""Of a frame_id in a record of ours, its length before it and padding behind it."""
+_RECORDS = {False: record_dtype(CAN_FRAME_DTYPE), True: record_dtype(FD_FRAME_DTYPE)}
+"""Records of ours, classic and FD."""
 _NO_FRAMES = np.zeros(0, RECORDED_FRAME_DTYPE)
 
 
@@ -101,7 +92,7 @@ class McapFrames:
         self.epoch_ns = 0
         self.problem = ""
         self._bus = ""
-        self._schemas: dict[int, Schema] = {}
+        self._definitions = Definitions()
         self._sources: dict[int, _Source | None] = {}
         self._files = list(parts_of(source).values()) if isinstance(source, Path) else [source]
         first = self._files[0]
@@ -130,7 +121,7 @@ class McapFrames:
 
     def _read(self, file: IO[bytes], name: str) -> Iterator[NDArray[Any]]:
         """Yield the frames of one file of the log in blocks; note damage."""
-        self._schemas, self._sources = {}, {}
+        self._definitions, self._sources = Definitions(), {}
         summary = summary_of(file)  # for the case that the chunk that defines channels is damaged
         for item in read_blocks(file, name, block_bytes=1):
             if isinstance(item, Block) and not self._sources:
@@ -167,15 +158,13 @@ class McapFrames:
 
     def _define(self, record: RawRecord) -> None:
         """Take in a schema or a channel. Raises LogError."""
-        if record.opcode == Opcode.SCHEMA:
-            schema: Schema = parse(record.opcode, record.body)
-            self._schemas[schema.id] = schema
-        elif record.opcode == Opcode.CHANNEL:
-            channel: Channel = parse(record.opcode, record.body)
-            self._sources[channel.id] = self._source(channel)
+        if record.opcode in DEFINITIONS:
+            definition = self._definitions.add_record(record)
+            if isinstance(definition, Channel):
+                self._sources[definition.id] = self._source(definition)
 
     def _source(self, channel: Channel) -> _Source | None:
-        schema = self._schemas.get(channel.schema_id)
+        schema = self._definitions.schemas.get(channel.schema_id)
         if schema is None or schema.name not in (CAN_FRAME.name, FD_FRAME.name):
             return None
         name = channel.metadata.get(CHANNEL_KEY, self._bus)
@@ -224,34 +213,34 @@ def _unpack(source: _Source, rows: NDArray[np.uint8], name_bytes: int, epoch_ns:
 
     Raises ValueError where they are shorter than their type.
     """
-    size = rows.shape[1]
     body_start = _HEAD_BYTES + name_bytes
     body_start += -(body_start - MESSAGE_HEAD - len(ENCAPSULATION)) % 4
-    body = _FD_DTYPE if source.is_fd else _CLASSIC_DTYPE
-    if body_start + body.itemsize > size:
+    layout = _RECORDS[source.is_fd]
+    places: Any = layout.fields
+    name_start, own_start = _HEAD_BYTES - 4, _HEAD_BYTES - 4 + _FRAME_ID_BYTES
+    bodies = rows[:, body_start:][:, : layout.itemsize - own_start]
+    if own_start + bodies.shape[1] < (places["data"][1] if source.is_fd else layout.itemsize):
         raise ValueError("a frame is shorter than its type")
-    heads = rows[:, :_HEAD_BYTES].copy().view(_HEAD_DTYPE)[:, 0]
-    bodies = rows[:, body_start : body_start + body.itemsize].copy().view(body)[:, 0]
+    own = np.zeros((len(rows), layout.itemsize), np.uint8)
+    own[:, :name_start] = rows[:, :name_start]
+    own[:, own_start : own_start + bodies.shape[1]] = bodies
+    records = own.view(layout)[:, 0]
     frames = np.zeros(len(rows), RECORDED_FRAME_DTYPE)
-    frames["t_ns"] = heads["sec"].astype(np.int64) * 1_000_000_000 + heads["nanosec"] - epoch_ns
-    frames["cycle_t_ns"] = heads["publish_time"].astype(np.int64) - epoch_ns
+    fill_times(frames, records, epoch_ns)
     frames["is_tx"] = source.is_tx
     frames["channel"] = source.channel
-    for name in ("can_id", "length", "is_error", "is_extended"):
-        frames[name] = bodies[name]
+    frames["can_id"] = records["can_id"]
+    for name in ("is_error", "is_extended") if source.is_fd else ("is_error", "is_extended", "is_remote"):
+        frames[name] = records[name].view(np.uint8) != 0
     if source.is_fd:
         frames["is_fd"] = True
         frames["has_rate_switch"] = source.has_rate_switch
         frames["has_error_state"] = source.has_error_state
-        count = min(size - body_start - body.itemsize, MAX_DATA)
-        data_bytes = rows[:, body_start + body.itemsize :][:, :count]
-    else:
-        frames["is_remote"] = bodies["is_remote"]
-        data_bytes = bodies["data"]
-    frames["length"] = np.minimum(frames["length"], MAX_DATA if source.is_fd else CLASSIC_BYTES)
+    data_bytes = records["data"]
+    most = data_bytes.shape[1]
+    frames["length"] = np.minimum(records["length"], most)
     counts = np.where(frames["is_remote"], 0, frames["length"])
-    is_data = np.arange(data_bytes.shape[1]) < counts[:, np.newaxis]
-    frames["data"][:, : data_bytes.shape[1]] = np.where(is_data, data_bytes, 0)
+    frames["data"][:, :most] = np.where(np.arange(most) < counts[:, np.newaxis], data_bytes, 0)
     return frames
 
 
@@ -293,7 +282,7 @@ class FrameWriter:
         self._first_channel: str | None = None
         self._flushed_ns: int | None = None
 
-    def write(self, frame: RecordedFrame) -> None:
+    def write_frame(self, frame: RecordedFrame) -> None:
         """Write a frame. Raises ValueError for a time that no stamp can hold."""
         if not 0 <= frame.t_ns < END_OF_TIME_NS:
             raise ValueError(f"t_ns = {frame.t_ns} is not within 0 and {END_OF_TIME_NS} ns")

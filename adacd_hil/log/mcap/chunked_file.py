@@ -91,7 +91,7 @@ class ChunkedFile:
         self._crc = crc32(data, self._crc)
         self._target.write(data, packets)
 
-    def attach(self, attachment: Attachment) -> None:
+    def add_attachment(self, attachment: Attachment) -> None:
         """Add an attachment."""
         offset = self._target.tell()
         record = encode(attachment)
@@ -125,7 +125,7 @@ class ChunkedFile:
         self._channels.append(channel)
         self._chunk += encode(channel)
 
-    def add(
+    def add_messages(
         self,
         records: NDArray[np.uint8],
         channels: NDArray[np.uint16],

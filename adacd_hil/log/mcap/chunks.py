@@ -15,7 +15,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import IO, Any, NamedTuple, TypeAlias, TypeVar
+from typing import IO, Any, NamedTuple, TypeAlias
 
 import lz4.frame
 import numpy as np
@@ -47,7 +47,6 @@ FREE_BYTES = 64 << 20
 """Bytes that may be decompressed from a file of any size."""
 _PIECE_BYTES = 1 << 20
 _KINDS = ("", "zstd", "lz4")
-AnyBytes = TypeVar("AnyBytes", bytes, memoryview)
 
 
 class ChunkError(ValueError):
@@ -69,36 +68,14 @@ class Opening:
         if self._opened > FREE_BYTES + MOST_RATIO * self._packed:
             raise ChunkError(f"opens to more than {MOST_RATIO} times the file before it")
 
-    def open(self, chunk: Chunk) -> bytes:
-        """Return the decompressed contents of a chunk. Raises ChunkError if they are too large or damaged."""
+    def open_chunk(self, chunk: Chunk) -> bytes:
+        """Return the decompressed contents of a chunk. Raises ChunkError for too many, or another size or CRC."""
         data = decompress(chunk.compression, chunk.data)
         self.allow(len(chunk.data), len(data))
-        return data
-
-    def open_checked(self, chunk: Chunk) -> bytes:
-        """Return the decompressed contents of a chunk. Raises ChunkError if their size or CRC differs."""
-        return _checked(chunk, self.open(chunk), is_size_certain=bool(chunk.uncompressed_crc))
+        return _checked(chunk, data, is_size_certain=bool(chunk.uncompressed_crc))
 
 
-def open_into(chunk: Chunk, memory: memoryview, decompressor: zstandard.ZstdDecompressor) -> None:
-    """Decompress a chunk, whose size has been allowed, into `memory`, which has room for one byte more.
-
-    Raises ChunkError if its size or CRC differs.
-    """
-    size = chunk.uncompressed_size
-    try:
-        is_direct = chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) == size
-        if not is_direct or not chunk.uncompressed_crc:
-            memory[:size] = _checked(chunk, decompress(chunk.compression, chunk.data, size), is_size_certain=False)
-            return
-        with decompressor.stream_reader(chunk.data) as reader:
-            count = reader.readinto(memory)
-    except zstandard.ZstdError as error:
-        raise ChunkError(f"can't be decompressed: {error}") from None
-    _checked(chunk, memory[:count], is_size_certain=False)
-
-
-def _checked(chunk: Chunk, data: AnyBytes, is_size_certain: bool) -> AnyBytes:
+def _checked(chunk: Chunk, data: bytes, is_size_certain: bool) -> bytes:
     if chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
         raise ChunkError("fails its CRC")
     if not is_size_certain and len(data) != chunk.uncompressed_size:
@@ -164,14 +141,11 @@ PADDING = 128
 """Behind chunks: a record whose size varies is taken as if it were the longest, which has 64 bytes of data."""
 
 
-Data: TypeAlias = bytes | bytearray
-
-
 @dataclass
 class Contents:
     """The records of chunks. Messages as columns (n,), which are read at their first use."""
 
-    data: Data
+    data: bytes
     starts: NDArray[np.int64]
     definitions: list[RawRecord] = field(default_factory=list)  # schemas and channels; `offset`: where in the data
     strangers: list[int] = field(default_factory=list)
@@ -225,7 +199,7 @@ def read_contents(data: bytes) -> Contents:
     return _walk_through(data, (len(data),))
 
 
-def read_chunks(data: Data, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents:
+def read_chunks(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents:
     """Find the records of opened chunks that follow each other in `data`; PADDING bytes of no meaning follow the last.
 
     ends: of the chunks; indexes: the entries of all message indexes of each chunk; without them, and where they are
@@ -235,7 +209,7 @@ def read_chunks(data: Data, ends: Sequence[int], indexes: Sequence[bytes]) -> Co
     return _walk_through(data, ends) if indexed is None else indexed
 
 
-def _indexed(data: Data, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents | None:
+def _indexed(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents | None:
     """Take where messages begin from the indexes; None where these leave out anything that chunks hold."""
     if not indexes or not all(index and len(index) % INDEX_ENTRY.itemsize == 0 for index in indexes):
         return None
@@ -254,7 +228,7 @@ def _indexed(data: Data, ends: Sequence[int], indexes: Sequence[bytes]) -> Conte
     return contents if np.array_equal(lasts, ends) else None
 
 
-def _walk_through(data: Data, ends: Sequence[int]) -> Contents:
+def _walk_through(data: bytes, ends: Sequence[int]) -> Contents:
     """Find the records of chunks step by step."""
     definitions: list[RawRecord] = []
     strangers: list[int] = []
@@ -287,7 +261,7 @@ def message_contents(record: RawRecord) -> Contents:
     return Contents(data, np.zeros(1, np.int64))
 
 
-def _windows(data: Data, size: int) -> NDArray[Any]:
+def _windows(data: bytes, size: int) -> NDArray[Any]:
     """View the `size` bytes that begin at each byte as one item."""
     windows: NDArray[Any] = np.ndarray((max(0, len(data) - size + 1),), f"V{size}", data, strides=(1,))
     return windows
@@ -304,7 +278,6 @@ class Block(NamedTuple):
     """Records of chunks, one chunk after the other; a message or a definition outside chunks is one by itself."""
 
     contents: Contents
-    memory: bytearray  # of the contents; reused after the next item is requested
     position: int  # in the file, of the first of them
     problem: str  # why chunks are missing, "" if none is
 
@@ -328,46 +301,25 @@ def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES, is_a
     advance. Raises LogError if it isn't MCAP.
     """
     if not is_ahead:
-        yield from _open_each(_pack(file, name, block_bytes))
+        for item in _pack(file, name, block_bytes):
+            yield _open(item) if isinstance(item, list) else item
         return
     waiting: deque[Future[Block] | RawRecord | Problem] = deque()
-    free: list[bytearray] = []
     # A second thread would wait for Python's lock more than it opens: 1.3 times the processor time, no sooner done.
     with ThreadPoolExecutor(1, "log-reader") as thread:
         try:
             for item in _pack(file, name, block_bytes):
-                if isinstance(item, list):
-                    waiting.append(thread.submit(_open, item, free.pop() if free else bytearray()))
-                else:
-                    waiting.append(item)
+                waiting.append(thread.submit(_open, item) if isinstance(item, list) else item)
                 if len(waiting) > AHEAD:
-                    yield from _finished(waiting.popleft(), free)
+                    yield _finished(waiting.popleft())
             while waiting:
-                yield from _finished(waiting.popleft(), free)
+                yield _finished(waiting.popleft())
         finally:
             thread.shutdown(cancel_futures=True)
 
 
-def _open_each(items: Iterator[list[_Packed] | RawRecord | Problem]) -> Iterator[Item]:
-    """Decompress chunks when they are requested."""
-    memory = bytearray()
-    for item in items:
-        if isinstance(item, list):
-            block = _open(item, memory)
-            memory = block.memory
-            yield block
-        else:
-            yield item
-
-
-def _finished(item: Future[Block] | RawRecord | Problem, free: list[bytearray]) -> Iterator[Item]:
-    """Yield an item; take back its memory afterwards, since new pages cost more time than the work on them."""
-    if not isinstance(item, Future):
-        yield item
-        return
-    block = item.result()
-    yield block
-    free.append(block.memory)
+def _finished(item: Future[Block] | RawRecord | Problem) -> Item:
+    return item.result() if isinstance(item, Future) else item
 
 
 def _pack(file: IO[bytes], name: str, block_bytes: int) -> Iterator[list[_Packed] | RawRecord | Problem]:
@@ -423,26 +375,26 @@ def _packed(record: RawRecord, opening: Opening) -> _Packed | Problem:
     return _Packed(chunk, chunk.uncompressed_size, position, [])
 
 
-def _open(packed: list[_Packed], memory: bytearray) -> Block:
-    size = sum(one.size for one in packed) + PADDING
-    if len(memory) < size:
-        memory = bytearray(size)
-    view, decompressor = memoryview(memory), _decompressor()
+def _open(packed: list[_Packed]) -> Block:
+    opened: list[bytes] = []
     ends: list[int] = []
-    indexes, problem = [], ""
+    indexes, problem, end = [], "", 0
     for one in packed:
-        start = ends[-1] if ends else 0
-        end = start + one.size
         try:
-            if isinstance(one.chunk, bytes):
-                view[start:end] = one.chunk
-            else:
-                open_into(one.chunk, view[start : end + 1], decompressor)
+            data = one.chunk if isinstance(one.chunk, bytes) else _open_sized(one.chunk)
         except ChunkError:
             problem = problem or f"damaged at byte {one.position}"
         else:
+            opened.append(data)
+            end += len(data)
             ends.append(end)
             indexes.append(b"".join(one.entries))
-    contents = read_chunks(memory, ends, indexes)
+    contents = read_chunks(b"".join((*opened, bytes(PADDING))), ends, indexes)
     _ = contents.channels, contents.publish_times  # here, where two processors can share the work
-    return Block(contents, memory, packed[0].position, problem)
+    return Block(contents, packed[0].position, problem)
+
+
+def _open_sized(chunk: Chunk) -> bytes:
+    """Decompress a chunk whose size has been allowed. Raises ChunkError if its size or CRC differs."""
+    data = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
+    return _checked(chunk, data, is_size_certain=False)

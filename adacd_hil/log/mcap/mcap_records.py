@@ -156,12 +156,6 @@ class Problem(NamedTuple):
     is_damage: bool = False
 
 
-class Trailer(NamedTuple):
-    """The magic behind the footer."""
-
-    offset: int
-
-
 def name_of(opcode: int) -> str:
     """Name a kind of record as the specification does."""
     if opcode not in set(Opcode):
@@ -234,8 +228,11 @@ def _index_run(data: bytes) -> IndexRun:
     return IndexRun(data[:position], entries)
 
 
-def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap | Trailer]:
-    """List the records of a file, and the gaps between them: after damage, search for the next record."""
+def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
+    """List the records of a file, and the gaps between them: after damage, search for the next record.
+
+    It ends with a Footer that the magic follows.
+    """
     return _Scan(file).items()
 
 
@@ -257,7 +254,7 @@ class _Scan:
         self._file = file
         self._size = os.fstat(file.fileno()).st_size
 
-    def items(self) -> Iterator[RawRecord | FileGap | Trailer]:
+    def items(self) -> Iterator[RawRecord | FileGap]:
         position = len(MAGIC)
         if self._read(0, position) != MAGIC:
             position = 0
@@ -272,7 +269,6 @@ class _Scan:
             yield record
             position = record.end
             if record.opcode == Opcode.FOOTER and self._read(position, len(MAGIC)) == MAGIC:
-                yield Trailer(position)
                 return
 
     def _read(self, position: int, count: int) -> bytes:
@@ -428,12 +424,16 @@ class Definitions:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
 
-    def take(self, records: Iterable[RawRecord]) -> None:
-        """Take in definitions. Raises LogError for one that makes no sense or contradicts an earlier one."""
+    def add_record(self, record: RawRecord) -> Schema | Channel:
+        """Add a definition. Raises LogError for one that makes no sense or contradicts an earlier one."""
+        definition: Schema | Channel = parse(record.opcode, record.body)
+        known: dict[int, Any] = self.schemas if isinstance(definition, Schema) else self.channels
+        if known.setdefault(definition.id, definition) != definition:
+            raise LogError(f"{type(definition).__name__.lower()} {definition.id} is defined in two ways")
+        return definition
+
+    def add_records(self, records: Iterable[RawRecord]) -> None:
+        """Add the definitions among some records. Raises LogError as `add_record` does."""
         for record in records:
-            known: dict[int, Schema] | dict[int, Channel] = self.channels
-            if record.opcode == Opcode.SCHEMA:
-                known = self.schemas
-            definition = parse(record.opcode, record.body)
-            if known.setdefault(definition.id, definition) != definition:
-                raise LogError(f"{type(definition).__name__.lower()} {definition.id} is defined in two ways")
+            if record.opcode in DEFINITIONS:
+                self.add_record(record)

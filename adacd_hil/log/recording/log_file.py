@@ -14,7 +14,6 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path, PurePath
-from typing import NamedTuple
 
 from mcap.records import Attachment, Schema
 from mcap.records import Channel as ChannelRecord
@@ -26,11 +25,6 @@ from adacd_hil.log.types.topics import LogChannel
 
 WAITING_BYTES = 32 * 1024 * 1024
 """Most bytes waiting for the disk: about 45 s of a run at 1 kHz, compressed."""
-
-
-class _Write(NamedTuple):
-    data: bytes
-    packets: int
 
 
 class Sink:
@@ -66,7 +60,7 @@ class Sink:
         self._most_waiting = most_waiting
         self._on_written = on_written
         self._position = 0
-        self._tasks: deque[_Write | Path | None] = deque()
+        self._tasks: deque[tuple[bytes, int] | Path | None] = deque()  # data and their packets; a file to begin
         self._waiting = 0  # bytes
         self._is_idle = True
         self._is_behind = False
@@ -82,7 +76,7 @@ class Sink:
             with self._changed:
                 self._changed.wait_for(lambda: not self._waits or self._waiting < self._most_waiting)
                 self._waiting += len(data)
-                self._tasks.append(_Write(data, packets))
+                self._tasks.append((data, packets))
                 self._changed.notify_all()
         return len(data)
 
@@ -131,10 +125,10 @@ class Sink:
             if isinstance(task, Path):
                 self._open(task)
             else:
-                self._write(task)
+                self._write(*task)
         self._close()
 
-    def _next(self) -> _Write | Path | None:
+    def _next(self) -> tuple[bytes, int] | Path | None:
         with self._changed:
             self._is_idle = True
             self._changed.notify_all()
@@ -142,13 +136,13 @@ class Sink:
             self._is_idle = False
             return self._tasks.popleft()
 
-    def _write(self, task: _Write) -> None:
+    def _write(self, data: bytes, packets: int) -> None:
         if not self.error:
             try:
-                _write_all(self._descriptor, task.data)
-                self.written += len(task.data)
-                self._on_written(task.packets)
-                if self._has_told and task.packets:
+                _write_all(self._descriptor, data)
+                self.written += len(data)
+                self._on_written(packets)
+                if self._has_told and packets:
                     self._has_told = False
                     self.say(f"log {self.path} is written again; packets are missing before it")
             except OSError as error:
@@ -156,8 +150,8 @@ class Sink:
                 with contextlib.suppress(OSError):  # a pipe or device can't be truncated
                     os.ftruncate(self._descriptor, self.written)
         with self._changed:
-            self._waiting -= len(task.data)
-            self._lost += task.packets if self.error else 0
+            self._waiting -= len(data)
+            self._lost += packets if self.error else 0
 
     def _open(self, path: Path) -> None:
         is_new = path != self.path or self._descriptor < 0
@@ -215,7 +209,7 @@ class McapFile(ChunkedFile):
         """Message types, by our channel ids."""
         for name, data in attachments.items():
             media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "text/plain")
-            self.attach(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
+            self.add_attachment(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
         self.add_metadata(RUN_METADATA, metadata)
         self._define(channels)
         self.head_bytes = sink.tell()

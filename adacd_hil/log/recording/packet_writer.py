@@ -197,7 +197,7 @@ class PacketWriter:
         if len(places):
             rows = _rows(pack_can_frame(_NO_STAMP, 0, b"", 0, False), len(places))
             records = rows.view(_CAN_FRAME_RECORD)[:, 0]
-            records["dlc"] = frames["length"][places]
+            records["length"] = frames["length"][places]
             records["data"] = frames["data"][places]
             ids = (ChannelId.TO_CAN_BUS, ChannelId.FROM_CAN_BUS)
             yield self._frame_group(frames[places], rows, records, ids, slots[places], publish_ns[places])
@@ -290,7 +290,7 @@ class PacketWriter:
             stamps = rows[:, _STAMP].view(np.uint32)
             stamps[:, 0], stamps[:, 1] = np.divmod(group.t_ns, 1_000_000_000)
             windows(records, size)[ends[group.slots] - size] = rows.view(f"V{size}")[:, 0]
-        self._file.add(records, channels, log_ns, ends, packet_ends)
+        self._file.add_messages(records, channels, log_ns, ends, packet_ends)
         if self._watch is not None:
             self._watch(records, channels, log_ns, ends)
 

@@ -200,9 +200,9 @@ _FRAME_ID = _EMPTY_STRING + b"\0\0\0"  # padded to the uint32 that follows
 _CAN_FRAME_BODY = struct.Struct("<I???B8s")
 CAN_FRAME_DTYPE = np.dtype(
     {
-        "names": ["sec", "nanosec", "can_id", "is_extended", "is_error", "dlc", "data"],
-        "formats": ["<u4", "<u4", "<u4", "?", "?", "u1", ("u1", (8,))],
-        "offsets": [4, 8, 20, 25, 26, 27, 28],
+        "names": ["sec", "nanosec", "can_id", "is_remote", "is_extended", "is_error", "length", "data"],
+        "formats": ["<u4", "<u4", "<u4", "?", "?", "?", "u1", ("u1", (8,))],
+        "offsets": [4, 8, 20, 24, 25, 26, 27, 28],
         "itemsize": 36,
     }
 )
@@ -213,7 +213,7 @@ MAX_DATA = 64
 _FD_FRAME_BODY = struct.Struct("<I??BxI")
 FD_FRAME_DTYPE = np.dtype(
     {
-        "names": ["sec", "nanosec", "can_id", "is_extended", "is_error", "len", "count", "data"],
+        "names": ["sec", "nanosec", "can_id", "is_extended", "is_error", "length", "count", "data"],
         "formats": ["<u4", "<u4", "<u4", "?", "?", "u1", "<u4", ("u1", (MAX_DATA,))],
         "offsets": [4, 8, 20, 24, 25, 26, 28, 32],
         "itemsize": 32 + MAX_DATA,

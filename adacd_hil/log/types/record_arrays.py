@@ -7,12 +7,10 @@ Messages are gathered by topic, piece by piece. A piece ends before the first me
 cycle's, is higher than any before.
 """
 
-import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
@@ -23,27 +21,10 @@ if TYPE_CHECKING:
     from adacd_hil.log.mcap.chunks import Contents
 
 
-_SPARE = 16
-_LARGE = 1 << 22
-"""Bytes from which numpy asks for large pages, which cost less; of them no more is used than is written to."""
 _MOST_SMALL = 1 << 15
 """Topics whose slots go into 16 bits."""
 UNKNOWN, UNWANTED = -1, -2
 """Slots of channels that aren't gathered."""
-
-
-class Payload(NamedTuple):
-    """The layout of a topic's payloads. `has_tail`: they end in bytes, counted by the field `count`, that fill `data`.
-
-    Records of such payloads are padded with zeros to those with the longest tail.
-    """
-
-    dtype: "np.dtype[Any]"
-    has_tail: bool = False
-
-
-PayloadLayout = Callable[[Channel, Schema], Payload | None]
-"""Describes the payloads of a channel; None where their size varies otherwise."""
 
 
 def record_dtype(payload: "np.dtype[Any]") -> "np.dtype[Any]":
@@ -66,14 +47,11 @@ class Topic(NamedTuple):
     name: str
     type_name: str
     dtype: "np.dtype[Any] | None"  # of its records; None where their size varies
-    has_tail: bool
 
-    @classmethod
-    def of(cls, name: str, type_name: str, payload: Payload | None) -> "Topic":
-        """Describe a topic by its payloads."""
-        if payload is None:
-            return cls(name, type_name, None, has_tail=False)
-        return cls(name, type_name, record_dtype(payload.dtype), payload.has_tail)
+    @property
+    def has_tail(self) -> bool:
+        """Whether payloads end after so many bytes of `data` as `count` says. Their records are padded with zeros."""
+        return self.type_name == FD_FRAME.name
 
 
 def _frame_dtype(data_bytes: int) -> "np.dtype[Any]":
@@ -127,13 +105,17 @@ def frames_of(records: NDArray[Any], topic: Topic, epoch_ns: int) -> NDArray[Any
     """Make frames of the records of a topic of frames; epoch_ns: subtracted from the file's times."""
     kind = FRAME_TOPICS[topic.name]
     frames = np.empty(len(records), LONG_FRAME_DTYPE if kind.is_long else FRAME_DTYPE)
-    frames["t_ns"] = records["sec"].astype(np.int64) * 1_000_000_000 + records["nanosec"] - epoch_ns
-    frames["cycle_t_ns"] = records["publish_time"].astype(np.int64) - epoch_ns
+    fill_times(frames, records, epoch_ns)
     frames["is_tx"] = kind.is_tx
-    frames["length"] = records["len" if kind.is_long else "dlc"]
-    for name in ("can_id", "is_error", "data"):
+    for name in ("can_id", "length", "is_error", "data"):
         frames[name] = records[name]
     return frames
+
+
+def fill_times(frames: NDArray[Any], records: NDArray[Any], epoch_ns: int) -> None:
+    """Take the times of frames from the records of a topic; epoch_ns: subtracted from the file's times."""
+    frames["t_ns"] = records["sec"].astype(np.int64) * 1_000_000_000 + records["nanosec"] - epoch_ns
+    frames["cycle_t_ns"] = records["publish_time"].astype(np.int64) - epoch_ns
 
 
 def joined_frames(pieces: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -226,73 +208,35 @@ class RawPiece(NamedTuple):
     payloads: dict[str, list[bytes]]
 
 
-class _Rows:
-    """Rows of one size, in memory that has room for as many as were there before."""
-
-    def __init__(self, size: int) -> None:
-        self._memory = np.empty((0, size), np.uint8)
-        self.count = 0
-
-    def make_room(self, count: int) -> None:
-        """Have room for `count` rows in all."""
-        if count > len(self._memory):
-            size = self._memory.shape[1]
-            least = _LARGE // size + 1 if count * size > _LARGE // 4 else 0
-            memory = np.empty((max(count, len(self._memory) * 3 // 2, least), size), np.uint8)
-            memory[: self.count] = self._memory[: self.count]
-            self._memory = memory
-
-    def add(self, rows: NDArray[np.uint8]) -> None:
-        """Add rows."""
-        count = self.count + len(rows)
-        self.make_room(count)
-        self._memory[self.count : count] = rows
-        self.count = count
-
-    def end(self) -> NDArray[np.uint8]:
-        """Return all rows, and begin anew."""
-        rows = self._memory[: self.count]
-        self._memory = np.empty((self.count + self.count // _SPARE, rows.shape[1]), np.uint8)
-        self.count = 0
-        return rows
-
-
 class PieceBuilder:
     """Gathers messages; a topic's place in `topics` is its slot."""
 
-    def __init__(self, cycles: int, epoch_ns: int, has_frame_records: bool) -> None:
-        """Gather at most so many cycles at a time; of frames also the records if `has_frame_records`."""
+    def __init__(self, cycles: int, epoch_ns: int) -> None:
+        """Gather at most so many cycles at a time."""
         self.topics: list[Topic] = []
         self.wrong = 0
         """Messages that weren't as long as their schema says."""
         self._most_cycles = cycles
         self._epoch_ns = epoch_ns
-        self._has_frame_records = has_frame_records
         self._cycles = 0  # of the piece: how often the publish time has risen
         self._latest_ns = np.iinfo(np.int64).min
-        self._rows: list[_Rows] = []
+        self._rows: list[list[NDArray[np.uint8]]] = []
         self._payloads: list[list[bytes]] = []
         self._frames: list[NDArray[Any]] = []
 
     @property
     def is_empty(self) -> bool:
         """Whether no message has been gathered since the latest piece."""
-        return not (self._frames or any(rows.count for rows in self._rows) or any(self._payloads))
+        return not (self._frames or any(self._rows) or any(self._payloads))
 
     def add_topic(self, topic: Topic) -> int:
         """Gather one more topic; return its slot."""
         self.topics.append(topic)
-        self._rows.append(_Rows(topic.dtype.itemsize if topic.dtype is not None else 0))
+        self._rows.append([])
         self._payloads.append([])
         return len(self.topics) - 1
 
-    def expect(self, slot: int, messages: int) -> None:
-        """Make room for so many messages of a topic, as far as they go into one piece: growing is dear."""
-        rows = self._rows[slot]
-        with contextlib.suppress(MemoryError):  # the file may lie
-            rows.make_room(min(rows.count + messages, self._most_cycles + self._most_cycles // _SPARE))
-
-    def add(self, contents: "Contents", messages: slice, slots: NDArray[np.int32]) -> Iterator[RawPiece]:
+    def add_messages(self, contents: "Contents", messages: slice, slots: NDArray[np.int32]) -> Iterator[RawPiece]:
         """Gather some messages of chunks, and give the pieces that are whole with them. slots (n,): of each message."""
         publish_ns = contents.publish_times[messages].view(np.int64)
         if not len(publish_ns):
@@ -304,20 +248,21 @@ class PieceBuilder:
         while cycles[-1] > self._most_cycles:
             stop = int(np.searchsorted(cycles, self._most_cycles, side="right"))
             self._gather(contents, messages.start + start, slots[start:stop])
-            yield self.end()
+            yield self.take_piece()
             cycles -= self._most_cycles
             start = stop
         self._gather(contents, messages.start + start, slots[start:])
         self._cycles = int(cycles[-1])
 
-    def end(self) -> RawPiece:
+    def take_piece(self) -> RawPiece:
         """Return the gathered records and payloads, and start a new piece."""
         records, payloads = {}, {}
         for topic, rows, texts in zip(self.topics, self._rows, self._payloads, strict=True):
             if topic.dtype is None:
                 payloads[topic.name] = texts
-            elif self._has_frame_records or not is_of_frames(topic):
-                records[topic.name] = rows.end()
+            elif not is_of_frames(topic):
+                records[topic.name] = np.concatenate((np.empty((0, topic.dtype.itemsize), np.uint8), *rows))
+                rows.clear()
         piece = RawPiece(records, joined_frames(self._frames), payloads)
         self._payloads = [[] for _ in self.topics]
         self._frames = []
@@ -339,11 +284,11 @@ class PieceBuilder:
                 continue
             is_right, rows = _rows_of(contents, starts[own], ends[own] - starts[own], topic)
             self.wrong += own.stop - own.start - len(rows)
-            if is_of_frames(topic) and len(rows):
+            if not is_of_frames(topic):
+                self._rows[slot].append(rows)
+            elif len(rows):
                 places = order[own] if is_right is None else order[own][is_right]
                 frames.append((places, frames_of(rows.view(topic.dtype)[:, 0], topic, self._epoch_ns)))
-            if self._has_frame_records or not is_of_frames(topic):
-                self._rows[slot].add(rows)
         if frames:
             sequence = np.argsort(np.concatenate([places for places, _ in frames]))
             self._frames.append(reordered_frames(joined_frames([part for _, part in frames]), sequence))

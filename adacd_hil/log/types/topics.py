@@ -23,14 +23,14 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 | /truth | adacd_hil_msgs/msg/Truth | every cycle, in the emulator's own log; records.TRUTH_LAYOUT |
 """
 
-import itertools
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from operator import attrgetter, itemgetter
-from typing import Any, NamedTuple
+from typing import Any
+
+import numpy as np
 
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import (
@@ -99,36 +99,30 @@ class LogChannel:
     type: MessageType
 
 
-class BlockSize(NamedTuple):
-    """Counts that size the block of /scheme; further_count and channel_count: see `records.certified_layout`."""
-
-    parameter_count: int
-    further_count: int = 0
-    channel_count: int = 0
-
-
 @dataclass(frozen=True)
 class OwnTopic:
     """A topic of ours.
 
-    type: of its messages; a name makes it a type of our own. head: the fields that a message of that type begins with;
-    each is an attribute of the record that is packed, unless `given` names it: then it is handed over beside it. block:
-    lays out the float64 values that follow. rate_Hz: of the live view; 0: every message is shown.
+    type: of its messages; a name makes it a type of our own. head: the fields that a message of that type begins with.
+    block: lays out the float64 values that follow, by the counts that `channel` gets. rate_Hz: of the live view; 0:
+    every message is shown.
     """
 
     id: int
     name: str
     type: MessageType | str
     head: tuple[Member, ...] = ()
-    given: tuple[str, ...] = ()
-    block: Callable[[BlockSize], Layout] | None = None
+    block: Callable[[int, int, int], Layout] | None = None
     rate_Hz: int = 0
 
-    def channel(self, size: BlockSize) -> LogChannel:
-        """Describe the topic to a file. Raises LogError when two fields share a name."""
+    def channel(self, parameter_count: int = 0, further_count: int = 0, channel_count: int = 0) -> LogChannel:
+        """Describe the topic to a file. Raises LogError when two fields share a name.
+
+        The counts size the block of /scheme: see `records.certified_layout`.
+        """
         if isinstance(self.type, MessageType):
             return LogChannel(self.id, self.name, self.type)
-        fields = self.block(size).fields if self.block is not None else ()
+        fields = self.block(parameter_count, further_count, channel_count).fields if self.block is not None else ()
         members = (Member(field.name, "float64", field.size, field.unit, field.meaning) for field in fields)
         return LogChannel(self.id, self.name, number_type(f"{PACKAGE}/{self.type}", (*self.head, *members)))
 
@@ -138,50 +132,16 @@ class OwnTopic:
         return body_struct(self.head, has_block=self.block is not None)
 
     @cached_property
-    def pack(self) -> Callable[..., bytes]:
-        """`pack(record, *given, block=None)` packs the body of a message; `given` in the order of the head.
+    def _has_arrays(self) -> bool:
+        return any(member.size > 1 for member in self.head)
 
-        It raises struct.error for too many or too few. One function a topic: the control process packs three a cycle.
-        """
-        names = [member.name for member in self.head if member.name not in self.given]
-        head = (*names, *self.given)
-        places = [head.index(member.name) for member in self.head]
-        order: Callable[[Any], tuple[Any, ...]] = itemgetter(*places) if len(places) > 1 else tuple
-        taken: Callable[[Any], tuple[Any, ...]] = (
-            attrgetter(*names) if len(names) > 1 else lambda record: tuple(getattr(record, name) for name in names)
-        )
-        pack, is_ordered = self.body.pack, head == tuple(member.name for member in self.head)
-        sizes = [member.size for member in self.head]
-
-        def in_order(record: Any, given: tuple[Any, ...]) -> tuple[Any, ...]:
-            if len(given) != len(self.given):
-                raise struct.error(f"{self.name}: {len(given)} values given, {len(self.given)} expected")
-            return order((*taken(record), *given))
-
-        def pack_flat(record: Any, *given: Any, block: Vector | None = None) -> bytes:
-            packed = pack(*(given if not names else taken(record) if not given else (*taken(record), *given)))
-            return packed if block is None else packed + block.tobytes()
-
-        def pack_mixed(record: Any, *given: Any, block: Vector | None = None) -> bytes:
-            packed = pack(*in_order(record, given))
-            return packed if block is None else packed + block.tobytes()
-
-        def pack_arrays(record: Any, *given: Any, block: Vector | None = None) -> bytes:
-            pairs = zip(sizes, in_order(record, given), strict=True)
-            packed = pack(*(number for size, value in pairs for number in (value if size > 1 else (value,))))
-            return packed if block is None else packed + block.tobytes()
-
-        return pack_arrays if any(size > 1 for size in sizes) else pack_flat if is_ordered else pack_mixed
-
-    def unpack(self, body: bytes) -> dict[str, Any]:
-        """Unpack the head of a body. Raises struct.error when it is cut, ValueError for a value that has no name."""
-        numbers = iter(self.body.unpack_from(body))
-        return {
-            member.name: member.value_of(
-                itertools.islice(numbers, member.size) if member.size > 1 else next(numbers),
-            )
-            for member in self.head
-        }
+    def pack(self, *values: Any, block: Vector | None = None) -> bytes:
+        """Pack the body of a message; `values`: in the order of the head. Raises struct.error or ValueError."""
+        if self._has_arrays:
+            pairs = zip(self.head, values, strict=True)
+            values = tuple(number for member, value in pairs for number in (value if member.size > 1 else (value,)))
+        packed = self.body.pack(*values)
+        return packed if block is None else packed + block.tobytes()
 
 
 _CYCLE_NUMBER = Member("cycle", "uint64", meaning="number of the cycle")
@@ -211,8 +171,7 @@ SCHEME = OwnTopic(
         Member("contact_joints", "uint8", meaning="bit i: joint i over the threshold"),
         Member("is_model_valid", "bool", meaning="theta_hat may be fed forward"),
     ),
-    given=("request",),
-    block=lambda size: certified_layout(*size) if size.channel_count else scheme_layout(size.parameter_count),
+    block=lambda *counts: certified_layout(*counts) if counts[-1] else scheme_layout(counts[0]),
     rate_Hz=50,
 )
 ARM = OwnTopic(
@@ -270,8 +229,7 @@ CONTROL = OwnTopic(
         Member("enable", "bool", meaning="drives are asked to be enabled"),
         Member("quick_stop", "bool", meaning="drives are asked for a quick stop"),
     ),
-    given=("cycle", "gate_flags", "enable", "quick_stop"),
-    block=lambda _: CONTROL_LAYOUT,
+    block=lambda *_: CONTROL_LAYOUT,
     rate_Hz=50,
 )
 CYCLE = OwnTopic(
@@ -313,14 +271,11 @@ FRAME_CHECKS = OwnTopic(
         ),
         Member("implausible", "uint64", len(_DEVICES), meaning="frames so far that failed their plausibility check"),
     ),
-    given=tuple(f"{device}_checks" for device in _DEVICES),
 )
 EVENTS = OwnTopic(ChannelId.EVENTS, "/events", LOG)
 CERTIFIED_MODEL = "certified model"
 """Name of the events at the end of an attempt with a certificate each, as JSON."""
-TRUTH = OwnTopic(
-    ChannelId.TRUTH, "/truth", "Truth", head=(_CYCLE_NUMBER,), given=("cycle",), block=lambda _: TRUTH_LAYOUT
-)
+TRUTH = OwnTopic(ChannelId.TRUTH, "/truth", "Truth", head=(_CYCLE_NUMBER,), block=lambda *_: TRUTH_LAYOUT)
 RUN_TOPICS = (
     TO_CAN_BUS,
     FROM_CAN_BUS,
@@ -345,8 +300,7 @@ def run_channels(
 
     further_count, channel_count: of the certified scheme, see `records.certified_layout`; 0 for the paper's.
     """
-    size = BlockSize(parameter_count, further_count, channel_count)
-    own = tuple(topic.channel(size) for topic in RUN_TOPICS)
+    own = tuple(topic.channel(parameter_count, further_count, channel_count) for topic in RUN_TOPICS)
     decoded = tuple(
         _decoded_channel(ChannelId.DECODED_FIRST + index, message) for index, message in enumerate(messages)
     )
@@ -356,7 +310,7 @@ def run_channels(
 
 def truth_channels() -> tuple[LogChannel, ...]:
     """List the topics of the emulator's own log."""
-    return TRUTH.channel(BlockSize(0)), EVENTS.channel(BlockSize(0))
+    return TRUTH.channel(), EVENTS.channel()
 
 
 def _decoded_channel(channel_id: int, message: MessageTable) -> LogChannel:
@@ -375,7 +329,9 @@ def _check_names(channels: tuple[LogChannel, ...]) -> None:
 
 def pack_scheme(output: SchemeOutput, request: Request) -> bytes:
     """Pack the body of /scheme."""
-    return SCHEME.pack(output, request, block=output.block)
+    o = output
+    head = (o.cycle, o.state, o.previous_state, o.fault, request, o.contact_joints, o.is_model_valid)
+    return SCHEME.pack(*head, block=o.block)
 
 
 def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
@@ -388,29 +344,42 @@ def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
 
 def pack_contact(report: ContactReport) -> bytes:
     """Pack the body of /contact."""
-    return CONTACT.pack(report)
+    return CONTACT.pack(*(getattr(report, member.name) for member in CONTACT.head))
+
+
+def contact_report(record: Any) -> ContactReport:
+    """Read a report of a record of /contact, of which an older log has fewer fields.
+
+    Raises ValueError or OverflowError for a value that has no name.
+    """
+    members = [member for member in CONTACT.head if member.name in (record.dtype.names or ())]
+    return ContactReport(**{member.name: member.value_of(record[member.name].tolist()) for member in members})
 
 
 def unpack_contact(body: bytes) -> ContactReport:
-    """Unpack the body of /contact. Raises struct.error when it is cut, ValueError for a value that has no name."""
-    return ContactReport(**CONTACT.unpack(body))
+    """Unpack the body of /contact. Raises ValueError when it is cut, or for a value that has no name."""
+    head = bytes(_CONTACT_DTYPE.itemsize - CONTACT.body.size)
+    return contact_report(np.frombuffer(head + body, _CONTACT_DTYPE)[0])
+
+
+_CONTACT_DTYPE = CONTACT.channel().type.dtype
 
 
 def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:
     """Pack the body of /control; `block` is laid out by CONTROL_LAYOUT."""
-    return CONTROL.pack(None, cycle, gate_flags, enable, quick_stop, block=block)
+    return CONTROL.pack(cycle, gate_flags, enable, quick_stop, block=block)
 
 
 def pack_cycle(record: CycleRecord) -> bytes:
     """Pack the body of /cycle."""
-    return CYCLE.pack(record)
+    return CYCLE.pack(*record)
 
 
 def pack_frame_checks(checks: FrameChecks) -> bytes:
     """Pack the body of /frame_checks."""
-    return FRAME_CHECKS.pack(checks, *checks.counts)
+    return FRAME_CHECKS.pack(checks.cycle, *checks.counts, checks.implausible)
 
 
 def pack_truth(cycle: int, block: Vector) -> bytes:
     """Pack the body of /truth; `block` is laid out by TRUTH_LAYOUT."""
-    return TRUTH.pack(None, cycle, block=block)
+    return TRUTH.pack(cycle, block=block)

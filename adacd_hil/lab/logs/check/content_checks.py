@@ -46,11 +46,11 @@ class DefinitionCheck:
         """Check a schema and compare it with earlier ones of its number."""
         name = f"schema {schema.id}"
         if schema.id == 0:
-            self._findings.add("schema-id", f"schema {schema.name!r} has the number 0", offset)
+            self._findings.add_finding("schema-id", f"schema {schema.name!r} has the number 0", offset)
         if not schema.encoding and schema.data:
-            self._findings.add("schema-encoding", f"{name} has data but no encoding", offset)
+            self._findings.add_finding("schema-encoding", f"{name} has data but no encoding", offset)
         elif not schema.encoding:
-            self._findings.add("empty-schema", f"{name} ({schema.name!r}) is empty", offset)
+            self._findings.add_finding("empty-schema", f"{name} ({schema.name!r}) is empty", offset)
         known = self.schemas.get(schema.id)
         if known is not None:
             pairs = (("name", "name"), ("encoding", "encoding"), ("data", "data"))
@@ -76,7 +76,7 @@ class DefinitionCheck:
         is_defined = channel.schema_id in self.schemas or (is_summary and channel.schema_id in self.summary_schemas)
         if channel.schema_id and not is_defined:
             text = f"{name} ({channel.topic}) has the schema {channel.schema_id}, which is not defined"
-            self._findings.add("undefined-schema", text, offset)
+            self._findings.add_finding("undefined-schema", text, offset)
         self._place("channel", channel.id, channel.id in self.channels, offset, is_summary)
         if is_summary:
             self.summary_channels.add(channel.id)
@@ -90,7 +90,9 @@ class DefinitionCheck:
     ) -> None:
         different = [what for what, field in pairs if getattr(known, field) != getattr(other, field)]
         if different:
-            self._findings.add("redefinition", f"{name} is defined again with another {', '.join(different)}", offset)
+            self._findings.add_finding(
+                "redefinition", f"{name} is defined again with another {', '.join(different)}", offset
+            )
 
     def _place(self, kind: str, number: int, is_known: bool, offset: int, is_summary: bool) -> None:
         name = f"{kind} {number}"
@@ -98,7 +100,7 @@ class DefinitionCheck:
             self._summary_only.append((kind, number, offset))
         elif not is_summary and is_known and name not in self._duplicates:
             self._duplicates.add(name)
-            self._findings.add("duplicate", f"{name} is defined more than once in the data section", offset)
+            self._findings.add_finding("duplicate", f"{name} is defined more than once in the data section", offset)
 
     def finish(self, counts: NDArray[Any]) -> None:
         """Judge the channels and schemas that only the summary defines. counts: messages of each channel."""
@@ -107,12 +109,12 @@ class DefinitionCheck:
         unused = []
         for kind, number, offset in self._summary_only:
             if number in used[kind]:
-                self._findings.add("summary-only", f"{kind} {number} is defined in the summary only", offset)
+                self._findings.add_finding("summary-only", f"{kind} {number} is defined in the summary only", offset)
             else:
                 unused.append(f"{kind} {number}")
         if unused:
             text = f"the summary alone defines what no message uses: {', '.join(unused)}"
-            self._findings.add("unused-summary-only", text)
+            self._findings.add_finding("unused-summary-only", text)
 
 
 class ContentCheck:
@@ -134,7 +136,7 @@ class ContentCheck:
         if schema.encoding == "ros2msg" and schema.id not in self._read:
             self._read.add(schema.id)
             if problem := text_problem(schema.data):
-                self._findings.add("schema-text", f"schema {schema.id} ({schema.name}): {problem}", offset)
+                self._findings.add_finding("schema-text", f"schema {schema.id} ({schema.name}): {problem}", offset)
 
     def messages(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
         """Check order and payloads of the messages of a chunk."""
@@ -173,7 +175,7 @@ class ContentCheck:
                 f"{len(backwards)} messages of a chunk are earlier than the one before in their channel, the first on "
                 f"{channel.topic if channel else number} by {back_ns} ns"
             )
-            self._findings.add("order", text, offset)
+            self._findings.add_finding("order", text, offset)
         np.maximum.at(self._latest, channels, times)
 
     def _check_payloads(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
@@ -196,7 +198,7 @@ class ContentCheck:
             channel = definitions.channels[int(contents.channels[place])]
             count = np.count_nonzero(is_wrong)
             text = f"{count} messages of a chunk aren't as their schemas say, the first on {channel.topic}"
-            self._findings.add("cdr", text, offset)
+            self._findings.add_finding("cdr", text, offset)
 
 
 def _is_fd_frame(payload: bytes) -> bool:

@@ -42,7 +42,7 @@ class Findings:
     without_crc: Counter[str] = field(default_factory=Counter)
     """Parts of the file that have no CRC, by kind."""
 
-    def add(self, rule: str, text: str, offset: int = -1) -> None:
+    def add_finding(self, rule: str, text: str, offset: int = -1) -> None:
         """Add a finding of a rule of `RULES`."""
         self.counts[rule] += 1
         if self.counts[rule] <= _TOLD:
@@ -54,58 +54,57 @@ class Findings:
 
 
 class Rule(NamedTuple):
-    """A rule. `origin`: "doctor" when `mcap doctor` has it, "" when it is our own."""
+    """A rule: what a log must be like, and how bad it is when it is not."""
 
     severity: Severity
     demand: str
-    origin: str = ""
 
 
 _ERROR, _WARNING, _NOTE = Severity
 RULES: dict[str, Rule] = {
     # the file
-    "magic": Rule(_ERROR, "the file begins and ends with MCAP's magic, and nothing follows", "doctor"),
-    "record": Rule(_ERROR, "every byte belongs to a record that can be read", "doctor"),
+    "magic": Rule(_ERROR, "the file begins and ends with MCAP's magic, and nothing follows"),
+    "record": Rule(_ERROR, "every byte belongs to a record that can be read"),
     "header": Rule(_ERROR, "one Header, before all else"),
-    "data-end": Rule(_ERROR, "one DataEnd", "doctor"),
-    "footer": Rule(_ERROR, "one Footer", "doctor"),
+    "data-end": Rule(_ERROR, "one DataEnd"),
+    "footer": Rule(_ERROR, "one Footer"),
     "place": Rule(_ERROR, "each kind of record is in its section"),
-    "library": Rule(_WARNING, "the Header says what wrote the file", "doctor"),
-    "profile": Rule(_WARNING, "the Header's profile is empty, ros1 or ros2", "doctor"),
-    "unknown-record": Rule(_WARNING, "every kind of record is known", "doctor"),
+    "library": Rule(_WARNING, "the Header says what wrote the file"),
+    "profile": Rule(_WARNING, "the Header's profile is empty, ros1 or ros2"),
+    "unknown-record": Rule(_WARNING, "every kind of record is known"),
     # CRCs
-    "chunk-crc": Rule(_ERROR, "every chunk can be opened and fits its CRC", "doctor"),
-    "data-crc": Rule(_ERROR, "the data section fits its CRC", "doctor"),
-    "summary-crc": Rule(_ERROR, "the summary fits its CRC", "doctor"),
+    "chunk-crc": Rule(_ERROR, "every chunk can be opened and fits its CRC"),
+    "data-crc": Rule(_ERROR, "the data section fits its CRC"),
+    "summary-crc": Rule(_ERROR, "the summary fits its CRC"),
     "attachment-crc": Rule(_ERROR, "every attachment fits its CRC"),
     "no-crc": Rule(_NOTE, "CRCs vouch for all messages, attachments and the summary"),
     "some-crc": Rule(_WARNING, "without a CRC of the data section, all chunks have a CRC or none"),
     # definitions
-    "schema-id": Rule(_ERROR, "no schema has the number 0", "doctor"),
-    "schema-encoding": Rule(_ERROR, "a schema with data names its encoding", "doctor"),
-    "empty-schema": Rule(_WARNING, "a schema isn't empty", "doctor"),
-    "redefinition": Rule(_ERROR, "definitions of one number are equal", "doctor"),
-    "duplicate": Rule(_WARNING, "the data section defines each number once", "doctor"),
-    "undefined-schema": Rule(_ERROR, "the schema of a channel is defined before it", "doctor"),
-    "undefined-channel": Rule(_ERROR, "the channel of a message is defined before it", "doctor"),
-    "summary-only": Rule(_ERROR, "what the summary defines and messages use, the data section defines too", "doctor"),
+    "schema-id": Rule(_ERROR, "no schema has the number 0"),
+    "schema-encoding": Rule(_ERROR, "a schema with data names its encoding"),
+    "empty-schema": Rule(_WARNING, "a schema isn't empty"),
+    "redefinition": Rule(_ERROR, "definitions of one number are equal"),
+    "duplicate": Rule(_WARNING, "the data section defines each number once"),
+    "undefined-schema": Rule(_ERROR, "the schema of a channel is defined before it"),
+    "undefined-channel": Rule(_ERROR, "the channel of a message is defined before it"),
+    "summary-only": Rule(_ERROR, "what the summary defines and messages use, the data section defines too"),
     "unused-summary-only": Rule(_NOTE, "the data section defines what no message uses, too"),
     # chunks and indexes
-    "chunk-record": Rule(_ERROR, "a chunk holds schemas, channels and messages, whole ones", "doctor"),
-    "chunk-times": Rule(_ERROR, "a chunk's times are those of its earliest and latest message", "doctor"),
-    "chunk-size": Rule(_ERROR, "a chunk is as large as it says", "doctor"),
+    "chunk-record": Rule(_ERROR, "a chunk holds schemas, channels and messages, whole ones"),
+    "chunk-times": Rule(_ERROR, "a chunk's times are those of its earliest and latest message"),
+    "chunk-size": Rule(_ERROR, "a chunk is as large as it says"),
     "message-index": Rule(_ERROR, "the message indexes behind a chunk have exactly its messages"),
     "no-message-index": Rule(_WARNING, "a chunk has message indexes"),
-    "unindexed-messages": Rule(_WARNING, "a file with indexes has no messages outside chunks", "doctor"),
-    "chunk-index": Rule(_ERROR, "one chunk index for each chunk, and all it says is so", "doctor"),
+    "unindexed-messages": Rule(_WARNING, "a file with indexes has no messages outside chunks"),
+    "chunk-index": Rule(_ERROR, "one chunk index for each chunk, and all it says is so"),
     "no-chunk-index": Rule(_WARNING, "the summary has chunk indexes"),
-    "summary-channels": Rule(_ERROR, "the summary defines the channels and schemas that it needs", "doctor"),
+    "summary-channels": Rule(_ERROR, "the summary defines the channels and schemas that it needs"),
     "attachment-index": Rule(_ERROR, "one index for each attachment, and all it says is so"),
     "metadata-index": Rule(_ERROR, "one index for each metadata record, and all it says is so"),
     "summary-offset": Rule(_ERROR, "summary offsets and Footer say where the groups are"),
-    "statistics": Rule(_ERROR, "at most one Statistics, and all its counts and times are so", "doctor"),
+    "statistics": Rule(_ERROR, "at most one Statistics, and all its counts and times are so"),
     # messages
-    "order": Rule(_WARNING, "log_time doesn't run backwards within a channel", "doctor"),
+    "order": Rule(_WARNING, "log_time doesn't run backwards within a channel"),
     "schema-text": Rule(_ERROR, "the text of a ros2msg schema can be read"),
     "cdr": Rule(_ERROR, "a cdr message begins with its encapsulation and is as long as its schema says"),
     # our logs

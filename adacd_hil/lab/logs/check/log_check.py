@@ -7,7 +7,6 @@ record to the rules that concern it.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -30,6 +29,7 @@ from adacd_hil.log.log_files import (
     LogError,
     failing_as,
     find_parts,
+    missing_parts,
     part_path,
     parts_of,
 )
@@ -38,7 +38,6 @@ from adacd_hil.log.mcap.mcap_records import (
     MAGIC,
     FileGap,
     RawRecord,
-    Trailer,
     attachment_crc_fits,
     crc32,
     crc_of,
@@ -94,19 +93,20 @@ class _FileCheck:
         magic = self._file.read(len(MAGIC))
         is_right = magic == MAGIC
         if not is_right:
-            self._findings.add("magic", "the file doesn't begin with MCAP's magic", 0)
+            self._findings.add_finding("magic", "the file doesn't begin with MCAP's magic", 0)
         self._crc = crc32(magic) if is_right else 0
         end = len(magic) if is_right else 0
         for item in scan(self._file):
-            if isinstance(item, Trailer):
-                self._has_trailer = True
-                end = item.offset + len(MAGIC)
-            elif isinstance(item, FileGap):
+            if isinstance(item, FileGap):
                 self._gap(item)
                 end = item.offset + item.size
             else:
                 self._record(item)
                 end = item.end
+        self._file.seek(end)
+        if self._counts[Opcode.FOOTER] and self._file.read(len(MAGIC)) == MAGIC:
+            self._has_trailer = True
+            end += len(MAGIC)
         self._chunks.end_indexes()
         self._finish(end)
         topics = {number: channel.topic for number, channel in self._definitions.channels.items()}
@@ -117,7 +117,7 @@ class _FileCheck:
 
     def _gap(self, gap: FileGap) -> None:
         """Report bytes that don't form a record; the CRC includes them."""
-        self._findings.add("record", f"{gap.size} bytes are no record", gap.offset)
+        self._findings.add_finding("record", f"{gap.size} bytes are no record", gap.offset)
         position = self._file.tell()
         self._crc = crc_of(self._file, gap.offset, gap.offset + gap.size, self._crc)
         self._file.seek(position)
@@ -138,7 +138,7 @@ class _FileCheck:
         try:
             self._judge(record)
         except LogError as error:
-            self._findings.add("record", str(error), record.offset)
+            self._findings.add_finding("record", str(error), record.offset)
 
     def _count(self, record: RawRecord) -> None:
         """Count records that a file may have only once."""
@@ -146,7 +146,7 @@ class _FileCheck:
         self._counts[opcode] += 1
         if self._counts[opcode] > 1:
             rule = {Opcode.HEADER: "header", Opcode.DATA_END: "data-end", Opcode.FOOTER: "footer"}[opcode]
-            self._findings.add(rule, f"there is more than one {name_of(opcode)}", record.offset)
+            self._findings.add_finding(rule, f"there is more than one {name_of(opcode)}", record.offset)
 
     def _data_end(self, record: RawRecord) -> None:
         self._count(record)
@@ -154,18 +154,20 @@ class _FileCheck:
         if not stored:
             self._findings.without_crc[_DATA_SECTION] += 1
         elif stored != self._crc:
-            self._findings.add("data-crc", "the data section fails its CRC", record.offset)
+            self._findings.add_finding("data-crc", "the data section fails its CRC", record.offset)
         self._is_summary = True
         self._crc = 0
 
     def _judge(self, record: RawRecord) -> None:
         opcode = record.opcode
         if opcode not in set(Opcode):
-            self._findings.add("unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset)
+            self._findings.add_finding(
+                "unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset
+            )
             return
         if opcode in (_DATA if self._is_summary else _SUMMARY):
             where = "summary" if self._is_summary else "data section"
-            self._findings.add("place", f"{name_of(opcode)} in the {where}", record.offset)
+            self._findings.add_finding("place", f"{name_of(opcode)} in the {where}", record.offset)
             return
         if self._is_summary:
             self._summary.record(record)
@@ -194,12 +196,12 @@ class _FileCheck:
     def _header(self, record: RawRecord) -> None:
         self._count(record)
         if record.offset != len(MAGIC):
-            self._findings.add("header", "the Header doesn't come first", record.offset)
+            self._findings.add_finding("header", "the Header doesn't come first", record.offset)
         header: Header = parse(record.opcode, record.body)
         if not header.library:
-            self._findings.add("library", "the Header doesn't say what wrote the file", record.offset)
+            self._findings.add_finding("library", "the Header doesn't say what wrote the file", record.offset)
         if header.profile not in _PROFILES:
-            self._findings.add("profile", f"the profile {header.profile!r} is not a known one", record.offset)
+            self._findings.add_finding("profile", f"the profile {header.profile!r} is not a known one", record.offset)
 
     def _attachment(self, record: RawRecord) -> None:
         attachment = parse(record.opcode, record.body)
@@ -207,19 +209,21 @@ class _FileCheck:
         if record.body[-4:] == bytes(4):
             self._findings.without_crc["attachment"] += 1
         elif not attachment_crc_fits(record):
-            self._findings.add("attachment-crc", f"the attachment {attachment.name} fails its CRC", record.offset)
+            self._findings.add_finding(
+                "attachment-crc", f"the attachment {attachment.name} fails its CRC", record.offset
+            )
 
     def _finish(self, end: int) -> None:
         """Judge the file as a whole; it was read up to `end`."""
         for opcode, rule in ((Opcode.HEADER, "header"), (Opcode.DATA_END, "data-end"), (Opcode.FOOTER, "footer")):
             if not self._counts[opcode]:
-                self._findings.add(rule, f"there is no {name_of(opcode)}")
+                self._findings.add_finding(rule, f"there is no {name_of(opcode)}")
         self._file.seek(0, 2)
         size = self._file.tell()
         if not self._has_trailer:
-            self._findings.add("magic", "the file doesn't end with a Footer and MCAP's magic", size)
+            self._findings.add_finding("magic", "the file doesn't end with a Footer and MCAP's magic", size)
         elif end < size:
-            self._findings.add("magic", f"{size - end} bytes follow the end", end)
+            self._findings.add_finding("magic", f"{size - end} bytes follow the end", end)
         self._definitions.finish(self._chunks.counts)
         self._summary.finish()
         self._judge_missing_crcs()
@@ -231,12 +235,14 @@ class _FileCheck:
             missing = Counter(summary=missing["summary"])
         elif 0 < missing["chunk"] < chunks:
             text = f"{missing['chunk']} of {chunks} chunks have no CRC, nor has the data section"
-            self._findings.add("some-crc", text)
+            self._findings.add_finding("some-crc", text)
         elif chunks and not missing["chunk"] and not self._chunks.has_outside:
             missing = missing - Counter([_DATA_SECTION])  # each chunk has its own
         parts = [f"{count} {part}s" if count > 1 else f"the {part}" for part, count in missing.items() if count]
         if parts:
-            self._findings.add("no-crc", f"nothing vouches for these bytes, which have no CRC: {', '.join(parts)}")
+            self._findings.add_finding(
+                "no-crc", f"nothing vouches for these bytes, which have no CRC: {', '.join(parts)}"
+            )
 
 
 class LogCheck(NamedTuple):
@@ -294,12 +300,13 @@ def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> L
 
 def _check_parts(path: Path, checked: dict[int, FileFacts], findings: Findings) -> None:
     """Judge the parts of a log together."""
-    for before, number in pairwise((-1, *checked)):
-        for missing in range(before + 1, number):
-            findings.add("missing-part", f"{part_path(path, missing).name} is missing")
     last = max(checked)
+    for missing in missing_parts(path, checked):
+        findings.add_finding("missing-part", f"{missing.name} is missing")
     if _summary(checked[last]).get(ENDING_KEY) == CONTINUED:
-        findings.add("missing-part", f"{part_path(path, last + 1).name} is missing: the part before says it follows")
+        findings.add_finding(
+            "missing-part", f"{part_path(path, last + 1).name} is missing: the part before says it follows"
+        )
     runs = {number: facts.metadata[RUN_METADATA] for number, facts in checked.items() if RUN_METADATA in facts.metadata}
     first = next(iter(runs.values()), {})
     for number, run in runs.items():
@@ -307,10 +314,10 @@ def _check_parts(path: Path, checked: dict[int, FileFacts], findings: Findings) 
         different = sorted(key for key, _ in {*_identity(run)} ^ {*_identity(first)})
         if different:
             text = f"{name} is of another run: {', '.join(dict.fromkeys(different))} differ"
-            findings.add("foreign-part", text)
+            findings.add_finding("foreign-part", text)
         said = run.get(PART_KEY, str(number))
         if said != str(number):
-            findings.add("foreign-part", f"{name} is part {said} of a log")
+            findings.add_finding("foreign-part", f"{name} is part {said} of a log")
 
 
 def _identity(run: dict[str, str]) -> Iterator[tuple[str, str]]:
@@ -328,16 +335,18 @@ def _check_words(facts: FileFacts) -> None:
         return
     if not summary:
         if facts.is_ended:
-            findings.add("ending", "the log doesn't say why it ended")
+            findings.add_finding("ending", "the log doesn't say why it ended")
         return
     for key, real in (("messages", facts.messages), ("frames", facts.frames)):
         if summary.get(key, str(real)) != str(real):
-            findings.add("counts", f"there are {real} {key}, the summary says {summary[key]}")
+            findings.add_finding("counts", f"there are {real} {key}, the summary says {summary[key]}")
     dropped = summary.get(DROPPED_KEY, "0")
     if dropped != "0":
-        findings.add("dropped", f"{dropped} packets were dropped on the way to the log")
+        findings.add_finding("dropped", f"{dropped} packets were dropped on the way to the log")
     ending = summary.get(ENDING_KEY, "")
     if ending not in PLANNED_ENDINGS:
-        findings.add("ending", f"the log ended because: {ending}" if ending else "the log doesn't say why it ended")
+        findings.add_finding(
+            "ending", f"the log ended because: {ending}" if ending else "the log doesn't say why it ended"
+        )
     if LOST_KEY in summary:
-        findings.add("lost", f"lost before it was recovered: {summary[LOST_KEY]}")
+        findings.add_finding("lost", f"lost before it was recovered: {summary[LOST_KEY]}")

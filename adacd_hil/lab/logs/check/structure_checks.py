@@ -31,9 +31,9 @@ from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, HEAD, INDEX_ENTRY, 
 
 @dataclass
 class ChunkFacts:
-    """The values that the index of a chunk must have."""
+    """The values that the index of a chunk must have; the first ones have mcap's names."""
 
-    length: int
+    chunk_length: int
     message_start_time: int
     message_end_time: int
     compression: str
@@ -43,6 +43,18 @@ class ChunkFacts:
     message_index_length: int = 0
     message_index_offsets: bytes = b""  # packed: as a table they would fill 60 MB in an hour
     is_indexed: bool = False
+
+
+_INDEXED = (
+    "chunk_length",
+    "message_start_time",
+    "message_end_time",
+    "compression",
+    "compressed_size",
+    "uncompressed_size",
+    "message_index_length",
+)
+"""Fields of a chunk index that are compared as they are."""
 
 
 def pack_offsets(offsets: Mapping[int, int]) -> bytes:
@@ -86,19 +98,19 @@ class ChunkCheck:
         if not chunk.uncompressed_crc:
             self._findings.without_crc["chunk"] += 1
         try:
-            data = self._opening.open_checked(chunk)
+            data = self._opening.open_chunk(chunk)
         except ChunkError as error:
-            self._findings.add("chunk-crc", f"a chunk {error}", record.offset)
+            self._findings.add_finding("chunk-crc", f"a chunk {error}", record.offset)
             return
         if len(data) != chunk.uncompressed_size:
             text = f"a chunk holds {len(data)} bytes, and says {chunk.uncompressed_size}"
-            self._findings.add("chunk-size", text, record.offset)
+            self._findings.add_finding("chunk-size", text, record.offset)
         contents = read_contents(data)
         for opcode in contents.strangers:
-            self._findings.add("chunk-record", f"a chunk holds a {name_of(opcode)}", record.offset)
+            self._findings.add_finding("chunk-record", f"a chunk holds a {name_of(opcode)}", record.offset)
         for place in contents.breaks:
             rest = len(data) - place
-            self._findings.add("chunk-record", f"a chunk ends with {rest} bytes of no record", record.offset)
+            self._findings.add_finding("chunk-record", f"a chunk ends with {rest} bytes of no record", record.offset)
         self._compare_times(chunk, contents, record.offset)
         self._messages(contents, record.offset)
         self._expect(contents, facts)
@@ -109,10 +121,10 @@ class ChunkCheck:
         first, last = int(contents.log_times.min()), int(contents.log_times.max())
         if chunk.message_start_time != first:
             text = f"a chunk begins at {chunk.message_start_time}, its earliest message at {first}"
-            self._findings.add("chunk-times", text, offset)
+            self._findings.add_finding("chunk-times", text, offset)
         if chunk.message_end_time != last:
             text = f"a chunk ends at {chunk.message_end_time}, its latest message at {last}"
-            self._findings.add("chunk-times", text, offset)
+            self._findings.add_finding("chunk-times", text, offset)
 
     def _expect(self, contents: Contents, facts: ChunkFacts) -> None:
         """Store the message indexes that the chunk must have."""
@@ -127,20 +139,20 @@ class ChunkCheck:
         channel = int.from_bytes(record.body[:2], "little")
         latest = self._latest
         if latest is None:
-            self._findings.add("place", "a MessageIndex doesn't follow a chunk", record.offset)
+            self._findings.add_finding("place", "a MessageIndex doesn't follow a chunk", record.offset)
             return
         self._offsets[channel] = record.offset
         latest.message_index_length += HEAD.size + len(record.body)
         latest.message_index_offsets = pack_offsets(self._offsets)
         if self._expected is None or len(record.body) % INDEX_ENTRY.itemsize != 6:
             if self._expected is not None:
-                self._findings.add("message-index", "an index has part of an entry", record.offset)
+                self._findings.add_finding("message-index", "an index has part of an entry", record.offset)
             return
         found = np.frombuffer(record.body[6:], INDEX_ENTRY)
         expected = self._expected.pop(channel, found[:0])
         if found.tobytes() != expected.tobytes() and np.sort(found, order="offset").tobytes() != expected.tobytes():
             text = f"the index of channel {channel} has {len(found)} entries that aren't its {len(expected)} messages"
-            self._findings.add("message-index", text, record.offset)
+            self._findings.add_finding("message-index", text, record.offset)
 
     def end_indexes(self) -> None:
         """Take notice that the indexes of the latest chunk are over."""
@@ -148,10 +160,10 @@ class ChunkCheck:
             channels = [channel for channel, entries in self._expected.items() if len(entries)]
             offset = next(reversed(self.facts))
             if not self._offsets:
-                self._findings.add("no-message-index", "a chunk has no message index", offset)
+                self._findings.add_finding("no-message-index", "a chunk has no message index", offset)
             elif channels:
                 text = f"a chunk has no index of the channels {', '.join(map(str, channels))}"
-                self._findings.add("message-index", text, offset)
+                self._findings.add_finding("message-index", text, offset)
         self._latest = None
 
     def message(self, record: RawRecord) -> None:
@@ -176,7 +188,7 @@ class ChunkCheck:
         for channel in channels.tolist():
             if channel not in known:
                 text = f"messages of channel {channel} come before its definition"
-                self._findings.add("undefined-channel", text, offset)
+                self._findings.add_finding("undefined-channel", text, offset)
         if len(contents.starts):
             self.counts += np.bincount(contents.channels, minlength=CHANNEL_NUMBERS)
             self.start_ns = min(self.start_ns, int(contents.log_times.min()))
@@ -191,28 +203,21 @@ class ChunkCheck:
         facts = self.facts.get(index.chunk_start_offset)
         if facts is None:
             text = f"a chunk index points to byte {index.chunk_start_offset}, where no chunk begins"
-            self._findings.add("chunk-index", text, offset)
+            self._findings.add_finding("chunk-index", text, offset)
             return
         if facts.is_indexed:
             text = f"the chunk at byte {index.chunk_start_offset} is indexed more than once"
-            self._findings.add("chunk-index", text, offset)
+            self._findings.add_finding("chunk-index", text, offset)
         facts.is_indexed = True
-        pairs = {
-            "length": (index.chunk_length, facts.length),
-            "start time": (index.message_start_time, facts.message_start_time),
-            "end time": (index.message_end_time, facts.message_end_time),
-            "compression": (index.compression, facts.compression),
-            "compressed size": (index.compressed_size, facts.compressed_size),
-            "uncompressed size": (index.uncompressed_size, facts.uncompressed_size),
-            "length of message indexes": (index.message_index_length, facts.message_index_length),
-        }
-        for what, (said, real) in pairs.items():
+        for name in _INDEXED:
+            said, real = getattr(index, name), getattr(facts, name)
             if said != real:
+                what = name.replace("_", " ")
                 text = f"the {what} of the chunk at byte {index.chunk_start_offset} is {real}, its index says {said}"
-                self._findings.add("chunk-index", text, offset)
+                self._findings.add_finding("chunk-index", text, offset)
         if pack_offsets(index.message_index_offsets) != facts.message_index_offsets:
             text = f"the message indexes of the chunk at byte {index.chunk_start_offset} are not where its index says"
-            self._findings.add("chunk-index", text, offset)
+            self._findings.add_finding("chunk-index", text, offset)
 
 
 class SummaryCheck:
@@ -269,19 +274,19 @@ class SummaryCheck:
             self._compare("metadata-index", self._metadata, parse(record.opcode, record.body), record.offset)
         elif record.opcode == Opcode.STATISTICS:
             if self.statistics is not None:
-                self._findings.add("statistics", "there is more than one Statistics", record.offset)
+                self._findings.add_finding("statistics", "there is more than one Statistics", record.offset)
             self.statistics = parse(record.opcode, record.body)
             self._check_counted_channels(self.statistics, record.offset)
 
     def _compare(self, rule: str, expected: Mapping[int, Any], index: Any, offset: int) -> None:
         kind = rule.removesuffix("-index")
         if index.offset in self._indexed:
-            self._findings.add(rule, f"the {kind} at byte {index.offset} is indexed more than once", offset)
+            self._findings.add_finding(rule, f"the {kind} at byte {index.offset} is indexed more than once", offset)
         elif index.offset not in expected:
-            self._findings.add(rule, f"an index points to byte {index.offset}, where no {kind} begins", offset)
+            self._findings.add_finding(rule, f"an index points to byte {index.offset}, where no {kind} begins", offset)
         elif index != expected[index.offset]:
             text = f"an index says {index}, it is {expected[index.offset]}"
-            self._findings.add(rule, text, offset)
+            self._findings.add_finding(rule, text, offset)
         self._indexed.add(index.offset)
 
     def _check_counted_channels(self, statistics: Statistics | None, offset: int) -> None:
@@ -290,21 +295,21 @@ class SummaryCheck:
         needed = {*self._definitions.channels, *statistics.channel_message_counts}
         for channel in sorted(needed - self._definitions.summary_channels):
             text = f"channel {channel} is counted, but isn't defined in the summary before the Statistics"
-            self._findings.add("summary-channels", text, offset)
+            self._findings.add_finding("summary-channels", text, offset)
 
     def footer(self, record: RawRecord, crc: int) -> None:
         """Check the footer. crc: of the summary up to the footer's own CRC."""
         footer: Footer = parse(record.opcode, record.body)
         if footer.summary_start != self._start:
             text = f"the Footer says that the summary begins at byte {footer.summary_start}, it is {self._start}"
-            self._findings.add("summary-offset", text, record.offset)
+            self._findings.add_finding("summary-offset", text, record.offset)
         if footer.summary_offset_start != self._offset_start:
             text = f"the Footer says {footer.summary_offset_start} for the summary offsets, it is {self._offset_start}"
-            self._findings.add("summary-offset", text, record.offset)
+            self._findings.add_finding("summary-offset", text, record.offset)
         if not footer.summary_crc:
             self._findings.without_crc["summary"] += 1
         elif footer.summary_crc != crc:
-            self._findings.add("summary-crc", "the summary fails its CRC", record.offset)
+            self._findings.add_finding("summary-crc", "the summary fails its CRC", record.offset)
 
     def finish(self) -> None:
         """Judge the summary as a whole."""
@@ -318,7 +323,7 @@ class SummaryCheck:
         for offset, said in self._offsets:
             if (said.group_opcode, said.group_start, said.group_length) not in groups and said.group_length:
                 text = f"a group is said to be at byte {said.group_start}, {said.group_length} bytes, and isn't"
-                self._findings.add("summary-offset", text, offset)
+                self._findings.add_finding("summary-offset", text, offset)
 
     def _check_indexes(self) -> None:
         if not self._groups:
@@ -326,20 +331,20 @@ class SummaryCheck:
         kinds = {group[0] for group in self._groups}
         chunks = self._chunks.facts
         if chunks and Opcode.CHUNK_INDEX not in kinds:
-            self._findings.add("no-chunk-index", "the summary has no chunk indexes")
+            self._findings.add_finding("no-chunk-index", "the summary has no chunk indexes")
         elif chunks:
             for offset in (offset for offset, facts in chunks.items() if not facts.is_indexed):
-                self._findings.add("chunk-index", "a chunk isn't in the index", offset)
+                self._findings.add_finding("chunk-index", "a chunk isn't in the index", offset)
             self._check_needed_channels()
         if self._chunks.has_outside and Opcode.CHUNK_INDEX in kinds:
-            self._findings.add("unindexed-messages", "there are messages outside chunks, which no index has")
+            self._findings.add_finding("unindexed-messages", "there are messages outside chunks, which no index has")
         for rule, opcode, expected in (
             ("attachment-index", Opcode.ATTACHMENT_INDEX, self._attachments),
             ("metadata-index", Opcode.METADATA_INDEX, self._metadata),
         ):
             if opcode in kinds:
                 for offset in sorted(set(expected) - self._indexed):
-                    self._findings.add(rule, f"a record has no {rule.replace('-', ' ')}", offset)
+                    self._findings.add_finding(rule, f"a record has no {rule.replace('-', ' ')}", offset)
 
     def _check_needed_channels(self) -> None:
         used = {
@@ -349,10 +354,12 @@ class SummaryCheck:
             for channel in np.frombuffer(facts.channels, np.uint16)
         }
         for channel in sorted(used - self._definitions.summary_channels):
-            self._findings.add("summary-channels", f"channel {channel} of an indexed chunk isn't in the summary")
+            self._findings.add_finding(
+                "summary-channels", f"channel {channel} of an indexed chunk isn't in the summary"
+            )
         schemas = {self._definitions.channels[channel].schema_id for channel in used & set(self._definitions.channels)}
         for schema in sorted(schemas - self._definitions.summary_schemas - {0}):
-            self._findings.add("summary-channels", f"schema {schema} of an indexed chunk isn't in the summary")
+            self._findings.add_finding("summary-channels", f"schema {schema} of an indexed chunk isn't in the summary")
 
     def _check_statistics(self, statistics: Statistics) -> None:
         chunks = self._chunks
@@ -365,7 +372,7 @@ class SummaryCheck:
         }
         for what, (said, real) in pairs.items():
             if said != real:
-                self._findings.add("statistics", f"there are {real} {what}, the Statistics say {said}")
+                self._findings.add_finding("statistics", f"there are {real} {what}, the Statistics say {said}")
         # Some writers count the schemas and channels that only the summary defines, some don't.
         for what, said, data, summary in (
             ("schemas", statistics.schema_count, self._definitions.schemas, self._definitions.summary_schemas),
@@ -373,7 +380,7 @@ class SummaryCheck:
         ):
             if said not in (len(data), len({*data, *summary})):
                 text = f"there are {len({*data, *summary})} {what}, the Statistics say {said}"
-                self._findings.add("statistics", text)
+                self._findings.add_finding("statistics", text)
         if total:
             for what, said, allowed in (  # mcap's writer in C++ takes 0 for no time yet
                 ("first", statistics.message_start_time, (chunks.start_ns, chunks.first_later_than_zero_ns)),
@@ -381,11 +388,11 @@ class SummaryCheck:
             ):
                 if said not in allowed:
                     text = f"the {what} message is of {allowed[0]}, the Statistics say {said}"
-                    self._findings.add("statistics", text)
+                    self._findings.add_finding("statistics", text)
         counts = statistics.channel_message_counts
         if counts:
             for channel in sorted({*counts, *np.flatnonzero(chunks.counts).tolist()}):
                 said, real = counts.get(channel, 0), int(chunks.counts[channel])
                 if said != real:
                     text = f"channel {channel} has {real} messages, the Statistics say {said}"
-                    self._findings.add("statistics", text)
+                    self._findings.add_finding("statistics", text)
