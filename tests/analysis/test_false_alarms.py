@@ -172,16 +172,16 @@ def test_a_margin_that_shrinks_is_a_warning():
     watch = MarginWatch(2, memory_blocks=100.0)
     assert np.all(watch.margin == np.inf)
     for _ in range(300):
-        watch.add(generator.gumbel(0.25, 0.03, 2))
+        watch.add_block(generator.gumbel(0.25, 0.03, 2))
     assert watch.warning == ""
     np.testing.assert_allclose(watch.reference, 1.0 / (0.25 + 0.03 * math.log(3600.0)), rtol=0.25)
-    watch.add(np.array([np.nan, 1.0]))
+    watch.add_block(np.array([np.nan, 1.0]))
     for _ in range(500):
-        watch.add(generator.gumbel(0.25, 0.03, 2) * np.array([1.0, 2.0]))
+        watch.add_block(generator.gumbel(0.25, 0.03, 2) * np.array([1.0, 2.0]))
     margin = watch.margin
     assert watch.warning == f"joint 2: margin {margin[1]:.1f} x, was {watch.reference[1]:.1f} x"
     assert margin[1] < 0.7 * margin[0]
-    watch.restart()
+    watch.forget()
     assert watch.warning == ""
 
 
@@ -190,6 +190,6 @@ def test_the_largest_ratio_of_an_hour_is_what_the_margin_says():
     watch = MarginWatch(1, memory_blocks=1000.0)
     blocks = generator.gumbel(0.2, 0.02, (3600 * 20, 1))
     for block in blocks[:3000]:
-        watch.add(block)
+        watch.add_block(block)
     hourly = np.median(blocks.reshape(20, 3600).max(axis=1))
     np.testing.assert_allclose(1.0 / watch.margin[0], hourly, rtol=0.1)

@@ -132,12 +132,12 @@ def break_pdo_map(rig: Rig, index: int, subindex: int, value: int) -> None:
 @pytest.mark.parametrize(
     ("index", "subindex", "value", "reason"),
     [
-        (0x1A00, 1, 0x60640010, "Drive1Feedback: 0x6064 of 16 bits is mapped at place 1, 0x6064 of 32 bits expected"),
-        (0x1A00, 1, 0x60630020, "Drive1Feedback: 0x6063 of 32 bits is mapped at place 1, 0x6064 of 32 bits expected"),
-        (0x1A00, 0, 1, "Drive1Feedback: nothing is mapped at place 2, 0x606C of 32 bits expected"),
-        (0x1800, 1, 0x80000181, "Drive1Feedback: the device has no PDO with identifier 0x181"),
-        (0x1400, 1, 0x00000211, "Drive1Command: the device has no PDO with identifier 0x201"),
-        (0x1600, 3, 0x60710010, "Drive1Command: 0x6071 of 16 bits is mapped at place 3, 0x6040 of 16 bits expected"),
+        (0x1A00, 1, 0x60640010, "Drive1Feedback: mapped object 0x1A00:1 = 0x60640010, 0x60640020 expected"),
+        (0x1A00, 1, 0x60630020, "Drive1Feedback: mapped object 0x1A00:1 = 0x60630020, 0x60640020 expected"),
+        (0x1A00, 0, 1, "Drive1Feedback: number of mapped objects 0x1A00 = 1, 2 expected"),
+        (0x1800, 1, 0x80000181, "Drive1Feedback: identifier 0x1800:1 = 0x80000181, 0x181 expected"),
+        (0x1400, 1, 0x00000211, "Drive1Command: identifier 0x1400:1 = 0x211, 0x201 expected"),
+        (0x1600, 3, 0x60710010, "Drive1Command: mapped object 0x1600:3 = 0x60710010, 0x60400010 expected"),
     ],
 )
 def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, value: int, reason: str) -> None:
