@@ -52,6 +52,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, documents: dict[str, Docume
     for name, block in named_toml(documents).items():
         (folder / name).write_text(block.text)
     run_embedded(resolve("certified", str(folder / "experiment.toml"), None, None), "lockstep", folder / "runs/demo")
+    own = resolve(str(folder / "my-arm.toml"), str(folder / "experiment.toml"), None, None)
+    run_embedded(own, "lockstep", folder / "runs/rehearsed")  # the arm that `runs` and `trend` choose
     for place in ("runs/run", "runs/vcan", "runs/today"):
         shutil.copytree(folder / "runs/demo", folder / place)
     shutil.copy(folder / "runs/demo/run.mcap", folder)

@@ -42,7 +42,7 @@ def recorded(path, frames):
     with path.open("wb") as file:
         writer = FrameWriter(file)
         for t_ms, (can_id, data) in enumerate(frames):
-            writer.write(RecordedFrame(1_000_000 * t_ms, can_id, data, len(data)))
+            writer.write_frame(RecordedFrame(1_000_000 * t_ms, can_id, data, len(data)))
         writer.finish()
     return RecordedCycles(path, CODEC)
 
