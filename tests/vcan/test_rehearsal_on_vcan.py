@@ -21,5 +21,5 @@ def test_the_rehearsal_of_an_own_arm_certifies_it_and_finds_the_touches(tmp_path
     assert played.status == 0, played.stderr
     assert played.json["state"] == "MONITOR"
     assert "model certified" in played.stderr
-    links = [contact.report.link for contact in read_log(played.log).contacts if contact.report.is_final]
+    links = [report.link for _, report in read_log(played.log).contacts if report.is_final]
     assert links == LINKS[:2]
