@@ -35,7 +35,7 @@ def test_a_run_that_deviates_is_told_and_is_the_exit_status(tmp_path: Path) -> N
     assert done.returncode == 1
     rows = {row["name"]: row for row in json.loads(done.stdout)}
     assert (rows["good"]["is_good"], rows["good"]["deviations"]) == (True, [])
-    assert (rows["bad"]["is_good"], rows["bad"]["deviations"]) == (False, ["adaptations: none, expected 1"])
+    assert (rows["bad"]["is_good"], rows["bad"]["deviations"]) == (False, ["adaptations: 0, expected 1"])
     assert rows["bad"]["outcome"]["end"] == "finished"
     assert (tmp_path / "logs" / "paper" / "bad" / "run.mcap").is_file()
     assert "2/2" in done.stderr
