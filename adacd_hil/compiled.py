@@ -5,8 +5,8 @@ numba alone looks only at the file of the function itself; it would use old code
 of an edited constant.
 
 A function that one process is compiling is not compiled by another at the same time (`_SharedCache`). The code is for
-every processor of the architecture, so that a wheel can bring it along (`tools/wheel`). It is as fast as code for this
-machine's processor, and gives the same bits.
+every processor of the architecture, so that a wheel can bring it along (`tools/wheel`). On the one machine measured it
+was as fast as code for that processor, with the same bits.
 """
 
 import contextlib
