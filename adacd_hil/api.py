@@ -6,7 +6,7 @@ Everything else may move; these names stay. docs/api.md has examples.
 |---|---|
 | `load`, `LoadedRun` | a run's log as named arrays, events, contacts, certificates |
 | `detect`, `fit`, `Arm`, `Detection`, `Model`, `Verdict`, `ArrayError` | the scheme over arrays of any serial arm |
-| `Detector`, `register_detector` | a detector of your own |
+| `Detector`, `register_detector`, `check_detector` | a detector of your own |
 | `Bus`, `Frame` | another CAN interface |
 | `SchemeState`, `ContactReport`, `Certificate`, `LogError` | types of the results |
 """
@@ -28,6 +28,7 @@ __all__ = [
     "RunEvent",
     "SchemeState",
     "Verdict",
+    "check_detector",
     "detect",
     "fit",
     "load",
@@ -43,7 +44,7 @@ PLACES = {
     "Certificate": ("adacd_hil.scheme.identify.certificate", "Certificate"),
     "ContactReport": ("adacd_hil.records", "ContactReport"),
     "Detection": (f"{_LIBRARY}.array_detection", "ArrayDetection"),
-    "Detector": ("adacd_hil.scheme.detect.detector_registry", "StreamDetector"),
+    "Detector": ("adacd_hil.lab.detectors.detector_registry", "StreamDetector"),
     "Frame": ("adacd_hil.wire.bus", "Frame"),
     "LoadedRun": (f"{_LIBRARY}.loaded_run", "LoadedRun"),
     "LogError": ("adacd_hil.log.log_files", "LogError"),
@@ -52,10 +53,11 @@ PLACES = {
     "RunEvent": (f"{_LIBRARY}.loaded_run", "RunEvent"),
     "SchemeState": ("adacd_hil.records", "SchemeState"),
     "Verdict": ("adacd_hil.lab.offline.recording_verdict", "Verdict"),
+    "check_detector": ("adacd_hil.lab.detectors.detector_registry", "check_contract"),
     "detect": (f"{_LIBRARY}.array_detection", "detect"),
     "fit": (f"{_LIBRARY}.array_detection", "fit"),
     "load": (f"{_LIBRARY}.loaded_run", "load"),
-    "register_detector": ("adacd_hil.scheme.detect.detectors", "register"),
+    "register_detector": ("adacd_hil.lab.detectors.detectors", "register"),
 }
 
 

@@ -1,3 +1,6 @@
+from adacd_hil.lab.detectors.detector_registry import StreamDetector as Detector
+from adacd_hil.lab.detectors.detector_registry import check_contract as check_detector
+from adacd_hil.lab.detectors.detectors import register as register_detector
 from adacd_hil.lab.library.array_detection import ArrayContact, ArrayError, detect, fit
 from adacd_hil.lab.library.array_detection import ArrayDetection as Detection
 from adacd_hil.lab.library.array_detection import FittedModel as Model
@@ -6,8 +9,6 @@ from adacd_hil.lab.library.loaded_run import LoadedRun, RunContact, RunEvent, lo
 from adacd_hil.lab.offline.recording_verdict import Verdict
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import ContactReport, SchemeState
-from adacd_hil.scheme.detect.detector_registry import StreamDetector as Detector
-from adacd_hil.scheme.detect.detectors import register as register_detector
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.wire.bus import Bus, Frame
 
@@ -28,6 +29,7 @@ __all__ = [
     "RunEvent",
     "SchemeState",
     "Verdict",
+    "check_detector",
     "detect",
     "fit",
     "load",

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adacd_hil.scheme.model import chain
-from adacd_hil.scheme.model.urdf import SerialArm, read_urdf
+from adacd_hil.lab.serial_arm import chain
+from adacd_hil.lab.serial_arm.urdf import SerialArm, read_urdf
 
 AXES = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0", "0 0 1")
 

@@ -168,10 +168,10 @@ def test_pip_installs_the_example_of_a_detector_and_its_name_is_known(tmp_path: 
         timeout=120,
     )
     code = (
-        "from adacd_hil.scheme.detect.detector_registry import check_contract; from lab_detectors import MeanOfTwenty;"
+        "from adacd_hil.api import check_detector; from lab_detectors import MeanOfTwenty;"
         "from importlib.metadata import entry_points;"
         "(point,) = entry_points(group='adacd_hil.detectors', name='mean of 20');"
-        "assert point.load() is MeanOfTwenty; check_contract('mean of 20', MeanOfTwenty); print('kept')"
+        "assert point.load() is MeanOfTwenty; check_detector('mean of 20', MeanOfTwenty); print('kept')"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT)))}
     ran = subprocess.run(

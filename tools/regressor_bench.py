@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.scheme.identify import estimator, offline
-from adacd_hil.scheme.model import chain, filter_bank, regressor
-from adacd_hil.scheme.model.urdf import read_urdf
+from adacd_hil.lab.serial_arm import chain, offline
+from adacd_hil.lab.serial_arm.urdf import read_urdf
+from adacd_hil.scheme.identify import estimator
+from adacd_hil.scheme.model import filter_bank, regressor
 
 ROOT = Path(__file__).resolve().parent.parent
 BLOCK, BLOCKS = 100, 300

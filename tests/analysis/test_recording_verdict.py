@@ -16,8 +16,8 @@ from adacd_hil.lab.offline.other_readings import is_possible
 from adacd_hil.lab.offline.recording_identification import Identified, identify
 from adacd_hil.lab.offline.recording_import import read_recording
 from adacd_hil.lab.offline.recording_map import read_map
-from adacd_hil.scheme.identify.offline import model_of
-from adacd_hil.scheme.model.urdf import read_urdf
+from adacd_hil.lab.serial_arm.offline import model_of
+from adacd_hil.lab.serial_arm.urdf import read_urdf
 
 LEVEL, UPRIGHT = ("0 0 1",) * 7, ("0 1 0",) * 7
 """Axes of an arm that gravity doesn't reach, and of one that it does."""

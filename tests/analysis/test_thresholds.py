@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from numpy.lib.stride_tricks import sliding_window_view
 
 from adacd_hil.cli.main import cli
+from adacd_hil.lab.detectors.detectors import DetectorBankSettings, register, unregister
 from adacd_hil.lab.thresholds import free_motion as module
 from adacd_hil.lab.thresholds.detector_comparison import (
     STEPS_NM,
@@ -26,7 +27,6 @@ from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, compute_thr
 from adacd_hil.log.log_files import LogError
 from adacd_hil.plain_values import plain_values
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.detect.detectors import DetectorBankSettings, register, unregister
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import read_toml
 

@@ -22,11 +22,11 @@ from adacd_hil.control.cycle import RunResult
 from adacd_hil.control.gate import GateFlag
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.lab.live.live_view import LiveView
+from adacd_hil.lab.serial_arm.urdf import read_urdf
 from adacd_hil.log.reader import RunLog
 from adacd_hil.log.robot_description import ROBOT_NAME
 from adacd_hil.log.viewer_layout import LAYOUT_NAME
 from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState
-from adacd_hil.scheme.model.urdf import read_urdf
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.e2e import E2eStatus
 

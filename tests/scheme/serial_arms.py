@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adacd_hil.scheme.model.chain import Chain, point_mass
-from adacd_hil.scheme.model.urdf import SerialArm, read_urdf
+from adacd_hil.lab.serial_arm.chain import Chain, point_mass
+from adacd_hil.lab.serial_arm.urdf import SerialArm, read_urdf
 
 SEVEN_JOINT_URDF = (Path(__file__).parent / "seven_joint_arm.urdf").read_text()
 GRAVITY = (0.0, 0.0, -9.81)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from serial_arms import PLANAR_LENGTH_M, planar_chain, random_chain, random_state, seven_joint_arm
 
+from adacd_hil.lab.serial_arm import chain
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, PARAMETER_NAMES
-from adacd_hil.scheme.model import chain, regressor
+from adacd_hil.scheme.model import regressor
 
 SEEDS = range(20)
 G_M_S2 = 9.81

@@ -9,9 +9,9 @@ from serial_arms import GRAVITY, SEVEN_JOINT_URDF, planar_chain, seven_joint_arm
 from simulated_arm import Multisine, simulate
 from smooth_motion import smooth_motion, torque_of
 
-from adacd_hil.scheme.identify import offline
-from adacd_hil.scheme.identify.offline import OfflineSettings, Record
-from adacd_hil.scheme.model.chain import mass_matrix, regressor
+from adacd_hil.lab.serial_arm import offline
+from adacd_hil.lab.serial_arm.chain import mass_matrix, regressor
+from adacd_hil.lab.serial_arm.offline import OfflineSettings, Record
 
 pinocchio = pytest.importorskip("pinocchio")
 

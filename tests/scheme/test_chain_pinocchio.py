@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from serial_arms import GRAVITY, SEVEN_JOINT_URDF, planar_chain, random_chain, random_state, seven_joint_arm
 
-from adacd_hil.scheme.model import chain
+from adacd_hil.lab.serial_arm import chain
 
 pinocchio = pytest.importorskip("pinocchio")
 

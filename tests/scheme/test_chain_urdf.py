@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from serial_arms import SEVEN_JOINT_URDF, seven_joint_arm
 
-from adacd_hil.scheme.model.urdf import UrdfError, read_urdf
+from adacd_hil.lab.serial_arm.urdf import UrdfError, read_urdf
 
 INERTIA = '<inertia ixx="3" ixy="0" ixz="0" iyy="3" iyz="0" izz="1"/>'
 BODY = f'<inertial><origin xyz="0 0 0.5"/><mass value="2"/>{INERTIA}</inertial>'

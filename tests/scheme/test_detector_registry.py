@@ -6,8 +6,8 @@ import tomllib
 import pytest
 from documents import ROOT
 
-from adacd_hil.scheme.detect import detector_registry
-from adacd_hil.scheme.detect.detectors import DetectorBankSettings
+from adacd_hil.lab.detectors import detector_registry
+from adacd_hil.lab.detectors.detectors import DetectorBankSettings
 from adacd_hil.settings.configuration import Settings, load_settings, renewed
 from adacd_hil.settings.schema import ConfigError, DetectorError, parse
 from adacd_hil.settings.setting_keys import apply_settings

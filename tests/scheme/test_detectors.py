@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from adacd_hil.scheme.detect.detectors import (
+from adacd_hil.lab.detectors.detectors import (
     DetectorBankSettings,
     autocovariance,
     constants_of,

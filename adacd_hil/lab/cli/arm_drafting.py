@@ -41,8 +41,8 @@ from adacd_hil.lab.commission.profile_draft import (
     kind_of,
 )
 from adacd_hil.lab.commission.survey import survey
+from adacd_hil.lab.serial_arm.urdf import UrdfError
 from adacd_hil.log.recording.run_folder import is_there
-from adacd_hil.scheme.model.urdf import UrdfError
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.setting_keys import known_keys

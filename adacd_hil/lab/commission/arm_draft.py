@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from adacd_hil.lab.serial_arm.chain import PER_LINK, Chain
+from adacd_hil.lab.serial_arm.urdf import BASE, SerialArm, UrdfError, read_urdf
 from adacd_hil.records import GRAVITY_M_S2, JOINTS, Vector
-from adacd_hil.scheme.model.chain import PER_LINK, Chain
-from adacd_hil.scheme.model.urdf import BASE, SerialArm, UrdfError, read_urdf
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError, parse

@@ -1,6 +1,6 @@
 """Arrays of any serial arm through the offline scheme: a model from free motion, its test, contacts in the rest.
 
-The steps and their equations: `adacd_hil.scheme.identify.offline`. Only the arm's geometry must be known; masses,
+The steps and their equations: `adacd_hil.lab.serial_arm.offline`. Only the arm's geometry must be known; masses,
 friction and the torque sensors' offsets are identified.
 """
 
@@ -24,12 +24,12 @@ from adacd_hil.lab.offline.recording_import import (
 )
 from adacd_hil.lab.offline.recording_map import ArmSection, ColumnsSection, RecordingMap
 from adacd_hil.lab.offline.recording_verdict import Verdict
+from adacd_hil.lab.serial_arm.offline import OfflineSettings
+from adacd_hil.lab.serial_arm.urdf import STANDARD_GRAVITY_M_S2, SerialArm, read_urdf
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.robot_description import robot_description
 from adacd_hil.records import Vector
 from adacd_hil.remedies import nearest_name
-from adacd_hil.scheme.identify.offline import OfflineSettings
-from adacd_hil.scheme.model.urdf import STANDARD_GRAVITY_M_S2, SerialArm, read_urdf
 from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError, parse

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from adacd_hil.lab.offline.recording_import import ForeignRecording, derivative_window, derive, samples
 from adacd_hil.lab.offline.recording_map import RecordingMap, units_by_slope
+from adacd_hil.lab.serial_arm.urdf import SerialArm
 from adacd_hil.lab.signal_noise import white_noise
 from adacd_hil.records import Vector
-from adacd_hil.scheme.model.urdf import SerialArm
 from adacd_hil.score.wording import number_of
 
 _STUCK_S: Final = 0.5

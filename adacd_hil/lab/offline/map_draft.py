@@ -16,9 +16,9 @@ from adacd_hil.lab.logs.joint_state_bags import JOINT_STATES, is_bag, joint_stat
 from adacd_hil.lab.offline.column_checks import largest_torques
 from adacd_hil.lab.offline.recording_map import ISO, TIME_S, UnitsSection, time_unit_of, units_by_slope
 from adacd_hil.lab.offline.table_guess import TableGuess, guess_table
+from adacd_hil.lab.serial_arm.urdf import SerialArm, UrdfError, read_urdf
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
-from adacd_hil.scheme.model.urdf import SerialArm, UrdfError, read_urdf
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import toml_value
 

@@ -17,10 +17,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from adacd_hil.lab.offline.recording_map import RecordingMap
+from adacd_hil.lab.serial_arm import offline
+from adacd_hil.lab.serial_arm.offline import ArmModel, OfflineSettings, Record
+from adacd_hil.lab.serial_arm.urdf import STANDARD_GRAVITY_M_S2
 from adacd_hil.records import Vector
-from adacd_hil.scheme.identify import offline
-from adacd_hil.scheme.identify.offline import ArmModel, OfflineSettings, Record
-from adacd_hil.scheme.model.urdf import STANDARD_GRAVITY_M_S2
 
 _MOST_S: Final = 10.0
 """Longest part of fit and of test that is used."""

@@ -19,10 +19,10 @@ from adacd_hil.lab.drawing import COLOURS, Drawing, note, plot, style
 from adacd_hil.lab.offline.recording_import import ForeignRecording, RecordingStretch
 from adacd_hil.lab.offline.recording_map import RecordingMap
 from adacd_hil.lab.offline.recording_verdict import Fitted, Verdict, judge_fit
+from adacd_hil.lab.serial_arm import offline
+from adacd_hil.lab.serial_arm.offline import ModelEstimate, OfflineCertificate, OfflineSettings
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
-from adacd_hil.scheme.identify import offline
-from adacd_hil.scheme.identify.offline import ModelEstimate, OfflineCertificate, OfflineSettings
 from adacd_hil.score.judge import explained_until, owners
 
 FIT_SHARE = 0.6

@@ -26,10 +26,10 @@ from adacd_hil.lab.offline.column_checks import CLIPPED_REMEDY, RecordingFinding
 from adacd_hil.lab.offline.other_readings import UNITS, find_readings, mass_rows
 from adacd_hil.lab.offline.recording_import import ForeignRecording, samples
 from adacd_hil.lab.offline.recording_map import RecordingMap
+from adacd_hil.lab.serial_arm import offline
+from adacd_hil.lab.serial_arm.offline import ArmModel, ModelEstimate, OfflineCertificate, OfflineSettings
 from adacd_hil.lab.signal_noise import low_pass
 from adacd_hil.records import Vector
-from adacd_hil.scheme.identify import offline
-from adacd_hil.scheme.identify.offline import ArmModel, ModelEstimate, OfflineCertificate, OfflineSettings
 
 WHOLE: Final = 0.99
 HALF: Final = 0.5

@@ -16,11 +16,11 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
+from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
 from adacd_hil.lab.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, calibrate_all
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.detect import detectors
 
 STEPS_NM: Final = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 ROC_STEP_NM: Final = 0.1

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
+from adacd_hil.lab.detectors import detectors
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.log_info import attachment
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
 from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
-from adacd_hil.scheme.detect import detectors
 
 APART_S: Final = 0.6
 """Distance from contacts and gaps: six time constants of the slowest filter."""
@@ -227,7 +227,7 @@ def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
 def torque_streams(
     pieces: Iterable[Motion], lag_s: float, standstill_rad_s: float
 ) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:
-    """Yield each piece of a motion with its stream of `scheme.detect.detectors`.
+    """Yield each piece of a motion with its stream of `lab.detectors.detectors`.
 
     The stream: z, and the torque that friction may hold, (n, 2) each, Nm.
     """

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
 from adacd_hil.lab.thresholds.false_alarms import (
     BLOCK_S,
@@ -31,7 +32,6 @@ from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, rea
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import Milestones, Progress
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
-from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.model.regressor import mass_matrix
 from adacd_hil.settings.schema import setting
 

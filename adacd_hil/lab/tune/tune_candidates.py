@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.thresholds.detector_comparison import WARM_UP_S
 from adacd_hil.lab.thresholds.free_motion import torque_streams
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, run_detectors
@@ -24,7 +25,6 @@ from adacd_hil.lab.tune.tune_roc import Changes, Observed, Touched, TunedLog, Wi
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.replay.replay import Watch, replay_many
-from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError

@@ -3,11 +3,11 @@
 import numpy as np
 from lab_detectors import MeanOfTwenty
 
-from adacd_hil.scheme.detect.detector_registry import check_contract
+from adacd_hil.api import check_detector
 
 
 def test_it_keeps_the_contract():
-    check_contract("mean of 20", MeanOfTwenty)
+    check_detector("mean of 20", MeanOfTwenty)
 
 
 def test_a_step_of_1_Nm_is_over_a_half_after_10_samples():

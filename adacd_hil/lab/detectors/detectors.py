@@ -43,9 +43,9 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 
 from adacd_hil.compiled import compiled
+from adacd_hil.lab.detectors import detector_registry
+from adacd_hil.lab.detectors.detector_registry import Maker, Registered
 from adacd_hil.records import Vector
-from adacd_hil.scheme.detect import detector_registry
-from adacd_hil.scheme.detect.detector_registry import Maker, Registered
 from adacd_hil.scheme.model import regressor
 from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.structured import PerJoint, Structured, packed, zeros_of

@@ -19,8 +19,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from adacd_hil.lab.serial_arm.chain import PER_LINK, Chain
 from adacd_hil.records import GRAVITY_M_S2, Vector
-from adacd_hil.scheme.model.chain import PER_LINK, Chain
 
 MOVING = ("revolute", "continuous", "prismatic")
 STANDARD_GRAVITY_M_S2 = (0.0, 0.0, -GRAVITY_M_S2)

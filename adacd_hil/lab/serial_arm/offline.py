@@ -43,11 +43,12 @@ import numpy as np
 import scipy.linalg
 
 from adacd_hil.compiled import compiled
+from adacd_hil.lab.serial_arm import chain
+from adacd_hil.lab.serial_arm.chain import BaseParameters, Chain, Indices, Scratch
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.identify import estimator
-from adacd_hil.scheme.model import chain, filter_bank
-from adacd_hil.scheme.model.chain import BaseParameters, Chain, Indices, Scratch
+from adacd_hil.scheme.model import filter_bank
 from adacd_hil.settings.schema import setting
 
 _PARTS = 12
