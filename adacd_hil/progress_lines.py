@@ -9,7 +9,8 @@ from typing import Self
 
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.compile_progress import telling
-from adacd_hil.terminal import in_line, moves_cursor, write_line
+from adacd_hil.printable import in_line
+from adacd_hil.terminal import moves_cursor, write_line
 
 
 class Progress:

@@ -9,7 +9,8 @@ import re
 from collections.abc import Collection, Sequence
 from itertools import zip_longest
 
-from adacd_hil.terminal import in_line, wrap_words
+from adacd_hil.printable import in_line
+from adacd_hil.terminal import wrap_words
 
 _GAP = "  "
 _LEAST_ROOM, _LEAST_CUT = 16, 8

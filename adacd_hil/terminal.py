@@ -1,8 +1,8 @@
 """Standard output and error of both programs: all text for a terminal, a pipe or a file passes here.
 
-Text from files or the bus can't control a terminal: control characters are escaped as in JSON; within a line of ours
-(`in_line`) line ends are escaped, too. A reader that goes away, as `head` does, is no error. An output that blocks
-delays the end by half a second at most once the user has asked for it.
+Text from files or the bus can't control a terminal: control characters are escaped as in JSON (`plain`). A reader
+that goes away, as `head` does, is no error. An output that blocks delays the end by half a second at most once the user
+has asked for it.
 """
 
 import _thread
@@ -20,11 +20,8 @@ import threading
 from types import FrameType
 from typing import TextIO
 
-_CONTROL = re.compile(
-    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # C0 but for tab and newline, DEL, C1
-    "\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"  # controls of writing direction, invisible line ends
-)
-_MOST_LETTERS = 2000
+from adacd_hil.printable import plain
+
 _POLL_MS = 100
 _PATIENCE_POLLS = 5
 """Polls of a blocked output after the user's request to end: 0.5 s."""
@@ -33,22 +30,6 @@ _NOBODY_READS = (errno.EPIPE, errno.EIO)
 _MOMENT_S = 0.02
 _PIECE = 1024
 """Bytes that a pipe or a terminal takes without blocking when it is ready: POSIX has PIPE_BUF of at least 512."""
-
-
-def plain(text: str) -> str:
-    """Escape control characters of a text, except tabs and newlines, as JSON does, with four hexadecimal digits."""
-    return _CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
-
-
-def in_line(text: str) -> str:
-    """Escape control characters as `plain` does, and also tabs and newlines, so that the text stays in its line."""
-    return plain(text).replace("\n", "\\u000a").replace("\t", "\\u0009")
-
-
-def one_line(text: object) -> str:
-    """Put a text into one line, without control characters, cut at 2000 letters."""
-    line = plain(" ".join(str(text).split()))
-    return line if len(line) <= _MOST_LETTERS else f"{line[:_MOST_LETTERS]} …"
 
 
 def terminal_columns(stream: "TextIO | Terminal | None" = None) -> int | None:

@@ -19,9 +19,10 @@ from long_cases import long_but
 
 from adacd_hil.lab.cli.monitor_command import Screen
 from adacd_hil.log.reader import read_log
+from adacd_hil.printable import in_line, one_line, plain
 from adacd_hil.progress_lines import Progress
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import for_people, has_colour, in_line, one_line, plain, terminal_columns
+from adacd_hil.terminal import for_people, has_colour, terminal_columns
 from firmware_sim.bench.bench_time import TruthLog
 
 OK, USAGE, PARTIAL, INTERRUPTED = 0, 2, 3, 130

@@ -12,6 +12,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
+from adacd_hil.log.viewer_layout import viewer_files
 from adacd_hil.records import TRUTH_LAYOUT, Vector
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.score.emulator_truth import config_digest
@@ -125,6 +126,7 @@ def run_embedded(
                 "embedded",
                 metadata={"scenario": scenario.name, "seed": str(scenario.seed)},
                 progress=progress,
+                viewer_files=viewer_files(settings),
                 live=live,
                 on_started=on_started,
                 touched_ns=lambda: touched_ns,

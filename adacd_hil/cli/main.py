@@ -21,8 +21,9 @@ from adacd_hil.cli.options import (
 )
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, complain
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
+from adacd_hil.printable import one_line
 from adacd_hil.remedies import pip_command
-from adacd_hil.terminal import is_interrupted, one_line, open_terminals
+from adacd_hil.terminal import is_interrupted, open_terminals
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection

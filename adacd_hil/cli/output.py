@@ -23,8 +23,9 @@ from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.plain_values import json_text
+from adacd_hil.printable import in_line, one_line
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import fold, in_line, one_line, painted, terminal_columns, write_result, write_screen
+from adacd_hil.terminal import fold, painted, terminal_columns, write_result, write_screen
 
 PROGRAM = "adacd-hil"
 

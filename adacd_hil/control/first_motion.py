@@ -63,13 +63,15 @@ most for exchanged drives."""
 _FAR: Final = 2.5
 """Sensed over commanded torque from which wrong scales are the likeliest reason of an arm that runs away or lags."""
 _EXCHANGES: Final = ("drives", "sensors", "joints")
-_NO_CAUSE: Final = (
+NO_CAUSE: Final = (
     "the motion contradicts the configuration, for an unknown reason: check nodes, signs and scales of the devices"
 )
-_TOO_SHORT: Final = (
+"""Line of a contradiction that no reading of the devices explains."""
+TOO_SHORT: Final = (
     "perhaps a node, sign or scale of the devices is wrong, or something pushed the arm; the motion was too short to "
     "distinguish them"
 )
+"""Line of an arm that left its limits before the readings could be told apart."""
 _OWN, _OTHER = 0, 1
 _COLUMNS: Final = 7
 
@@ -150,7 +152,7 @@ class FirstMotion(EventSource):
             squares = ddq * ddq, tau_c * tau_c, tau_J * tau_J
             self._pushed += *squares, tau_c * ddq, tau_J * ddq, tau_c * block.dq, tau_c * tau_J
             if readings.judge_blocks(is_torque_known=not self._open):
-                self.line = readings.name_causes(self._left()) or _NO_CAUSE
+                self.line = readings.name_causes(self._left()) or NO_CAUSE
 
     def certify(self, certificates: tuple[Certificate, ...]) -> None:
         """Compare the first certificate of the run, if any, with the configured lengths."""
@@ -176,7 +178,7 @@ class FirstMotion(EventSource):
         elif not self._readings.is_unlike_an_arm():
             return ""
         text = self._readings.name_causes(left)
-        return f"perhaps {text.removeprefix('either ')}" if text else _TOO_SHORT
+        return f"perhaps {text.removeprefix('either ')}" if text else TOO_SHORT
 
     def _left(self) -> list[Reading]:
         """Return the device readings that agree with the arm's equation and with the commanded torques."""

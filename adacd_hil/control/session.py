@@ -2,8 +2,9 @@
 
 import json
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -21,12 +22,10 @@ from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.profile import enable_timeout_s, place_devices
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import place_file
-from adacd_hil.log.log_files import LOG_NAME, arithmetic
+from adacd_hil.log.log_files import LAYOUT_NAME, LOG_NAME, arithmetic
 from adacd_hil.log.recording.processes import LiveService
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
-from adacd_hil.log.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
-from adacd_hil.log.viewer_layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import Event, FaultReason, SchemeState
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
 from adacd_hil.scheme.identify.certificate import Certificate
@@ -61,8 +60,8 @@ class SessionSummary:
 class LiveView(Protocol):
     """Options of a live view that the user requested."""
 
-    def server(self, settings: Settings, robot: str) -> LiveService:
-        """Return the server of the view for an arm; robot: its URDF."""
+    def server(self, settings: Settings) -> LiveService:
+        """Return the server of the view for an arm."""
 
 
 class ArmFile(Protocol):
@@ -103,7 +102,8 @@ class Ending(NamedTuple):
 class Session:
     """One run on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time.
 
-    `on_started` is called when the devices are set to Operational for the first time. `touched_ns`: see `RunNarration`.
+    `viewer_files`: attached to the log and written beside it, by name. `on_started` is called when the devices are set
+    to Operational for the first time. `touched_ns`: see `RunNarration`.
     """
 
     settings: Settings
@@ -116,6 +116,7 @@ class Session:
     metadata: dict[str, str] = field(default_factory=dict)
     progress: Callable[[str], None] = lambda _: None
     files: Sequence[ArmFile] = ()
+    viewer_files: Mapping[str, bytes] = field(default_factory=dict)
     live: LiveView | None = None
     on_started: Callable[[], None] = lambda: None
     touched_ns: Callable[[], int | None] = lambda: None
@@ -273,7 +274,7 @@ class Session:
         attachments["config.toml"] = to_toml(self.settings).encode()
         for file in self.files:
             attachments |= file.attachments()
-        robot = robot_description(self.settings)
+        attachments |= self.viewer_files
         with grant.unpinned():
             recorder = Recorder(
                 self.out / LOG_NAME,
@@ -286,19 +287,18 @@ class Session:
                 epoch_ns=0 if is_lockstep else wall_ns() - MonotonicClock().now_ns(),
                 blocking=is_lockstep,
                 settings=self.settings.log,
-                robot=robot.encode(),
-                live=None if self.live is None else self.live.server(self.settings, robot),
+                live=None if self.live is None else self.live.server(self.settings),
             )
-        self._write_beside(robot.encode(), recorder)
+        self._write_beside(recorder)
         return recorder
 
-    def _write_beside(self, robot: bytes, recorder: Recorder) -> None:
-        """Write the viewers' files beside the log; the log contains them, too."""
-        for write in (
-            lambda: place_file(self.out / ROBOT_NAME, robot),
-            lambda: place_file(self.out / LAYOUT_NAME, viewer_layout(robot)),
-            lambda: write_contract(self.codec, self.out),
-        ):
+    def _write_beside(self, recorder: Recorder) -> None:
+        """Write the viewers' files and the contract beside the log; the log contains them, too."""
+        writes: list[Callable[[], object]] = [
+            partial(place_file, self.out / name, content) for name, content in self.viewer_files.items()
+        ]
+        writes.append(partial(write_contract, self.codec, self.out))
+        for write in writes:
             try:
                 write()
             except OSError as error:

@@ -30,6 +30,8 @@ def failing_as(what: str) -> Iterator[None]:
 
 
 PRODUCT = "adacd-hil"
+ROBOT_NAME, LAYOUT_NAME = "robot.urdf", "viewer-layout.json"
+"""The viewers' files, in a log and beside it: the arm's URDF, and the layout of the panels."""
 RUN_METADATA = "run"
 SUMMARY_METADATA = "summary"
 EPOCH_KEY = "epoch_ns"

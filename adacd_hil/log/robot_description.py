@@ -77,7 +77,6 @@ def find_bodies(
     return LinkBody(moment / center1_m, center1_m, left - moment * center1_m), second
 
 
-ROBOT_NAME = "robot.urdf"
 WORLD, BASE, TIP = "world", "base", "tip"
 LINK_NAMES = ("link1", "link2")
 LINK_WIDTH_M = 0.04

@@ -1,14 +1,15 @@
-"""The panel layout for viewers of a log, Foxglove and Lichtblick."""
+"""The files for viewers of a log, Foxglove and Lichtblick: the arm, and the layout of the panels."""
 
 import base64
 import json
 from typing import Any
 
-from adacd_hil.log.robot_description import WORLD
+from adacd_hil.log.log_files import LAYOUT_NAME, ROBOT_NAME
+from adacd_hil.log.robot_description import WORLD, robot_description
+from adacd_hil.settings.configuration import Settings
 
 SCENE_TOPIC = "/scene"
 """Topic of the 3-D arm, which only the live view has."""
-LAYOUT_NAME = "viewer-layout.json"
 
 
 def _titled(title: str, panel: dict[str, Any]) -> dict[str, Any]:
@@ -57,6 +58,12 @@ def _scene(robot: bytes) -> dict[str, Any]:
         "topics": {SCENE_TOPIC: {"visible": True}, "/joint_states": {"visible": True}},
     }
     return _titled("Arm", panel)
+
+
+def viewer_files(settings: Settings) -> dict[str, bytes]:
+    """Return the files of a run's arm by name: its URDF, and a layout with the arm in it."""
+    robot = robot_description(settings).encode()
+    return {ROBOT_NAME: robot, LAYOUT_NAME: viewer_layout(robot)}
 
 
 def viewer_layout(robot: bytes = b"") -> bytes:

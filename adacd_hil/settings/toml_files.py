@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil.file_access import exists, read_input
+from adacd_hil.printable import one_line
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.terminal import one_line
 
 _MOST_TOML_BYTES = 1 << 20
 _DEEPEST = 16

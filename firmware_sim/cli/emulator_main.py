@@ -19,11 +19,12 @@ from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError
 from adacd_hil.log.log_info import run_metadata
 from adacd_hil.log.recording.run_folder import check_free
+from adacd_hil.printable import in_line, one_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import in_line, one_line, open_terminals, terminal_columns, write_result
+from adacd_hil.terminal import open_terminals, terminal_columns, write_result
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from adacd_hil.wire.contract_frames import HOST_NODE, move_contract

@@ -23,9 +23,9 @@ from adacd_hil.control.gate import GateFlag
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.serial_arm.urdf import read_urdf
+from adacd_hil.log.log_files import LAYOUT_NAME, ROBOT_NAME
 from adacd_hil.log.reader import RunLog
-from adacd_hil.log.robot_description import ROBOT_NAME
-from adacd_hil.log.viewer_layout import LAYOUT_NAME
+from adacd_hil.log.viewer_layout import viewer_files
 from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.e2e import E2eStatus
@@ -212,6 +212,7 @@ def test_the_log_says_which_drive_faulted_and_why(tmp_path: Path) -> None:
 def test_viewers_find_the_arm_and_a_layout_in_the_log_and_beside_it_and_the_address(tmp_path: Path) -> None:
     rig = SessionRig(tmp_path, finish_s=0.3)
     said: list[str] = []
+    rig.session.viewer_files = viewer_files(rig.session.settings)
     rig.session.live, rig.session.progress = LiveView("127.0.0.1", 0), said.append
     summary, log = rig.run()
     assert summary.log.is_complete

@@ -18,7 +18,7 @@ from adacd_hil import __version__
 from adacd_hil.log.reader import read_log, topic_bytes
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_truth, run_channels
-from adacd_hil.log.viewer_layout import LAYOUT_NAME
+from adacd_hil.log.viewer_layout import viewer_layout
 from adacd_hil.records import CONTROL_LAYOUT, TRUTH_LAYOUT, Event, scheme_layout
 from adacd_hil.wire.bus import Frame
 
@@ -226,7 +226,7 @@ def test_attachments_and_metadata_come_before_the_first_chunk(run, recorded):
     records = records_of(recorded[0])
     first_chunk = next(index for index, record in enumerate(records) if isinstance(record, Chunk))
     before = records[:first_chunk]
-    assert [r.name for r in before if isinstance(r, Attachment)] == [*run.attachments, LAYOUT_NAME]
+    assert [r.name for r in before if isinstance(r, Attachment)] == [*run.attachments]
     assert [r.name for r in before if isinstance(r, Metadata)] == ["run"]
 
 
@@ -245,7 +245,7 @@ def test_the_summary_section_lets_a_viewer_seek(recorded):
     with recorded[0].open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary.statistics.message_count == recorded[1].messages
-    assert summary.statistics.attachment_count == 3
+    assert summary.statistics.attachment_count == 2
     assert len(summary.chunk_indexes) == summary.statistics.chunk_count
     assert {c.message_encoding for c in summary.channels.values()} == {"cdr"}
     assert {s.encoding for s in summary.schemas.values()} == {"ros2msg"}
@@ -254,8 +254,8 @@ def test_the_summary_section_lets_a_viewer_seek(recorded):
     }
 
 
-def test_the_viewer_layout_names_topics_and_fields_that_exist(log):
-    layout = json.loads(log.attachments[LAYOUT_NAME])
+def test_the_viewer_layout_names_topics_and_fields_that_exist():
+    layout = json.loads(viewer_layout())
     types = {channel.topic: channel.type.text for channel in run_channels(7)}
     paths = [path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())]
     assert len(paths) > 10

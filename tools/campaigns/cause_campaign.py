@@ -31,6 +31,7 @@ from campaign_loop import add_jobs, add_seeds, play_trials
 from adacd_hil.api import load
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.cli.output import format_table
+from adacd_hil.control.first_motion import NO_CAUSE, TOO_SHORT
 from adacd_hil.records import FaultReason
 from adacd_hil.settings.run_settings import RequestSettings
 from adacd_hil.settings.schema import ConfigError
@@ -167,8 +168,8 @@ def outcome_of(statement: str, fault: FaultReason, line: str) -> str:
     is_right = re.search(STATEMENTS[statement].pattern, line) is not None
     if is_right:
         return "certain" if is_certain else "among"
-    is_named = (fault is FaultReason.MISCONFIGURED and "doesn't say why" not in line) or (
-        "perhaps" in line and "too short to say which" not in line
+    is_named = (fault is FaultReason.MISCONFIGURED and NO_CAUSE not in line) or (
+        "perhaps" in line and TOO_SHORT not in line
     )
     return "wrong" if is_named else "stopped"
 

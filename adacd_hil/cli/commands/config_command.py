@@ -8,7 +8,7 @@ from adacd_hil.cli.completion import complete_configuration, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, set_option
 from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table
 from adacd_hil.given_path import CommandGroup
-from adacd_hil.terminal import in_line
+from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.settings.setting_keys import KnownKey

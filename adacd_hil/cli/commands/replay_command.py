@@ -10,8 +10,8 @@ from adacd_hil.cli.options import json_option, profile_option, set_option, stret
 from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table, quoted
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
+from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
-from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.log.log_files import TimeWindow

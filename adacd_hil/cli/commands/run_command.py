@@ -32,12 +32,13 @@ from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.control.tare_file import TARED, use_tare
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.log.viewer_layout import viewer_files
+from adacd_hil.printable import in_line, one_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.records import FaultReason
 from adacd_hil.scheme.identify.anchor import unanchored_joints
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.terminal import in_line, one_line
 from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.can_interface import CanInterface
@@ -118,6 +119,7 @@ def run_on_bus(
             interface,
             progress=progress,
             files=files,
+            viewer_files=viewer_files(settings),
             live=live,
             on_started=functools.partial(folder.link, progress),
         )

@@ -43,10 +43,10 @@ from adacd_hil.lab.commission.profile_draft import (
 from adacd_hil.lab.commission.survey import survey
 from adacd_hil.lab.serial_arm.urdf import UrdfError
 from adacd_hil.log.recording.run_folder import is_there
+from adacd_hil.printable import in_line
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.setting_keys import known_keys
-from adacd_hil.terminal import in_line
 from adacd_hil.wire.can_interface import can_interfaces, read_link
 from adacd_hil.wire.open_bus import open_bus
 

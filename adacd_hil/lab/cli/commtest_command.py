@@ -22,19 +22,20 @@ from adacd_hil.lab.commission.communication_test import (
     ZeroTorqueLoop,
 )
 from adacd_hil.lab.score.evaluation import collect_evidence
-from adacd_hil.log.log_files import failing_as
+from adacd_hil.log.log_files import LAYOUT_NAME, failing_as
 from adacd_hil.log.logged_run import QUANTITIES
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.log.types.topics import ChannelId, pack_cycle
+from adacd_hil.log.viewer_layout import viewer_layout
 from adacd_hil.plain_values import plain_values
+from adacd_hil.printable import in_line
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.score.distribution import bar_chart, doubling_bins
 from adacd_hil.score.metrics import TimingEvidence
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import to_toml
-from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import BusError, Tap
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import read_bitrates
@@ -137,7 +138,11 @@ def _open_log(
     return Recorder(
         out / LOG_NAME,
         messages=codec.messages.values(),
-        attachments={codec.path.name: codec.text, "config.toml": to_toml(settings).encode()},
+        attachments={
+            codec.path.name: codec.text,
+            "config.toml": to_toml(settings).encode(),
+            LAYOUT_NAME: viewer_layout(),
+        },
         metadata={
             "command": "commtest",
             "config": settings.name,

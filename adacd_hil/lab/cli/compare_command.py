@@ -9,8 +9,8 @@ from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import ExitCode, answer, explained, format_table
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
+from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
-from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.lab.runs.log_comparison import Contact, LogComparison

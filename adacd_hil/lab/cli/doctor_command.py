@@ -16,9 +16,9 @@ from adacd_hil.lab.commission.host_checks import (
     diagnose,
     summarise,
 )
+from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import request_realtime
-from adacd_hil.terminal import in_line
 from adacd_hil.wire.can_interface import InterfaceState, read_link
 from adacd_hil.wire.contract_frames import read_bitrates
 from adacd_hil.wire.open_bus import open_bus

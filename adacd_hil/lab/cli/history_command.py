@@ -9,7 +9,7 @@ from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained, format_table
 from adacd_hil.file_access import is_anothers, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.terminal import in_line
+from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.control.history_file import History

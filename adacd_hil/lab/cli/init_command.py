@@ -12,7 +12,7 @@ from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quot
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.plain_values import json_text
-from adacd_hil.terminal import in_line
+from adacd_hil.printable import in_line
 
 
 def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple, TypeVar
 import click
 
 from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.printable import in_line
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.terminal import in_line
 
 Answer = TypeVar("Answer")
 

@@ -18,6 +18,7 @@ from adacd_hil.lab.live.client import LiveClient, LiveMessage, live_client
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import unpack_log
 from adacd_hil.plain_values import json_text
+from adacd_hil.printable import one_line
 from adacd_hil.records import (
     GRAVITY_PARAMETER_NAMES,
     JOINT_NAMES,
@@ -29,7 +30,7 @@ from adacd_hil.records import (
     Location,
     SchemeState,
 )
-from adacd_hil.terminal import fold, moves_cursor, one_line, terminal_columns, write_screen
+from adacd_hil.terminal import fold, moves_cursor, terminal_columns, write_screen
 
 TOPICS = ("/scheme", "/cycle", "/contact", "/events")
 _BAR_WIDTH = 40

@@ -11,7 +11,7 @@ from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
-from adacd_hil.terminal import in_line
+from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,7 +12,8 @@ from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.lab.commission.survey import BusView, MessageView, Snapshot
 from adacd_hil.lab.commission.traffic import receive_until
 from adacd_hil.plain_values import json_text
-from adacd_hil.terminal import fold, moves_cursor, plain, terminal_columns, write_screen
+from adacd_hil.printable import plain
+from adacd_hil.terminal import fold, moves_cursor, terminal_columns, write_screen
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
 from adacd_hil.wire.codec import Codec

@@ -16,8 +16,8 @@ from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explain
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.given_path import GivenPath
 from adacd_hil.lab.cli.log_command import dbc_option, find_dbc
+from adacd_hil.printable import in_line
 from adacd_hil.scheduling import freeze_garbage, request_realtime
-from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.can_interface import is_virtual
 

@@ -13,9 +13,9 @@ from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME, LogError
+from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.remedies import nearest_name
-from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.lab.runs.run_summary import RunSummary

@@ -9,7 +9,7 @@ from adacd_hil.clock import MonotonicClock
 from adacd_hil.device.network import Master
 from adacd_hil.lab.commission.survey import Node, Survey, compare, expected_nodes, message_name, survey
 from adacd_hil.lab.commission.traffic import Talk
-from adacd_hil.terminal import in_line
+from adacd_hil.printable import in_line
 from adacd_hil.wire.codec import Codec
 
 

@@ -14,8 +14,8 @@ from adacd_hil.cli.options import json_option, profile_option
 from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
-from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.lab.tune.sweep import Plan, SweepRow, Task, Values

@@ -15,9 +15,9 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.lab.commission.tare import TareRefusedError
 from adacd_hil.lab.commission.tare_session import TareSession
+from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.terminal import in_line
 
 
 @dataclass(frozen=True)

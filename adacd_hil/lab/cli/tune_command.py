@@ -21,8 +21,8 @@ from adacd_hil.cli.output import (
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.plain_values import json_text
+from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
-from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.lab.tune.tune_roc import Candidate, Found, Tuning

@@ -29,10 +29,12 @@ class LiveView:
     robot_description: str = ""
     shape: Shape = Shape((0.0, 0.0))
 
-    def server(self, settings: "Settings", robot: str) -> "LiveView":
-        """Return the view of an arm; robot: its URDF."""
+    def server(self, settings: "Settings") -> "LiveView":
+        """Return the view of an arm."""
+        from adacd_hil.log.robot_description import robot_description
+
         shape = Shape(settings.arm.link_length_m, settings.tilt_rad, settings.level_rad)
-        return dataclasses.replace(self, robot_description=robot, shape=shape)
+        return dataclasses.replace(self, robot_description=robot_description(settings), shape=shape)
 
     def open(self, setup: "WriterSetup", ids: dict[int, int], start_ns: int) -> "LiveFeed":
         """Start the process that serves it. Raises LogError."""

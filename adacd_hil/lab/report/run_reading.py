@@ -54,6 +54,7 @@ from adacd_hil.log.logged_run import (
     split_sections,
 )
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, contacts_of, start_of_log
+from adacd_hil.printable import one_line
 from adacd_hil.records import JOINTS, ContactReport, Request, SchemeState
 from adacd_hil.score.emulator_truth import (
     Rows,
@@ -69,7 +70,6 @@ from adacd_hil.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.score.metrics import Gathered, ReportSource
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.terminal import one_line
 
 BUSY: Final = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.REACT, SchemeState.STOPPED)
 """States that a stretch does not cut."""

@@ -26,8 +26,8 @@ from adacd_hil.lab.report.report_json import JSON_NAME, SCHEMA
 from adacd_hil.log.log_files import EPOCH_KEY, LOG_NAME, PLANNED_ENDINGS, TRUTH_NAME, LogError, parts_of
 from adacd_hil.log.log_info import LogInfo, attachment, read_info
 from adacd_hil.log.logged_run import settings_of
+from adacd_hil.printable import one_line
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.terminal import one_line
 
 DEEPEST: Final = 4
 """Levels below a folder in which its runs are looked for."""

@@ -31,7 +31,7 @@ from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import MOST_BYTES
 from adacd_hil.log.types.message_types import MAX_DATA
 from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE
-from adacd_hil.terminal import in_line
+from adacd_hil.printable import in_line
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 

@@ -21,9 +21,7 @@ from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.processes import LiveService, WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring, room_of
 from adacd_hil.log.recording.run_folder import check_free, make_room
-from adacd_hil.log.robot_description import ROBOT_NAME
 from adacd_hil.log.types.topics import run_channels, truth_channels
-from adacd_hil.log.viewer_layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame
@@ -70,14 +68,13 @@ class Recorder:
         blocking: bool = False,
         is_truth: bool = False,
         settings: LogSettings | None = None,
-        robot: bytes = b"",
         live: LiveService | None = None,
     ) -> None:
         """Create the file, which must not exist (see run_folder.py), and start the writer.
 
         messages: of the DBC, by default the package's. epoch_ns: added to t_ns for the log's times; 0 in lockstep.
-        is_truth: the emulator's own log, /truth and /events only. robot: the arm's URDF, for viewers. live: live view
-        to open. Raises LogExistsError, LogError.
+        is_truth: the emulator's own log, /truth and /events only. live: live view to open. Raises LogExistsError,
+        LogError.
         """
         settings = settings or LogSettings()
         own = {
@@ -86,8 +83,6 @@ class Recorder:
             "parameter_count": str(parameter_count),
             "mode": "lockstep" if blocking else "realtime",
         }
-        layout = {} if is_truth else {LAYOUT_NAME: viewer_layout(robot)}
-        drawn = {ROBOT_NAME: robot} if robot else {}
         self.path = path
         self.dropped = 0
         self.live_url = ""
@@ -110,7 +105,7 @@ class Recorder:
             epoch_ns=epoch_ns,
             part_bytes=settings.part_MiB * _MIB,
             part_ns=round(settings.part_min * _MINUTE_NS),
-            attachments={**(attachments or {}), **drawn, **layout},
+            attachments=dict(attachments or {}),
             metadata={**(metadata or {}), **own},
             live=live,
         )

@@ -30,7 +30,7 @@ from adacd_hil.log.recording.packet_writer import Numbers, PacketWriter, Rows
 from adacd_hil.log.recording.processes import LiveFeed, LiveService, WriterSetup, read_setup
 from adacd_hil.log.recording.ring import RingReader, split
 from adacd_hil.log.recording.run_folder import is_there
-from adacd_hil.terminal import in_line
+from adacd_hil.printable import in_line
 
 POLL_PERIOD_US = 25_000
 """Polling interval of the ring in real time. A wake-up would cost the control process more than the packet; a poll
