@@ -23,6 +23,8 @@ JOINTS = 2
 JOINT_NAMES = ("joint1", "joint2")
 GRAVITY_M_S2 = 9.80665
 """Standard acceleration of gravity. Source: 3rd CGPM, 1901."""
+QUINTIC_PEAK_SPEED, QUINTIC_PEAK_ACCELERATION = 1.875, 10.0 / math.sqrt(3.0)
+"""Of a rest-to-rest quintic: peak speed over travel / duration, peak acceleration over travel / duration²."""
 
 PARAMETER_NAMES = ("a1", "a2", "a3", "F_v1", "F_v2", "F_c1", "F_c2")
 """Eq. (19): inertia kg m², viscous friction Nm s/rad, Coulomb friction Nm."""

@@ -13,7 +13,7 @@ configuration doesn't yet identify the mistake. One reading is of the mounting: 
 plane of motion, so a4 and a5 have columns of sin(q1 - level_rad), too. A reading is refuted
 
     by the equation   if it leaves 1 / `_BETTER` times the least share of all, at a likelihood that is at least
-                      exp(`_LOG_ODDS`) times smaller, or if its inertia is outside any arm's by `_DEVIATIONS` standard
+                      exp(`_LOG_ODDS`) times smaller, or if its inertia is outside any arm's by `DEVIATIONS` standard
                       deviations: gravity and a short motion leave the inertia open
     by the torques    if sensed over commanded torque differs from its prediction by more than that ratio's error
 
@@ -48,7 +48,7 @@ _ROUNDS: Final = 3
 _SUSPECT_BLOCKS: Final = 6
 _CORRELATED: Final = 4.0
 """Number of blocks that count as one: the errors of the equation last longer than a block."""
-_DEVIATIONS: Final = 5.0
+DEVIATIONS: Final = 5.0
 _LOG_ODDS: Final = 7.0
 """Logarithm of 1000 : 1, for blocks of normal errors: n / 2 times the logarithm of the ratio of shares."""
 _OTHERS: Final = 0.4
@@ -124,7 +124,7 @@ class Reading(NamedTuple):
             if drive != sensor:
                 own, other, own_std, other_std = other, own, other_std, own_std
             low, high = (0.0, math.inf) if self.kind == "torque" else (1.0 - error, 1.0 / (1.0 - error))
-            slack, cross_slack = _DEVIATIONS * own_std, _DEVIATIONS * other_std
+            slack, cross_slack = DEVIATIONS * own_std, DEVIATIONS * other_std
             if own + slack < low or own - slack > high or abs(other) > _OTHERS + cross_slack:
                 return False
         return True
@@ -408,7 +408,7 @@ class DeviceReadings:
         inverse = np.diagonal(np.linalg.inv(scaled + RIDGE * np.eye(scaled.shape[1])), axis1=1, axis2=2)
         spread = self._normals[list(places), -1, -1]
         left = np.maximum(self._shares[list(places)] * spread, 1e-12) / self._freedom * _CORRELATED
-        slack = _DEVIATIONS * np.sqrt(left[:, np.newaxis] * np.maximum(inverse, 0.0)) / size
+        slack = DEVIATIONS * np.sqrt(left[:, np.newaxis] * np.maximum(inverse, 0.0)) / size
         return [may_be_arm(self._solutions[place], slack[row]) for row, place in enumerate(places)]
 
     def _solve(self, among: Iterable[int]) -> int:

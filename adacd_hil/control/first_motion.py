@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.control.device_readings import RIDGE, DeviceReadings, Reading, TorqueRatio
+from adacd_hil.control.device_readings import DEVIATIONS, RIDGE, DeviceReadings, Reading, TorqueRatio
 from adacd_hil.control.geometry_check import EVENT as GEOMETRY
 from adacd_hil.control.geometry_check import geometry_event
 from adacd_hil.device.arm import Arm
@@ -42,7 +42,6 @@ _MOVING_RAD_S: Final = 0.05
 """At a lower speed, friction before the sensor may hold any torque."""
 _CORRELATED: Final = 4.0
 """Number of blocks that count as one: the errors of the regression last longer than a block."""
-_DEVIATIONS: Final = 5.0
 _SURE: Final = 0.06
 """Largest standard deviation of k at which a joint can be judged wrong."""
 _KNOWN: Final = 0.02
@@ -263,7 +262,7 @@ class FirstMotion(EventSource):
         for joint, ratio in enumerate(found):
             if ratio is None or joint not in self._open or ratio.own_std > _SURE:
                 continue
-            slack = _DEVIATIONS * ratio.own_std
+            slack = DEVIATIONS * ratio.own_std
             if ratio.own + slack < 1.0 - self._error or ratio.own - slack > 1.0 / (1.0 - self._error):
                 if abs(ratio.other) > 0.5:  # perhaps exchanged: the other joint's ratios decide
                     continue

@@ -8,11 +8,8 @@ import math
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import JOINTS, QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, Vector
 from adacd_hil.settings.configuration import Settings
-
-PEAK_SPEED_FACTOR = 1.875
-"""Peak speed of a rest-to-rest quintic over its mean speed."""
 
 
 @compiled
@@ -31,10 +28,6 @@ def corner_to_corner(
         ddq[i] = travel * rate * rate * x * (60.0 + x * (-180.0 + 120.0 * x))
 
 
-PEAK_ACCELERATION_FACTOR = 10.0 / math.sqrt(3.0)
-"""Peak acceleration of a rest-to-rest quintic over travel / duration²."""
-
-
 class QuinticMove:
     """A straight move in joint space from rest to rest, all joints together; the slowest joint sets the duration.
 
@@ -47,8 +40,8 @@ class QuinticMove:
         """Plan the move. start, end (2,); limits (2,); shortest_s: least duration, s."""
         self._start, self._end, self._travel = start.copy(), end.copy(), end - start
         distance = np.abs(self._travel)
-        by_speed_s = PEAK_SPEED_FACTOR * distance / speed_rad_s
-        by_acceleration_s = np.sqrt(PEAK_ACCELERATION_FACTOR * distance / acceleration_rad_s2)
+        by_speed_s = QUINTIC_PEAK_SPEED * distance / speed_rad_s
+        by_acceleration_s = np.sqrt(QUINTIC_PEAK_ACCELERATION * distance / acceleration_rad_s2)
         self.duration_s = max(shortest_s, float(by_speed_s.max()), float(by_acceleration_s.max()))
 
     def evaluate(self, elapsed_s: float, q: Vector, dq: Vector, ddq: Vector) -> None:
@@ -200,8 +193,8 @@ def motion_problems(settings: Settings) -> list[str]:
     needed = {
         "`trajectory`": (
             0.5 * travel,
-            PEAK_SPEED_FACTOR * travel / half_period_s,
-            PEAK_ACCELERATION_FACTOR * travel / half_period_s**2,
+            QUINTIC_PEAK_SPEED * travel / half_period_s,
+            QUINTIC_PEAK_ACCELERATION * travel / half_period_s**2,
         )
     }
     excitation = Excitation(settings)

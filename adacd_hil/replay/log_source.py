@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.device.network import RESET_COMMUNICATION
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import SHOWN, settings_of
@@ -24,11 +25,7 @@ from adacd_hil.replay.logged_arms import has_arms, logged_arms
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.codec import Codec, parse_codec
-from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
-
-NMT_ID, RESET_COMMUNICATION = 0x000, 0x82
-"""NMT identifier and command that begin an attempt on the bus. Source: CiA 301 (4.2), clause 7.2.8.3.1."""
-SYNC_ID = 0x080
+from adacd_hil.wire.contract_frames import NMT_ID, SYNC_ID, SYNC_OVERFLOW
 
 Places = NDArray[np.int64]
 

@@ -31,6 +31,7 @@ from adacd_hil.wire.time_marks import NEVER_NS, MarkKind, unpack_mark
 from firmware_sim.bench.bench_nodes import TICK_NS, BenchNodes
 from firmware_sim.bench.injector import Injector, Outbox
 from firmware_sim.body.body import MovableArm
+from firmware_sim.nodes.drive_profile import REST_RAD_S
 from firmware_sim.scenario.scenario import Scenario
 
 OnTruth = Callable[[int, int, Vector], None]
@@ -122,8 +123,8 @@ LONGEST_ORPHANAGE_NS = 5_000_000_000
 """How long an arm is watched whose host has died; braking takes 1 s at most, coasting with friction a few more."""
 _FIRST_OVERDUE = 4
 """By the clock, rows of truth are added from so many periods after the last SYNC on; a lost SYNC or two leave a gap."""
-_REST_RAD_S, _REST_NS = 0.02, 50_000_000
-"""At rest: slower than that for so long, by the velocity that the drives know."""
+_REST_NS = 50_000_000
+"""At rest: at a drive's standstill for so long, by the velocity that the drives know."""
 
 
 class BenchTime:
@@ -301,6 +302,6 @@ class BenchTime:
     def _has_rested(self, now_ns: int) -> bool:
         """Tell whether the arm has stood still for a while, and no drive could move it; call while it may move."""
         is_powered = any(drive.motor_mode for drive in self._nodes.drives)
-        if is_powered or max(map(abs, self._arm.drive_velocity_rad_s)) > _REST_RAD_S:
+        if is_powered or max(map(abs, self._arm.drive_velocity_rad_s)) > REST_RAD_S:
             self._moving_ns = now_ns
         return now_ns - self._moving_ns >= _REST_NS

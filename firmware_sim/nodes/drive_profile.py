@@ -135,7 +135,7 @@ def decode_command(controlword: int, previous: int) -> DriveEvent | None:
     return DriveEvent.ENABLE_OPERATION if controlword & 0x08 else DriveEvent.SWITCH_ON
 
 
-_REST_RAD_S = 0.02  # standstill: a hundredth of the slowest motion that the arm makes
+REST_RAD_S = 0.02  # standstill: a hundredth of the slowest motion that the arm makes
 _REST_NS = 10_000_000  # standstill lasts; passing through zero does not
 _LONGEST_BRAKING_NS = 1_000_000_000  # an arm that someone keeps pushing never stands still
 
@@ -176,7 +176,7 @@ class Standstill:
 
     def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
         """Tell whether the motor stands still, or has braked for the longest time."""
-        if abs(velocity_rad_s) > _REST_RAD_S:
+        if abs(velocity_rad_s) > REST_RAD_S:
             self._moving_ns = t_ns
         return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.control.motions import PEAK_ACCELERATION_FACTOR, PEAK_SPEED_FACTOR, corner_to_corner
+from adacd_hil.control.motions import corner_to_corner
 from adacd_hil.control.reference import SHORTEST_APPROACH_S
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import JOINTS, QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, Vector
 from adacd_hil.settings.run_settings import TrajectorySettings
 
 PERIOD_S = 1e-3
@@ -136,7 +136,7 @@ def _lead(before: Motion, end: NDArray[np.float64], speed_rad_s: float) -> Motio
         # straight to the end it would overshoot, far if that takes long
         stop = _way(q, dq, ddq, q + 0.5 * BRAKE_S * dq, BRAKE_S)
         return _cut("", [stop, rest := _lead(stop, end, speed_rad_s)], len(stop.q_d) + len(rest.q_d))
-    duration_s = PEAK_SPEED_FACTOR * float(np.abs(end - q).max()) / speed_rad_s
+    duration_s = QUINTIC_PEAK_SPEED * float(np.abs(end - q).max()) / speed_rad_s
     if duration_s < PERIOD_S:
         return _still("", 0, end)
     return _way(q, dq, ddq, end, max(duration_s, SHORTEST_APPROACH_S))
@@ -199,8 +199,8 @@ def _move(
 ) -> Motion:
     """Move by quintics that keep to peak speeds (2,) and ACCELERATION_RAD_S2; the quicker joint waits at its end."""
     travel = end - start
-    by_acceleration = np.sqrt(PEAK_ACCELERATION_FACTOR * np.abs(travel) / ACCELERATION_RAD_S2)
-    duration_s = np.maximum(PEAK_SPEED_FACTOR * np.abs(travel) / speed, by_acceleration) + PERIOD_S
+    by_acceleration = np.sqrt(QUINTIC_PEAK_ACCELERATION * np.abs(travel) / ACCELERATION_RAD_S2)
+    duration_s = np.maximum(QUINTIC_PEAK_SPEED * np.abs(travel) / speed, by_acceleration) + PERIOD_S
     if is_synchronous:
         duration_s[:] = duration_s.max()
     count = int(np.ceil(duration_s.max() / PERIOD_S))

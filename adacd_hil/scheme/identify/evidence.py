@@ -20,13 +20,11 @@ Shapes: Q quantities, S sources, p parameters; columns (Q, p), columns_prior, to
 (Q,).
 """
 
-import math
-
 import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, QUINTIC_PEAK_ACCELERATION, Vector
 from adacd_hil.scheme.memory import Constants, EvidenceConstants, Memory
 from adacd_hil.settings.configuration import Settings
 
@@ -47,8 +45,6 @@ ANCHOR_SIGMAS, LAST_SIGMAS = 4.0, 4.0
 BELIEF_SIGMAS = 3.5
 """With the floors of `earlier`: fits of 400 untouched arms had a median of 0.23 of the allowed excess, and a maximum of
 0.73."""
-PEAK_ACCELERATION = 10.0 / math.sqrt(3.0)
-"""Peak acceleration of a rest-to-rest quintic, over travel / duration²."""
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:
@@ -79,7 +75,7 @@ def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:
 def _accelerations(settings: Settings) -> tuple[float, ...]:
     """Return the largest accelerations on the trajectory that go with a1, a2, a3, rad/s²."""
     travel_rad = 2.0 * np.radians(settings.trajectory.amplitude_deg)
-    first, second = PEAK_ACCELERATION * travel_rad / np.square(settings.trajectory.half_period_s)
+    first, second = QUINTIC_PEAK_ACCELERATION * travel_rad / np.square(settings.trajectory.half_period_s)
     return first, 2.0 * first + second, first + second
 
 

@@ -23,7 +23,7 @@ from adacd_hil.scheme.kernel.kernel_samples import put_sample
 from adacd_hil.scheme.memory import Sample
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.supervisor import supervisor
-from adacd_hil.scheme.supervisor.supervisor import IS_REACTING, LEARNING, SupervisorConstants, SupervisorMemory, among
+from adacd_hil.scheme.supervisor.supervisor import IS_LEARNING, IS_REACTING, SupervisorConstants, SupervisorMemory
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, WITHHELD
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured, described, zeros_of
@@ -79,7 +79,6 @@ class RunMemory:
 
 
 _SIZES = {"n": JOINTS, "states": len(SchemeState), "levels": len(ContactLevel)}
-_IS_LEARNING = among(LEARNING)
 _CERTIFIED_MODE = np.zeros(len(SchemeState), np.int64)
 for _state, _mode in (
     (SchemeState.COMMISSION, certified_kernel.MEASURE),
@@ -188,7 +187,7 @@ def end_certified(
     asked = follow_contact(
         course_constants[0], run, samples[place], decision, m.filters.y[filter_bank.WIDE], out.tau_ext_wide_hat
     )
-    is_disturbed = IS_REACTING[state] and _IS_LEARNING[run.supervisor.origin]
+    is_disturbed = IS_REACTING[state] and IS_LEARNING[run.supervisor.origin]
     is_reported = is_disturbed and contact.is_open == 0
     if is_reported and m.watch.has_forgotten == 0.0:
         asked |= FORGET

@@ -90,7 +90,7 @@ def among(states: Collection[SchemeState]) -> NDArray[np.bool_]:
 
 _IS_POWERED = among(POWERED)
 _IS_CHECKED = among(POWERED | {SchemeState.ENABLE})
-_IS_LEARNING = among(LEARNING)
+IS_LEARNING = among(LEARNING)
 IS_REACTING = among(REACTING)
 _IS_HELD_FROM = among((SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED))
 """States in which a late host makes the arm hold, or in which it holds already; in the others a late host is a
@@ -211,7 +211,7 @@ def doubt(m: SupervisorMemory) -> None:
 def _count(m: SupervisorMemory, arm: Sample, observation: int) -> None:
     """Count this cycle and its findings: rest, motion, missing data, late host."""
     m.phase_periods += arm.periods
-    if _IS_LEARNING[m.state]:
+    if IS_LEARNING[m.state]:
         m.learning_periods += arm.periods
     m.still_cycles = m.still_cycles + 1 if observation & AT_REST else 0
     m.moving_cycles = 0 if observation & AT_REST else m.moving_cycles + 1
@@ -338,7 +338,7 @@ def _progress(
         event = SchemeEvent.PAYLOAD_ANNOUNCED
     elif state == SchemeState.STOPPED:
         event = _released(k, m, arm, observation, is_still)
-    elif _IS_LEARNING[state]:
+    elif IS_LEARNING[state]:
         event = _verdict(state, observation)
     elif state == SchemeState.REACT and not is_reporting:
         event = _settled(k, m, is_still, goes_on)
@@ -423,7 +423,7 @@ def _is_commissioned(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, o
 @compiled
 def _overdue(k: SupervisorConstants, m: SupervisorMemory) -> int:
     """Return the fault of a phase that has taken too long, or NONE. In REACT a learning arm's clock stops."""
-    spent = m.learning_periods if _IS_LEARNING[m.state] else m.phase_periods
+    spent = m.learning_periods if IS_LEARNING[m.state] else m.phase_periods
     is_over = spent >= k.limit_periods[m.state]
     return int(_OVERDUE[m.state]) if is_over else FaultReason.NONE
 
