@@ -244,8 +244,11 @@ def _times_table(evidence: TimingEvidence) -> Table:
     rows = [_time_row(quantity, evidence, PERCENTILE_NAMES) for quantity in QUANTITIES if not quantity.is_reserve]
     reaction = evidence.reaction
     if reaction is not None:
-        label = ("Reaction", f"detection decision to first reaction frame, {number_of(reaction.count, 'reaction')}")
-        rows.append((label, *_values(reaction.percentiles, PERCENTILE_NAMES)))
+        label = (
+            "Reaction",
+            f"detection decision to first reaction frame, {number_of(int(reaction['count']), 'reaction')}",
+        )
+        rows.append((label, *_values(reaction, PERCENTILE_NAMES)))
     head = [None, *(Cell(name, "head") for name in LOW_PERCENTILE_NAMES)]
     rows += [head, *(_time_row(quantity, evidence, LOW_PERCENTILE_NAMES) for quantity in reserves)]
     return make_table(("µs", *PERCENTILE_NAMES), rows)
@@ -257,8 +260,8 @@ def _time_row(quantity: Quantity, evidence: TimingEvidence, names: Sequence[str]
     if statistics is None:
         reason = NONE if evidence.is_modelled and quantity.name == "lateness" else _ABSENT
         return (label, *[""] * (len(names) - 1), reason)
-    cells: list[object] = [*_values(statistics.percentiles, names)]
-    if quantity.is_reserve and statistics.percentiles.get("min", 0.0) < 0.0:
+    cells: list[object] = [*_values(statistics, names)]
+    if quantity.is_reserve and statistics.get("min", 0.0) < 0.0:
         cells[-1] = Cell(cells[-1], "bad")
     return (label, *cells)
 
