@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from string import ascii_letters
-from typing import Final, NamedTuple
+from typing import Final
 
 from adacd_hil.lab.report.page import (
     ADAPTATIONS,
@@ -215,27 +215,20 @@ _QUEUES: Final = {
 }
 
 
-class TimingTables(NamedTuple):
-    """The tables. queues: None without queues. is_modelled: the times come from a model."""
+def timing_tables(evidence: TimingEvidence) -> dict[str, Table | bool | None] | None:
+    """Make the tables of `timing.html.j2`: percentiles, counts, queues and ages. None without a cycle.
 
-    is_modelled: bool
-    times: Table
-    counts: Table
-    queues: Table | None
-    ages: Table
-
-
-def timing_tables(evidence: TimingEvidence) -> TimingTables | None:
-    """Make the tables: percentiles, counts, queues and ages. None without a cycle."""
+    is_modelled: the times come from a model, which has no queues.
+    """
     if not evidence.cycles:
         return None
-    return TimingTables(
-        is_modelled=evidence.is_modelled,
-        times=_times_table(evidence),
-        counts=_counts_table(evidence),
-        queues=None if evidence.is_modelled else _queues_table(evidence),
-        ages=_ages_table(evidence),
-    )
+    return {
+        "is_modelled": evidence.is_modelled,
+        "times": _times_table(evidence),
+        "counts": _counts_table(evidence),
+        "queues": None if evidence.is_modelled else _queues_table(evidence),
+        "ages": _ages_table(evidence),
+    }
 
 
 def _times_table(evidence: TimingEvidence) -> Table:
