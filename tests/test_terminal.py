@@ -98,7 +98,7 @@ def test_a_name_reaches_a_terminal_as_plain_text(
 ) -> None:
     (tmp_path / EVIL).mkdir()
     with TruthLog(tmp_path / EVIL / "truth.mcap", blocking=True) as log:
-        log.event(0, "info", "run", "begun")
+        log.write_event(0, "info", "run", "begun")
     ours, theirs = os.openpty()
     program, *rest = (word.replace("EVIL", EVIL) for word in words)
     done = subprocess.run([BIN / program, *rest], stdout=theirs, stderr=theirs, check=False, cwd=tmp_path)

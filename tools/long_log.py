@@ -188,7 +188,7 @@ class Writer:
         self._file.finish(
             {ENDING_KEY: ending, DROPPED_KEY: "0", "frames": str(frames), "messages": str(self._file.messages)}
         )
-        self._sink.close()
+        self._sink.close_file()
 
     def add(self, block: Block, later_ns: int, has_cycles: bool, is_attempt: bool = False) -> None:
         """Write messages so much later; has_cycles: the numbers of their cycles grow with it.

@@ -111,7 +111,12 @@ def run_embedded(
 
             with compiling_cycle(settings, Body.compiled_functions):
                 bench = Bench(
-                    scenario, codec, embedded.deliver, contract=contract, on_truth=write_truth, on_event=truth.event
+                    scenario,
+                    codec,
+                    embedded.deliver,
+                    contract=contract,
+                    on_truth=write_truth,
+                    on_event=truth.write_event,
                 )
                 new_pipeline(settings).compile_cycle()
             embedded.attach(bench.on_frame)

@@ -8,7 +8,7 @@ the log.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
 from adacd_hil.log.types.topics import ARM
 from adacd_hil.records import CERTIFICATE_EVENTS, ArmBatch, ContactReport, SchemeState
 from adacd_hil.replay.logged_arms import has_arms, logged_arms
-from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.codec import Codec, parse_codec
 from adacd_hil.wire.contract_frames import NMT_ID, SYNC_ID, SYNC_OVERFLOW
@@ -48,27 +47,6 @@ class CycleStretch(NamedTuple):
     scheme: Series | None
 
 
-class _Paired(NamedTuple):
-    """The records of n cycles, in order: /scheme's, and /arm's or, of an older log, /cycle's."""
-
-    scheme: NDArray[Any]
-    other: NDArray[Any]
-    has_arms: bool
-
-    @property
-    def number(self) -> Places:
-        """Number of each cycle."""
-        return np.asarray(self.other["cycle"].astype(np.int64))
-
-
-class _Rows(NamedTuple):
-    """Number of each of n cycles, periods since the one before, and how many cycles the log lacks in between."""
-
-    number: Places
-    periods: Places
-    missing: Places
-
-
 class AttemptSplitter:
     """Splits the pieces of a log, in order.
 
@@ -84,6 +62,7 @@ class AttemptSplitter:
         self.unpaired = 0
         """Records of /scheme, /arm and /cycle without the other one of their cycle."""
         self._epoch_ns = epoch_ns
+        self._has_arms = False  # the log has /arm
         self._frames: NDArray[Any] | None = None  # of an attempt whose first cycle is yet to come
         self._has_begun = False
         self._attempt = -1
@@ -94,52 +73,54 @@ class AttemptSplitter:
 
     def split(self, piece: Piece) -> Iterator[CycleStretch]:
         """Yield the stretches of the next piece."""
-        paired = self._pair(piece)
+        scheme, other = self._pair(piece)
         frames = piece.frames
         if self._frames is not None:
             frames = joined_frames((self._frames, frames))
             self._frames = None
-        t_ns = paired.other["publish_time"].astype(np.int64) - self._epoch_ns
-        begins = self._begins(t_ns, paired, frames)
+        t_ns = other["publish_time"].astype(np.int64) - self._epoch_ns
+        begins = self._begins(t_ns, scheme, other, frames)
         if len(begins) and begins[-1][0] == len(t_ns):
             self._frames = frames[begins[-1][1] :]
             frames = frames[: begins[-1][1]]
             begins = begins[:-1]
         if len(t_ns):
-            yield from self._stretches(t_ns, paired, frames, dict(begins))
+            yield from self._stretches(t_ns, scheme, other, frames, dict(begins))
 
-    def _pair(self, piece: Piece) -> _Paired:
-        """Return the records that belong to one cycle each; count the others."""
-        has_arms = ARM.name in piece.series
+    def _pair(self, piece: Piece) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the records of /scheme and /arm, or of an older log /cycle, of the same cycles; count the others."""
+        self._has_arms = ARM.name in piece.series
         scheme = piece.series["/scheme"].records
-        other = piece.series[ARM.name if has_arms else "/cycle"].records
+        other = piece.series[ARM.name if self._has_arms else "/cycle"].records
         theirs, own = scheme["publish_time"], other["publish_time"]
         if not np.array_equal(theirs, own):
             _, first, second = np.intersect1d(theirs, own, return_indices=True)
             self.unpaired += len(scheme) + len(other) - 2 * len(first)
             scheme, other = scheme[first], other[second]
-        return _Paired(scheme, other, has_arms)
+        return scheme, other
 
-    def _begins(self, t_ns: Places, paired: _Paired, frames: NDArray[Any]) -> list[tuple[int, int]]:
+    def _begins(
+        self, t_ns: Places, scheme: NDArray[Any], other: NDArray[Any], frames: NDArray[Any]
+    ) -> list[tuple[int, int]]:
         """List the rows with which attempts begin, and the frame with which each does."""
         begins: dict[int, int] = {}
         resets = find_resets(frames)
         rows = np.searchsorted(t_ns, frames["cycle_t_ns"][resets])
         for row, place in zip(rows.tolist(), resets.tolist(), strict=True):
             begins[row] = place  # the last one, if the devices didn't answer to the first
-        is_new = self._named_begins(paired) if paired.has_arms else self._shown_begins(paired.scheme)
+        is_new = self._named_begins(other) if self._has_arms else self._shown_begins(scheme)
         for row in np.flatnonzero(is_new).tolist():
             begins.setdefault(row, int(np.searchsorted(frames["cycle_t_ns"], t_ns[row])))
-        if paired.has_arms:
+        if self._has_arms:
             begins = {row: place for row, place in begins.items() if row == len(t_ns) or is_new[row]}
         return sorted(begins.items())
 
-    def _named_begins(self, paired: _Paired) -> NDArray[np.bool_]:
+    def _named_begins(self, arm: NDArray[Any]) -> NDArray[np.bool_]:
         """Return whether each cycle belongs to another attempt than the one before (n,)."""
-        first = paired.other["first_cycle"].astype(np.int64)
+        first = arm["first_cycle"].astype(np.int64)
         is_new = np.diff(first, prepend=self._first_cycle) != 0
         if len(first):
-            is_new[0] &= self._has_begun or first[0] == paired.other["cycle"][0] or self._first_cycle >= 0
+            is_new[0] &= self._has_begun or first[0] == arm["cycle"][0] or self._first_cycle >= 0
             self._first_cycle = int(first[-1])
         return np.asarray(is_new)
 
@@ -153,16 +134,22 @@ class AttemptSplitter:
         return np.asarray(is_anew & is_after_fault)
 
     def _stretches(
-        self, t_ns: Places, paired: _Paired, frames: NDArray[Any], begins: dict[int, int]
+        self,
+        t_ns: Places,
+        scheme: NDArray[Any],
+        other: NDArray[Any],
+        frames: NDArray[Any],
+        begins: dict[int, int],
     ) -> Iterator[CycleStretch]:
         is_begin = np.zeros(len(t_ns), np.bool_)
         is_begin[list(begins)] = True
-        rows = (
-            self._read_periods(paired, is_begin)
-            if paired.has_arms
-            else self._count_periods(t_ns, paired, frames, begins, is_begin)
+        number: Places = other["cycle"].astype(np.int64)
+        periods, missing = (
+            self._read_periods(number, other, is_begin)
+            if self._has_arms
+            else self._count_periods(t_ns, number, scheme, other, frames, begins, is_begin)
         )
-        is_gap = rows.missing != 0
+        is_gap = missing != 0
         cuts = np.flatnonzero(is_begin | is_gap).tolist()
         bounds = sorted({0, *cuts, len(t_ns)})
         places = [begins.get(row, int(np.searchsorted(frames["cycle_t_ns"], t_ns[row]))) for row in bounds[:-1]]
@@ -173,45 +160,46 @@ class AttemptSplitter:
                 self._attempt += 1
             if is_gap[start]:
                 self._is_exact = False
-                self.gaps.append((int(rows.number[start]), int(rows.missing[start])))
+                self.gaps.append((int(number[start]), int(missing[start])))
             if not self._has_begun:
                 self.headless_cycles += end - start
                 self._attempt = 0
                 continue
-            scheme, other = paired.scheme[start:end], paired.other[start:end]
-            ticks = Ticks(rows.number[start:end], t_ns[start:end], rows.periods[start:end])
+            mine = scheme[start:end]
+            ticks = Ticks(number[start:end], t_ns[start:end], periods[start:end])
             yield CycleStretch(
                 attempt=self._attempt,
                 is_begin=bool(is_begin[start]),
                 is_exact=self._is_exact,
                 ticks=ticks,
                 frames=frames[first:last],
-                arms=logged_arms(scheme, other, ticks) if paired.has_arms else None,
-                requests=scheme["request"],
-                scheme=Series(scheme, self._epoch_ns),
+                arms=logged_arms(mine, other[start:end], ticks) if self._has_arms else None,
+                requests=mine["request"],
+                scheme=Series(mine, self._epoch_ns),
             )
 
-    def _read_periods(self, paired: _Paired, is_begin: NDArray[np.bool_]) -> _Rows:
+    def _read_periods(self, number: Places, arm: NDArray[Any], is_begin: NDArray[np.bool_]) -> tuple[Places, Places]:
         """Return each cycle's periods by /arm, and the number of cycles before it that the log lacks."""
-        number, periods = paired.number, np.asarray(paired.other["periods"], np.int64)
+        periods = np.asarray(arm["periods"], np.int64)
         steps = np.diff(number, prepend=self._last_cycle)
-        missing = np.where(is_begin, number - paired.other["first_cycle"].astype(np.int64), steps - periods)
+        missing = np.where(is_begin, number - arm["first_cycle"].astype(np.int64), steps - periods)
         if not self._has_begun and not is_begin[0]:
             missing[0] = 0
         self._last_cycle = int(number[-1])
-        return _Rows(number, np.where((missing != 0) & ~is_begin, np.maximum(steps, 1), periods), missing)
+        return np.where((missing != 0) & ~is_begin, np.maximum(steps, 1), periods), missing
 
     def _count_periods(
         self,
         t_ns: Places,
-        paired: _Paired,
+        number: Places,
+        scheme: NDArray[Any],
+        cycles: NDArray[Any],
         frames: NDArray[Any],
         begins: dict[int, int],
         is_begin: NDArray[np.bool_],
-    ) -> _Rows:
+    ) -> tuple[Places, Places]:
         """Return each cycle's periods by its overruns; for the first one of an attempt by SYNC's counters, too."""
-        number, scheme = paired.number, paired.scheme
-        overruns = paired.other["overruns"].astype(np.int64)
+        overruns = cycles["overruns"].astype(np.int64)
         skipped = np.diff(overruns, prepend=self._overruns)
         steps = np.diff(number, prepend=self._last_cycle)
         is_cut = is_begin & (scheme["previous_state"] != SchemeState.INIT)  # its first cycles are missing
@@ -226,7 +214,7 @@ class AttemptSplitter:
             periods[row] -= _skipped(counters if row else np.concatenate((self._tail, counters)), last)
         self._last_cycle, self._overruns, self._state = int(number[-1]), int(overruns[-1]), int(scheme["state"][-1])
         self._tail = _sync_counters(frames[np.searchsorted(frames["cycle_t_ns"], t_ns[-1], "right") :])
-        return _Rows(number, np.maximum(periods, 1), missing)
+        return np.maximum(periods, 1), missing
 
 
 def _sync_counters(frames: NDArray[Any]) -> NDArray[np.uint8]:
@@ -253,29 +241,6 @@ CYCLES_PER_PIECE: Final = 8_000
 _SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
 _SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
 """Names of the events that the scheme itself reports."""
-
-
-class ReplaySource(Protocol):
-    """Source of stretches: a log of ours, or a recording of another program. Read once; notes are complete then.
-
-    has_arms: whether stretches have the arm's states. is_recording: frames come from a recording and are all decoded.
-    """
-
-    settings: Settings
-    codec: Codec
-    metadata: Mapping[str, str]
-    has_arms: bool
-    is_recording: bool
-
-    def parts(self, with_frames: bool) -> Iterator["Part"]:
-        """Return the parts, in order. with_frames: stretches have their frames, else none."""
-
-    @property
-    def start_ns(self) -> int:
-        """When it begins, ns of the clock of its cycles."""
-
-    def notes(self) -> list[str]:
-        """List the missing parts, a line each."""
 
 
 class Part(NamedTuple):

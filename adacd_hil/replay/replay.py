@@ -25,7 +25,8 @@ from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
-from adacd_hil.replay.log_source import CycleStretch, LogSource, Part, ReplaySource
+from adacd_hil.replay.can_recording import RecordingAlone
+from adacd_hil.replay.log_source import CycleStretch, LogSource, Part
 from adacd_hil.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.replay.scheme_comparison import (
     TOLERANCE,
@@ -45,6 +46,7 @@ SCRIPTED: Final = "script"
 """Value of `operator` in a log's metadata: the user could not type."""
 _PROGRESS_CYCLES: Final = 200_000
 
+ReplaySource = LogSource | RecordingAlone
 Watch = Callable[[int, Ticks, SchemeBatch], None]
 """Is shown the decisions of each variant, by its place among them, as they are made."""
 
@@ -392,6 +394,7 @@ def _result(
             comparison.add_mismatch(Mismatch("/scheme", "request", "", cycle, t_ns, str(logged), str(asked)))
         if comparison.missing_fields:
             notes.append(f"/scheme lacks {', '.join(comparison.missing_fields)}, an older format")
+    threshold_Nm, push_Nm = gatherer.sensitivity_Nm()
     return Replay(
         settings=player.settings,
         cycles=player.cycles,
@@ -411,6 +414,7 @@ def _result(
         tolerance=tolerance,
         zero_ns=next((each.t_ns for each in gatherer.transitions if each.state is SchemeState.ADAPT), 0),
         ending=gatherer.transitions[-1] if gatherer.transitions else None,
-        sight=gatherer.sight,
+        threshold_Nm=threshold_Nm,
+        push_Nm=push_Nm,
         notes=tuple(notes),
     )

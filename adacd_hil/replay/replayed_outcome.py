@@ -46,17 +46,6 @@ class Adaptation(NamedTuple):
     theta_hat: tuple[float, ...]
 
 
-class Sight(NamedTuple):
-    """Sensitivity of the detection in MONITOR from the beginning of the log: medians of each joint, Nm.
-
-    threshold: the lowest of all channels, nan where it never monitored. push: the smallest that is found within 100 ms,
-    an estimate; () of the paper's scheme.
-    """
-
-    threshold_Nm: tuple[float, ...]
-    push_Nm: tuple[float, ...]
-
-
 class OutcomeGatherer:
     """Takes in the decisions of one replay. `truth`: the true contacts, None if unknown."""
 
@@ -135,15 +124,13 @@ class OutcomeGatherer:
         for joint, kept in enumerate(self._thresholds):
             kept.add_values(block[:, self._threshold][:, joint])
 
-    @property
-    def sight(self) -> Sight:
-        """The detection's sensitivity in MONITOR."""
+    def sensitivity_Nm(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the medians, in MONITOR, of each joint's threshold and smallest push found: see `Replay`."""
         pushes = None if self._push is None else self._push.smallest_push()
-        seen = tuple(kept.percentiles().get("p50", math.nan) for kept in self._thresholds)
         if pushes is None:
-            return Sight(seen, ())
+            return tuple(kept.percentiles().get("p50", math.nan) for kept in self._thresholds), ()
         threshold, push = (tuple(joint["p50"] for joint in each) for each in (pushes.threshold_Nm, pushes.push_Nm))
-        return Sight(threshold, push)
+        return threshold, push
 
     def _enter(self, transition: StateChange, theta_hat: Vector) -> None:
         self.transitions.append(transition)
@@ -204,8 +191,10 @@ class Replay:
     in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`.
     contacts: reports with their times, ns. parameters: of the end. score: of contacts and alarms that begin in the
     stretch, None where the truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0
-    without one. ending: the last change of state, which may be before the stretch. attempts, sight: from the beginning
-    of the log.
+    without one. ending: the last change of state, which may be before the stretch. threshold_Nm: median in MONITOR of
+    each joint's lowest threshold of all channels, nan where it never monitored; push_Nm: of the smallest push found
+    within 100 ms, an estimate, () of the paper's scheme. attempts, threshold_Nm, push_Nm: from the log's
+    beginning.
     """
 
     settings: Settings
@@ -226,7 +215,8 @@ class Replay:
     tolerance: float
     zero_ns: int
     ending: StateChange | None
-    sight: Sight
+    threshold_Nm: tuple[float, ...]
+    push_Nm: tuple[float, ...]
     notes: tuple[str, ...] = ()
     """Parts of the log that could not be compared or judged, a line each."""
 
@@ -269,9 +259,9 @@ def side_by_side(replays: Sequence[Replay]) -> list[Row]:
         ("false alarms", *map(_false_alarms, replays)),
         ("median delay, ms", *map(_median_delay, replays)),
     ]
-    rows.append(("threshold, Nm", *(_by_joint(each.sight.threshold_Nm) for each in replays)))
-    if any(each.sight.push_Nm for each in replays):
-        rows.append(("smallest push in 100 ms, Nm", *(_by_joint(each.sight.push_Nm) for each in replays)))
+    rows.append(("threshold, Nm", *(_by_joint(each.threshold_Nm) for each in replays)))
+    if any(each.push_Nm for each in replays):
+        rows.append(("smallest push in 100 ms, Nm", *(_by_joint(each.push_Nm) for each in replays)))
     for index in range(max(len(each.adaptation_s) for each in replays)):
         rows.append((f"adaptation {index + 1}, s", *(_adaptation(each, index) for each in replays)))
     for name in dict.fromkeys(itertools.chain.from_iterable(each.parameters for each in replays)):
@@ -371,8 +361,8 @@ def as_json(found: Replay) -> dict[str, Any]:
         else [found.time_s(alarm.t_ns) for alarm in found.score.false_alarms],
         "missed": None if found.score is None else found.score.missed,
         "adaptation_s": found.adaptation_s,
-        "threshold_Nm": [value for value in found.sight.threshold_Nm if math.isfinite(value)],
-        "smallest_push_Nm": found.sight.push_Nm,
+        "threshold_Nm": [value for value in found.threshold_Nm if math.isfinite(value)],
+        "smallest_push_Nm": found.push_Nm,
         "parameters": found.parameters,
         "states": [
             {

@@ -37,14 +37,6 @@ if TYPE_CHECKING:
     from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
 
 
-@dataclass(frozen=True)
-class TimeStatistics:
-    """Percentiles by name, µs, and the histogram of a time; both empty without a value."""
-
-    percentiles: Mapping[str, float]
-    histogram: LogHistogram
-
-
 class Count(NamedTuple):
     """How often something happened, in all and per 100 000 cycles; None without a cycle."""
 
@@ -53,45 +45,37 @@ class Count(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ReactionLatency:
-    """Latency from the decision to the first command that reacts, over `count` reactions; percentiles in µs."""
-
-    count: int
-    percentiles: Mapping[str, float]
-
-
-@dataclass(frozen=True)
 class TimingEvidence:
     """The times of a run, summed up; None: not in the log, or without a meaning in lockstep.
 
-    is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. data_age: cycles by
-    the age of the oldest value used; the last entry counts all from OLDEST_CYCLES on.
+    is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. times: percentiles by
+    name, µs, of each time; histograms: of the same. reaction: percentiles of the latency from the decision to the first
+    command that reacts, and the `count` of reactions. data_age: cycles by the age of the oldest value used; the last
+    entry counts all from OLDEST_CYCLES on.
     """
 
     period_us: float
     is_modelled: bool
     cycles: int
-    times: Mapping[str, TimeStatistics | None]
-    reaction: ReactionLatency | None
+    times: Mapping[str, Mapping[str, float] | None]
+    histograms: Mapping[str, LogHistogram | None]
+    reaction: Mapping[str, float] | None
     data_age: tuple[int, ...] | None
     queues_bytes: Mapping[str, Mapping[str, float] | None]
     counts: Mapping[str, Count | None]
 
     def by_key(self) -> dict[str, Any]:
         """Return the evidence by the keys of report.json."""
-        times = {name: found for name, found in self.times.items() if found is not None}
-        absent = dict.fromkeys(self.times)
-        reaction = self.reaction
         return {
             "is_modelled": self.is_modelled,
             "period_us": self.period_us,
             "cycles": self.cycles,
-            "times_us": {**absent, **{name: found.percentiles for name, found in times.items()}},
-            "reaction_us": None if reaction is None else {"count": reaction.count, **reaction.percentiles},
+            "times_us": self.times,
+            "reaction_us": self.reaction,
             "data_age_cycles": self.data_age,
             "queues_bytes": self.queues_bytes,
             "counts": self.counts,
-            "histograms_us": {**absent, **{name: found.histogram.trimmed() for name, found in times.items()}},
+            "histograms_us": {name: found and found.trimmed() for name, found in self.histograms.items()},
         }
 
 
@@ -387,11 +371,3 @@ class Metrics:
         if push is None or self.armed_false_alarms is None:
             return None
         return rate_bound_per_h(self.armed_false_alarms, push.hours)
-
-
-class Gathered(NamedTuple):
-    """Sums over all cycles of a run."""
-
-    untouched: Untouched
-    timing: TimingEvidence
-    data: CyclicData

@@ -247,7 +247,7 @@ class Bench:
         else:
             self._outbox.collect(sync_ns + late_ns)
             self._sample_and_send(data, takers)
-            self._outbox.close(sync_ns, sync_ns + self._nodes.period_ns)
+            self._outbox.send_released(sync_ns, sync_ns + self._nodes.period_ns)
         self.time.note_sent()
         self._on_answer()
         self.time.has_begun = True
@@ -261,7 +261,7 @@ class Bench:
             self.time.pass_lost_syncs(self._lost_syncs + 1)
         self._outbox.collect(self.time.now_ns)
         self.time.poll(self.time.now_ns)
-        self._outbox.close(self.time.now_ns, self.time.now_ns + self._nodes.period_ns)
+        self._outbox.send_released(self.time.now_ns, self.time.now_ns + self._nodes.period_ns)
         self.time.note_sent()
         self.time.end_sync(self.cycle, t_ns)
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from adacd_hil.log.log_files import find_parts
-from adacd_hil.log.recording.recorder import LogSummary, Recorder
+from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_truth
 from adacd_hil.records import TRUTH_LAYOUT, Event, Vector
 from adacd_hil.settings.toml_files import to_toml
@@ -67,7 +67,7 @@ SCENARIO_NAME = "scenario.toml"
 """The attachment."""
 
 
-class TruthLog:
+class TruthLog(Recorder):
     """Writes the truth; `write` is a Bench's `on_truth`."""
 
     def __init__(
@@ -83,9 +83,8 @@ class TruthLog:
 
         Raises LogExistsError when there is one already, LogError.
         """
-        self.path = path
         faults = () if scenario is None else scenario.faults
-        self._recorder = Recorder(
+        super().__init__(
             path,
             attachments={} if scenario is None else {SCENARIO_NAME: to_toml(scenario).encode()},
             metadata={**(metadata or {}), **{f"fault_{index}": row.timed_text for index, row in enumerate(faults)}},
@@ -96,27 +95,17 @@ class TruthLog:
 
     def write(self, cycle: int, t_ns: int, block: Vector) -> None:
         """Log the truth of one cycle; `block` is laid out by TRUTH_LAYOUT."""
-        self._recorder.cycle(t_ns, ((ChannelId.TRUTH, pack_truth(cycle, block)),))
+        self.cycle(t_ns, ((ChannelId.TRUTH, pack_truth(cycle, block)),))
 
-    def event(self, t_ns: int, level: str, name: str, text: str) -> None:
+    def write_event(self, t_ns: int, level: str, name: str, text: str) -> None:
         """Log something that happened: a fault that begins or ends. `level`: info, warning or error."""
-        self._recorder.event(t_ns, Event(level, name, text))
-
-    def close(self) -> LogSummary:
-        """End the file and say how it went; twice is once."""
-        return self._recorder.close()
+        self.event(t_ns, Event(level, name, text))
 
     def discard(self) -> None:
         """End the log and remove it. Raises OSError."""
         self.close()
         for part in find_parts(self.path).values():
             part.unlink()
-
-    def __enter__(self) -> "TruthLog":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 LONGEST_ORPHANAGE_NS = 5_000_000_000

@@ -81,11 +81,11 @@ class Outbox:
             heapq.heappop(self._held).act()
 
     def collect(self, now_ns: int) -> None:
-        """Begin the answer to a SYNC that isn't plain: frames that are put from now on wait for `close`."""
+        """Begin the answer to a SYNC that isn't plain: frames that are put from now on wait for `send_released`."""
         self._now_ns = now_ns
         self._is_open = True
 
-    def close(self, sync_ns: int, until_ns: int) -> None:
+    def send_released(self, sync_ns: int, until_ns: int) -> None:
         """Send all that is released before `until_ns`; in lockstep, say when after `sync_ns`, and when it is all."""
         self._is_open = False
         if self.is_paced:

@@ -17,7 +17,7 @@ from jinja2 import UndefinedError
 from parsed_page import Page
 
 from adacd_hil.lab.report import page
-from adacd_hil.lab.report.page import Heading, render, render_page
+from adacd_hil.lab.report.page import render, render_page
 from adacd_hil.lab.report.report_tables import timing_tables
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.runs.run_pages import ListedRun, runs_page, trend_page
@@ -94,8 +94,8 @@ def page_of_a_trend(_: Run) -> str:
 
 def page_of_a_communication_test(run: Run) -> str:
     timing = timing_tables(evaluate(run).timing)
-    heading = Heading("commtest", "good", ("event: late",), True)
-    return render_page("communication_test_page.html.j2", "test", heading, timing=timing)
+    heading = {"over": "commtest", "headline": "good", "is_good": True, "problems": ("event: late",)}
+    return render_page("communication_test_page.html.j2", "test", **heading, timing=timing)
 
 
 PAGES = {

@@ -29,7 +29,7 @@ from adacd_hil.lab.tune.tune_roc import (
     FACTORS,
     Candidate,
     Observed,
-    Touched,
+    Trial,
     Tuning,
     TuningOutcome,
     Window,
@@ -75,13 +75,13 @@ def test_rates_and_shares_have_exact_bounds():
 # thresholds from one half
 
 
-def observed(seconds=600.0, touches=(), seed=1):
+def observed(seconds=600.0, trials=(), seed=1):
     """Peaks of two joints: most are 0, some exponential ones stand apart; the first half chooses."""
     generator = np.random.default_rng(seed)
     count = round(seconds / 0.1)
     peaks = 0.01 * generator.random((count, 1, 2))
     peaks[::20, 0] += generator.exponential(0.02, (len(peaks[::20]), 2))
-    return Observed("made", peaks, np.arange(count) < count // 2, touches)
+    return Observed("made", peaks, np.arange(count) < count // 2, trials)
 
 
 def touched(height, is_chosen_on=False):
@@ -89,10 +89,10 @@ def touched(height, is_chosen_on=False):
     since_s = np.arange(20) * 0.01
     statistic = np.zeros((20, 1, 2))
     statistic[:, 0, 1] = height * np.arange(20)
-    return Touched(since_s, statistic, is_chosen_on)
+    return Trial(since_s, statistic, is_chosen_on)
 
 
-NOTHING = Touched(np.zeros(0), np.zeros((0, 1, 2)), False)
+NOTHING = Trial(np.zeros(0), np.zeros((0, 1, 2)), False)
 
 
 def test_thresholds_are_chosen_on_one_half_and_checked_on_the_other():
@@ -122,11 +122,11 @@ def test_the_bound_of_the_tail_is_the_wanted_rate():
 
 
 def test_a_delay_is_that_of_the_first_sample_over_a_threshold_and_what_was_not_armed_is_missed():
-    made = observed(touches=(touched(1e4), touched(1e-9), NOTHING, touched(1e4, is_chosen_on=True)))
+    made = observed(trials=(touched(1e4), touched(1e-9), NOTHING, touched(1e4, is_chosen_on=True)))
     choice = choose(made, 1.0)
     assert (choice.chosen.contacts, choice.checked.contacts) == (1, 3)
     assert choice.checked.delays_ms == pytest.approx((10.0,))
-    exact = choose(observed(touches=(touched(choice.thresholds[0, 1] / 5.0),)), 1.0)
+    exact = choose(observed(trials=(touched(choice.thresholds[0, 1] / 5.0),)), 1.0)
     assert exact.checked.delays_ms == pytest.approx((60.0,)), "over, not equal"
 
 
@@ -134,7 +134,7 @@ def test_what_is_left_out_of_a_contact_changes_no_delay():
     generator = np.random.default_rng(3)
     statistic = np.cumsum(generator.normal(0.0, 1.0, (500, 3, 2)), axis=0)
     statistic[100:110, 1] = np.nan
-    whole = Touched(np.arange(500) * 1e-3, statistic, True)
+    whole = Trial(np.arange(500) * 1e-3, statistic, True)
     kept = rising(whole)
     assert len(kept.since_s) < 250
     for _ in range(200):
@@ -144,7 +144,7 @@ def test_what_is_left_out_of_a_contact_changes_no_delay():
 
 
 def test_along_a_roc_fewer_alarms_are_paid_with_fewer_contacts():
-    choice = choose(observed(touches=tuple(touched(0.002 * k) for k in range(1, 30))), 1.0)
+    choice = choose(observed(trials=tuple(touched(0.002 * k) for k in range(1, 30))), 1.0)
     alarms = [found.alarms for _, found, _ in choice.roc]
     shares = [len(found.delays_ms) for _, found, _ in choice.roc]
     assert alarms == sorted(alarms, reverse=True)
@@ -228,7 +228,7 @@ def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_moni
     np.testing.assert_allclose(peaks[0, 0], [99 / 399, 2 * 99 / 399 - 0.5], atol=1e-12)
     assert np.isnan(peaks[1:3]).all(), "a block of which a part doesn't count"
     np.testing.assert_allclose(peaks[3, 0], [1.0, 1.5])
-    (contact,) = shown.touches()
+    (contact,) = shown.trials()
     assert len(contact.since_s) == 50
     np.testing.assert_allclose(contact.statistic[0, 0], [200 / 399, 400 / 399 - 0.5])
     assert contact.since_s[-1] == pytest.approx(0.049)
@@ -249,7 +249,7 @@ def test_a_candidate_that_does_not_monitor_misses_the_contact_and_counts_no_moti
     rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
     shown.take_stretch(rows, batch_of(settings, states, tau_ext_hat=1.0, threshold=100.0))
     assert np.isfinite(shown.peaks()[:, 0, 0]).tolist() == [True, False, False, False]
-    assert [len(contact.since_s) for contact in shown.touches()] == [0]
+    assert [len(contact.since_s) for contact in shown.trials()] == [0]
 
 
 def test_the_certified_scheme_s_statistic_is_the_largest_ratio_to_its_thresholds():
@@ -273,7 +273,7 @@ def outcome(**changes):
 
 @functools.cache
 def choice_of(seconds):
-    return choose(observed(seconds, touches=(touched(1.0), touched(1.0, True))), 1.0)
+    return choose(observed(seconds, trials=(touched(1.0), touched(1.0, True))), 1.0)
 
 
 def candidate(delay_ms=2.0, name="made", changes=None, problems=(), seconds=600.0):
@@ -386,7 +386,7 @@ def test_the_report_has_the_figures_and_what_they_show(tmp_path):
     content = json.loads(with_truth[0].read_text())
     assert content["suggested"]["thresholds"]["checked_on"]["found"] == 1
     assert len(content["suggested"]["thresholds"]["roc"]) == len(FACTORS)
-    blind = dataclasses.replace(candidate(), choice=choose(observed(touches=None), 1.0))
+    blind = dataclasses.replace(candidate(), choice=choose(observed(trials=None), 1.0))
     assert blind.choice.checked.contacts is None
     (tmp_path / "file").write_text("")
     with pytest.raises(LogError, match="can't be written"):
@@ -497,13 +497,13 @@ def test_the_candidate_without_changes_shows_the_logged_residual(log):
     (read,) = read_logs([log])
     (shown,) = observe_candidates([read], [{}], lambda _: None)
     scheme = read_log(log, ("/scheme",)).scheme
-    for window, contact in zip(read.windows, shown.touches, strict=True):
+    for window, contact in zip(read.windows, shown.trials, strict=True):
         rows = slice(window.first, window.last + 1)
         allowance = scheme["threshold"][rows] - read.settings.detector.threshold_Nm
         known = np.isfinite(allowance).all(axis=1)
         logged = (np.abs(scheme["tau_ext_hat"][rows]) - allowance)[known]
         since_s = (scheme.t_ns[rows] - scheme.t_ns[window.first])[known] * 1e-9
-        rises = rising(Touched(since_s, logged[:, None, :], True))
+        rises = rising(Trial(since_s, logged[:, None, :], True))
         np.testing.assert_allclose(contact.statistic, rises.statistic, atol=1e-12)
         np.testing.assert_array_equal(contact.since_s, rises.since_s)
         assert known.all()

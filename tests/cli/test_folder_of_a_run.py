@@ -48,7 +48,7 @@ def test_demos_leave_each_other_as_they_are_and_the_links_lead_to_the_last(tmp_p
 def test_a_run_into_the_folder_of_one_that_is_going_on_is_told_by_whom(name: str, tmp_path: Path) -> None:
     with TruthLog(tmp_path / name, blocking=True) as log:
         refused = adacd_hil(tmp_path, "demo", *PAPER, "--out", ".")
-        log.event(0, "info", "run", "going on")
+        log.write_event(0, "info", "run", "going on")
     assert (refused.status, refused.stdout) == (USAGE, "")
     assert refused.stderr == (
         f"adacd-hil: {name} is being written by process {os.getpid()}; choose another folder with --out\n"

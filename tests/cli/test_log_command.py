@@ -152,7 +152,7 @@ def test_what_a_log_says_stays_within_its_line(tmp_path):
 
 def test_events_of_a_log_stay_within_their_line(tmp_path):
     with TruthLog(tmp_path / "truth.mcap", blocking=True) as log:
-        log.event(0, "error", "arm", "fell\nproblem: none")
+        log.write_event(0, "error", "arm", "fell\nproblem: none")
     (line,) = [line for line in call("info", tmp_path)[1].splitlines() if "fell" in line]
     assert line == "  error: arm: fell\\u000aproblem: none"
 

@@ -105,7 +105,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made: Path = tmp_path_factory.mktemp("terminal")
     (made / "mine.toml").write_text(CONFIGURATION)
     with TruthLog(made / "truth.mcap", blocking=True) as log:
-        log.event(0, "info", "run", "begun")
+        log.write_event(0, "info", "run", "begun")
     return made
 
 

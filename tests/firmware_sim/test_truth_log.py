@@ -25,7 +25,7 @@ def written(folder: Path, scenario: Scenario | None) -> Path:
         for cycle in range(3):
             block[TRUTH_LAYOUT.slices["faults"]] = cycle
             log.write(cycle, cycle * 1_000_000, block)
-        log.event(2_000_000, "warning", "faults", "begins: lose torque of sensor1")
+        log.write_event(2_000_000, "warning", "faults", "begins: lose torque of sensor1")
     return path
 
 

@@ -84,7 +84,7 @@ class Feed:
 
     def close(self) -> None:
         if self.live is not None:
-            self.live.close()
+            self.live.end_view()
             self.live.process.wait(HANG_S)
 
 

@@ -91,7 +91,6 @@ class Writer:
         self._socket.send(processes.END)
         self._thread.join()
         word = json.loads(self._socket.recv(processes.MOST_BYTES))
-        self._reader.close()
         self.ring.close()
         self._socket.close()
         self._theirs.close()

@@ -345,7 +345,7 @@ def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_waits_for_nobo
         thread.join()
     process.live.process.wait(HANG_S)
     assert clock.now_ns() == 3_000_000_000 + SHOW_PERIOD_NS
-    for end in (ours, theirs, reader, ring):
+    for end in (ours, theirs, ring):
         end.close()
 
 

@@ -551,7 +551,7 @@ def unstarted():
     server = make_server(ServerSetup(SETUP, setup_of(None), CHANNEL_IDS, EPOCH_NS), reader, theirs)
     listening = listen(SETUP)
     yield Unstarted(server, listening, listening.getsockname(), ours)
-    for end in (ours, theirs, reader, ring):
+    for end in (ours, theirs, ring):
         end.close()
 
 

@@ -26,9 +26,7 @@ def ring():
 
 @pytest.fixture
 def reader(ring):
-    reader = RingReader(ring.descriptor)
-    yield reader
-    reader.close()
+    return RingReader(ring.descriptor)
 
 
 def packets_of(data):

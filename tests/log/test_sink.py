@@ -13,7 +13,7 @@ def test_what_is_written_is_in_the_file_in_order(tmp_path):
     for piece in pieces:
         sink.write(piece)
     assert sink.tell() == sum(map(len, pieces))
-    sink.close()
+    sink.close_file()
     assert path.read_bytes() == b"".join(pieces)
     assert sink.error == ""
 
@@ -24,7 +24,7 @@ def test_a_settled_sink_knows_whether_writing_failed():
     sink.settle()
     assert sink.error == "No space left on device after 0 bytes"
     sink.write(b"more")
-    sink.close()
+    sink.close_file()
     assert sink.tell() == 8
 
 
@@ -34,7 +34,7 @@ def test_a_file_that_can_not_be_closed_is_reported(tmp_path):
     sink.write(b"data")
     sink.settle()
     os.close(descriptor)
-    sink.close()
+    sink.close_file()
     assert sink.error == "Bad file descriptor after 4 bytes"
 
 
@@ -50,7 +50,7 @@ def test_a_failure_ends_the_file_at_the_last_whole_write_though_there_is_room_ag
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     sink.write(b"c")
-    sink.close()
+    sink.close_file()
     assert sink.error == "File too large after 100 bytes"
     assert path.read_bytes() == b"a" * 100
 
@@ -66,7 +66,7 @@ def test_the_next_file_takes_the_place_of_nothing(tmp_path):
         assert (sink.error, sink.path) == (f"{name}: File exists after 0 bytes", None)
     sink.begin_file(tmp_path / "second")
     sink.write(b"data")
-    sink.close()
+    sink.close_file()
     assert (sink.error, sink.take_lost()) == ("", 6)
     assert (tmp_path / "target").read_bytes() == b"kept"
     assert (tmp_path / "second").read_bytes() == b"data"
@@ -78,5 +78,5 @@ def test_a_file_is_begun_again_from_its_start(tmp_path):
     sink.write(b"what came first")
     sink.begin_file(path)
     sink.write(b"again")
-    sink.close()
+    sink.close_file()
     assert (sink.error, path.read_bytes()) == ("", b"again")

@@ -140,7 +140,7 @@ def embedded(witnessed: Witnessed, tmp_path_factory: pytest.TempPathFactory) -> 
     settings = load_settings(str(files / "settings.toml"))
     scenario = load_scenario(str(files / "scenario.toml"))
     with TruthLog(folder / TRUTH_NAME, blocking=True, scenario=scenario) as truth:
-        watched = {"on_truth": truth.write, "on_event": truth.event}
+        watched = {"on_truth": truth.write, "on_event": truth.write_event}
         SessionRig(folder, settings, scenario, is_modelled=True, **watched).session.run()
     return folder
 

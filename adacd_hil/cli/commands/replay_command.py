@@ -15,7 +15,7 @@ from adacd_hil.progress_lines import Progress
 
 if TYPE_CHECKING:
     from adacd_hil.log.log_files import TimeWindow
-    from adacd_hil.replay.log_source import ReplaySource
+    from adacd_hil.replay.replay import ReplaySource
     from adacd_hil.replay.replayed_outcome import Replay
     from adacd_hil.settings.configuration import Settings
 

@@ -163,7 +163,7 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
     Returns the files that were written, [] without a cycle. Raises LogError when they can't be written.
     """
     # Here and not above: they take a second to import, and memory that the test itself has no use for.
-    from adacd_hil.lab.report.page import Heading, render_page
+    from adacd_hil.lab.report.page import render_page
     from adacd_hil.lab.report.report_tables import timing_tables
     from adacd_hil.lab.report.traces import pack_tracks, timing_track
 
@@ -176,8 +176,11 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
     page = render_page(
         "communication_test_page.html.j2",
         "communication test",
-        Heading("adacd-hil commtest", findings[-1], findings[:-1], report.verdict is Verdict.GOOD),
-        pack_tracks([track], period_us * 1e-6),
+        over="adacd-hil commtest",
+        headline=findings[-1],
+        is_good=report.verdict is Verdict.GOOD,
+        problems=findings[:-1],
+        traces=pack_tracks([track], period_us * 1e-6),
         timing=timing_tables(evidence),
     )
     with failing_as(f"pictures in {out} can't be written"):

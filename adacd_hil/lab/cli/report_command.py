@@ -16,22 +16,15 @@ from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.schema import ConfigError
 
 
-class IndexEntry(NamedTuple):
-    """A run of the folder, and its report; None if it can't be reported."""
-
-    listed: ListedRun
-    report: Report | None
-
-
 class Index(NamedTuple):
-    """Reports of a folder of runs, and their index page."""
+    """Runs of a folder, each with its report, None if it can't be reported; and their index page."""
 
     path: Path
-    entries: tuple[IndexEntry, ...]
+    entries: list[tuple[ListedRun, Report | None]]
 
     def as_text(self) -> str:
         """Return the index as text: a line for each run, with its verdict."""
-        lines = [count_text([entry.listed.run for entry in self.entries]), ""]
+        lines = [count_text([listed.run for listed, _ in self.entries]), ""]
         for listed, _ in self.entries:
             run = listed.run
             lines.append(f"{run.name}: {'good' if run.is_clean else 'NOT GOOD'}: {one_line(listed.verdict)}")
@@ -64,7 +57,7 @@ def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -
             if runs:
                 index = _report_runs(given, runs, folder, stretch, progress)
                 reported.append(index)
-                codes += [_code(entry.report) for entry in index.entries]
+                codes += [_code(report) for _, report in index.entries]
             else:
                 report = _report_one(log_in(given), folder, stretch, progress)
                 reported.append(report)
@@ -79,23 +72,23 @@ def _runs_in(given: Path) -> tuple[Path, ...]:
 
 def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWindow, progress: Progress) -> Index:
     """Report the runs of a folder, and write their index page."""
-    entries: list[IndexEntry] = []
+    entries: list[tuple[ListedRun, Report | None]] = []
     for number, run in enumerate(runs, start=1):
         name = run.relative_to(given).as_posix()
         progress(f"{number} of {len(runs)}: {run}")
         try:
             report = _report_one(run / LOG_NAME, out / name, stretch, progress)
             listed = ListedRun(reported(run, name, report.as_json()), report.html_path)
-            entries.append(IndexEntry(listed, report))
+            entries.append((listed, report))
         except (LogError, ConfigError) as error:
             problem = one_line(error)
             progress(problem)
             broken = RunSummary(name, run / LOG_NAME, BROKEN, problem)
-            entries.append(IndexEntry(ListedRun(broken, None, problem), None))
-    index = Index(out / INDEX_NAME, tuple(entries))
+            entries.append((ListedRun(broken, None, problem), None))
+    index = Index(out / INDEX_NAME, entries)
     with failing_as(f"{index.path} can't be written"):
         out.mkdir(parents=True, exist_ok=True)  # missing if no run could be reported
-        replace_file(index.path, runs_page(out, [entry.listed for entry in entries]))
+        replace_file(index.path, runs_page(out, [listed for listed, _ in entries]))
     return index
 
 

@@ -177,7 +177,7 @@ class LiveFeed:
         with contextlib.suppress(OSError):  # it has words that it hasn't heard yet, or is dead
             self._socket.send(word)
 
-    def close(self) -> None:
+    def end_view(self) -> None:
         """Ask the view's process to send the rest and end; don't wait for it."""
         self._say(processes.END)
         self._release()

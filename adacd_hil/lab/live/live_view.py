@@ -36,7 +36,7 @@ class LiveView:
         shape = Shape(settings.arm.link_length_m, settings.tilt_rad, settings.level_rad)
         return dataclasses.replace(self, robot_description=robot_description(settings), shape=shape)
 
-    def open(self, setup: "WriterSetup", ids: dict[int, int], start_ns: int) -> "LiveFeed":
+    def __call__(self, setup: "WriterSetup", ids: dict[int, int], start_ns: int) -> "LiveFeed":
         """Start the process that serves it. Raises LogError."""
         from adacd_hil.lab.live.feed import LiveFeed
 

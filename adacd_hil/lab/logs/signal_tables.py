@@ -12,10 +12,10 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,8 @@ _HEADS = {"csv": b"t_ns,", "parquet": b"PAR1"}
 
 Columns = Mapping[str, Any]
 """Columns of a table by name, of equal length: arrays or lists."""
+AddRows = Callable[[Columns], None]
+"""Adds rows to a table."""
 
 
 def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
@@ -96,7 +98,7 @@ class Tables:
         self._kind = kind
         self._metadata = dict(metadata)
         self._paths: dict[str, Path] = {}
-        self._tables: dict[str, _Csv | _Parquet] = {}
+        self._tables: dict[str, AddRows] = {}
         self._files = ExitStack()
         if kind == "parquet":
             import_pyarrow()
@@ -111,12 +113,13 @@ class Tables:
                 if is_anothers(path, _HEADS[self._kind]):  # as a recording may be, which is CSV, too
                     raise FileExistsError(errno.EEXIST, "what is there is no table of this command", str(path))
                 beside = self._files.enter_context(replacing(path))
-                table: _Csv | _Parquet = _Csv(beside) if self._kind == "csv" else _Parquet(beside, self._metadata)
-                self._tables[topic] = self._files.enter_context(closing(table))
+                is_csv = self._kind == "csv"
+                table = _csv_table(beside, columns) if is_csv else _parquet_table(beside, columns, self._metadata)
+                self._tables[topic] = self._files.enter_context(table)
                 self.rows[path] = 0
-                self._tables[topic].add_rows(columns)
+                self._tables[topic](columns)
             elif len(columns["t_ns"]):
-                self._tables[topic].add_rows(columns)
+                self._tables[topic](columns)
         self.rows[path] += len(columns["t_ns"])
 
     def _path(self, topic: str) -> Path:
@@ -138,40 +141,25 @@ class Tables:
             self._files.__exit__(kind, value, trace)
 
 
-class _Csv:
-    def __init__(self, path: Path) -> None:
-        self._file: IO[str] = path.open("w", encoding="utf-8", newline="")
-        self._writer = csv.writer(self._file, lineterminator="\n")
-        self._has_head = False
+@contextmanager
+def _csv_table(path: Path, head: Columns) -> Iterator[AddRows]:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(head)
 
-    def add_rows(self, columns: Columns) -> None:
-        if not self._has_head:
-            self._writer.writerow(columns)
-            self._has_head = True
-        lists = [values.tolist() if isinstance(values, np.ndarray) else values for values in columns.values()]
-        self._writer.writerows(zip(*lists, strict=True))
+        def add_rows(columns: Columns) -> None:
+            lists = [values.tolist() if isinstance(values, np.ndarray) else values for values in columns.values()]
+            writer.writerows(zip(*lists, strict=True))
 
-    def close(self) -> None:
-        self._file.close()
+        yield add_rows
 
 
-class _Parquet:
-    def __init__(self, path: Path, metadata: dict[str, str]) -> None:
-        self._path = path
-        self._metadata = metadata
-        self._writer: Any = None
-        self._arrow, self._parquet = import_pyarrow()
-
-    def add_rows(self, columns: Columns) -> None:
-        table = self._arrow.table(dict(columns))
-        if self._writer is None:
-            schema = table.schema.with_metadata(self._metadata)
-            self._writer = self._parquet.ParquetWriter(self._path, schema, compression="zstd")
-        self._writer.write_table(table)
-
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
+@contextmanager
+def _parquet_table(path: Path, head: Columns, metadata: dict[str, str]) -> Iterator[AddRows]:
+    arrow, parquet = import_pyarrow()
+    schema = arrow.table(dict(head)).schema.with_metadata(metadata)
+    with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+        yield lambda columns: writer.write_table(arrow.table(dict(columns)))
 
 
 def import_pyarrow() -> tuple[Any, Any]:

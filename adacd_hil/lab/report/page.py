@@ -54,16 +54,6 @@ STEPS: Final = 2
 """Next steps on the first screen, at most; the others are folded."""
 
 
-class Heading(NamedTuple):
-    """The head of a page: a line over the title, the title, problems of the log, and further findings, a line each."""
-
-    over: str
-    title: str
-    problems: Sequence[str]
-    is_good: bool
-    further: Sequence[str] = ()
-
-
 class Cell(NamedTuple):
     """The content of a table's cell, and its class."""
 
@@ -88,21 +78,28 @@ def make_table(head: Sequence[object], rows: Iterable[Sequence[object]], left: S
     return Table(line(head), [line(row) for row in rows], left)
 
 
-class _Asset(NamedTuple):
-    """A style or a script, and the digest by which the content security policy allows it."""
-
-    text: str
-    digest: str
-
-
 _STYLES: Final = ("uplot-1.6.32.min.css", "report.css")
 _SCRIPTS: Final = ("uplot-1.6.32.iife.min.js", "traces.js")
 """uPlot is Leon Sorokin's, MIT licence, from npm; its licence lies beside it."""
 
 
-def render_page(template: str, title: str, heading: Heading, traces: "Traces | None" = None, **values: Any) -> str:
-    """Write a page whose template extends `page.html.j2`. traces: its curves; without any it has no script."""
+def render_page(
+    template: str,
+    title: str,
+    over: str,
+    headline: str,
+    is_good: bool,
+    problems: Sequence[str] = (),
+    findings: Sequence[str] = (),
+    traces: "Traces | None" = None,
+    **values: Any,
+) -> str:
+    """Write a page whose template extends `page.html.j2`. traces: its curves; without any it has no script.
+
+    over: a line over the headline; problems: of the log, and further findings, a line each.
+    """
     sheets, programs = ([_asset(name) for name in names] for names in (_STYLES, _SCRIPTS if traces else ()))
+    heading = {"over": over, "title": headline, "is_good": is_good, "problems": problems, "further": findings}
     return render(template, title=title, heading=heading, traces=traces, styles=sheets, scripts=programs, **values)
 
 
@@ -132,9 +129,10 @@ def _environment() -> Environment:
 
 
 @cache
-def _asset(name: str) -> _Asset:
+def _asset(name: str) -> dict[str, str]:
+    """Read a style or a script, with the digest by which the content security policy allows it."""
     text = f"\n{resources.files(_PACKAGE).joinpath('assets', name).read_text(encoding='utf-8').strip()}\n"
-    return _Asset(text, b64encode(hashlib.sha256(text.encode()).digest()).decode())
+    return {"text": text, "digest": b64encode(hashlib.sha256(text.encode()).digest()).decode()}
 
 
 def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:

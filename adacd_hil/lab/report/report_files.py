@@ -19,13 +19,13 @@ from adacd_hil.lab.report.report_json import JSON_NAME, report_json
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.report.timeline import stays_of
-from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.evaluation import RunGatherer, evaluate
 from adacd_hil.lab.score.verdict import headlines
 from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
 from adacd_hil.log.logged_run import Progress, Run, StretchOfRun, section_at
 from adacd_hil.printable import in_line
 from adacd_hil.records import PARAMETER_UNITS
-from adacd_hil.score.metrics import Gathered, Metrics, ReportedContact, ReportSource
+from adacd_hil.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.score.wording import NONE, number_of, number_text, why_not_found
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import terminal_columns
@@ -103,7 +103,7 @@ def write_report(
     return write_run_report(run, out_dir, source, gathered)
 
 
-def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: Gathered | None = None) -> Report:
+def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer | None = None) -> Report:
     """Write the report of a run that is in memory. Raises LogError when it can't be written.
 
     gathered: the sums over all cycles; None: the run has all of its cycles.

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from string import ascii_letters
-from typing import Final, NamedTuple
+from typing import Final
 
 from adacd_hil.lab.report.page import (
     ADAPTATIONS,
@@ -215,27 +215,20 @@ _QUEUES: Final = {
 }
 
 
-class TimingTables(NamedTuple):
-    """The tables. queues: None without queues. is_modelled: the times come from a model."""
+def timing_tables(evidence: TimingEvidence) -> dict[str, Table | bool | None] | None:
+    """Make the tables of `timing.html.j2`: percentiles, counts, queues and ages. None without a cycle.
 
-    is_modelled: bool
-    times: Table
-    counts: Table
-    queues: Table | None
-    ages: Table
-
-
-def timing_tables(evidence: TimingEvidence) -> TimingTables | None:
-    """Make the tables: percentiles, counts, queues and ages. None without a cycle."""
+    is_modelled: the times come from a model, which has no queues.
+    """
     if not evidence.cycles:
         return None
-    return TimingTables(
-        is_modelled=evidence.is_modelled,
-        times=_times_table(evidence),
-        counts=_counts_table(evidence),
-        queues=None if evidence.is_modelled else _queues_table(evidence),
-        ages=_ages_table(evidence),
-    )
+    return {
+        "is_modelled": evidence.is_modelled,
+        "times": _times_table(evidence),
+        "counts": _counts_table(evidence),
+        "queues": None if evidence.is_modelled else _queues_table(evidence),
+        "ages": _ages_table(evidence),
+    }
 
 
 def _times_table(evidence: TimingEvidence) -> Table:
@@ -244,8 +237,11 @@ def _times_table(evidence: TimingEvidence) -> Table:
     rows = [_time_row(quantity, evidence, PERCENTILE_NAMES) for quantity in QUANTITIES if not quantity.is_reserve]
     reaction = evidence.reaction
     if reaction is not None:
-        label = ("Reaction", f"detection decision to first reaction frame, {number_of(reaction.count, 'reaction')}")
-        rows.append((label, *_values(reaction.percentiles, PERCENTILE_NAMES)))
+        label = (
+            "Reaction",
+            f"detection decision to first reaction frame, {number_of(int(reaction['count']), 'reaction')}",
+        )
+        rows.append((label, *_values(reaction, PERCENTILE_NAMES)))
     head = [None, *(Cell(name, "head") for name in LOW_PERCENTILE_NAMES)]
     rows += [head, *(_time_row(quantity, evidence, LOW_PERCENTILE_NAMES) for quantity in reserves)]
     return make_table(("µs", *PERCENTILE_NAMES), rows)
@@ -257,8 +253,8 @@ def _time_row(quantity: Quantity, evidence: TimingEvidence, names: Sequence[str]
     if statistics is None:
         reason = NONE if evidence.is_modelled and quantity.name == "lateness" else _ABSENT
         return (label, *[""] * (len(names) - 1), reason)
-    cells: list[object] = [*_values(statistics.percentiles, names)]
-    if quantity.is_reserve and statistics.percentiles.get("min", 0.0) < 0.0:
+    cells: list[object] = [*_values(statistics, names)]
+    if quantity.is_reserve and statistics.get("min", 0.0) < 0.0:
         cells[-1] = Cell(cells[-1], "bad")
     return (label, *cells)
 

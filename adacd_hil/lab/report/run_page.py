@@ -11,7 +11,6 @@ from adacd_hil.lab.report.page import (
     CONTACTS,
     TRACED_CONTACTS,
     Cell,
-    Heading,
     Table,
     has_paper,
     left_out_text,
@@ -313,8 +312,8 @@ def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
     return render_page(
         "run_page.html.j2",
         f"{_name(run, source)} – run report",
-        _heading(metrics, run, source),
-        traces_of(run, metrics),
+        **_heading(metrics, run, source),
+        traces=traces_of(run, metrics),
         run=run,
         metrics=metrics,
         next_steps=steps,
@@ -349,16 +348,21 @@ def _name(run: Run, source: ReportSource) -> str:
     return " ".join(filter(None, words)) or source.log_name
 
 
-def _heading(metrics: Metrics, run: Run, source: ReportSource) -> Heading:
+def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]:
     words = origin_words(run)
     if run.stretch is not None:
         words.append(stretch_text(run.stretch))
     problems = [f"The log is not whole: {source.problem}"] if source.problem else []
     if not problems and metrics.dropped:
         problems = [f"{metrics.dropped} packets are not in the log."]
-    over = " · ".join(["run report", *words])
     first, *further = headlines(metrics)
-    return Heading(over, first, problems, metrics.is_clean, further)
+    return {
+        "over": " · ".join(["run report", *words]),
+        "headline": first,
+        "is_good": metrics.is_clean,
+        "problems": problems,
+        "findings": further,
+    }
 
 
 def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:

@@ -67,7 +67,7 @@ from adacd_hil.score.emulator_truth import (
 )
 from adacd_hil.score.judge import find_detections, timed_contacts
 from adacd_hil.score.margins import SETTLING_TIME_CONSTANTS
-from adacd_hil.score.metrics import Gathered, ReportSource
+from adacd_hil.score.metrics import ReportSource
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
@@ -99,7 +99,7 @@ class ReadRun(NamedTuple):
     """A run with the cycles that are drawn, the sums over all of its cycles, and its log."""
 
     run: Run
-    gathered: Gathered
+    gathered: RunGatherer
     source: ReportSource
 
 
@@ -131,10 +131,10 @@ def read_run(
         stream = LogStream(log_path, RUN_TOPICS)
         reading = RunReading(shell, stream.empty().series["/scheme"], None, full_cycles)
         _read(stream, reading, progress, bounds_ns)
-    run, gathered = reading.finished()
+    run = reading.finished()
     if run.cycle.size == 0 and run.stretch is not None:
         raise LogError(f"log {log_path} has no cycle from {stretch.start_s:g} to {stretch.end_s:g} s")
-    return _with_ending(run, gathered, stream, truth, problem)
+    return _with_ending(run, reading.sums, stream, truth, problem)
 
 
 def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
@@ -197,7 +197,7 @@ def _within(series: Series, bounds_ns: Bounds) -> Series:
 
 
 def _with_ending(
-    run: Run, gathered: Gathered, stream: LogStream, truth: TruthTable | None, truth_problem: str
+    run: Run, gathered: RunGatherer, stream: LogStream, truth: TruthTable | None, truth_problem: str
 ) -> ReadRun:
     """Add the ending, the problems and the counts of the log."""
     ending = stream.summary.get(ENDING_KEY, "")
@@ -235,7 +235,7 @@ class RunReading:
         self._is_onset = (index >= 0.0) & (np.concatenate(([-1.0], index))[:-1] != index)
         self._rows = SchemeRows(empty)
         self._times = ThinnedTimes(shell.timing, full_cycles)
-        self._sums = RunGatherer(shell.settings, not is_realtime(shell))
+        self.sums = RunGatherer(shell.settings, not is_realtime(shell))
         self._full_cycles = full_cycles
         self._bucket = 1
         self._settled = 0  # rows that have been gathered
@@ -257,7 +257,7 @@ class RunReading:
         self._checks += _checks_of(series["/frame_checks"])
         scheme, columns = series["/scheme"], columns_of_series(series["/cycle"])
         cycle, state = scheme.records["cycle"].astype(np.int64), scheme.records["state"]
-        self._sums.add_times(columns, cycle, state)
+        self.sums.add_times(columns, cycle, state)
         self._times.add_columns(columns)
         if not len(scheme):
             return
@@ -340,7 +340,7 @@ class RunReading:
         """Gather the rows up to one, and keep of them those that are drawn."""
         outline = self.outline()
         shell = replace(self._shell, truth=None, motion_start_ns=outline.motion_start_ns)
-        self._sums.add_untouched(self._rows.run(shell, slice(self._settled, end)), outline)
+        self.sums.untouched.add_untouched(self._rows.run(shell, slice(self._settled, end)), outline)
         first, cycles = self._settled, self._rows.cycles
         self._settled = end
         if cycles <= self._full_cycles or first == end:
@@ -361,13 +361,11 @@ class RunReading:
             for trace in panel.traces:
                 yield trace.values
 
-    def finished(self) -> tuple[Run, Gathered]:
-        """Return the run with the cycles that were kept, and the sums, at the end of the log."""
+    def finished(self) -> Run:
+        """Return the run with the cycles that were kept, at the end of the log; `sums` then has all of them."""
         self._settle(self._rows.count)
-        run = self.outline()
-        gathered = self._sums.gathered(run)
         timing = self._times.columns()
-        return replace(run, timing=timing, all_cycles=self._rows.cycles, bucket=self._bucket), gathered
+        return replace(self.outline(), timing=timing, all_cycles=self._rows.cycles, bucket=self._bucket)
 
 
 def _bucket_of(cycles: int, most: int, bucket: int) -> int:

@@ -112,18 +112,10 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
     return sorted(notices[:_MOST_NOTICES])
 
 
-class CertificateNote(NamedTuple):
-    """A certificate of the log: given or taken back, and its clauses."""
-
-    at_s: float
-    is_taken_back: bool
-    clauses: list[str]
-
-
-def certificates_of(run: Run) -> list[CertificateNote]:
-    """List the certificates that were given and taken back, in the order of time."""
+def certificates_of(run: Run) -> list[tuple[float, bool, list[str]]]:
+    """List when certificates were given or taken back, s, whether the latter, and their clauses, by time."""
     return [
-        CertificateNote((t_ns - run.zero_ns) * 1e-9, event.name == "revoked", event.message.split("; "))
+        ((t_ns - run.zero_ns) * 1e-9, event.name == "revoked", event.message.split("; "))
         for t_ns, event in run.events
         if event.name in ("certificate", "revoked")
     ]
@@ -140,7 +132,7 @@ def timeline_of(run: Run, metrics: Metrics) -> Timeline | None:
     if run.state.size == 0:
         return None
     time_s, stays = run.time_s(), stays_of(run)
-    scale = _Scale(float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-3))
+    scale = float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-3)
     return Timeline(
         left=_LEFT,
         width=_RIGHT - _LEFT,
@@ -152,53 +144,46 @@ def timeline_of(run: Run, metrics: Metrics) -> Timeline | None:
     )
 
 
-class _Scale(NamedTuple):
-    start_s: float
-    end_s: float
-
-    def x(self, time_s: float) -> float:
-        share = (time_s - self.start_s) / (self.end_s - self.start_s)
-        return _LEFT + min(max(share, 0.0), 1.0) * (_RIGHT - _LEFT)
+_Scale = tuple[float, float]
+"""When the drawing begins and ends, s."""
 
 
-class _Narrow(NamedTuple):
-    """Stays that are drawn as one."""
-
-    stays: list[Stay]
-
-    @property
-    def gravest(self) -> Stay:
-        """A stay from the first to the last, with the gravest state: the last one of `STATE_COLOURS`."""
-        order = list(STATE_COLOURS)
-        state = max((stay.state for stay in self.stays), key=lambda state: state in order and 1 + order.index(state))
-        return Stay(state, self.stays[0].start_s, self.stays[-1].end_s)
+def _x(scale: _Scale, time_s: float) -> float:
+    start_s, end_s = scale
+    share = (time_s - start_s) / (end_s - start_s)
+    return _LEFT + min(max(share, 0.0), 1.0) * (_RIGHT - _LEFT)
 
 
-def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[Stay | _Narrow]:
+def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[list[Stay]]:
     """Give the stays as they are drawn: of many, those that are narrower than a mark together."""
     group: list[Stay] = []
     for stay in stays:
-        is_narrow = len(stays) > MARKS and scale.x(stay.end_s) - scale.x(stay.start_s) < _NARROWEST
-        if group and (not is_narrow or scale.x(stay.end_s) - scale.x(group[0].start_s) > _NARROWEST):
-            yield _Narrow(group)
+        is_narrow = len(stays) > MARKS and _x(scale, stay.end_s) - _x(scale, stay.start_s) < _NARROWEST
+        if group and (not is_narrow or _x(scale, stay.end_s) - _x(scale, group[0].start_s) > _NARROWEST):
+            yield group
             group = []
         if is_narrow:
             group.append(stay)
         else:
-            yield stay
+            yield [stay]
     if group:
-        yield _Narrow(group)
+        yield group
+
+
+def _gravity(stay: Stay) -> int:
+    order = list(STATE_COLOURS)
+    return 1 + order.index(stay.state) if stay.state in order else 0
 
 
 def _state_marks(stays: list[Stay], scale: _Scale) -> Iterator[Mark]:
     for drawn in _drawn_stays(stays, scale):
-        stay = drawn.gravest if isinstance(drawn, _Narrow) else drawn
-        left, right = scale.x(stay.start_s), scale.x(stay.end_s)
+        stay = Stay(max(drawn, key=_gravity).state, drawn[0].start_s, drawn[-1].end_s)
+        left, right = _x(scale, stay.start_s), _x(scale, stay.end_s)
         name, width = STATE_WORDS[stay.state], max(right - left, _NARROWEST)
         label = name if width > _LETTER * len(name) + 8 else ""
         margin_s = 0.05 * (stay.end_s - stay.start_s) + 0.005
-        if isinstance(drawn, _Narrow):
-            name = f"{len(drawn.stays)} states"
+        if len(drawn) > 1:
+            name = f"{len(drawn)} states"
         title = f"{name}, {number_text(stay.start_s, 2)} to {number_text(stay.end_s, 2, 's')}"
         colour = STATE_COLOURS.get(stay.state, "paper")
         yield Mark(stay.start_s - margin_s, stay.end_s + margin_s, title, left, width, colour, label)
@@ -209,13 +194,13 @@ def _contact_marks(metrics: Metrics, scale: _Scale) -> Iterator[Mark]:
     is_crowded = len(metrics.contacts) > MARKS
     for contact in metrics.contacts:
         at_s = contact.at_s
-        left = scale.x(at_s)
+        left = _x(scale, at_s)
         is_right = contact.detected_s is not None or not contact.is_armed
         if is_crowded and is_right and left - drawn < _NARROWEST:
             continue  # it would cover the one before
         drawn = left
         end_s = contact.end_s if contact.end_s is not None else at_s
-        width = max(scale.x(end_s) - left, 2.5)
+        width = max(_x(scale, end_s) - left, 2.5)
         look = "touch" if contact.detected_s is not None else "touch missed"
         label = str(contact.number)
         if left - labelled >= max(_APART, _DIGIT * len(label)):
@@ -242,11 +227,11 @@ def _contact_title(contact: ReportedContact, at_s: float) -> str:
 def _notice_marks(notices: list[Notice], scale: _Scale) -> Iterator[Mark]:
     for at_s, is_bad, text in notices:
         title = f"{text}, at {number_text(at_s, 2, 's')}"
-        yield Mark(at_s - 0.25, at_s + 0.25, title, scale.x(at_s), 0.0, "bad" if is_bad else "warn")
+        yield Mark(at_s - 0.25, at_s + 0.25, title, _x(scale, at_s), 0.0, "bad" if is_bad else "warn")
 
 
 def _ticks(scale: _Scale) -> Iterator[tuple[float, str]]:
-    span_s = scale.end_s - scale.start_s
+    span_s = scale[1] - scale[0]
     step_s = next(
         step
         for power in range(-4, 9)
@@ -254,8 +239,8 @@ def _ticks(scale: _Scale) -> Iterator[tuple[float, str]]:
         if span_s / step <= _TICKS
     )
     digits = max(0, -int(np.floor(np.log10(step_s))))
-    for number in range(int(np.ceil(scale.start_s / step_s)), int(scale.end_s / step_s) + 1):
-        yield scale.x(number * step_s), number_text(number * step_s, digits)
+    for number in range(int(np.ceil(scale[0] / step_s)), int(scale[1] / step_s) + 1):
+        yield _x(scale, number * step_s), number_text(number * step_s, digits)
 
 
 def traces_of(run: Run, metrics: Metrics) -> Traces | None:

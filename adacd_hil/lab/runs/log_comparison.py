@@ -20,7 +20,6 @@ from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
 from adacd_hil.records import ContactReport, SchemeState
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.setting_keys import changed_keys
 
 _TOPICS: Final = ("/scheme", "/cycle", "/contact")
@@ -32,33 +31,22 @@ Contact = tuple[float, ContactReport]
 """When a contact was found, s since motion start, and its last report, with the log's own numbers for its enums."""
 
 
-@dataclass(frozen=True)
-class RunDigest:
-    """The kept data of one run."""
-
-    path: Path
-    settings: Settings
-    metadata: dict[str, str]
-    problem: str
-    cycles: int
-    states: list[tuple[float, str]]
-    contacts: list[Contact]
-    parameters: dict[str, list[float]]
-    timing_us: dict[str, dict[str, float]]
-
-
 class RunReader:
-    """One of the logs: rows of /scheme with their cycle since motion start, and the digest of the log."""
+    """One of the logs: iterate once for its rows of /scheme; its figures are complete then.
+
+    states: entered, s since motion start; parameters: at each beginning of MONITOR, else at the end.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._zero = _motion_start(path)
         self._stream = LogStream(path, _TOPICS)
         self.settings = settings_of(path, self._stream.attachments)
+        self.metadata = {key: value for key, value in self._stream.metadata.items() if key not in _NOT_METADATA}
         self.cycles = 0
-        self._states: list[tuple[float, str]] = []
+        self.states: list[tuple[float, str]] = []
+        self.parameters: dict[str, list[float]] = {}
         self._contacts: dict[int, Contact] = {}
-        self._parameters: dict[str, list[float]] = {}
         self._times = {name: Distribution() for name in _TIMES}
         self._bounds: tuple[int, int] | None = None
 
@@ -92,17 +80,17 @@ class RunReader:
         zero_ns = self.zero_ns
         for piece in self._stream:
             if self._is_over(piece.series["/scheme"]):
-                return
+                break
             scheme = self._wanted(piece.series["/scheme"])
             t_s = (scheme.t_ns - zero_ns) * 1e-9
             records = scheme.records
             self.cycles += len(records)
             for row in np.flatnonzero(records["state"] != records["previous_state"]).tolist():
-                self._states.append((float(t_s[row]), _name_of(int(records["state"][row]))))
+                self.states.append((float(t_s[row]), _name_of(int(records["state"][row]))))
                 if records["state"][row] == SchemeState.MONITOR:
                     self._keep_parameters(records[row])
             if len(records):
-                self._last = records[-1].copy()
+                last = records[-1].copy()
             contacts = self._wanted(piece.series["/contact"])
             for time_ns, record in zip(contacts.t_ns.tolist(), contacts.records, strict=True):
                 self._take_contact((time_ns - zero_ns) * 1e-9, record)
@@ -111,10 +99,12 @@ class RunReader:
                 if name in cycles.fields:
                     self._times[name].add_values(cycles.records[name] / 1e3)
             yield records
+        if not self.parameters and self.cycles:
+            self._keep_parameters(last)
 
     def _keep_parameters(self, record: Any) -> None:
         for name, value in zip(self.settings.estimator.parameter_names, record["theta_hat"].tolist(), strict=False):
-            self._parameters.setdefault(name, []).append(value)
+            self.parameters.setdefault(name, []).append(value)
 
     def _take_contact(self, time_s: float, record: Any) -> None:
         """Keep the last report of each contact, with the time of its first one."""
@@ -124,25 +114,23 @@ class RunReader:
         report = ContactReport(**{name: record[name].tolist() for name in there})
         self._contacts[key] = (time_s if before is None else before[0], report)
 
-    def digest(self) -> RunDigest:
-        """Return the digest, once everything has been read."""
-        if not self._parameters and self.cycles:
-            self._keep_parameters(self._last)
-        timing = {}
-        for name, times in self._times.items():
-            found = times.low_percentiles() if name == "slack_ns" else times.percentiles()
-            timing[name.removesuffix("_ns")] = found
-        return RunDigest(
-            self.path,
-            self.settings,
-            {key: value for key, value in self._stream.metadata.items() if key not in _NOT_METADATA},
-            self._stream.problem,
-            self.cycles,
-            self._states,
-            sorted(self._contacts.values(), key=lambda contact: contact[0]),
-            self._parameters,
-            timing,
-        )
+    @property
+    def problem(self) -> str:
+        """The parts of the log that are missing, one line."""
+        return self._stream.problem
+
+    @property
+    def contacts(self) -> list[Contact]:
+        """The contacts, by time."""
+        return sorted(self._contacts.values(), key=lambda contact: contact[0])
+
+    @property
+    def timing_us(self) -> dict[str, dict[str, float]]:
+        """Percentiles of the times of its cycles."""
+        return {
+            name.removesuffix("_ns"): times.low_percentiles() if name == "slack_ns" else times.percentiles()
+            for name, times in self._times.items()
+        }
 
 
 def _name_of(state: int) -> str:
@@ -195,8 +183,8 @@ class LogComparison:
     stretch: of the first log, to which all but settings and metadata is limited.
     """
 
-    first: RunDigest
-    second: RunDigest
+    first: RunReader
+    second: RunReader
     settings: dict[str, tuple[str, str]]
     metadata: dict[str, tuple[str, str]]
     fields: tuple[FieldDifference, ...]
@@ -307,13 +295,13 @@ def compare_logs(
             reader.only(*bounds)
     differences = _Differences(period_s, readers[0].zero_cycle)
     cycles, only = _walk_together(readers, differences, progress)
-    one, two = (reader.digest() for reader in readers)
-    for run in (one, two):
+    one, two = readers
+    for run in readers:
         if not stretch.is_whole and not run.cycles:
             raise LogError(f"log {run.path} has no cycle {stretch.text}")
     keys = [*one.metadata, *(key for key in two.metadata if key not in one.metadata)]
     metadata = {key: (one.metadata.get(key, ""), two.metadata.get(key, "")) for key in keys}
-    notes = [f"{run.path}: {run.problem}" for run in (one, two) if run.problem]
+    notes = [f"{run.path}: {run.problem}" for run in readers if run.problem]
     if differences.missing:
         notes.append(f"not in both, or not of one size: {', '.join(sorted(differences.missing))}")
     return LogComparison(

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from adacd_hil.lab.report.page import Heading, Table, make_table, render_page
+from adacd_hil.lab.report.page import Table, make_table, render_page
 from adacd_hil.lab.report.traces import Trace, TracePanel, Track, pack_tracks
 from adacd_hil.lab.runs.run_summary import BROKEN, RunSummary
 from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, cells, count_text
@@ -38,45 +38,43 @@ class ListedRun(NamedTuple):
         return f"The log can't be reported: {self.problem}" if self.problem else self.run.verdict
 
 
-class _RunRow(NamedTuple):
-    listed: ListedRun
-    place: str
-    cells: Sequence[str]
-
-
 def runs_page(folder: Path, listed: Sequence[ListedRun]) -> str:
     """Write the list, which lies in `folder`."""
     runs = [each.run for each in listed]
     count = count_text(runs)
-    heading = Heading("adacd-hil runs", f"{count[0].upper()}{count[1:]}.", (), all(run.is_clean for run in runs))
-    rows = [_RunRow(each, _place(folder, each.report), cells(each.run)[1:]) for each in listed]
-    right = [place - 1 for place in NUMBERS]
-    return render_page("runs_page.html.j2", f"{count} – runs", heading, rows=rows, head=HEAD[1:], right=right)
+    return render_page(
+        "runs_page.html.j2",
+        f"{count} – runs",
+        over="adacd-hil runs",
+        headline=f"{count[0].upper()}{count[1:]}.",
+        is_good=all(run.is_clean for run in runs),
+        rows=[(each, _place(folder, each.report), cells(each.run)[1:]) for each in listed],
+        head=HEAD[1:],
+        right=[place - 1 for place in NUMBERS],
+    )
 
 
 def _place(folder: Path, report: Path | None) -> str:
     return "" if report is None else quote(Path(os.path.relpath(report, folder)).as_posix())
 
 
-class _TrendSection(NamedTuple):
-    trend: Trend
-    track: str
-    changes: Table
-    runs: Table
-
-
 def trend_page(found: Sequence[Trend]) -> str:
     """Write a page with a section for each arm."""
     sections = [
-        _TrendSection(trend, f"trend{number}", _changes_table(trend), _runs_table(trend))
-        for number, trend in enumerate(found)
+        (trend, f"trend{number}", _changes_table(trend), _runs_table(trend)) for number, trend in enumerate(found)
     ]
     broken = [run.name for trend in found for run in trend.left_out if run.status == BROKEN]
     problems = (f"Left out, as the log is broken: {', '.join(broken)}",) if broken else ()
-    title = found[0].sentence if len(found) == 1 else f"{len(found)} arms"
-    heading = Heading("adacd-hil trend", title, problems, not broken)
-    traces = pack_tracks([_track_of(each.trend, each.track) for each in sections], _SHORTEST_S, is_dated=True)
-    return render_page("trend_page.html.j2", "Trend over runs", heading, traces, sections=sections)
+    return render_page(
+        "trend_page.html.j2",
+        "Trend over runs",
+        over="adacd-hil trend",
+        headline=found[0].sentence if len(found) == 1 else f"{len(found)} arms",
+        is_good=not broken,
+        problems=problems,
+        traces=pack_tracks([_track_of(trend, track) for trend, track, *_ in sections], _SHORTEST_S, is_dated=True),
+        sections=sections,
+    )
 
 
 def _track_of(trend: Trend, name: str) -> Track:

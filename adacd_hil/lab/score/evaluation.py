@@ -7,6 +7,7 @@ the first command that reacts.
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -44,11 +45,8 @@ from adacd_hil.score.margins import UntouchedGatherer, evaluate_certified, last_
 from adacd_hil.score.metrics import (
     Count,
     CycleStatistics,
-    Gathered,
     Metrics,
-    ReactionLatency,
     ReportedContact,
-    TimeStatistics,
     TimingEvidence,
 )
 from adacd_hil.settings.configuration import Settings
@@ -59,43 +57,34 @@ class RunGatherer:
     """Sums up all cycles of a run, piece by piece, in bounded memory."""
 
     def __init__(self, settings: Settings, is_modelled: bool) -> None:
-        self._untouched = UntouchedGatherer(settings)
-        self._data = CyclicDataGatherer(settings)
-        self._timing = TimingGatherer(settings.bus.period_us, is_modelled)
+        self.untouched = UntouchedGatherer(settings)
+        self.data = CyclicDataGatherer(settings)
+        self.timing = TimingGatherer(settings.bus.period_us, is_modelled)
         self._state = int(SchemeState.INIT)  # of the last cycle so far
 
     def add_times(self, timing: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
         """Take the times of the next cycles, and the states of the same cycles (k,)."""
-        self._timing.add_columns(timing, find_reactions(timing, cycle, state, self._state))
-        self._data.add_columns(timing, cycle, state)
+        self.timing.add_columns(timing, find_reactions(timing, cycle, state, self._state))
+        self.data.add_columns(timing, cycle, state)
         if state.size:
             self._state = int(state[-1])
 
-    def add_untouched(self, piece: Run, outline: Run) -> None:
-        """Take the next cycles; outline: see `adacd_hil.score.margins`."""
-        self._untouched.add_untouched(piece, outline)
 
-    def gathered(self, run: Run) -> Gathered:
-        """Sum up. run: has the cycles in which the state changes."""
-        return Gathered(self._untouched.untouched(run), self._timing.evidence(), self._data.data(run))
-
-
-def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
+def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
     """Compute all metrics of a run.
 
     gathered: the sums over all cycles; None: the run has all of its cycles.
     """
     if gathered is None:
-        gatherer = RunGatherer(run.settings, not is_realtime(run))
-        gatherer.add_times(run.timing, run.cycle, run.state)
-        gatherer.add_untouched(run, run)
-        gathered = gatherer.gathered(run)
+        gathered = RunGatherer(run.settings, not is_realtime(run))
+        gathered.add_times(run.timing, run.cycle, run.state)
+        gathered.untouched.add_untouched(run, run)
+    untouched, timing, data = gathered.untouched.untouched(run), gathered.timing.evidence(), gathered.data.data(run)
     detections = find_detections(run)
     score = judge_run(run, contacts_of(run), detections)
     sections = split_sections(run)
     contacts = list_contacts(run, sections, detections, score)
-    residuals = gathered.untouched.residuals
-    evidence = evaluate_certified(run, sections, gathered.untouched)
+    evidence = evaluate_certified(run, sections, untouched)
     adaptation_s = {
         section.label: section.duration_s if section.is_complete else None
         for section in sections
@@ -107,7 +96,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     return Metrics(
         sections=sections,
         adaptation_s=adaptation_s,
-        frozen_residual_max_Nm=residuals,
+        frozen_residual_max_Nm=untouched.residuals,
         contacts=contacts,
         false_alarms=len(false_s) if has_truth else None,
         false_alarms_s=false_s if has_truth else None,
@@ -116,15 +105,17 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         payload_kg=payload_kg,
         fault=faults[0].reason if faults else None,
         fault_s=faults[0].at_s if faults else None,
-        cycle=_cycle_statistics(run, gathered.timing.cycles),
-        timing=gathered.timing,
-        data=gathered.data,
+        cycle=_cycle_statistics(run, timing.cycles),
+        timing=timing,
+        data=data,
         frames=run.frames,
         dropped=run.dropped,
         evidence=evidence,
-        paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
+        paper=compare_with_paper(
+            run, sections, adaptation_s, untouched.residuals, contacts, len(false_s), payload_kg, evidence
+        ),
         findings=list_findings(
-            run, sections, score, contacts, adaptation_s, payload_kg, evidence, faults, find_causes(run), gathered.data
+            run, sections, score, contacts, adaptation_s, payload_kg, evidence, faults, find_causes(run), data
         ),
         armed_false_alarms=score.armed_false_alarms if has_truth else None,
     )
@@ -386,19 +377,19 @@ class TimingGatherer:
             period_us=self._period_us,
             is_modelled=self._is_modelled,
             cycles=self._cycles,
-            times={quantity.name: self._statistics(quantity) for quantity in QUANTITIES},
-            reaction=None if reactions is None else ReactionLatency(reactions.count, reactions.percentiles()),
+            times={quantity.name: self._percentiles(quantity) for quantity in QUANTITIES},
+            histograms={quantity.name: self._histograms.get(quantity.name) for quantity in QUANTITIES},
+            reaction=None if reactions is None else {"count": reactions.count, **reactions.percentiles()},
             data_age=None if self._ages is None else tuple(self._ages.tolist()),
             queues_bytes={name: self._depths[name].percentiles() if name in self._depths else None for name in QUEUES},
             counts={name: self._count(name) for name in (*_RUNNING, *_PER_CYCLE)},
         )
 
-    def _statistics(self, quantity: Quantity) -> TimeStatistics | None:
+    def _percentiles(self, quantity: Quantity) -> Mapping[str, float] | None:
         values = self._times.get(quantity.name)
         if values is None:
             return None
-        found = values.low_percentiles() if quantity.is_reserve else values.percentiles()
-        return TimeStatistics(found, self._histograms[quantity.name])
+        return values.low_percentiles() if quantity.is_reserve else values.percentiles()
 
     def _count(self, name: str) -> Count | None:
         if name not in self._totals:

@@ -21,7 +21,7 @@ from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.thresholds.detector_comparison import WARM_UP_S
 from adacd_hil.lab.thresholds.free_motion import torque_streams
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, run_detectors
-from adacd_hil.lab.tune.tune_roc import Changes, Observed, Touched, TunedLog, Window, rising
+from adacd_hil.lab.tune.tune_roc import Changes, Observed, Trial, TunedLog, Window, rising
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.replay.replay import Watch, replay_many
@@ -105,7 +105,7 @@ def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progr
             name_of(changes),
             np.concatenate([one.peaks() for one in all_logs]),
             np.concatenate([log.is_chosen_on for log in logs]),
-            tuple(touched for one in all_logs for touched in one.touches()) if has_truth else None,
+            tuple(trial for one in all_logs for trial in one.trials()) if has_truth else None,
         )
         for changes, all_logs in zip(tried, gathered, strict=True)
     ]
@@ -140,7 +140,7 @@ class ShownLog:
         self._windows = [window for window in log.windows or () if window.is_armed]
         self._open = sorted(self._windows, key=lambda window: window.first)  # those whose last cycle is yet to come
         self._parts: dict[int, list[tuple[Vector, Vector]]] = {}  # by number of a window: since_s and statistic
-        self._touches: dict[int, Touched] = {}
+        self._trials: dict[int, Trial] = {}
 
     def take_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
         """Add a stretch; skips cycles that the log lacks."""
@@ -177,7 +177,7 @@ class ShownLog:
         self._open.remove(window)
         parts = self._parts.pop(window.number, None) or [(np.zeros(0), np.zeros((0, 1, self._channels)))]
         since_s, statistic = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        self._touches[window.number] = rising(Touched(since_s, statistic, window.is_chosen_on))
+        self._trials[window.number] = rising(Trial(since_s, statistic, window.is_chosen_on))
 
     def _statistic_of(self, block: Vector) -> Vector:
         """Return the statistic that the thresholds to be chosen bound (k, 1, channels)."""
@@ -194,11 +194,11 @@ class ShownLog:
         peaks[~whole] = np.nan
         return peaks
 
-    def touches(self) -> list[Touched]:
+    def trials(self) -> list[Trial]:
         """Return the statistics during the contacts for which the log's scheme was armed."""
         for window in list(self._open):
             self._close(window)
-        return [self._touches[window.number] for window in self._windows]
+        return [self._trials[window.number] for window in self._windows]
 
 
 def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: None) -> list[Observed]:
@@ -206,14 +206,14 @@ def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: N
     settings = detectors.DetectorBankSettings()
     statistics = run_detectors([log.motion for log in logs], settings, progress)
     is_chosen_on = chosen_blocks(logs)
-    touches: dict[str, list[Touched]] = {name: [] for name in settings.detectors}
+    trials: dict[str, list[Trial]] = {name: [] for name in settings.detectors}
     for log in logs:
-        for touched in _touches(log, statistics):
+        for trial in _trials(log, statistics):
             for name, rows in settings.detectors.items():
-                touches[name].append(rising(touched._replace(statistic=touched.statistic[:, list(rows), :])))
+                trials[name].append(rising(trial._replace(statistic=trial.statistic[:, list(rows), :])))
     has_truth = any(log.windows is not None for log in logs)
     return [
-        Observed(name, statistics.peaks[:, list(rows), :], is_chosen_on, tuple(touches[name]) if has_truth else None)
+        Observed(name, statistics.peaks[:, list(rows), :], is_chosen_on, tuple(trials[name]) if has_truth else None)
         for name, rows in settings.detectors.items()
     ]
 
@@ -224,7 +224,7 @@ def chosen_blocks(logs: Sequence[TunedLog]) -> NDArray[np.bool_]:
     return np.concatenate(chosen)[:: logs[0].block]
 
 
-def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:
+def _trials(log: TunedLog, statistics: Statistics) -> Iterator[Trial]:
     """Run the detectors over each contact that the log's scheme was armed for."""
     waiting = sorted((window for window in log.windows or () if window.is_armed), key=lambda window: window.first)
     if not waiting:
@@ -243,7 +243,7 @@ def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:
             bank = detectors.DetectorBank(statistics.settings, statistics.weights, log.motion.period_s)
             shown = bank.take_stream(held[0][rows], held[1][rows])
             since_s = (log.t_ns[window.first : window.last + 1] - log.t_ns[window.first]) * 1e-9
-            yield Touched(since_s, shown[window.first - first :], window.is_chosen_on)
+            yield Trial(since_s, shown[window.first - first :], window.is_chosen_on)
         waiting = [window for window in waiting if window.last >= end]
         needed = min((max(window.first - before, 0) for window in waiting), default=end)
         held = tuple(column[max(min(needed, end - before) - begin, 0) :] for column in held)

@@ -49,8 +49,8 @@ FACTORS: Final = tuple(10.0 ** (k / 12.0) for k in range(-9, 19))
 _LEAST: Final = 1e-9
 
 
-class Touched(NamedTuple):
-    """A detector's statistics on one true contact: since_s (k,) its onset, statistic (k, channels, n).
+class Trial(NamedTuple):
+    """A trial of a detector, one true contact: since_s (k,) its onset, statistic (k, channels, n).
 
     Both are empty where the detector was not armed, which counts as missed. Samples in which no statistic is larger
     than before may be left out: no threshold is crossed there for the first time.
@@ -61,27 +61,27 @@ class Touched(NamedTuple):
     is_chosen_on: bool
 
 
-def rising(touched: Touched) -> Touched:
+def rising(trial: Trial) -> Trial:
     """Leave out the samples in which no statistic is larger than in all before."""
-    if not len(touched.since_s):
-        return touched
-    flat = touched.statistic.reshape(len(touched.since_s), -1)
+    if not len(trial.since_s):
+        return trial
+    flat = trial.statistic.reshape(len(trial.since_s), -1)
     before = np.fmax.accumulate(flat, axis=0)[:-1]
     is_kept = np.concatenate(([True], ~(flat[1:] <= before).all(axis=1)))
-    return touched._replace(since_s=touched.since_s[is_kept], statistic=touched.statistic[is_kept])
+    return trial._replace(since_s=trial.since_s[is_kept], statistic=trial.statistic[is_kept])
 
 
 @dataclass(frozen=True)
 class Observed:
     """A detector's statistics: peaks (B, channels, n) per block of 0.1 s, NaN unless free; is_chosen_on (B,).
 
-    touches: the contacts for which the logged scheme was armed; None if no log records the true contacts.
+    trials: the contacts for which the logged scheme was armed; None if no log records the true contacts.
     """
 
     name: str
     peaks: Vector
     is_chosen_on: NDArray[np.bool_]
-    touches: tuple[Touched, ...] | None
+    trials: tuple[Trial, ...] | None
 
     def half(self, is_chosen_on: bool) -> Vector:
         """Return the peaks of one half, NaN elsewhere."""
@@ -173,21 +173,21 @@ def choose(observed: Observed, rate_per_h: float) -> Choice:
     thresholds = np.maximum(thresholds, _LEAST)
     held_out = observed.half(False)
     roc = tuple(
-        (factor, _count(held_out, observed.touches, factor * thresholds), _predicted(calibration, factor))
+        (factor, _count(held_out, observed.trials, factor * thresholds), _predicted(calibration, factor))
         for factor in FACTORS
     )
     return Choice(
         observed.name,
         thresholds,
         calibration,
-        _count(first, _half(observed.touches, True), thresholds),
-        _count(held_out, _half(observed.touches, False), thresholds),
+        _count(first, _half(observed.trials, True), thresholds),
+        _count(held_out, _half(observed.trials, False), thresholds),
         roc,
     )
 
 
-def _half(touches: tuple[Touched, ...] | None, is_chosen_on: bool) -> tuple[Touched, ...] | None:
-    return None if touches is None else tuple(each for each in touches if each.is_chosen_on == is_chosen_on)
+def _half(trials: tuple[Trial, ...] | None, is_chosen_on: bool) -> tuple[Trial, ...] | None:
+    return None if trials is None else tuple(each for each in trials if each.is_chosen_on == is_chosen_on)
 
 
 def _predicted(calibration: TailCalibration | None, factor: float) -> float | None:
@@ -198,21 +198,21 @@ def _predicted(calibration: TailCalibration | None, factor: float) -> float | No
     return calibration.tail.rate_at(ratio) if ratio >= calibration.tail.level else None
 
 
-def _count(peaks: Vector, touches: tuple[Touched, ...] | None, thresholds: Vector) -> Found:
+def _count(peaks: Vector, trials: tuple[Trial, ...] | None, thresholds: Vector) -> Found:
     alarms = clusters(largest_ratio(peaks, thresholds), 1.0).size
-    delays = [delay_ms(touched, thresholds) for touched in touches or ()]
+    delays = [delay_ms(trial, thresholds) for trial in trials or ()]
     return Found(
         counted_hours(peaks[:, 0, 0]),
         int(alarms),
-        None if touches is None else len(touches),
+        None if trials is None else len(trials),
         tuple(delay for delay in delays if delay is not None),
     )
 
 
-def delay_ms(touched: Touched, thresholds: Vector) -> float | None:
+def delay_ms(trial: Trial, thresholds: Vector) -> float | None:
     """Give when some statistic is first over its threshold, ms after the onset; None: never."""
-    over = np.flatnonzero((touched.statistic > thresholds).any(axis=(1, 2)))
-    return float(touched.since_s[over[0]]) * 1e3 if over.size else None
+    over = np.flatnonzero((trial.statistic > thresholds).any(axis=(1, 2)))
+    return float(trial.since_s[over[0]]) * 1e3 if over.size else None
 
 
 _TENTHS = 10
@@ -348,21 +348,21 @@ def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterat
             yield contact.counted_from(begins[contact.attempt])
 
 
-def _windows(touches: Sequence[TrueContact], t_ns: Times, place: int | None) -> tuple[Window, ...]:
+def _windows(contacts: Sequence[TrueContact], t_ns: Times, place: int | None) -> tuple[Window, ...]:
     """Give the rows of contacts. place: of the log; None for a single log."""
-    onsets_ns = np.array([touch.onset_ns for touch in touches], np.int64)
-    until_ns = explained_until(onsets_ns, np.array([touch.forgotten_ns for touch in touches], np.int64))
+    onsets_ns = np.array([contact.onset_ns for contact in contacts], np.int64)
+    until_ns = explained_until(onsets_ns, np.array([contact.forgotten_ns for contact in contacts], np.int64))
     firsts = np.searchsorted(t_ns, onsets_ns).tolist()
     lasts = (np.searchsorted(t_ns, until_ns, side="right") - 1).tolist()
     return tuple(
         Window(
-            number=touch.number,
+            number=contact.number,
             first=first,
             last=max(last, first),
-            is_armed=touch.is_armed,
-            is_chosen_on=(touch.number if place is None else place) % 2 == (1 if place is None else 0),
+            is_armed=contact.is_armed,
+            is_chosen_on=(contact.number if place is None else place) % 2 == (1 if place is None else 0),
         )
-        for touch, first, last in zip(touches, firsts, lasts, strict=True)
+        for contact, first, last in zip(contacts, firsts, lasts, strict=True)
     )
 
 

@@ -113,7 +113,7 @@ class Sink:
         with self._changed:
             self._changed.wait_for(lambda: self._is_idle and not self._tasks)
 
-    def close(self) -> None:
+    def close_file(self) -> None:
         """Write the waiting data, then close the file."""
         with self._changed:
             self._tasks.append(None)

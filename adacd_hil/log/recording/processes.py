@@ -9,7 +9,7 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -38,15 +38,15 @@ class LiveFeed(Protocol):
     ) -> None:
         """Show consecutive message records (b,); channels, log_ns, ends (n,): one entry per record."""
 
-    def close(self) -> None:
-        """Close the view without waiting for viewers."""
+    def end_view(self) -> None:
+        """End the view without waiting for viewers."""
 
 
-class LiveService(Protocol):
-    """A live view that the writer process opens; it is sent there pickled."""
+LiveService = Callable[["WriterSetup", dict[int, int], int], LiveFeed]
+"""Opens a live view in the writer process, to which it is sent pickled. Raises LogError.
 
-    def open(self, setup: "WriterSetup", ids: dict[int, int], start_ns: int) -> LiveFeed:
-        """Open the view. ids: the file's id of each channel; start_ns: before the first record. Raises LogError."""
+It takes the log's setup, the file's id of each channel, and a log time before the first record.
+"""
 
 
 @dataclass(frozen=True)

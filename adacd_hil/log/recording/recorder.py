@@ -13,7 +13,7 @@ import socket
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from adacd_hil.file_access import create_file
 from adacd_hil.log.log_files import LogError, LogExistsError, find_parts
@@ -230,7 +230,7 @@ class Recorder:
         word: dict[str, str] = json.loads(received) if received else {}
         return word or None
 
-    def __enter__(self) -> "Recorder":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -53,11 +53,6 @@ class _SharedRing:
         data = self._memory[_COUNTS_BYTES + place : _COUNTS_BYTES + min(place + size, self.capacity)]
         return data if len(data) == size else data + self._memory[_COUNTS_BYTES : _COUNTS_BYTES + size - len(data)]
 
-    def close(self) -> None:
-        """Unmap the shared memory."""
-        self._counts.release()
-        self._memory.close()
-
 
 class Ring(_SharedRing):
     """The ring's writing side: puts packets."""
@@ -113,7 +108,8 @@ class Ring(_SharedRing):
 
     def close(self) -> None:
         """Release the memory; later puts return False."""
-        super().close()
+        self._counts.release()
+        self._memory.close()
         os.close(self.descriptor)
         self._counts = memoryview(bytearray(_COUNTS_BYTES)).cast("Q")
         self.capacity = self._room_until = 0

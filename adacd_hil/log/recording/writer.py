@@ -74,7 +74,7 @@ class WriterProcess:
 
     def _open(self, live: LiveService) -> LiveFeed:
         start_ns = self._setup.epoch_ns + (0 if self._setup.is_blocking else self._clock.now_ns())
-        return live.open(self._setup, self._file.ids, start_ns)
+        return live(self._setup, self._file.ids, start_ns)
 
     def run(self) -> None:
         """Write until the end, then answer with the summary."""
@@ -91,7 +91,7 @@ class WriterProcess:
 
     def _end(self, summary: dict[str, str]) -> None:
         """Close the last file and send the summary."""
-        self._sink.close()
+        self._sink.close_file()
         path = part_path(self._setup.path, self._part)
         if self._part and self._sink.error and self._sink.path == path and not self._has_chunks:
             with contextlib.suppress(OSError):
@@ -100,7 +100,7 @@ class WriterProcess:
         last = {"parts": str(self._parts), "lost": str(lost), "error": self._sink.first_error}
         _send(self._connection, json.dumps({**summary, **last}).encode())
         if self.live is not None:
-            self.live.close()
+            self.live.end_view()
 
     def _hear(self) -> bytes | None:
         """Receive a message; NOTHING if the control process is dead; None after a timeout."""
