@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from general_arm import NOBODY, GeneralArm, without_friction
+from general_arm import NO_PAYLOAD, NOBODY, GeneralArm, without_friction
 from long_cases import long_but
 
 from adacd_hil.control.motions import corner_to_corner
@@ -15,13 +15,12 @@ from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_tab
 
 POINT_PAYLOAD = (1.0, (0.0, 0.0), 0.0)
 BODY_PAYLOAD = (1.5, (0.05, 0.08), 0.01)
-NONE = (0.0, (0.0, 0.0), 0.0)
 CORNER = np.radians([-30.0, -60.0])
 AS_RIGID = MechanicsSettings(heat_capacity_J_K=(1e9, 1e9))
 SPRINGS = {"stiffness_Nm_rad": (6000.0, 2000.0), "rotor_inertia_kg_m2": (0.3, 0.05)}
 
 
-def engine(arm: GeneralArm, payload=NONE, ball: str = "") -> mujoco.MjModel:
+def engine(arm: GeneralArm, payload=NO_PAYLOAD, ball: str = "") -> mujoco.MjModel:
     """Build the arm: links as bodies, rotors as wheels of their own, springs as tendons between wheel and joint."""
     settings = arm.settings
     lengths_m, masses_kg, centers_m, inertias = (
@@ -115,7 +114,7 @@ def paper_torque(arm: GeneralArm, seconds: float) -> tuple[np.ndarray, np.ndarra
             # a spring that is off by 1 % moves the links by 4e-5 rad
             (MechanicsSettings(**SPRINGS), POINT_PAYLOAD, 10.0, 1e-5),
             # flanks that rattle undamped forget their past: each knock enlarges what the knock before it left
-            (MechanicsSettings(**SPRINGS, backlash_rad=(2e-3, 2e-3)), NONE, 2.0, 1e-3),
+            (MechanicsSettings(**SPRINGS, backlash_rad=(2e-3, 2e-3)), NO_PAYLOAD, 2.0, 1e-3),
         ],
     ),
 )
@@ -203,7 +202,7 @@ def test_a_prescribed_pulse_changes_the_momentum_as_in_mujoco(settings, link, po
     assert np.linalg.norm(gained - expected) < 0.002 * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize(("speed_m_s", "payload"), [(0.5, NONE), (2.0, POINT_PAYLOAD)])
+@pytest.mark.parametrize(("speed_m_s", "payload"), [(0.5, NO_PAYLOAD), (2.0, POINT_PAYLOAD)])
 def test_a_ball_that_hits_link_2_in_mujoco_moves_our_arm_alike(speed_m_s, payload):
     """The ball's loss of momentum in the engine, given to our arm as a pulse, changes the arm's momentum within 2 %."""
     arm = GeneralArm(without_friction("S"), AS_RIGID, q=(0.3, 0.9), payload=payload)

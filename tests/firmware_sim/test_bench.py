@@ -39,13 +39,6 @@ def test_the_cyclic_frames_come_last_so_that_a_host_in_lockstep_has_everything()
     assert [can_id for can_id, _ in host.take()] == [0x281, 0x282, 0x181, 0x182, 0x183, 0x184]
 
 
-def test_truth_comes_every_cycle_with_its_number_and_the_syncs_time():
-    host = BenchHost()
-    play(host, 300)
-    assert [cycle for cycle, _, _ in host.truths] == list(range(303))
-    assert [t_ns for _, t_ns, _ in host.truths] == [(k + 1) * PERIOD_NS for k in range(303)]
-
-
 def test_scenario_time_starts_when_both_drives_are_first_enabled():
     host = BenchHost(quiet_scenario(contacts=TWITCH))
     host.start()
@@ -77,15 +70,14 @@ def test_by_sync_the_arm_moves_one_period_per_sync_however_long_it_takes():
     assert quick.bench.now_ns == 302 * PERIOD_NS
 
 
-@pytest.mark.parametrize("lost", [2])
-def test_a_lost_sync_keeps_the_arms_time(lost):
+def test_a_lost_sync_keeps_the_arms_time():
     whole, holed = BenchHost(), BenchHost()
     for host in (whole, holed):
         play(host, 100)
         host.step(ENABLE, 50)
-    for _ in range(lost + 1):
+    for _ in range(3):
         whole.sync()
-    holed.cycle += lost
+    holed.cycle += 2
     holed.sync()
     assert holed.bench.cycle == whole.bench.cycle
     assert np.array_equal(holed.truths[-1][2], whole.truths[-1][2])
@@ -98,20 +90,6 @@ def test_the_counter_is_unwrapped_over_its_overflow():
     for _ in range(500):
         host.sync()
     assert host.bench.cycle == 506
-
-
-def test_another_period_takes_effect_before_the_arm_has_moved():
-    host, reference = BenchHost(), BenchHost()
-    for node in (1, 2, 3, 4):
-        host.write(node, 0x1006, 0, 2000)
-    host.enable()
-    reference.enable()
-    for _ in range(50):
-        host.step(ENABLE, 50)
-    for _ in range(100):
-        reference.step(ENABLE, 50)
-    assert host.bench.now_ns == 52 * 2 * PERIOD_NS
-    assert host.true("dq")[0] == pytest.approx(reference.true("dq")[0], rel=0.05)
 
 
 def test_a_second_host_that_leaves_the_default_period_finds_the_arm_where_the_first_left_it():

@@ -40,15 +40,6 @@ def test_a_torque_that_comes_with_a_sync_moves_the_arm_from_that_sync_on(clock_m
     assert np.abs(host.true("tau_m")).max() < 0.02
 
 
-def test_the_arm_waits_between_syncs_where_every_sync_is_a_period():
-    host = moving()
-    before = host.true("dq").copy()
-    run_on(host, 3)  # too short for a watchdog
-    host.sync()
-    moved = np.diff(rows(host, Q), axis=0)[-1]
-    assert moved == pytest.approx(before * 1e-3, rel=0.1)
-
-
 def test_the_arm_goes_on_between_syncs_by_the_clock():
     host = moving("wall")
     before = rows(host, Q)[-1]

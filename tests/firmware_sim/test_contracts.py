@@ -119,18 +119,6 @@ def test_the_stock_sensors_mapping_and_what_is_to_be_mapped_on_stock_drives_are_
     assert seen == cyclic_ids(database)
 
 
-@pytest.mark.parametrize("name", PRESENT)
-def test_every_eds_lists_exactly_the_objects_that_it_describes(name):
-    for file in (CONTRACTS[name].drive_eds, CONTRACTS[name].sensor_eds):
-        parser = configparser.ConfigParser()
-        parser.read(contract_folder() / file)
-        listed = set()
-        for section in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
-            count = int(parser[section]["SupportedObjects"])
-            listed |= {int(parser[section][str(number)], 16) for number in range(1, count + 1)}
-        assert listed == {int(section, 16) for section in parser.sections() if len(section) == 4}
-
-
 def stock_host(**scenario) -> BenchHost:
     host = BenchHost(quiet_scenario(**scenario), contract="arm_stock")
     for node in (*DRIVE_NODES, *SENSOR_NODES):

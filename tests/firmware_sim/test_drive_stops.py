@@ -60,6 +60,7 @@ def test_an_option_code_is_taken_or_refused(option, codes):
     ],
 )
 def test_quick_stop_brakes_by_its_ramp_and_ends_as_its_code_says(code, mode, end):
+    """Operation resumes only from a stop that stays."""
     host = moving_host(0x605A, code)
     host.step(QUICK_STOP)
     assert host.state_bits() == STOPPING
@@ -67,17 +68,12 @@ def test_quick_stop_brakes_by_its_ramp_and_ends_as_its_code_says(code, mode, end
     host.step(QUICK_STOP)
     host.step(QUICK_STOP)
     assert (host.true("tau_J") * host.true("dq")).max() < 0.0
+    host.step(ENABLE)
+    assert host.state_bits() == (ENABLED if end == STOPPING else STOPPING)
     for _ in range(200):
         host.step(QUICK_STOP)
     assert host.state_bits() == end
     assert abs(host.true("dq")).max() < 0.02
-
-
-def test_quick_stop_code_0_disables_the_drive_at_once():
-    host = moving_host(0x605A, 0)
-    host.step(QUICK_STOP)
-    assert host.state_bits() == DISABLED
-    assert host.bench.drives[0].motor_mode == DriveMode.OFF
 
 
 def damping(code: int) -> float:
@@ -99,20 +95,6 @@ def test_the_ramps_brake_with_half_all_and_one_and_a_half_of_the_damping():
     assert hard == pytest.approx(1.5 * 12.5, rel=0.05)
 
 
-@pytest.mark.parametrize("code", [5, 6, 7])
-def test_operation_resumes_only_from_a_quick_stop_that_stays(code):
-    host = moving_host(0x605A, code)
-    for _ in range(3):
-        host.step(QUICK_STOP)
-    host.step(ENABLE)
-    assert host.state_bits() == ENABLED
-    host = moving_host(0x605A, code - 4)
-    for _ in range(3):
-        host.step(QUICK_STOP)
-    host.step(ENABLE)
-    assert host.state_bits() == STOPPING
-
-
 @pytest.mark.parametrize(("option", "word", "end"), [(0x605B, SHUTDOWN, READY), (0x605C, SWITCH_ON, SWITCHED_ON)])
 def test_shutdown_and_disable_operation_may_ramp_down_first(option, word, end):
     host = moving_host(option, 1)
@@ -127,10 +109,21 @@ def test_shutdown_and_disable_operation_may_ramp_down_first(option, word, end):
     assert abs(host.true("dq")).max() < 0.02
 
 
-@pytest.mark.parametrize(("option", "word", "end"), [(0x605B, SHUTDOWN, READY), (0x605C, SWITCH_ON, SWITCHED_ON)])
-def test_without_a_ramp_they_disable_at_once(option, word, end):
+@pytest.mark.parametrize(
+    ("option", "words", "end"),
+    [
+        (0x605A, [QUICK_STOP], DISABLED),
+        (0x605B, [SHUTDOWN], READY),
+        (0x605C, [SWITCH_ON], SWITCHED_ON),
+        (0x605E, [None] * 3, FAULT),
+    ],
+)
+def test_without_a_ramp_each_stop_ends_at_once(option, words, end):
+    """Commands that are missing are a fault with the third SYNC."""
     host = moving_host(option, 0)
-    host.step(word)
+    for word in words:
+        host.command(word) if word is not None else None
+        host.sync()
     assert host.state_bits() == end
     assert host.bench.drives[0].motor_mode == DriveMode.OFF
 

@@ -6,8 +6,8 @@ import struct
 import numpy as np
 import pytest
 from bench_host import DISABLED, ENABLE, ENABLED, FAULT, FAULT_RESET, BenchHost, quiet_scenario
+from general_arm import truth_of
 
-from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.hardware_settings import DriveSettings
 from firmware_sim.arm.sensing import DriveMode
@@ -68,9 +68,7 @@ def arm(**drives) -> Body:
 
 
 def true_torque(body: Body) -> np.ndarray:
-    block = np.zeros(TRUTH_LAYOUT.size)
-    body.truth(block)
-    return block[TRUTH_LAYOUT.slices["tau_J"]]
+    return truth_of(body)["tau_J"]
 
 
 @pytest.mark.parametrize("bandwidth_Hz", [20.0, 1_000.0, 5_000.0])
@@ -196,13 +194,6 @@ def test_the_torque_falls_in_a_line_from_the_derating_start_to_nothing(preheat_K
     assert Motors(preheat_K=[preheat_K, 0.0]).available_Nm() == pytest.approx(available_Nm, abs=1e-12)
 
 
-def test_derating_begins_when_the_winding_has_warmed_up_to_it():
-    """25 + 300 (1 − exp(−t / t_w)) = 110."""
-    motors = Motors(winding_rise_K=[300.0, 0.0], winding_time_s=[0.2, 1.0])
-    expected_s = -0.2 * math.log(1.0 - 85.0 / 300.0)
-    assert motors.until_limited(12.0, 12.0) == pytest.approx(expected_s, abs=1.5 * TICK_S)
-
-
 def test_a_derated_drive_finds_the_torque_that_it_can_bear():
     """At 125 °C half the torque is left, and a quarter of 400 K is what that heats."""
     body = arm(winding_rise_K=[400.0, 0.0], winding_time_s=[0.05, 1.0])
@@ -260,24 +251,6 @@ def test_the_statusword_says_that_a_limit_is_active():
         words.append(bool(host.statusword() & INTERNAL_LIMIT))
     assert words == [False, True, True, False, False]
     assert not host.statusword(2) & INTERNAL_LIMIT
-
-
-def test_a_status_frame_tells_at_once_that_a_limit_has_become_active():
-    host = make_host(peak_torque_Nm=[6.0, 0.0])
-    host.step(ENABLE, 700)
-    host.take()
-    host.step(ENABLE, 700)
-    frames = host.taken(0x281)
-    assert len(frames) == 1
-    assert struct.unpack_from("<H", frames[0])[0] & INTERNAL_LIMIT
-
-
-def test_0x6077_is_what_the_drive_believes():
-    host = make_host(torque_constant_error=[0.2, 0.0])
-    for _ in range(4):
-        host.step(ENABLE, 100)
-    assert host.read(1, 0x6077) == 100
-    assert host.true("tau_J") == pytest.approx([1.44, 0.6], rel=1e-5)
 
 
 def test_an_overheated_motor_faults_its_drive_and_no_other():

@@ -85,15 +85,6 @@ def test_writing_back_what_was_read_is_accepted_for_every_writable_object(host, 
             assert (index, sub, host.read(node, index, sub)) == (index, sub, default_of(default, node))
 
 
-def test_each_device_has_its_own_identity(host):
-    assert [host.read(node, 0x1018, 4) for node in (1, 2, 3, 4)] == [1, 2, 3, 4]
-    assert [host.read(node, 0x1018, 2) for node in (1, 2, 3, 4)] == [0x402, 0x402, 0x404, 0x404]
-
-
-def test_all_devices_announce_themselves_at_power_on(host):
-    assert host.take() == [(0x701, b"\0"), (0x702, b"\0"), (0x703, b"\0"), (0x704, b"\0")]
-
-
 STATES = {START: 5, STOP: 4, PRE_OPERATIONAL: 127, RESET_NODE: 127, RESET_COMMUNICATION: 127}
 
 

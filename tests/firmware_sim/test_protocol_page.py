@@ -121,16 +121,6 @@ def test_what_sdo_writes_to_the_header_objects_is_dropped():
     assert [host.read(1, 0x2100, 1), host.read(1, 0x2100, 2)] == [frame[0], frame[1]]
 
 
-@pytest.mark.parametrize("bit", [4, 8, 15])
-def test_halt_and_the_other_bits_of_the_controlword_have_no_effect(bit):
-    host = BenchHost()
-    host.start()
-    for word in (SHUTDOWN, SWITCH_ON, ENABLE, ENABLE):
-        host.step(word | 1 << bit, 100)
-    assert host.state_bits() == ENABLED
-    assert host.bench.drives[0].torque_Nm == pytest.approx(1.2)
-
-
 def test_bits_9_10_and_12_of_the_statusword():
     host = BenchHost()
     host.start()

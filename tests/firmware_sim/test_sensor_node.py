@@ -73,25 +73,6 @@ def test_before_the_first_sample_the_value_is_not_valid():
     assert host.taken(0x283) == [b"\x00\x00"]
 
 
-def test_status_comes_every_100_ms():
-    host = BenchHost()
-    host.nmt(START)
-    host.sync()
-    host.take()
-    for _ in range(1000):
-        host.sync()
-    assert len(host.taken(0x284)) == 10
-
-
-def test_frames_come_in_operational_only():
-    host = BenchHost()
-    assert torque_frames(host, 3) == []
-    host.nmt(START)
-    assert len(torque_frames(host, 3)) == 3
-    host.nmt(PRE_OPERATIONAL)
-    assert torque_frames(host, 3) == []
-
-
 def test_the_counter_goes_on_over_a_pause_and_begins_anew_after_reset_communication():
     host = BenchHost()
     host.nmt(START)

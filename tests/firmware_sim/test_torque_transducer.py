@@ -233,22 +233,6 @@ def test_a_frame_without_a_new_sample_repeats_the_old_one_with_its_noise():
     assert np.count_nonzero(np.diff(at_sync)) > 300
 
 
-def test_the_errors_of_the_sensor_are_measured_and_do_not_move_the_arm():
-    """Commands are given in advance, so nothing of the sensor comes back into the arm."""
-    errors = {"gain_error": [0.1, 0.1], "cross_talk": [0.1, 0.1], "hysteresis_Nm": [1.0, 1.0]}
-    positions, torques = [], []
-    for sensors in ({}, errors):
-        body = Body(parse(Scenario, {"noise": False, "sensors": sensors}))
-        measured = []
-        for _ in range(50):
-            body.advance((3.0, -1.0), TORQUE)
-            measured.append(body.sample())
-        positions.append([row.position_counts for row in measured])
-        torques.append(measured[-1].torque_counts[0])
-    assert positions[0] == positions[1]
-    assert abs(torques[0] - torques[1]) > 50
-
-
 @pytest.mark.parametrize(
     ("offset_Nm", "status", "value_uNm"),
     [(19.9, 0x00, 19.9e6), (20.0, 0x03, 20e6), (35.0, 0x03, 20e6), (-19.9, 0x00, -19.9e6), (-20.0, 0x05, -20e6)],

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from general_arm import TouchedArm
+from general_arm import TouchedArm, normal_of, point_of
 
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import MechanicsSettings
@@ -21,20 +21,6 @@ from firmware_sim.body.body import initial_touch_state, largest_rate_rad_s, touc
 
 POSE = (0.3, 0.7)
 SOFT = {"mass_kg": 1.5, "stiffness_N_m": 2000.0}
-
-
-def normal_of(link: int, q) -> np.ndarray:
-    """Normal of a link on the side of +q."""
-    angle = q[0] if link == 1 else q[0] + q[1]
-    return np.array([-math.sin(angle), math.cos(angle)])
-
-
-def point_of(link: int, point_m: float, q) -> np.ndarray:
-    reach_m = point_m if link == 1 else 0.35
-    elbow = reach_m * np.array([math.cos(q[0]), math.sin(q[0])])
-    if link == 1:
-        return elbow
-    return elbow + point_m * np.array([math.cos(q[0] + q[1]), math.sin(q[0] + q[1])])
 
 
 def beside(

@@ -5,9 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from general_arm import GeneralArm, one_joint, without_friction
+from general_arm import GeneralArm, one_joint, truth_of, without_friction
 
-from adacd_hil.records import TRUTH_LAYOUT
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.joint_forces import spring_torque
@@ -187,9 +186,7 @@ def test_the_encoder_is_on_its_side_of_the_spring(side):
     body = Body(Scenario(mechanics=settings, noise=False))
     for _ in range(10):
         body.advance((5.0, 2.0), TORQUE)
-    block = np.zeros(TRUTH_LAYOUT.size)
-    body.truth(block)
-    state = {name: block[place] for name, place in TRUTH_LAYOUT.slices.items()}
+    state = truth_of(body)
     read = state["q_m"] if side == "motor" else state["q"]
     assert np.abs(state["q_m"] - state["q"]).min() > 10.0 * POSITION_LSB_RAD
     assert body.sample().q == pytest.approx(read, abs=0.51 * POSITION_LSB_RAD)
