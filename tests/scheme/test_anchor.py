@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop, arm_state
+from excited_arm import FREE, NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop, arm_state, kernel_of, learnt_s, states
 from long_cases import long_but
 from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.identify import anchor, evidence
-from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 
@@ -23,8 +22,8 @@ NOT_AT_ALL = "not at all: who has leaned on it since before the start is in its 
 FRICTION = NAMES.index("F_c1")
 
 
-def settings_with(timeout_s=None, commission_s=COMMISSION_S, **arm):
-    safety = replace(SETTINGS.safety, commission_s=commission_s)
+def settings_with(timeout_s=None, **arm):
+    safety = replace(SETTINGS.safety, commission_s=COMMISSION_S)
     termination = SETTINGS.termination
     if timeout_s is not None:
         safety = replace(safety, phase_timeout_s=timeout_s)
@@ -32,7 +31,6 @@ def settings_with(timeout_s=None, commission_s=COMMISSION_S, **arm):
     return replace(SETTINGS, safety=safety, termination=termination, arm=replace(SETTINGS.arm, **arm))
 
 
-FREE = settings_with(holding_torque_Nm=(0.0, 0.0))
 TARED = settings_with(torque_offset_std_Nm=(0.005, 0.005))
 BOTH = settings_with(holding_torque_Nm=(0.0, 0.0), torque_offset_std_Nm=(0.005, 0.005))
 UNKNOWN = settings_with()
@@ -45,7 +43,7 @@ def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(se
     loop = TouchedLoop(settings)
     loop.run_until(SchemeState.ENABLE)  # this arm's motors hold it from the first cycle on
     leant = loop.lean(joint, torque_Nm, 3.5)
-    assert SchemeState.MONITOR not in {output.state for output in leant}
+    assert SchemeState.MONITOR not in states(leant)
     withheld = loop.said("anchor")[0]
     assert f"joint {joint + 1} has a fitted torque offset of" in withheld
     assert "somebody leans on it" in withheld
@@ -72,7 +70,7 @@ def test_a_lean_that_begins_while_the_arm_learns_gets_no_certificate_either(begi
     loop.run_until(SchemeState.ADAPT)
     before = loop.run(round(begins_s / PERIOD_S))
     leant = loop.lean(0, torque_Nm, 5.0)
-    assert SchemeState.MONITOR not in {output.state for output in before + leant}
+    assert SchemeState.MONITOR not in states(before + leant)
     loop.recover()
     assert np.abs(loop.offset_error_Nm).max() < LARGEST_ERROR_NM
 
@@ -82,7 +80,7 @@ def test_what_can_not_be_told_is_said_in_the_certificate():
     loop.tau_ext[0] = 0.5
     loop.run_until(SchemeState.MONITOR)
     assert abs(loop.offset_error_Nm[0]) > 0.4
-    memory = loop.pipeline.numbers.memory[0]
+    memory = loop.m
     assert loop.said("certificate") == [
         f"torque offsets anchored: joint 1 {NOT_AT_ALL}; joint 2 {NOT_AT_ALL}; "
         f"{margin.describe_sight(memory)}; {THIS_RUN_ONLY}"
@@ -121,8 +119,7 @@ def test_a_certificate_says_of_each_joint_what_anchors_it(settings, level, joint
 def test_an_untouched_arm_is_certified_at_once_whatever_its_offset():
     loop = TouchedLoop(FREE, (0.2, -0.2), seed=2)
     outputs = loop.run_until(SchemeState.MONITOR)
-    learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
-    assert learnt_s < 2.5
+    assert learnt_s(outputs) < 2.5
     assert loop.said("anchor") == []
     assert np.abs(loop.offset_error_Nm).max() < 0.02
 
@@ -146,7 +143,7 @@ def test_where_nothing_else_anchors_an_offset_the_last_certificate_does():
     loop = TouchedLoop(with_last(UNKNOWN, (0.1, 0.0)), (0.1, 0.0))
     loop.run_until(SchemeState.ENABLE)
     leant = loop.lean(0, 0.3, 3.5)
-    assert SchemeState.MONITOR not in {output.state for output in leant}
+    assert SchemeState.MONITOR not in states(leant)
     assert re.search(
         r"joint 1 has a fitted torque offset of -0\.[12]\d\d Nm, by the last certificate it is 0\.100 ± 0\.0\d\d Nm: "
         "somebody leans on it, the sensor has moved, or a cable pulls on it",
@@ -201,7 +198,7 @@ def test_a_sensor_that_has_moved_since_its_tare_keeps_the_drives_off_and_the_tim
         settings_with(0.6, holding_torque_Nm=(0.0, 0.0), torque_offset_std_Nm=(0.005, 0.005)), (0.5, 0.0)
     )
     outputs = loop.run(700)
-    assert {output.state for output in outputs} <= {SchemeState.INIT, SchemeState.COMMISSION, SchemeState.FAULT}
+    assert states(outputs) <= {SchemeState.INIT, SchemeState.COMMISSION, SchemeState.FAULT}
     assert outputs[-1].fault is FaultReason.COMMISSION_TIMEOUT
     (said,) = loop.said("anchor")
     assert re.search(r"joint 1 reads 0\.49\d Nm at rest, by the tare it is 0\.000 ± 0\.0\d\d Nm: somebody", said)
@@ -276,7 +273,7 @@ def test_what_the_user_has_accepted_excuses_no_other_lean():
     loop.request = Request.ACCEPT
     loop.run(1)
     loop.tau_ext[0] = -0.4
-    assert SchemeState.MONITOR not in {output.state for output in loop.run(4000)}
+    assert SchemeState.MONITOR not in states(loop.run(4000))
 
 
 def test_nothing_is_accepted_beforehand():
@@ -284,7 +281,7 @@ def test_nothing_is_accepted_beforehand():
     loop.run_until(SchemeState.ADAPT)
     loop.request = Request.ACCEPT
     leant = loop.lean(0, 0.5, 3.0)
-    assert SchemeState.MONITOR not in {output.state for output in leant}
+    assert SchemeState.MONITOR not in states(leant)
     assert loop.said("anchor")[0] == "nothing to accept: no certificate is withheld"
 
 
@@ -316,7 +313,7 @@ class Judged:
     """A kernel's memory with one joint's offset judged by an anchor."""
 
     def __init__(self, settings=FREE, std_Nm=0.01, friction_Nm=0.0):
-        self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
+        self.k, self.m = kernel_of(settings)
         self.theta, self.P = np.zeros(len(NAMES)), np.zeros((len(NAMES), len(NAMES)))
         self.P[OFFSETS, OFFSETS] = std_Nm**2
         self.theta[FRICTION] = friction_Nm

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import NAMES, PERIOD_S, SETTINGS, Record, excitation_of, play, record
+from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, Kernel, Record, excitation_of, play, record
 from planar_arm import PAYLOAD_1KG, THETA
 from smooth_motion import smooth_motion, torque_of
 
@@ -16,41 +16,12 @@ from adacd_hil.scheme.supervisor import transitions
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 
 COUNT = len(NAMES)
-OFFSETS = [NAMES.index("offset1"), NAMES.index("offset2")]
 LAGS = [NAMES.index("lag1"), NAMES.index("lag2")]
 SMOOTH = THETA["M"] * [1, 1, 1, 1, 1, 0, 0]  # Coulomb friction of a reversal is no straight line between samples
 TOUCH = slice(900, 1200)
 PAYLOAD_AT = 4800
 RECOVER = round(SETTINGS.certified.recover_s / PERIOD_S)
 TESTED = round(SETTINGS.certified.test_s[0] / PERIOD_S)
-
-
-class Kernel:
-    """The step with its constants, memory and block, sample by sample."""
-
-    def __init__(self, settings=SETTINGS, theta=None, P=None):
-        self.constants = certified_memory.constants_of(settings)
-        self.memory, self.block = certified_memory.new_memory(settings), certified_memory.new_block(settings)
-        certified_kernel.begin_adaptation(self.constants, self.memory, False, True)
-        self.m, self.out = self.memory[0], self.block[0]
-        if theta is not None:
-            self.m.models.theta[: len(theta)] = theta
-            self.m.models.theta[len(theta) :] = 0.0
-        if P is not None:
-            self.m.models.P[:] = P
-
-    def step(self, q, dq, tau_J, mode=0, is_complete=1, periods=1, period_s=0.0):
-        self.out.q, self.out.dq, self.out.tau_J, self.out.period_s = q, dq, tau_J, period_s
-        return certified_kernel.step(self.constants, self.memory, self.block, is_complete, periods, mode)
-
-    def run(self, q, dq, tau_J, mode=0, period_s=None):
-        """Return observations (n,) and bare residuals (n, C, 2)."""
-        observations, residuals = [], []
-        for k in range(len(q)):
-            each_s = 0.0 if period_s is None else period_s[k]
-            observations.append(self.step(q[k], dq[k], tau_J[k], mode, period_s=each_s))
-            residuals.append(self.m.filters.r.copy())
-        return np.array(observations), np.array(residuals)
 
 
 @pytest.fixture(scope="module")

@@ -4,22 +4,20 @@ import re
 
 import numpy as np
 import pytest
-from excited_arm import PERIOD_S, SETTINGS
+from excited_arm import FREE, PERIOD_S, SETTINGS, TouchedLoop, added, kernel_of
 from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA
-from test_earlier import FREE, HeldLoop, added
 
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.scheme.identify import doubt
 from adacd_hil.scheme.identify.doubt import Doubt
-from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
 
 PAYLOAD, COULOMB1 = range(2)
 
 
-class MonitoredLoop(HeldLoop):
+class MonitoredLoop(TouchedLoop):
     """An arm that has been certified, and two seconds more."""
 
     def __init__(self, profile="P", **options):
@@ -150,9 +148,9 @@ def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD):
 
 
 def verdict_of(contacts, gap_s=1.0, lasts_s=0.5, peak=3.0, ways=(0.5, 0.5)):
-    m = certified_memory.new_memory(SETTINGS)[0]
+    k, m = kernel_of()
     m.models.theta = 0.0
-    judge, cycle, verdict = Doubt(SETTINGS, certified_memory.constants_of(SETTINGS)[0], m), 0, None
+    judge, cycle, verdict = Doubt(SETTINGS, k, m), 0, None
     for rw, ww, rr in contacts:
         judge.go_on(cycle)
         cycle += round(gap_s / PERIOD_S)
@@ -238,7 +236,7 @@ def test_a_contact_as_the_arm_goes_on_lets_it_move_further_the_next_time_four_ti
     loop = MonitoredLoop()
     loop.theta = loop.theta + added(F_c1=0.3)
     loop.run_until_taken_back()
-    assert loop.pipeline.numbers.memory[0].sensitivity.strain.tolist() == [doubt.MOST_STRAIN, 1.0]
+    assert loop.m.sensitivity.strain.tolist() == [doubt.MOST_STRAIN, 1.0]
 
 
 @pytest.mark.parametrize("size", [-0.3, 2.1])

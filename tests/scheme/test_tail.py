@@ -5,8 +5,7 @@ import re
 import numpy as np
 import pytest
 import scipy.signal
-from excited_arm import SETTINGS
-from test_certified_kernel import COUNT, RECOVER, Kernel
+from excited_arm import NAMES, SETTINGS, Kernel
 
 from adacd_hil.scheme.detect import margin, sensitivity
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
@@ -15,6 +14,8 @@ from adacd_hil.scheme.supervisor import transitions
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
 PERIOD_S = SETTINGS.bus.period_s
+COUNT = len(NAMES)
+RECOVER = round(SETTINGS.certified.recover_s / PERIOD_S)
 CUTOFFS = np.array(SETTINGS.certified.cutoffs_rad_s)
 NU_HZ = np.concatenate([CUTOFFS, CUTOFFS[1:]]) / np.pi
 BLOCK = round(margin.BLOCK_S / PERIOD_S)
