@@ -129,16 +129,18 @@ class BenchHost:
         for joint in joints:
             self.put(0x200 + joint, self.command_frame(joint, controlword, target))
 
-    def sync(self) -> None:
+    def sync(self, times: int = 1) -> None:
         """Send the next SYNC; time moves by one period."""
-        self.t_ns += PERIOD_NS
-        self.put(0x080, bytes([1 + self.cycle % 240]))
-        self.cycle += 1
+        for _ in range(times):
+            self.t_ns += PERIOD_NS
+            self.put(0x080, bytes([1 + self.cycle % 240]))
+            self.cycle += 1
 
-    def step(self, controlword: int, target: int = 0, joints: tuple[int, ...] = (1, 2)) -> None:
+    def step(self, controlword: int, target: int = 0, joints: tuple[int, ...] = (1, 2), times: int = 1) -> None:
         """Command, then SYNC, so that the command acts at this SYNC."""
-        self.command(controlword, target, joints)
-        self.sync()
+        for _ in range(times):
+            self.command(controlword, target, joints)
+            self.sync()
 
     def start(self, mode: int = 10) -> None:
         """Choose the mode and enter Operational."""
@@ -222,11 +224,9 @@ def in_state(bits: int) -> BenchHost:
     for word in words.get(bits, (SHUTDOWN, SWITCH_ON, ENABLE)):
         host.step(word)
     if bits in (STOPPING, REACTION):
-        for _ in range(30):
-            host.step(ENABLE, 300)
+        host.step(ENABLE, 300, times=30)
     if bits == STOPPING:
         host.step(QUICK_STOP)
-    for _ in range({REACTION: 3, FAULT: 20}.get(bits, 0)):
-        host.sync()
+    host.sync(times={REACTION: 3, FAULT: 20}.get(bits, 0))
     assert host.state_bits() == bits
     return host

@@ -51,8 +51,7 @@ def test_scenario_time_starts_when_both_drives_are_first_enabled():
         host.sync()
     assert host.bench.is_scenario_started
     enabled_at = host.truths[-1][0]
-    for _ in range(30):
-        host.step(ENABLE)
+    host.step(ENABLE, times=30)
     touched = [cycle for cycle, _, _ in host.truths if _field(host, cycle, "contact_force") > 0.0]
     assert touched[0] == enabled_at + 20
 
@@ -75,8 +74,7 @@ def test_a_lost_sync_keeps_the_arms_time():
     for host in (whole, holed):
         play(host, 100)
         host.step(ENABLE, 50)
-    for _ in range(3):
-        whole.sync()
+    whole.sync(times=3)
     holed.cycle += 2
     holed.sync()
     assert holed.bench.cycle == whole.bench.cycle
@@ -87,8 +85,7 @@ def test_a_lost_sync_keeps_the_arms_time():
 def test_the_counter_is_unwrapped_over_its_overflow():
     host = BenchHost()
     host.cycle = 7  # the first counter may be any
-    for _ in range(500):
-        host.sync()
+    host.sync(times=500)
     assert host.bench.cycle == 506
 
 

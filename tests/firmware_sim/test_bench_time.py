@@ -13,8 +13,7 @@ FREE = {"mechanics": {"stop_low_deg": [-720.0, -720.0], "stop_high_deg": [720.0,
 def moving(clock_mode: str = "sync", **scenario) -> BenchHost:
     host = BenchHost(quiet_scenario(**scenario), clock_mode=clock_mode)
     host.enable()
-    for _ in range(40):
-        host.step(ENABLE, 250)
+    host.step(ENABLE, 250, times=40)
     return host
 
 

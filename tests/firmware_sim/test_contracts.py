@@ -160,8 +160,7 @@ def test_a_stock_drive_watches_its_commands_by_the_event_timer_only():
     host.write(1, 0x1400, 5, 5)
     for word in (SHUTDOWN, SWITCH_ON, ENABLE):
         step(host, word)
-    for _ in range(5):
-        host.sync()
+    host.sync(times=5)
     assert host.read(1, 0x603F) == 0x8250
     assert host.read(2, 0x603F) == 0
     for index in (0x2000, 0x2100, 0x2200, 0x2201, 0x2210):
@@ -171,8 +170,7 @@ def test_a_stock_drive_watches_its_commands_by_the_event_timer_only():
 def test_a_stock_sensor_sends_its_torque_and_nothing_else():
     host = stock_host(torque_offset_Nm=[1.0, -2.0])
     host.take()
-    for _ in range(200):
-        host.sync()
+    host.sync(times=200)
     frames = host.take()
     torques = [data for can_id, data in frames if can_id == 0x183]
     assert len(torques) == 200

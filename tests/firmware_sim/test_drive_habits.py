@@ -64,12 +64,10 @@ def test_a_drive_may_take_its_time_to_be_enabled() -> None:
 def test_enabling_that_is_given_up_begins_anew() -> None:
     host = host_of(enable_s=0.02)
     host.enable()
-    for _ in range(15):
-        host.step(ENABLE)
+    host.step(ENABLE, times=15)
     for controlword in (DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON):
         host.step(controlword)
-    for _ in range(10):
-        host.step(ENABLE)
+    host.step(ENABLE, times=10)
     assert host.state_bits() == SWITCHED_ON
 
 

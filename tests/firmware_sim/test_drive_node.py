@@ -98,8 +98,7 @@ def test_below_operation_enabled_the_motor_has_no_torque_whatever_the_target(bef
 
 def test_target_torque_is_per_mille_of_rated_torque_in_the_motors_direction(host):
     host.enable()
-    for _ in range(10):
-        host.step(ENABLE, -250)
+    host.step(ENABLE, -250, times=10)
     assert host.true("tau_J").tolist() == pytest.approx([-3.0, -1.5], abs=1e-9)
     assert host.true("dq")[1] < 0.0
     assert host.read(1, 0x6077) == -250
@@ -162,8 +161,7 @@ def test_two_syncs_without_command_are_forgiven_and_hold_the_torque_and_the_thir
 def test_bit_7_that_was_set_already_when_the_fault_came_resets_nothing(host):
     host.enable()
     host.step(FAULT_RESET | ENABLE)
-    for _ in range(20):
-        host.sync()
+    host.sync(times=20)
     assert host.state_bits() == FAULT
     host.step(FAULT_RESET | ENABLE)
     assert host.state_bits() == FAULT
@@ -176,10 +174,8 @@ def test_a_fault_reaction_ends_even_when_someone_keeps_pushing():
     contact = {"at_s": 0.05, "link": 1, "point_m": 0.3, "force_N": 40.0, "duration_s": 5.0}
     host = BenchHost(quiet_scenario(contacts=[contact]))
     host.enable()
-    for _ in range(100):
-        host.step(ENABLE)
-    for _ in range(3):
-        host.sync()
+    host.step(ENABLE, times=100)
+    host.sync(times=3)
     host.wait_until_at_rest()
     assert abs(host.true("dq")[0]) > 0.05
     assert host.state_bits(1) == FAULT
@@ -188,8 +184,7 @@ def test_a_fault_reaction_ends_even_when_someone_keeps_pushing():
 @pytest.mark.parametrize("command", [STOP, RESET_COMMUNICATION])
 def test_leaving_operational_while_enabled_is_a_fault(command):
     host = in_state(ENABLED)
-    for _ in range(30):
-        host.step(ENABLE, 300)
+    host.step(ENABLE, 300, times=30)
     host.take()
     host.nmt(command)
     assert host.bench.drives[0].state is DriveState.FAULT_REACTION_ACTIVE
@@ -218,8 +213,7 @@ def test_feedback_comes_on_every_sync_in_operational_only(host):
     assert host.taken(0x181) == []
     host.nmt(START)
     host.take()
-    for _ in range(3):
-        host.sync()
+    host.sync(times=3)
     assert len(host.taken(0x181)) == 3
     host.nmt(STOP)
     host.take()
@@ -230,8 +224,7 @@ def test_feedback_comes_on_every_sync_in_operational_only(host):
 def test_feedback_carries_encoder_counts_and_velocity_as_served_by_sdo():
     host = BenchHost(quiet_scenario(start_deg=[-30.0, -60.0]))
     host.enable()
-    for _ in range(20):
-        host.step(ENABLE, 300)
+    host.step(ENABLE, 300, times=20)
     host.take()
     host.sync()
     position, velocity = struct.unpack("<ii", host.taken(0x182)[0])
@@ -243,11 +236,9 @@ def test_feedback_carries_encoder_counts_and_velocity_as_served_by_sdo():
 def test_status_comes_on_entering_operational_on_change_and_every_100_ms(host):
     host.nmt(START)
     assert len(host.taken(0x281)) == 1
-    for _ in range(99):
-        host.sync()
+    host.sync(times=99)
     assert host.taken(0x281) == []
-    for _ in range(2):
-        host.sync()
+    host.sync(times=2)
     assert len(host.taken(0x281)) == 1
     host.step(SHUTDOWN)
     assert [struct.unpack_from("<H", data)[0] & 0x6F for data in host.taken(0x281)] == [READY]
@@ -264,6 +255,5 @@ def test_status_keeps_its_inhibit_time(host):
     for controlword in (SHUTDOWN, SWITCH_ON, SHUTDOWN, SWITCH_ON):
         host.step(controlword)
     assert host.taken(0x281) == []
-    for _ in range(10):
-        host.step(SWITCH_ON)
+    host.step(SWITCH_ON, times=10)
     assert [data[0] & 0x6F for data in host.taken(0x281)] == [SWITCHED_ON]

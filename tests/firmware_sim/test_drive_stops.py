@@ -29,8 +29,7 @@ def moving_host(option: int | None = None, code: int = 0) -> BenchHost:
         for node in (1, 2):
             host.write(node, option, 0, code)
     host.enable()
-    for _ in range(40):
-        host.step(ENABLE, 300)
+    host.step(ENABLE, 300, times=40)
     return host
 
 
@@ -70,8 +69,7 @@ def test_quick_stop_brakes_by_its_ramp_and_ends_as_its_code_says(code, mode, end
     assert (host.true("tau_J") * host.true("dq")).max() < 0.0
     host.step(ENABLE)
     assert host.state_bits() == (ENABLED if end == STOPPING else STOPPING)
-    for _ in range(200):
-        host.step(QUICK_STOP)
+    host.step(QUICK_STOP, times=200)
     assert host.state_bits() == end
     assert abs(host.true("dq")).max() < 0.02
 
@@ -139,8 +137,7 @@ def test_a_ramp_gives_way_to_a_stronger_stop(word, end):
 @pytest.mark.parametrize(("code", "mode"), [(1, SLOWLY), (2, RAMP), (3, HARD)])
 def test_a_fault_brakes_by_its_reaction_code(code, mode):
     host = moving_host(0x605E, code)
-    for _ in range(4):
-        host.sync()
+    host.sync(times=4)
     assert host.bench.drives[0].motor_mode == mode
     host.wait_until_at_rest(None)
     assert host.state_bits() == FAULT

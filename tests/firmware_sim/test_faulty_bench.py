@@ -37,8 +37,7 @@ def test_lost_syncs_last_as_long_as_others_and_are_in_the_truth() -> None:
     host = enabled_host({"kind": "lose", "frame": "sync", "at_s": 0.002, "duration_s": 0.3})
     host.truths.clear()
     start_ns, start = host.bench.now_ns, host.bench.cycle
-    for _ in range(310):
-        host.step(ENABLE)
+    host.step(ENABLE, times=310)
     masks = [block[-1] for _, _, block in host.truths]
     assert host.bench.now_ns - start_ns == 310 * PERIOD_NS
     assert [cycle for cycle, _, _ in host.truths] == list(range(start + 1, start + 311))
@@ -52,8 +51,7 @@ def test_by_the_clock_a_drive_that_hears_no_sync_has_nothing_to_count() -> None:
     for node in (1, 2):
         host.nodes[node].sdo[0x2201].raw = 255  # 25 periods: nothing else stops it within the test
     host.enable()
-    for _ in range(20):
-        host.step(ENABLE)
+    host.step(ENABLE, times=20)
     assert [drive.error_code for drive in host.bench.drives] == [0, 0]
 
 

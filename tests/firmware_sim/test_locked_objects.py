@@ -137,8 +137,7 @@ def test_what_sdo_took_away_the_rpdos_next_word_does_not_bring_back(word):
     host.enable()
     host.step(ENABLE, 100)
     host.write(1, 0x6040, 0, word)
-    for _ in range(300):
-        host.step(ENABLE, 100)
+    host.step(ENABLE, 100, times=300)
     assert host.state_bits(1) == DISABLED
     assert host.bench.drives[0].torque_Nm == 0.0
     assert host.state_bits(2) == ENABLED

@@ -10,7 +10,6 @@ import pytest
 from general_arm import NO_PAYLOAD, RIGID, GeneralArm, one_joint, pinocchio_arm, truth_of, without_friction
 from long_cases import long_but
 
-from adacd_hil.settings.schema import ConfigError, parse
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import LARGEST_SUBSTEPS, MechanicsSettings
 from firmware_sim.arm.plant import accelerate, decide_slips, fit_payload
@@ -375,32 +374,3 @@ def test_a_faster_arm_gets_more_substeps_up_to_their_bound():
     assert 1 < counts[1] < counts[2]
     assert counts[3] == LARGEST_SUBSTEPS
     assert RIGID.substeps(ARMS["S"], [NO_PAYLOAD], touch_rad_s=2000.0) == 4
-
-
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        ({"stiffness_Nm_rad": [1000.0, 0.0]}, "needs a `rotor_inertia_kg_m2` above 0 kg m²"),
-        ({"backlash_rad": [0.0, 0.01]}, "`mechanics.backlash_rad[1]` = 0.01 needs a `stiffness_Nm_rad` above 0"),
-        ({"damping_Nm_s": [1.0, 0.0]}, "`mechanics.damping_Nm_s[0]` = 1 needs a `stiffness_Nm_rad` above 0"),
-        ({"static_Nm": [0.03, 0.0]}, "`mechanics.static_Nm[0]` = 0.03 Nm is below the Coulomb friction of profile P"),
-        ({"stop_low_deg": [-10.0, -10.0]}, "`mechanics.stop_low_deg` and `mechanics.stop_high_deg` come together"),
-        (
-            {"stop_low_deg": [10.0, -10.0], "stop_high_deg": [9.0, 10.0]},
-            "`mechanics.stop_low_deg[0]` = 10 deg is not below",
-        ),
-        (
-            {"stop_low_deg": [5.0, -10.0], "stop_high_deg": [9.0, 10.0]},
-            "`start_deg[0]` = 0 deg is beyond the joint's stops",
-        ),
-        (
-            {"stop_low_deg": [-5.0, -10.0], "stop_high_deg": [9.0, 10.0], "stop_damping_Nm_s": [1e4, 1e4]},
-            "is above 160000 rad/s",
-        ),
-    ],
-)
-def test_mechanics_that_cannot_be_are_refused_with_their_key(table, message):
-    with pytest.raises(ConfigError) as refusal:
-        parse(Scenario, {"mechanics": table})
-    assert message in str(refusal.value)
-    assert "\n" not in str(refusal.value)

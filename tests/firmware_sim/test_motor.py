@@ -275,8 +275,7 @@ def test_an_overheat_fault_stays_latched_and_is_reset_once_the_motor_has_cooled(
     overheat(host)
     while host.state_bits() != FAULT:
         host.step(ENABLE)
-    for _ in range(200):
-        host.step(ENABLE)
+    host.step(ENABLE, times=200)
     assert host.state_bits() == FAULT
     assert host.read(1, 0x603F) == EXCESS_TEMPERATURE
     host.step(FAULT_RESET)

@@ -21,8 +21,7 @@ def enabled_host(objects: dict[tuple[int, int, int], int] | None = None) -> Benc
     for (node, index, sub), value in (objects or {}).items():
         host.write(node, index, sub, value)
     host.enable()
-    for _ in range(5):
-        host.step(ENABLE, 100)
+    host.step(ENABLE, 100, times=5)
     host.take()
     return host
 

@@ -30,8 +30,7 @@ PUSHED = {
 def moving(clock_mode: str = "sync", torque: int = 300, **scenario) -> BenchHost:
     host = BenchHost(quiet_scenario(**scenario), clock_mode=clock_mode)
     host.enable()
-    for _ in range(40):
-        host.step(ENABLE, torque)
+    host.step(ENABLE, torque, times=40)
     return host
 
 
@@ -86,8 +85,7 @@ def test_an_arm_that_is_pushed_all_the_time_is_left_after_5_s():
 
 def test_after_an_ordinary_end_nothing_is_added():
     host = moving(torque=0)
-    for _ in range(20):
-        host.step(DISABLE_VOLTAGE)
+    host.step(DISABLE_VOLTAGE, times=20)
     told, now_ns = len(host.truths), host.bench.now_ns
     frames = len(host.frames)
     host.bench.outlive_host()
@@ -114,8 +112,7 @@ def test_a_braking_that_a_watchdog_caused_by_time_is_told_too():
         host.write(node, 0x1016, 1, 127 << 16 | 50)
     host.enable()
     host.put(0x77F, b"\x05")
-    for _ in range(40):
-        host.step(ENABLE, 300)
+    host.step(ENABLE, 300, times=40)
     begun = len(host.truths)
     host.bench.advance_to(host.bench.now_ns + 1_000 * MS)
     assert speeds(host, begun)[-1] < REST_RAD_S
@@ -137,8 +134,7 @@ def test_by_the_clock_the_truth_goes_on_once_sync_is_overdue():
 
 def test_by_the_clock_a_lost_sync_or_two_leave_a_gap_as_ever():
     host = patient_host()
-    for _ in range(40):
-        host.step(ENABLE, 300)
+    host.step(ENABLE, 300, times=40)
     begun = len(host.truths)
     for lost in (1, 2):
         host.cycle += lost

@@ -132,8 +132,7 @@ def test_a_synchronous_pdo_comes_on_every_nth_sync(host, kind, count):
     remap(host, 1, 0x1802, (0x60410010,), can_id=0x1C1, kind=kind)
     host.nmt(START)
     host.take()
-    for _ in range(12):
-        host.sync()
+    host.sync(times=12)
     assert len(host.taken(0x1C1)) == count
 
 
@@ -142,8 +141,7 @@ def test_type_0_comes_with_the_sync_after_an_event(host):
     host.start()
     host.sync()
     host.take()
-    for _ in range(5):
-        host.sync()
+    host.sync(times=5)
     assert host.taken(0x1C1) == []
     host.step(SHUTDOWN)
     host.sync()
@@ -155,8 +153,7 @@ def test_an_event_driven_pdo_without_a_state_in_it_comes_when_its_content_change
     host.enable()
     host.step(ENABLE)
     host.take()
-    for _ in range(5):
-        host.step(ENABLE)
+    host.step(ENABLE, times=5)
     assert host.taken(0x1C1) == []
     host.step(ENABLE, 100)
     host.step(ENABLE, 100)
@@ -180,8 +177,7 @@ def test_a_command_of_type_255_acts_without_waiting_for_sync(host):
     host.put(0x201, struct.pack("<Hh", ENABLE, 250))
     assert host.state_bits() == 0x27
     assert host.bench.drives[0].torque_Nm == pytest.approx(3.0)
-    for _ in range(2):
-        host.sync()
+    host.sync(times=2)
     assert host.state_bits() == 0x27
     host.sync()
     host.sync()

@@ -28,8 +28,7 @@ REMOTE, REACHED, LIMITED, FOLLOWS = 1 << 9, 1 << 10, 1 << 11, 1 << 12
 def running(torque: int = 0) -> BenchHost:
     host = BenchHost(quiet_scenario(noise=True))
     host.enable()
-    for _ in range(20):
-        host.step(ENABLE, torque)
+    host.step(ENABLE, torque, times=20)
     host.take()
     return host
 

@@ -16,8 +16,7 @@ DATABASE = cantools.database.load_file(contract_folder() / "arm.dbc")
 
 def torque_frames(host: BenchHost, count: int, node: int = 3) -> list[bytes]:
     host.take()
-    for _ in range(count):
-        host.sync()
+    host.sync(times=count)
     return host.taken(0x180 + node)
 
 

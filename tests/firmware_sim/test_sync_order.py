@@ -28,8 +28,7 @@ def running(clock_mode: str = "sync") -> BenchHost:
     """Both drives enabled, more than one overflow of the counter ago."""
     host = BenchHost(clock_mode=clock_mode)
     host.enable()
-    for _ in range(250):
-        host.step(ENABLE)
+    host.step(ENABLE, times=250)
     host.take()
     return host
 
@@ -69,8 +68,7 @@ def test_odd_syncs_are_tolerated_for_ever_if_100_right_ones_lie_between_them():
     host = running()
     for _ in range(TOLERATED + 2):
         again(host)
-        for _ in range(CLEAN_SYNCS):
-            host.step(ENABLE)
+        host.step(ENABLE, times=CLEAN_SYNCS)
     assert [host.state_bits(1), host.state_bits(2)] == [ENABLED] * 2
     assert [error[::2] for error in emergencies(host)] == [(0x8200, ORDER), (0, ORDER)] * (TOLERATED + 2)
     assert host.read(1, 0x1001) == 0
@@ -80,15 +78,13 @@ def test_fault_reset_is_refused_until_100_syncs_were_right():
     host = running()
     for _ in range(TOLERATED + 1):
         again(host)
-    for _ in range(CLEAN_SYNCS - 1):
-        host.step(ENABLE)
+    host.step(ENABLE, times=CLEAN_SYNCS - 1)
     assert host.state_bits(1) == FAULT
     host.command(0x80)
     again(host)
     host.sync()
     assert host.state_bits(1) == FAULT
-    for _ in range(CLEAN_SYNCS):
-        host.step(ENABLE)
+    host.step(ENABLE, times=CLEAN_SYNCS)
     host.step(0x80)
     assert host.state_bits(1) == 0x40
 
@@ -98,8 +94,7 @@ def test_a_warning_about_sync_does_not_keep_another_fault_from_being_reset():
     again(host)
     host.bench.drives[0].fail(0x2310, host.bench.now_ns)
     host.bench.drives[0].mend()
-    for _ in range(CLEAN_SYNCS - 10):
-        host.step(ENABLE)
+    host.step(ENABLE, times=CLEAN_SYNCS - 10)
     assert (host.state_bits(1), host.bench.devices[0].is_sync_odd) == (FAULT, True)
     host.step(0x80)
     assert host.state_bits(1) == 0x40
@@ -133,8 +128,7 @@ def test_syncs_that_a_fault_keeps_from_a_node_are_its_own_loss():
     rows = [{"kind": "lose", "node": "sensor1", "frame": "sync", "at_s": 0.01, "count": 5}]
     host = BenchHost(quiet_scenario(faults=rows))
     host.enable()
-    for _ in range(30):
-        host.step(ENABLE)
+    host.step(ENABLE, times=30)
     assert [counts(host, node) for node in NODES] == [[0] * 5, [0] * 5, [0, 0, 0, 0, 5], [0] * 5]
 
 
@@ -143,8 +137,7 @@ def test_a_fault_that_doubles_sync_is_noticed_by_those_who_hear_it(node):
     rows = [{"kind": "duplicate", "node": node, "frame": "sync", "at_s": 0.01, "count": 2}]
     host = BenchHost(quiet_scenario(faults=rows))
     host.enable()
-    for _ in range(30):
-        host.step(ENABLE)
+    host.step(ENABLE, times=30)
     repeated = [counts(host, number)[0] for number in NODES]
     assert repeated == ([2] * 4 if node == "all" else [0, 0, 0, 2])
     assert host.bench.cycle == 32

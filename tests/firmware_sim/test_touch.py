@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from general_arm import LENGTH_M, point_of
 
-from adacd_hil.settings.schema import ConfigError, parse
 from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_force, contact_table, contact_torque
 
 
@@ -88,18 +87,3 @@ def test_onset_and_end_lie_on_the_drives_ticks():
     one = contact(at_s=10.00004, duration_s=0.25)
     assert (one.onset_tick, one.end_tick) == (100_000, 102_500)
     assert contact(at_s=0.3).onset_tick * TICK_S == pytest.approx(0.3, abs=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"frame": "motion", "force_N": 101.0}, "force_N = 101.0 N is above 100.0 N, the most with frame 'motion'"),
-        ({"ramp_s": 0.01}, "ramp_s = 0.01 s belongs to shape 'push'"),
-        ({"shape": "push", "ramp_s": 0.03}, "ramp_s = 0.03 s is above half of duration_s = 0.05 s"),
-    ],
-)
-def test_a_contact_that_cannot_be_is_refused(changes, message):
-    table = {"at_s": 1.0, "link": 2, "point_m": 0.2, "force_N": 20.0, "duration_s": 0.05} | changes
-    with pytest.raises(ConfigError) as refusal:
-        parse(ContactSettings, table)
-    assert message in str(refusal.value)

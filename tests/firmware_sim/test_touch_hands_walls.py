@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from general_arm import GeneralArm, TouchedArm, point_of, truth_of, without_friction
 
-from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_forces import (
@@ -25,7 +24,7 @@ from firmware_sim.arm.touch_settings import (
     contact_table,
 )
 from firmware_sim.body.body import Body, largest_rate_rad_s
-from firmware_sim.scenario.scenario import Scenario, load_scenario
+from firmware_sim.scenario.scenario import Scenario
 
 POSE = (0.3, 0.7)
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
@@ -232,38 +231,3 @@ def test_the_strongest_hand_that_drags_brings_the_arm_to_rest_without_a_tremor()
         energies_J.append(arm.energy_J())
     assert np.diff(energies_J).max() <= 0.0
     assert energies_J[-1] < 1e-9 * before_J
-
-
-BODY = "at_s = 1.0, link = 2, x_m = 0.5, y_m = 0.3"
-INSIDE = "at_s = 0.0, link = 2, x_m = 0.5, y_m = 0.01, radius_m = 0.03"
-HAND = "at_s = 1.0, link = 2, point_m = 0.2, duration_s = 1.0"
-WALL = "x_m = 0.5, y_m = 0.3, normal_deg = 0.0"
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (f"bodies = [{{ {BODY}, region = 'hand_fingr' }}]", "did you mean 'hand_finger'?"),
-        (f"bodies = [{{ {BODY} }}]", "a body needs a region, or mass_kg and stiffness_N_m"),
-        (f"bodies = [{{ {BODY}, mass_kg = 1.0 }}]", "a body needs a region, or mass_kg and stiffness_N_m"),
-        (f"bodies = [{{ {BODY}, region = 'face', mass_kg = 1.0 }}]", "mass_kg = 1.0 is given by region 'face'"),
-        (f"bodies = [{{ {BODY}, region = 'face', clamped = true, gap_m = 0.1 }}]", "gap_m = 0.1 m: a clamped body"),
-        (f"bodies = [{{ {INSIDE}, region = 'face' }}]", "is 0.02 m inside it"),
-        (f"hands = [{{ {HAND.replace('0.2', '0.31')} }}]", "`hands[0].point_m` = 0.31 m is beyond the end of link 2"),
-        (
-            f"hands = [{{ {HAND}, move_to_m = [0.1, 0.2], direction_deg = 3.0 }}]",
-            "direction_deg = 3.0 deg beside move_to_m",
-        ),
-        (
-            f"walls = [{{ {WALL} }}]",
-            "`walls[0]`: at at_s = 0 s the arm in its start pose (0.0, 0.0) deg is 0.15 m inside it",
-        ),
-    ],
-)
-def test_a_thing_that_cannot_be_is_refused_in_one_line(tmp_path, text, message):
-    path = tmp_path / "scenario.toml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError) as refusal:
-        load_scenario(str(path))
-    assert message in str(refusal.value)
-    assert "\n" not in str(refusal.value)

@@ -43,11 +43,9 @@ class Watched:
             host.t_ns += 2 * PERIOD_NS
             host.bench.advance_to(host.t_ns)
         elif self.watchdog == COMMAND:
-            for _ in range(3):
-                host.step(ENABLE, joints=(2,))
+            host.step(ENABLE, joints=(2,), times=3)
         elif self.watchdog == HEARTBEAT:
-            for _ in range(51):
-                host.step(ENABLE)
+            host.step(ENABLE, times=51)
         elif self.watchdog == OPERATIONAL:
             host.nmt(PRE_OPERATIONAL, 1)
         else:
