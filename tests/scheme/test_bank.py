@@ -84,21 +84,6 @@ def test_each_filter_of_the_regressor_differentiates_the_momentum(c):
     np.testing.assert_allclose(W_f[:, c], derivative + held_by_scipy(CUTOFF[c], Y_h), rtol=1e-8, atol=1e-8)
 
 
-def test_the_filters_do_not_know_of_each_other():
-    Y_p, Y_h, tau_J = signals()
-    tau_f, W_f = Bank().run(Y_p, Y_h, tau_J)
-    for c, a in enumerate(CUTOFF):
-        hold = filter_bank.first_order_hold(a, a, T)
-        tau_old, alone_f = tau_J[0].copy(), np.zeros(2)
-        input_old, S, W_alone = (np.zeros((2, COLUMNS)) for _ in range(3))
-        filter_bank.resume(a, a, Y_p[0], Y_h[0], tau_J[0], input_old, tau_old, S, W_alone)
-        for k in range(1, len(tau_J)):
-            filter_bank.advance_torque(hold, tau_old, tau_J[k], alone_f)
-            filter_bank.advance_regressor(hold, a, a, Y_p[k], Y_h[k], input_old, S, W_alone)
-        np.testing.assert_array_equal(tau_f[-1, c], alone_f)
-        np.testing.assert_array_equal(W_f[-1, c], W_alone)
-
-
 def test_the_lag_column_is_the_filtered_derivative_of_its_joint_s_torque():
     _, _, tau_J = signals()
     tau_J -= tau_J[0]
@@ -127,15 +112,6 @@ def test_the_cross_talk_column_is_the_other_joint_s_filtered_torque():
     assert np.count_nonzero(W_f) == 6
 
 
-def test_a_push_toward_positive_q_is_a_positive_external_torque():
-    """The arm needs W theta, and the joint gives less: the environment gives the rest."""
-    random = np.random.default_rng(2)
-    W_f, theta = random.standard_normal((3, 2, COLUMNS)), random.standard_normal(COLUMNS)
-    tau_ext, tau_ext_hat = np.array([[0.5, 0.1], [0.6, 0.2], [0.7, 0.3]]), np.zeros((3, 2))
-    filter_bank.estimate_external(W_f @ theta - tau_ext, W_f, theta, tau_ext_hat)
-    np.testing.assert_allclose(tau_ext_hat, tau_ext, atol=1e-12)
-
-
 def test_smoothed_channels_come_first_and_all_but_the_slowest_are_there_bare_too():
     r = np.random.default_rng(3).standard_normal((100, 3, 2))
     y, got, smoothing = np.zeros((5, 2)), [], np.exp(-0.2)
@@ -155,18 +131,3 @@ def test_a_gap_leaves_every_residual_where_it_was_whatever_the_parameters():
     filtered.resume(Y_p[0] + 7.0, Y_h[0] - 5.0, tau_J[0] + 3.0)
     np.testing.assert_array_equal(filtered.tau_f, before[0])
     np.testing.assert_array_equal(filtered.W_f, before[1])
-
-
-def test_after_a_gap_the_residual_of_the_true_parameters_stays_zero():
-    """Momentum and torque jump in the gap; what acted meanwhile is cut out of time."""
-    theta = np.array([0.4, -0.2, 0.1, 0.3, 0.2])
-    t_s = np.arange(150) * T
-    slope = np.random.default_rng(4).standard_normal((2, COLUMNS))
-    Y_p = slope * t_s[:, None, None]
-    Y_h = np.tile(slope + 1.0, (len(t_s), 1, 1))
-    tau_J = np.tile((slope + slope + 1.0) @ theta, (len(t_s), 1))
-    filtered, residual = Bank(), np.zeros((3, 2))
-    for offset in (0.0, 8.0):
-        filtered.run(Y_p + offset, Y_h, tau_J)
-        filter_bank.estimate_external(filtered.tau_f, filtered.W_f, theta, residual)
-        np.testing.assert_allclose(residual, 0.0, atol=1e-12)

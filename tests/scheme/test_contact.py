@@ -78,52 +78,37 @@ def on_joints(first, second):
 STEP = np.where(np.arange(400) >= 100, 1.0, 0.0)
 
 
-def test_a_report_is_given_at_once_and_again_when_the_window_ends():
-    reports = Touch().run(on_joints(STEP, 0.0 * STEP))
-    assert [report.is_final for report in reports] == [False, True]
-
-
-def test_both_reports_carry_the_cycle_of_detection():
-    reports = Touch().run(on_joints(STEP, 0.0 * STEP))
-    assert [report.cycle for report in reports] == [116, 116]  # 16.3 ms after the step, which is between 99 and 100
-
-
-def test_without_a_window_the_first_report_is_final():
-    reports = Touch(window_cycles=0).run(on_joints(STEP, 0.0 * STEP))
-    assert [report.is_final for report in reports] == [True]
-
-
-def test_torque_on_joint_1_alone_is_a_contact_of_link_1():
-    reports = Touch().run(on_joints(STEP, 0.1 * STEP))
-    assert [report.link for report in reports] == [1, 1]
-
-
-def test_torque_on_joint_2_that_crosses_later_makes_it_link_2():
-    reports = Touch().run(on_joints(STEP, 0.5 * STEP))
-    assert [report.link for report in reports] == [1, 2]
-
-
-def test_torque_on_joint_2_that_crosses_after_the_window_comes_too_late():
-    reports = Touch(window_cycles=10).run(on_joints(STEP, 0.5 * STEP))
-    assert [report.link for report in reports] == [1, 1]
+@pytest.mark.parametrize(
+    ("second", "window_cycles", "links"),
+    [
+        (0.1 * STEP, 50, [1, 1]),
+        (-0.5 * STEP, 50, [1, 2]),
+        (0.5 * STEP, 10, [1, 1]),
+        (0.1 * STEP, 0, [1]),
+    ],
+    ids=["below", "crosses later", "crosses after the window", "no window"],
+)
+def test_a_report_is_given_at_once_and_again_when_the_window_ends_with_joint_2s_say_in_the_link(
+    second, window_cycles, links
+):
+    """Detected 16.3 ms after the step, which is between 99 and 100."""
+    reports = Touch(window_cycles).run(on_joints(STEP, second))
+    assert [report.is_final for report in reports] == [False, True][-len(links) :]
+    assert {report.cycle for report in reports} == {116}
+    assert [report.link for report in reports] == links
+    assert reports[0].direction == (1, 0)
 
 
 def test_torque_on_joint_2_that_is_gone_before_the_window_ends_still_counts():
     """0.3 Nm for 80 ms is over the threshold from 69 ms to 100 ms only."""
     brief = np.where((np.arange(400) >= 40) & (np.arange(400) < 120), 0.3, 0.0)
-    reports = Touch(window_cycles=100).run(on_joints(STEP, brief))
-    assert reports[-1].link == 2
+    assert Touch(window_cycles=100).run(on_joints(STEP, brief))[-1].link == 2
 
 
 @pytest.mark.parametrize(("first", "second"), [(1.0, 0.5), (-1.0, 0.5), (1.0, -0.5), (-1.0, -0.5), (1.0, 0.0)])
 def test_the_direction_is_the_sign_of_each_joint_torque(first, second):
     reports = Touch().run(on_joints(first * STEP, second * STEP))
     assert reports[-1].direction == (np.sign(first), np.sign(second))
-
-
-def test_the_first_report_says_nothing_of_a_joint_below_its_threshold():
-    reports = Touch().run(on_joints(STEP, -0.5 * STEP))
-    assert reports[0].direction == (1, 0)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

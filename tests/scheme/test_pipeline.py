@@ -185,13 +185,6 @@ def test_the_block_is_laid_out_as_the_records_say():
     assert block[PLACES["tau_f"]][0] > 0.0
 
 
-def test_an_incomplete_cycle_holds_the_estimate():
-    pipeline = new_pipeline(settings_with())
-    before = [pipeline.step(arm_state(k, tau_J=(0.1 * k, 0.0))) for k in range(10)][-1]
-    held = pipeline.step(arm_state(10, tau_J=(9.0, 9.0), is_complete=False))
-    np.testing.assert_array_equal(held.tau_ext_hat, before.tau_ext_hat)
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -256,14 +249,6 @@ class Standing:
 
 def test_a_model_without_positive_definite_mass_is_not_fed_forward():
     assert not Standing().monitor().step()[-1].is_model_valid
-
-
-def test_a_stop_is_not_released_while_somebody_pushes():
-    arm = Standing().monitor()
-    arm.step(300, tau_J=(1.0, 0.0))
-    arm.step(request=Request.ACKNOWLEDGE, tau_J=(1.0, 0.0))
-    assert arm.step(300, tau_J=(1.0, 0.0))[-1].state is SchemeState.STOPPED
-    assert arm.step(500)[-1].state is SchemeState.MONITOR
 
 
 def test_the_joints_over_their_threshold_are_named_until_the_push_is_over():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adacd_hil.scheme.identify.termination import add_information, eigenvalue_range, has_moved, is_quiet, widen
+from adacd_hil.scheme.identify.termination import add_information, eigenvalue_range, has_moved, is_quiet
 from adacd_hil.scheme.memory import Motion
 from adacd_hil.structured import zeros_of
 
@@ -50,14 +50,6 @@ def test_the_arm_has_moved_when_each_joint_went_far_and_both_ways(changed, expec
     assert has_moved(motion, 0.5, 0.2) == expected
 
 
-def test_a_range_widens_to_what_was_seen():
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for value in ([0.0, 1.0], [-1.0, 2.0], [0.5, -3.0]):
-        widen(np.array(value), low, high)
-    assert low.tolist() == [-1.0, -3.0]
-    assert high.tolist() == [0.5, 2.0]
-
-
 def information_of(columns, period_s=1e-3):
     information = np.zeros((columns.shape[2],) * 2)
     for W_f in columns:
@@ -82,7 +74,3 @@ def test_a_direction_that_was_never_moved_has_no_information():
     columns = np.random.default_rng(1).standard_normal((40, 2, 7))
     columns[:, :, 4] = 2.0 * columns[:, :, 3]
     assert eigenvalue_range(information_of(columns), np.ones(7), np.zeros((7, 7)))[0] < 1e-15
-
-
-def test_nothing_seen_is_no_information():
-    assert eigenvalue_range(np.zeros((7, 7)), np.ones(7), np.zeros((7, 7)))[0] == 0.0
