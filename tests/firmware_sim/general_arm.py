@@ -13,6 +13,7 @@ from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.joint_forces import gravity_torque
 from firmware_sim.arm.mechanics import integrate_mechanics, observe, work_space
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
+from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_forces import (
     THING,
     THING_STATE,
@@ -25,6 +26,8 @@ from firmware_sim.arm.touch_settings import TICK_S, contact_table
 from firmware_sim.body.body import Body, initial_touch_state, touch_table
 from firmware_sim.scenario.scenario import Scenario
 
+TORQUE, OFF, BRAKE = ((mode, mode) for mode in (DriveMode.TORQUE, DriveMode.OFF, DriveMode.BRAKE))
+"""Modes of both drives."""
 NOBODY = contact_table(())
 RIGID = MechanicsSettings()
 NOTHING = np.zeros(0, THING)

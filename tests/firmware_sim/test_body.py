@@ -5,17 +5,12 @@ import math
 
 import numpy as np
 import pytest
-from general_arm import truth_of
+from general_arm import BRAKE, OFF, TORQUE, truth_of
 
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import ContactSettings
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario, load_scenario
-
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
-OFF = (DriveMode.OFF, DriveMode.OFF)
-BRAKE = (DriveMode.BRAKE, DriveMode.BRAKE)
 
 
 def step(at_s: float, **changes) -> ContactSettings:

@@ -4,18 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from general_arm import truth_of
+from general_arm import BRAKE, OFF, TORQUE, truth_of
 
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.hardware_settings import SensorSettings
-from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.body.body import Body
 from firmware_sim.body.sensors import NOISE_TICKS, encoder_numbers, read_angle
 from firmware_sim.scenario.scenario import Scenario
-
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
-OFF = (DriveMode.OFF, DriveMode.OFF)
-BRAKE = (DriveMode.BRAKE, DriveMode.BRAKE)
 
 
 def errors_over_a_turn(joint: int, count: int = 4096, **settings) -> np.ndarray:

@@ -7,13 +7,12 @@ import os
 import numpy as np
 import pinocchio
 import pytest
-from general_arm import NO_PAYLOAD, RIGID, GeneralArm, one_joint, pinocchio_arm, truth_of, without_friction
+from general_arm import NO_PAYLOAD, OFF, RIGID, TORQUE, GeneralArm, one_joint, pinocchio_arm, truth_of, without_friction
 from long_cases import long_but
 
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import LARGEST_SUBSTEPS, MechanicsSettings
 from firmware_sim.arm.plant import accelerate, decide_slips, fit_payload
-from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, contact_table
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario
@@ -21,8 +20,6 @@ from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 ELASTIC = {"stiffness_Nm_rad": (6000.0, 2000.0), "rotor_inertia_kg_m2": (0.3, 0.05)}
 PAYLOAD = (1.5, (0.05, 0.08), 0.01)
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
-OFF = (DriveMode.OFF, DriveMode.OFF)
 
 
 # Rigid bodies

@@ -5,12 +5,11 @@ import struct
 
 import numpy as np
 import pytest
-from bench_host import DISABLED, ENABLE, ENABLED, FAULT, FAULT_RESET, BenchHost, quiet_scenario
-from general_arm import truth_of
+from bench_host import BenchHost, State, Word, quiet_scenario
+from general_arm import BRAKE, OFF, TORQUE, truth_of
 
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.hardware_settings import DriveSettings
-from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body
 from firmware_sim.body.motor import (
@@ -23,9 +22,6 @@ from firmware_sim.body.motor import (
 )
 from firmware_sim.scenario.scenario import Scenario
 
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
-OFF = (DriveMode.OFF, DriveMode.OFF)
-BRAKE = (DriveMode.BRAKE, DriveMode.BRAKE)
 RATED_NM = (12.0, 6.0)
 INTERNAL_LIMIT = 1 << 11
 EXCESS_TEMPERATURE, OVER_CURRENT = 0x4310, 0x2310
@@ -235,8 +231,8 @@ OVERHEATING = {"winding_rise_K": [400.0, 0.0], "winding_time_s": [0.05, 1.0], "o
 def overheat(host: BenchHost) -> int:
     """Ask for rated torque until drive 1 faults; return the SYNCs that it took."""
     for count in range(1, 400):
-        host.step(ENABLE, 1000, joints=(1,))
-        host.command(ENABLE, 0, joints=(2,))
+        host.step(Word.ENABLE, 1000, joints=(1,))
+        host.command(Word.ENABLE, 0, joints=(2,))
         if host.statusword() & 0x08:
             return count
     raise AssertionError("the drive did not fault")
@@ -246,8 +242,8 @@ def test_the_statusword_says_that_a_limit_is_active():
     host = make_host(peak_torque_Nm=[6.0, 0.0])
     words = []
     for target in (500, 501, 700, 500, 300):
-        host.step(ENABLE, target, joints=(1,))
-        host.step(ENABLE, target, joints=(1,))
+        host.step(Word.ENABLE, target, joints=(1,))
+        host.step(Word.ENABLE, target, joints=(1,))
         words.append(bool(host.statusword() & INTERNAL_LIMIT))
     assert words == [False, True, True, False, False]
     assert not host.statusword(2) & INTERNAL_LIMIT
@@ -267,19 +263,19 @@ def test_an_overheated_motor_faults_its_drive_and_no_other():
     assert [data for can_id, data in frames if can_id == 0x082] == []
     statuses = [struct.unpack("<HbhH", data) for can_id, data in frames if can_id == 0x281]
     assert statuses[-1][3] == EXCESS_TEMPERATURE
-    assert host.state_bits(2) == ENABLED
+    assert host.state_bits(2) == State.ENABLED
 
 
 def test_an_overheat_fault_stays_latched_and_is_reset_once_the_motor_has_cooled():
     host = make_host(**OVERHEATING)
     overheat(host)
-    while host.state_bits() != FAULT:
-        host.step(ENABLE)
-    host.step(ENABLE, times=200)
-    assert host.state_bits() == FAULT
+    while host.state_bits() != State.FAULT:
+        host.step(Word.ENABLE)
+    host.step(Word.ENABLE, times=200)
+    assert host.state_bits() == State.FAULT
     assert host.read(1, 0x603F) == EXCESS_TEMPERATURE
-    host.step(FAULT_RESET)
-    assert host.state_bits() == DISABLED
+    host.step(Word.FAULT_RESET)
+    assert host.state_bits() == State.DISABLED
     assert host.read(1, 0x603F) == 0
     assert host.read(1, 0x1001) == 0
 
@@ -287,18 +283,18 @@ def test_an_overheat_fault_stays_latched_and_is_reset_once_the_motor_has_cooled(
 def test_an_overheat_fault_is_not_reset_while_the_motor_is_hot():
     """0x605E is 2: braking ends before a motor with 20 s of time constant has cooled."""
     host = make_host(preheat_K=[106.0, 0.0], housing_time_s=[20.0, 1.0])
-    while host.state_bits() != FAULT:
-        host.step(ENABLE)
-    for controlword in (FAULT_RESET, ENABLE, FAULT_RESET):
+    while host.state_bits() != State.FAULT:
+        host.step(Word.ENABLE)
+    for controlword in (Word.FAULT_RESET, Word.ENABLE, Word.FAULT_RESET):
         host.step(controlword)
-        assert host.state_bits() == FAULT
-    host.step(ENABLE)
+        assert host.state_bits() == State.FAULT
+    host.step(Word.ENABLE)
     # 25 + 106 exp(−t / 20 s) = 110
     cooling_ms = round(1e3 * 20.0 * math.log(106.0 / 85.0))
     host.bench._body.advance((0.0, 0.0), OFF, 10 * cooling_ms)
-    host.step(ENABLE)
-    host.step(FAULT_RESET)
-    assert host.state_bits() == DISABLED
+    host.step(Word.ENABLE)
+    host.step(Word.FAULT_RESET)
+    assert host.state_bits() == State.DISABLED
 
 
 def test_a_drive_whose_i2t_is_to_fault_reports_over_current():

@@ -4,7 +4,7 @@ import dataclasses
 import struct
 
 import pytest
-from bench_host import CODEC, RESET_COMMUNICATION, START
+from bench_host import CODEC, Nmt
 from rig import play_lockstep
 
 from adacd_hil.cli.connection import model_time
@@ -23,7 +23,7 @@ from firmware_sim.scenario.scenario import load_scenario
 
 SYNC, NMT = 0x080, 0x000
 FEEDBACKS, TORQUES = (0x181, 0x182), (0x183, 0x184)
-RESET = (NMT, bytes([RESET_COMMUNICATION, 0]))
+RESET = (NMT, bytes([Nmt.RESET_COMMUNICATION, 0]))
 
 
 def sync(counter):
@@ -53,7 +53,7 @@ def test_cycles_are_counted_from_the_first_sync_after_a_reset(tmp_path):
         *answers(1),
         RESET,
         RESET,
-        (NMT, bytes([START, 0])),
+        (NMT, bytes([Nmt.START, 0])),
         sync(7),
         *answers(2),
         sync(8),
@@ -120,7 +120,7 @@ def host(tmp_path):
     frames[-1:] = [sync(4), answers(4)[0]]
     host = Host(recorded(tmp_path / "x.mcap", frames))
     host.put(*RESET)
-    host.put(NMT, bytes([START, 0]))
+    host.put(NMT, bytes([Nmt.START, 0]))
     return host
 
 
@@ -135,7 +135,7 @@ def test_cycles_count_from_the_hosts_first_sync_whatever_its_counter(host):
 def test_nothing_is_answered_before_the_nodes_are_operational(tmp_path):
     host = Host(recorded(tmp_path / "x.mcap", [sync(1), *answers(1), sync(2), *answers(2)]))
     assert host.cyclic(1) == ()
-    host.put(NMT, bytes([START, 0]))
+    host.put(NMT, bytes([Nmt.START, 0]))
     assert host.cyclic(2) == answers(2)
 
 
@@ -161,7 +161,7 @@ def test_a_host_in_lockstep_hears_that_a_cycle_lacks_frames(host):
 def test_without_cycles_all_but_sync_is_answered():
     host = Host(None)
     assert [data for _, data in host.put(*RESET)] == [b"\0"] * 4
-    host.put(NMT, bytes([START, 0]))
+    host.put(NMT, bytes([Nmt.START, 0]))
     assert host.cyclic(1) == ()
     assert host.read(1, 0x6064) == 0
 

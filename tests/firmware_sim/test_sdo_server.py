@@ -87,14 +87,6 @@ def test_a_segment_that_belongs_to_no_transfer_is_aborted(host, command):
     assert ask(host, bytes([command])) == aborted(0x1000, 0, UNKNOWN_COMMAND)
 
 
-def test_a_long_value_comes_in_segments_with_alternating_toggle(host):
-    assert ask(host, frame(0x40, 0x1008)) == frame(0x41, 0x1008, 0, struct.pack("<I", 22))
-    first, second, third, last = (ask(host, bytes([command])) for command in (0x60, 0x70, 0x60, 0x70))
-    assert (first[0], second[0], third[0], last[0]) == (0x00, 0x10, 0x00, 0x1D)
-    assert (first[1:] + second[1:] + third[1:] + last[1:]).rstrip(b"\0") == b"adacd-hil torque drive"
-    assert ask(host, b"\x60") == aborted(0x1008, 0, UNKNOWN_COMMAND)  # over
-
-
 def test_a_toggle_bit_that_stands_still_ends_the_upload(host):
     ask(host, frame(0x40, 0x1008))
     ask(host, b"\x60")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from general_arm import TORQUE
 
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
@@ -24,7 +25,6 @@ from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
 EVERY_SENSOR_ERROR = {
     "offset_drift_Nm_s": [0.1, -0.1],
     "offset_walk_Nm_rs": [0.1, 0.2],

@@ -3,18 +3,7 @@
 import struct
 
 import pytest
-from bench_host import (
-    ENABLE,
-    ENABLED,
-    FAULT,
-    PERIOD_NS,
-    RESET_COMMUNICATION,
-    RESET_NODE,
-    START,
-    BenchHost,
-    patient_host,
-    quiet_scenario,
-)
+from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, patient_host, quiet_scenario
 
 from firmware_sim.canopen.error_control import SyncKind, SyncOrder
 
@@ -28,7 +17,7 @@ def running(clock_mode: str = "sync") -> BenchHost:
     """Both drives enabled, more than one overflow of the counter ago."""
     host = BenchHost(clock_mode=clock_mode)
     host.enable()
-    host.step(ENABLE, times=250)
+    host.step(Word.ENABLE, times=250)
     host.take()
     return host
 
@@ -60,16 +49,16 @@ def test_one_doubled_sync_is_ignored_counted_and_reported_by_every_node(clock_mo
     assert {data for _, data in frames[4:]} == {b"\x00\x11"}  # the sensors' error register
     assert [counts(host, node) for node in NODES] == [[1, 0, 0, 0, 0]] * 4
     assert host.read(1, 0x2210, 2 + ORDER) == 1
-    host.step(ENABLE)
-    assert [host.state_bits(1), host.state_bits(2)] == [ENABLED] * 2
+    host.step(Word.ENABLE)
+    assert [host.state_bits(1), host.state_bits(2)] == [State.ENABLED] * 2
 
 
 def test_odd_syncs_are_tolerated_for_ever_if_100_right_ones_lie_between_them():
     host = running()
     for _ in range(TOLERATED + 2):
         again(host)
-        host.step(ENABLE, times=CLEAN_SYNCS)
-    assert [host.state_bits(1), host.state_bits(2)] == [ENABLED] * 2
+        host.step(Word.ENABLE, times=CLEAN_SYNCS)
+    assert [host.state_bits(1), host.state_bits(2)] == [State.ENABLED] * 2
     assert [error[::2] for error in emergencies(host)] == [(0x8200, ORDER), (0, ORDER)] * (TOLERATED + 2)
     assert host.read(1, 0x1001) == 0
 
@@ -78,13 +67,13 @@ def test_fault_reset_is_refused_until_100_syncs_were_right():
     host = running()
     for _ in range(TOLERATED + 1):
         again(host)
-    host.step(ENABLE, times=CLEAN_SYNCS - 1)
-    assert host.state_bits(1) == FAULT
+    host.step(Word.ENABLE, times=CLEAN_SYNCS - 1)
+    assert host.state_bits(1) == State.FAULT
     host.command(0x80)
     again(host)
     host.sync()
-    assert host.state_bits(1) == FAULT
-    host.step(ENABLE, times=CLEAN_SYNCS)
+    assert host.state_bits(1) == State.FAULT
+    host.step(Word.ENABLE, times=CLEAN_SYNCS)
     host.step(0x80)
     assert host.state_bits(1) == 0x40
 
@@ -94,8 +83,8 @@ def test_a_warning_about_sync_does_not_keep_another_fault_from_being_reset():
     again(host)
     host.bench.drives[0].fail(0x2310, host.bench.now_ns)
     host.bench.drives[0].mend()
-    host.step(ENABLE, times=CLEAN_SYNCS - 10)
-    assert (host.state_bits(1), host.bench.devices[0].is_sync_odd) == (FAULT, True)
+    host.step(Word.ENABLE, times=CLEAN_SYNCS - 10)
+    assert (host.state_bits(1), host.bench.devices[0].is_sync_odd) == (State.FAULT, True)
     host.step(0x80)
     assert host.state_bits(1) == 0x40
 
@@ -105,12 +94,12 @@ def test_a_counter_that_runs_backwards_is_odd_and_one_period(back):
     host = running()
     now_ns, cycle = host.bench.now_ns, host.bench.cycle
     host.cycle -= 1 + back
-    host.step(ENABLE)
+    host.step(Word.ENABLE)
     assert (host.bench.now_ns, host.bench.cycle) == (now_ns + PERIOD_NS, cycle + 1)
     assert emergencies(host) == [(0x8200, 0x11, ORDER)]
     assert counts(host) == [0, 1, 0, 0, 0]
-    host.step(ENABLE)
-    assert (host.state_bits(1), counts(host)) == (ENABLED, [0, 1, 0, 0, 0])
+    host.step(Word.ENABLE)
+    assert (host.state_bits(1), counts(host)) == (State.ENABLED, [0, 1, 0, 0, 0])
 
 
 @pytest.mark.parametrize("lost", [1, 119])
@@ -118,7 +107,7 @@ def test_a_counter_that_runs_forward_by_sync_is_lost_syncs(lost):
     host = running()
     now_ns = host.bench.now_ns
     host.cycle += lost
-    host.step(ENABLE)
+    host.step(Word.ENABLE)
     assert host.bench.now_ns == now_ns + (lost + 1) * PERIOD_NS
     assert counts(host) == [0, 0, 0, 0, lost]
     assert emergencies(host, 3) == []
@@ -128,7 +117,7 @@ def test_syncs_that_a_fault_keeps_from_a_node_are_its_own_loss():
     rows = [{"kind": "lose", "node": "sensor1", "frame": "sync", "at_s": 0.01, "count": 5}]
     host = BenchHost(quiet_scenario(faults=rows))
     host.enable()
-    host.step(ENABLE, times=30)
+    host.step(Word.ENABLE, times=30)
     assert [counts(host, node) for node in NODES] == [[0] * 5, [0] * 5, [0, 0, 0, 0, 5], [0] * 5]
 
 
@@ -137,7 +126,7 @@ def test_a_fault_that_doubles_sync_is_noticed_by_those_who_hear_it(node):
     rows = [{"kind": "duplicate", "node": node, "frame": "sync", "at_s": 0.01, "count": 2}]
     host = BenchHost(quiet_scenario(faults=rows))
     host.enable()
-    host.step(ENABLE, times=30)
+    host.step(Word.ENABLE, times=30)
     repeated = [counts(host, number)[0] for number in NODES]
     assert repeated == ([2] * 4 if node == "all" else [0, 0, 0, 2])
     assert host.bench.cycle == 32
@@ -162,10 +151,10 @@ def test_a_sync_of_the_wrong_length_is_ignored_and_never_a_fault(data):
     assert host.bench.cycle == cycle
     assert emergencies(host) == [(0x8240, 0x11, LENGTH)]
     assert counts(host) == [0, 0, 0, 20, 0]
-    host.step(ENABLE)
+    host.step(Word.ENABLE)
     assert emergencies(host) == [(0, 0, LENGTH)]
     again(host)  # one that comes twice is the first that counts
-    assert host.state_bits(1) == ENABLED
+    assert host.state_bits(1) == State.ENABLED
 
 
 def test_a_node_takes_syncs_by_its_own_overflow():
@@ -174,7 +163,7 @@ def test_a_node_takes_syncs_by_its_own_overflow():
         host.write(3, 0x1006, 0, value)
         if value == 0:
             host.write(3, 0x1019, 0, 0)
-    host.nmt(START)
+    host.nmt(Nmt.START)
     host.sync()
     host.take()
     host.sync()
@@ -188,15 +177,15 @@ def test_a_node_takes_syncs_by_its_own_overflow():
 def test_the_counts_outlive_a_reset_of_communication_and_not_one_of_the_node():
     host = running()
     again(host)
-    host.nmt(RESET_COMMUNICATION)
+    host.nmt(Nmt.RESET_COMMUNICATION)
     assert counts(host) == [1, 0, 0, 0, 0]
-    host.nmt(RESET_NODE)
+    host.nmt(Nmt.RESET_NODE)
     assert counts(host) == [0] * 5
 
 
 def wall_sync(host: BenchHost, periods: float, steps: int = 1) -> None:
     """Send commands and a SYNC so long after the last, its counter so many steps further."""
-    host.command(ENABLE)
+    host.command(Word.ENABLE)
     host.t_ns += round(periods * PERIOD_NS)
     host.bench.advance_to(host.t_ns)
     host.cycle += steps
@@ -248,7 +237,7 @@ def test_by_the_clock_a_gap_that_took_its_time_is_lost_syncs():
     for _ in range(5):
         wall_sync(host, 3.0, 3)
     assert counts(host) == [0, 0, 0, 0, 10]
-    assert host.state_bits(1) == ENABLED
+    assert host.state_bits(1) == State.ENABLED
 
 
 def judged(is_timed: bool, *syncs: tuple[int, float]) -> list[SyncKind]:

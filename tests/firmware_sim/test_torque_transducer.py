@@ -5,12 +5,13 @@ import struct
 
 import numpy as np
 import pytest
-from bench_host import START, BenchHost, quiet_scenario
+from bench_host import BenchHost, Nmt, quiet_scenario
+from general_arm import OFF
 from scipy import signal
 
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.hardware_settings import SensorSettings
-from firmware_sim.arm.sensing import TORQUE_LSB_NM, DriveMode, TorqueNoise
+from firmware_sim.arm.sensing import TORQUE_LSB_NM, TorqueNoise
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body
 from firmware_sim.body.sensors import (
@@ -23,9 +24,6 @@ from firmware_sim.body.sensors import (
     walk_offset,
 )
 from firmware_sim.scenario.scenario import Scenario
-
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
-OFF = (DriveMode.OFF, DriveMode.OFF)
 
 
 class Sensors:
@@ -240,7 +238,7 @@ def test_a_frame_without_a_new_sample_repeats_the_old_one_with_its_noise():
 def test_a_sensor_of_smaller_range_saturates_and_flags_its_overload_in_the_frame(offset_Nm, status, value_uNm):
     sensors = {"torque_range_Nm": [20.0, 50.0], "torque_bits": [12, 16]}
     host = BenchHost(quiet_scenario(torque_offset_Nm=[offset_Nm, 0.0], sensors=sensors))
-    host.nmt(START)
+    host.nmt(Nmt.START)
     host.take()
     host.sync()
     frame = host.taken(0x183)[0]

@@ -53,10 +53,8 @@ def reduced_mass(arm: TouchedArm, body: BodySettings, point_m: float) -> float:
 # Blows of 10 mm/s move the arm so little that its effective mass is constant; the model is linear in the speed.
 BLOWS = [
     ("P", 2, 0.2, 1, {"region": "skull_forehead"}),
-    ("P", 2, 0.3, -1, {"region": "hand_finger", "radius_m": 0.03}),
     ("P", 1, 0.25, 1, {"region": "chest"}),
-    ("S", 2, 0.15, -1, {"region": "lower_leg", "radius_m": 0.05}),
-    ("M", 1, 0.30, -1, {"mass_kg": 0.3, "stiffness_N_m": 5e4}),
+    ("M", 1, 0.30, -1, {"mass_kg": 0.3, "stiffness_N_m": 5e4, "radius_m": 0.05}),
 ]
 
 

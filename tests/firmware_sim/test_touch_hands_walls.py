@@ -5,10 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from general_arm import GeneralArm, TouchedArm, point_of, truth_of, without_friction
+from general_arm import TORQUE, GeneralArm, TouchedArm, point_of, truth_of, without_friction
 
 from firmware_sim.arm.hardware_settings import MechanicsSettings
-from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_forces import (
     THING_STATE,
     TOUCH_HEADER,
@@ -27,7 +26,6 @@ from firmware_sim.body.body import Body, largest_rate_rad_s
 from firmware_sim.scenario.scenario import Scenario
 
 POSE = (0.3, 0.7)
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
 FREE = MechanicsSettings(stop_low_deg=(-720.0, -720.0), stop_high_deg=(720.0, 720.0))
 
 

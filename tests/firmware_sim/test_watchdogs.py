@@ -3,19 +3,7 @@
 import struct
 
 import pytest
-from bench_host import (
-    DISABLED,
-    ENABLE,
-    ENABLED,
-    FAULT,
-    FAULT_RESET,
-    PERIOD_NS,
-    PRE_OPERATIONAL,
-    RESET_NODE,
-    START,
-    BenchHost,
-    remap,
-)
+from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, remap
 from served_bench import HOST_BEAT, MS, enabling_script, serve
 
 SYNC, COMMAND, HEARTBEAT, OPERATIONAL, LENGTH = 1, 2, 3, 4, 5
@@ -32,7 +20,7 @@ class Watched:
             self.host.write(1, 0x1016, 1, 127 << 16 | 50)
         remap(self.host, 1, 0x1402, (0x60400010,), can_id=0x401, kind=255)
         self.host.enable()
-        self.host.step(ENABLE)
+        self.host.step(Word.ENABLE)
         if watchdog == HEARTBEAT:
             self.host.put(*HOST_BEAT)
         self.host.take()
@@ -43,11 +31,11 @@ class Watched:
             host.t_ns += 2 * PERIOD_NS
             host.bench.advance_to(host.t_ns)
         elif self.watchdog == COMMAND:
-            host.step(ENABLE, joints=(2,), times=3)
+            host.step(Word.ENABLE, joints=(2,), times=3)
         elif self.watchdog == HEARTBEAT:
-            host.step(ENABLE, times=51)
+            host.step(Word.ENABLE, times=51)
         elif self.watchdog == OPERATIONAL:
-            host.nmt(PRE_OPERATIONAL, 1)
+            host.nmt(Nmt.PRE_OPERATIONAL, 1)
         else:
             host.put(0x201, b"\0")
 
@@ -56,9 +44,9 @@ class Watched:
         if self.watchdog == HEARTBEAT:
             host.put(*HOST_BEAT)
         if self.watchdog in (HEARTBEAT, OPERATIONAL):
-            host.nmt(START, 1)
+            host.nmt(Nmt.START, 1)
         for _ in range(8):  # the first are out of sequence where the drive hasn't listened for a while
-            host.step(ENABLE)
+            host.step(Word.ENABLE)
 
     def say(self, word: int) -> None:
         """Send drive 1 a controlword that acts at once: by PDO, where none is exchanged by SDO."""
@@ -112,16 +100,16 @@ def test_fault_reset_is_refused_while_the_cause_lasts_and_works_by_its_edge_afte
         if watchdog in (SYNC,):
             host.bench.advance_to(host.t_ns)
         elif watchdog == COMMAND:
-            host.step(ENABLE, joints=(2,))
+            host.step(Word.ENABLE, joints=(2,))
         else:
-            host.step(ENABLE)
-    assert host.state_bits(1) == FAULT
+            host.step(Word.ENABLE)
+    assert host.state_bits(1) == State.FAULT
     watched.say(0)
-    watched.say(FAULT_RESET)
-    assert host.state_bits(1) == FAULT
+    watched.say(Word.FAULT_RESET)
+    assert host.state_bits(1) == State.FAULT
     watched.find()
-    watched.say(FAULT_RESET)
-    assert host.state_bits(1) == DISABLED
+    watched.say(Word.FAULT_RESET)
+    assert host.state_bits(1) == State.DISABLED
     host.take()
     assert host.read(1, 0x1001) == 0
 
@@ -141,10 +129,10 @@ def test_several_tripped_watchdogs_keep_the_communication_error_until_the_last_h
     watched = Watched(HEARTBEAT)
     watched.lose()
     watched.host.put(0x201, b"\0")
-    watched.host.nmt(START, 1)
+    watched.host.nmt(Nmt.START, 1)
     watched.host.put(0x201, b"\0")
     assert watched.host.read(1, 0x1001) == 0x11
-    watched.host.step(ENABLE)
+    watched.host.step(Word.ENABLE)
     assert watched.host.read(1, 0x1001) == 0x11
     watched.host.put(*HOST_BEAT)
     assert watched.host.read(1, 0x1001) == 0x01
@@ -161,7 +149,7 @@ def test_a_heartbeat_that_is_no_longer_watched_is_not_missing():
 def test_a_reset_of_the_node_forgets_what_has_tripped():
     watched = Watched(COMMAND)
     watched.lose()
-    watched.host.nmt(RESET_NODE, 1)
+    watched.host.nmt(Nmt.RESET_NODE, 1)
     assert [watched.host.read(1, 0x2210, sub) for sub in range(1, 8)] == [0] * 7
 
 
@@ -173,7 +161,7 @@ def test_the_sync_tolerance_is_a_number_of_tenths_of_the_period(tenths, patience
     host.enable()
     last_ns = host.t_ns
     host.bench.advance_to(last_ns + patience_ns - 1)
-    assert host.state_bits() == ENABLED
+    assert host.state_bits() == State.ENABLED
     host.bench.advance_to(last_ns + patience_ns)
     assert host.read(1, 0x603F) == 0x8700
 
@@ -210,7 +198,7 @@ def test_by_sync_too_a_host_that_dies_leaves_no_torque_after_the_watchdogs_time(
     assert [(drive.torque_Nm, drive.state.value, drive.motor_mode) for drive in bench.drives] == [(0.0, "fault", 0)] * 2
     statuses = [data for _, can_id, data in bus.sent if can_id == 0x281]
     if deadline is DEADLINE_300:  # after a lost heartbeat the node is in Pre-operational
-        assert statuses[-1][0] & 0x4F == FAULT
+        assert statuses[-1][0] & 0x4F == State.FAULT
 
 
 def test_by_sync_a_host_that_pauses_within_the_watchdogs_time_finds_everything_as_it_left_it():
