@@ -166,9 +166,10 @@ def learnt(delay_s=0.0, offset=(0.0, 0.0)):
     return kernel.m.models.theta.copy()
 
 
-def test_the_lag_of_the_velocity_is_identified():
-    theta = learnt(delay_s=3e-3)
+def test_the_lag_of_the_velocity_and_the_offsets_of_the_torque_sensors_are_identified():
+    theta = learnt(delay_s=3e-3, offset=(0.15, -0.1))
     np.testing.assert_allclose(theta[LAGS], 3e-3, atol=2e-4)
+    np.testing.assert_allclose(theta[OFFSETS], [0.15, -0.1], atol=0.005)
     np.testing.assert_allclose(theta[:3], SMOOTH[:3], rtol=0.01)
 
 
@@ -178,12 +179,6 @@ def test_a_velocity_that_is_noisy_takes_no_inertia_away():
     noise = 0.005 * np.random.default_rng(5).standard_normal(measured.dq.shape)
     found = play(measured._replace(dq=measured.dq + noise)).memory[0].models.belief
     np.testing.assert_allclose(found[:3], THETA["P"][:3], rtol=0.005)
-
-
-def test_the_offsets_of_the_torque_sensors_are_identified():
-    theta = learnt(offset=(0.15, -0.1))
-    np.testing.assert_allclose(theta[OFFSETS], [0.15, -0.1], atol=0.005)
-    np.testing.assert_allclose(theta[:3], SMOOTH[:3], rtol=0.01)
 
 
 def test_an_untouched_arm_is_never_said_to_be_touched_and_soon_a_push_of_1_Nm_would_be(free):

@@ -15,6 +15,7 @@ from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD, CertificateWatch
 
 UNKNOWN = replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=None))
+BRAKED = replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=(8.0, 8.0)))
 VISCOUS, COULOMB, INERTIA = NAMES.index("F_v1"), NAMES.index("F_c1"), NAMES.index("a1")
 
 
@@ -34,9 +35,11 @@ def test_a_hand_that_begins_to_hold_while_the_arm_learns_gets_no_certificate_and
     said = loop.said("touch")
     assert any(re.search(named, text) for text in said)
     assert any("a touch that began then has not been seen to end" in text for text in said)
+    assert earlier.is_keeping(loop.m)
     released_at = loop.cycle
     loop.recover()
     assert (loop.cycle - released_at) * PERIOD_S < 6.5
+    assert not earlier.is_keeping(loop.m)
     for name in ("a1", "F_v1", "F_c1", "F_v2"):
         assert loop.error_of(name) < 0.02
 
@@ -71,23 +74,16 @@ def test_a_touch_within_the_fit_that_no_threshold_saw_is_no_certificate():
     assert loop.error_of("a1") < 0.005
 
 
-@pytest.mark.long
-def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_the_offset_before():
-    loop = TouchedLoop(UNKNOWN)
+@pytest.mark.parametrize("settings", long_but(1, [BRAKED, UNKNOWN]), ids=["brakes leave it open", "no anchor"])
+def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_the_offset_before(settings):
+    """What was kept is not forgotten for the word of an anchor that bounds nothing."""
+    loop = TouchedLoop(settings)
     loop.learn(1.0)
     leant = loop.lean(0, 0.5, 6.0)
     assert SchemeState.MONITOR not in states(leant)
     assert loop.said("touch")[0].startswith("torque offset of joint 1 is 0.50")
     loop.recover()
     assert abs(loop.offset_error_Nm[0]) < 0.03
-
-
-def test_an_anchor_that_a_brake_leaves_open_is_none_for_a_lean_that_begins_while_the_arm_learns():
-    """What was kept is not forgotten for the word of an anchor that bounds nothing."""
-    loop = TouchedLoop(replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=(8.0, 8.0))))
-    loop.learn(1.0)
-    assert SchemeState.MONITOR not in states(loop.lean(0, 0.5, 6.0))
-    assert loop.said("touch")[0].startswith("torque offset of joint 1 is 0.50")
 
 
 def test_what_was_learnt_under_a_lean_judges_nothing_once_the_lean_has_gone():
@@ -122,24 +118,6 @@ def test_a_hand_that_never_lets_go_is_a_fault_that_says_what_contradicts_what():
     assert re.search(r"friction of joint 1 at .* more than \d+\.\d s ago, bound 0\.\d\d\d Nm: a touch", lines[0])
     assert any(re.fullmatch(r"certificates withheld: \d", line) for line in lines)
     assert "`accept` says that nobody touches the arm" in lines
-
-
-def test_an_arm_that_learns_in_circles_says_again_why():
-    loop = TouchedLoop(FREE)
-    loop.learn(1.0)
-    loop.hold(added(F_c1=0.4), 11.0)
-    first, again = loop.said("touch")
-    assert re.search(r"friction of joint 1 at .* more than .*; no certificate", first)
-    assert re.search(r"friction of joint 1 at .* more than .*; the 5th fit in a row that is refused; no certif", again)
-
-
-def test_a_certificate_forgets_what_was_kept():
-    loop = TouchedLoop(FREE)
-    loop.learn(1.0)
-    loop.lean(0, 1.0, 0.2)
-    assert earlier.is_keeping(loop.m)
-    loop.recover()
-    assert not earlier.is_keeping(loop.m)
 
 
 @pytest.mark.parametrize("profile", ["P", "S", "M"])
@@ -248,12 +226,8 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
     earlier.forget(m)
     m.fit_check.steps_used, m.fit_check.steps_theta[:2] = 2.0, 0.1
     m.fit_check.steps_P[:2] = 0.02**2 * np.eye(len(NAMES))
-    m.fit_check.steps_square[:2], m.fit_check.steps_rows[:2], m.fit_check.fit_square, m.fit_check.fit_rows = (
-        0.0,
-        50.0,
-        0.0,
-        100.0,
-    )
+    m.fit_check.steps_square[:2], m.fit_check.steps_rows[:2] = 0.0, 50.0
+    m.fit_check.fit_square, m.fit_check.fit_rows = 0.0, 100.0
     added_variance = (1.0 + fit_check.REGULAR) * 0.02**2 - 0.01**2
     m.models.belief[INERTIA] += share * np.sqrt(fit_check.STEADY * fit_check.SMALLEST_SQUARE * added_variance)
     assert (fit_check.last_unsteady_step(m) == fit_check.NONE) is is_steady
@@ -358,12 +332,8 @@ def test_a_fit_with_noise_may_differ_by_more():
 def test_a_fit_whose_learnt_residuals_are_large_may_differ_by_a_share_of_the_better_part_of_them(share, is_borne_out):
     fit = Halves(steps_used=1)
     m, unit = fit.m, np.eye(len(NAMES))[1]
-    m.fit_check.steps_square[0], m.fit_check.steps_rows[0], m.fit_check.fit_square, m.fit_check.fit_rows = (
-        2.0,
-        50.0,
-        2.5,
-        100.0,
-    )
+    m.fit_check.steps_square[0], m.fit_check.steps_rows[0] = 2.0, 50.0
+    m.fit_check.fit_square, m.fit_check.fit_rows = 2.5, 100.0
     noise_Nm = fit_check.LEARNT_SHARE * FREE.certified.residual_Nm * np.sqrt(0.5 / 50.0)
     far = np.abs(Halves().differ(0, unit)[:2]).max()
     fit.differ(0, share * (fit_check.LATER_NM + noise_Nm) / far * unit)

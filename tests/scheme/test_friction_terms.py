@@ -51,12 +51,6 @@ def test_the_columns_follow_the_order_of_the_settings():
     np.testing.assert_array_equal(both, np.hstack([columns([LOAD]), columns([STRIBECK])]))
 
 
-def test_columns_before_the_first_are_left_alone():
-    Y_h = np.full((2, 7), 9.0)
-    fill_terms(DQ, TAU_J, np.array([1.0]), (STILL, NO_WIDTH, V_S), BENT, 5, Y_h)
-    np.testing.assert_array_equal(Y_h[:, :5], 9.0)
-
-
 def test_the_width_column_is_what_a_wider_tanh_would_change():
     """d/d(log width) of tanh(dq / width), by finite differences."""
     width, step = 0.1, 1e-6

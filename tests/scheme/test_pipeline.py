@@ -104,20 +104,6 @@ def test_a_push_is_detected_with_its_sign_and_link_and_the_arm_goes_on_after_an_
 
 
 @pytest.mark.slow
-def test_what_is_known_of_a_stopped_arm_is_taken_back_at_a_word_though_something_pushes():
-    loop = PaperLoop()
-    loop.monitor()
-    loop.tau_ext[0] = 1.0
-    loop.run_until(SchemeState.STOPPED, 5000)
-    loop.request = Request.ACKNOWLEDGE
-    assert loop.run(200)[-1].state is SchemeState.STOPPED
-    loop.request = Request.RELEARN
-    output = loop.run_until(SchemeState.ADAPT)[-1]
-    assert not output.is_model_valid
-    assert (output.theta_ff == 0.0).all()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("is_standing", [True, False])
 def test_without_motion_or_without_enough_information_the_adaptation_never_ends(is_standing):
     """Eq. (15) alone would end it after 5 s, of an arm that stands still with theta_hat = 0."""
@@ -174,17 +160,6 @@ def test_an_output_is_not_changed_by_the_next_cycle(scheme):
     np.testing.assert_array_equal(first.tau_ext_hat, kept[1])
 
 
-def test_the_block_is_laid_out_as_the_records_say():
-    pipeline = new_pipeline(settings_with())
-    pipeline.step(arm_state(0))
-    block = pipeline.step(arm_state(1, q=(0.1, 0.2), dq=(0.3, 0.4), tau_J=(0.5, 0.6))).block
-    assert block.shape == (scheme_layout(7).size,)
-    assert block[PLACES["q"]].tolist() == [0.1, 0.2]
-    assert block[PLACES["dq"]].tolist() == [0.3, 0.4]
-    assert block[PLACES["tau_J"]].tolist() == [0.5, 0.6]
-    assert block[PLACES["tau_f"]][0] > 0.0
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -217,13 +192,7 @@ def test_an_arm_that_moves_or_is_loaded_is_not_commissioned(changes):
 
 EASY = {
     "safety": {"commission_s": 0.01},
-    "termination": {
-        "beta_Nm": 50.0,
-        "hold_s": 0.1,
-        "travel_deg": 0.0,
-        "velocity_deg_s": 0.0,
-        "excitation_Nm2s": 0.0,
-    },
+    "termination": {"beta_Nm": 50.0, "hold_s": 0.1, "travel_deg": 0.0, "velocity_deg_s": 0.0, "excitation_Nm2s": 0.0},
 }
 """Settings with which an arm at rest gets to MONITOR after 113 cycles, with theta_hat = 0."""
 
@@ -255,14 +224,6 @@ def test_the_joints_over_their_threshold_are_named_until_the_push_is_over():
     arm = Standing().monitor()
     assert arm.step(300, tau_J=(0.0, -1.0))[-1].contact_joints == 0b10
     assert arm.step(500)[-1].contact_joints == 0b00
-
-
-def test_a_fault_leaves_a_report_unfinished():
-    arm = Standing().monitor()
-    pushed = arm.step(30, tau_J=(1.0, 0.0))
-    faulted = arm.step(fault=FaultReason.SENSOR) + arm.step(200)
-    reports = [output.contact for output in pushed + faulted if output.contact is not None]
-    assert [report.is_final for report in reports] == [False]
 
 
 class Learning:
