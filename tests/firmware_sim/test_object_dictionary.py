@@ -68,14 +68,6 @@ def test_every_listed_object_is_served_with_its_default_or_live_value(host, node
             assert (index, sub, host.read(node, index, sub)) == (index, sub, expected)
 
 
-@pytest.mark.parametrize("node", [1, 3])
-def test_writing_back_what_was_read_is_accepted_for_every_writable_object(host, node):
-    for index, sub, access, default in eds_rows(node):
-        if access in ("rw", "rww") and (index, sub) != (0x1003, 0):
-            host.write(node, index, sub, default_of(default, node))
-            assert (index, sub, host.read(node, index, sub)) == (index, sub, default_of(default, node))
-
-
 STATES = {Nmt.START: 5, Nmt.STOP: 4, Nmt.PRE_OPERATIONAL: 127, Nmt.RESET_NODE: 127, Nmt.RESET_COMMUNICATION: 127}
 
 

@@ -64,12 +64,6 @@ def test_a_drive_ignores_the_status_nibble_of_a_command():
         assert host.state_bits() == bits
 
 
-def test_every_command_of_the_host_has_a_status_nibble_of_0():
-    host = running()
-    assert host.command_frame(1, Word.ENABLE, 100)[1] >> 4 == 0
-    assert CODEC.message("Drive1Command").encode_raw(Word.ENABLE, 100)[1] >> 4 == 0
-
-
 def test_the_status_of_a_drive_follows_statusword_mode_and_error_and_not_the_torque():
     host = running()
     for _ in range(50):
