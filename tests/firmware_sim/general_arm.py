@@ -236,12 +236,6 @@ class TouchedArm(GeneralArm):
         """History of one value of one thing's state."""
         return self.states[:, TOUCH_HEADER:].copy().view(THING_STATE)[name][:, thing]
 
-    def kinetic_J(self, seen: dict[str, np.ndarray]) -> np.ndarray:
-        """Kinetic energy of the arm over time."""
-        m11, m12, m22 = np.array([mass_matrix(self.state, q2) for q2 in seen["q2"]]).T
-        dq1, dq2 = seen["dq1"], seen["dq2"]
-        return 0.5 * m11 * dq1**2 + m12 * dq1 * dq2 + 0.5 * m22 * dq2**2
-
     def mobility(self, link: int, point_m: float, q, normal) -> float:
         """Inverse of the arm's effective mass at a point of a link along a direction, 1/kg."""
         m11, m12, m22 = mass_matrix(self.state, q[1])
