@@ -121,15 +121,16 @@ def test_a_hand_that_never_lets_go_is_a_fault_that_says_what_contradicts_what():
 
 
 @pytest.mark.parametrize("profile", ["P", "S", "M"])
-def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound(profile):
-    loop = TouchedLoop(FREE, theta=THETA[profile], seed=5)
+def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound_whatever_its_offset(profile):
+    loop = TouchedLoop(FREE, (0.2, -0.2), theta=THETA[profile], seed=5)
     outputs = loop.run_until(SchemeState.CERTIFY)
     m = loop.m
     furthest = max(fit_check.distance(m, s) for s in range(int(m.fit_check.steps_used)))
     assert furthest < 0.5 * fit_check.STEADY * fit_check.SMALLEST_SQUARE
     outputs += loop.run_until(SchemeState.MONITOR)
     assert learnt_s(outputs) == pytest.approx(2.0, abs=0.01)
-    assert loop.said("touch") == []
+    assert loop.said("touch") + loop.said("anchor") == []
+    assert np.abs(loop.offset_error_Nm).max() < 0.02
 
 
 class Compared:
