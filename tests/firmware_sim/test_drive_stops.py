@@ -3,7 +3,7 @@
 import pytest
 from bench_host import BenchHost, State, Word, remap_mode, set_mode
 
-from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S, DriveMode
 
 SLOWLY, RAMP, HARD = DriveMode.BRAKE_SLOWLY, DriveMode.BRAKE, DriveMode.BRAKE_HARD
 
@@ -60,15 +60,13 @@ def test_quick_stop_brakes_by_its_ramp_and_ends_as_its_code_says(code, mode, end
 
 
 def damping(code: int) -> float:
-    """Return the braking torque of joint 1 per its velocity, Nm s/rad, once the current loop has followed.
+    """Return the braking torque of joint 1 per its velocity, Nm s/rad, by what its drive says of both.
 
     The period after a SYNC passes when the next one comes.
     """
     host = moving_host(0x605A, code)
-    host.step(Word.QUICK_STOP)
-    host.step(Word.QUICK_STOP)
-    body = host.bench._body
-    return -body.motor_torque_Nm[0] / body.drive_velocity_rad_s[0]
+    host.step(Word.QUICK_STOP, times=2)
+    return -host.read(1, 0x6077) * 12e-3 / (host.read(1, 0x606C) * VELOCITY_LSB_RAD_S)
 
 
 def test_the_ramps_brake_with_half_all_and_one_and_a_half_of_the_damping():

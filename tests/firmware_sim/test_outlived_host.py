@@ -42,16 +42,6 @@ def test_the_truth_goes_on_period_by_period_until_the_arm_is_at_rest():
     assert host.read(1, 0x603F) == 0x8700
 
 
-def test_the_drives_keep_their_torque_until_they_miss_their_sync():
-    host = moving()
-    begun = len(host.truths)
-    host.bench.outlive_host()
-    torques = [block[TRUTH_LAYOUT.slices["tau_m"]].tolist() for _, _, block in host.truths[begun - 1 : begun + 4]]
-    assert torques[:2] == [pytest.approx([3.6, 1.8])] * 2
-    assert torques[2][1] < 0.0  # it has braked since 1.5 periods after the last SYNC: the elbow turns forwards
-    assert speeds(host, begun - 1).argmax() == 1
-
-
 def test_it_is_outlived_once_until_a_sync_comes_again():
     host = moving(**PUSHED)
     host.bench.outlive_host()

@@ -60,21 +60,14 @@ def doubt_of(m):
     return CERTIFIED.model_sigmas * np.sqrt(m.sensitivity.unit * believed + unexplained)
 
 
-def test_a_moving_arm_s_thresholds_are_noise_and_doubt_in_quadrature():
+@pytest.mark.parametrize("is_steady", [True, False])
+def test_a_moving_arm_s_thresholds_are_noise_and_doubt_in_quadrature(is_steady):
+    """The doubt of a smoothed channel follows the motion as slowly as its residual."""
     m = known_arm()
-    g = doubt_of(m)
-    m.sensitivity.doubt[:] = g  # as after a while of the same motion
-    bare = np.concatenate([g, g[1:]])
-    np.testing.assert_allclose(thresholds_of(m), m.sensitivity.strain * np.sqrt(noise_of(m) + bare**2), rtol=1e-10)
-
-
-def test_the_doubt_of_a_smoothed_channel_follows_the_motion_as_slowly_as_its_residual():
-    m = known_arm()
-    m.sensitivity.doubt[:] = 0.0
-    h = thresholds_of(m)
-    followed = (1.0 - np.exp(-CERTIFIED.smoothing_rad_s * T)) * doubt_of(m)
-    expected = np.sqrt(noise_of(m) + np.concatenate([followed, doubt_of(m)[1:]]) ** 2)
-    np.testing.assert_allclose(h, m.sensitivity.strain * expected, rtol=1e-10)
+    m.sensitivity.doubt[:] = before = doubt_of(m) if is_steady else 0.0
+    share = 1.0 - np.exp(-CERTIFIED.smoothing_rad_s * T)
+    followed = np.concatenate([before + share * (doubt_of(m) - before), doubt_of(m)[1:]])
+    np.testing.assert_allclose(thresholds_of(m), m.sensitivity.strain * np.sqrt(noise_of(m) + followed**2), rtol=1e-10)
 
 
 def test_a_joint_at_rest_may_hold_what_static_friction_is_believed_to_hold():
