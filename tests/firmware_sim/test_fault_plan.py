@@ -221,50 +221,38 @@ def test_a_mask_says_which_bits_flip(mask, data):
 @pytest.mark.parametrize(
     ("contract", "name", "frame", "node"),
     [
-        ("arm", "Sensor1Torque", "torque", "sensor1"),
-        ("arm", "Drive2Command", "command", "drive2"),
-        ("arm_fd", "Drive1Feedback", "feedback", "drive1"),
-        ("arm_fd", "Sensor2Torque", "torque", "sensor2"),
+        ("arm", "Sensor1Torque", "torque", SENSOR1),
+        ("arm", "Drive2Command", "command", DRIVE2),
+        ("arm_fd", "Drive1Feedback", "feedback", DRIVE1),
     ],
 )
 def test_a_frozen_counter_stands_still_under_a_right_crc(contract, name, frame, node):
-    codec = CODEC if contract == "arm" else load_codec(CONTRACTS[contract].path)
-    message = codec.message(name)
-    plan = plan_of({"kind": "freeze_counter", "node": node, "frame": frame, "at_s": 0.0}, contract=contract)
+    message = load_codec(CONTRACTS[contract].path).message(name)
+    node_name = ("drive1", "drive2", "sensor1", "sensor2")[node]
+    plan = plan_of({"kind": "freeze_counter", "node": node_name, "frame": frame, "at_s": 0.0}, contract=contract)
     sender, receiver = message.sender(), message.receiver()
     statuses = []
     for k in range(6):
         if k == 2:
             plan.advance(0)
         data = sender.protect(bytearray([0] * (message.length - 1) + [k]))
-        place = ["drive1", "drive2", "sensor1", "sensor2"].index(node)
-        if frame == "command":
-            ((_, data),) = plan.receive(place, message.can_id, data)
-        else:
-            ((_, _, data),) = plan.transmit(place, message.can_id, data)
+        way = plan.receive if frame == "command" else plan.transmit
+        ((*_, data),) = way(node, message.can_id, data)
         assert data[-1] == k
         statuses.append(receiver.check(data))
     assert statuses == [E2eStatus.OK] * 3 + [E2eStatus.REPEATED] * 3
 
 
 @pytest.mark.parametrize(
-    ("row", "contract", "message"),
+    ("kind", "frame", "contract", "message"),
     [
-        (
-            {"kind": "freeze_counter", "node": "drive1", "frame": "feedback"},
-            "arm",
-            "Drive1Feedback has no counter to freeze in arm.dbc",
-        ),
-        (
-            {"kind": "lose", "node": "drive1", "frame": "status"},
-            "arm_fd",
-            "frame 'status' is not in arm_fd.dbc: ",
-        ),
+        ("freeze_counter", "feedback", "arm", "Drive1Feedback has no counter to freeze in arm.dbc"),
+        ("lose", "status", "arm_fd", "frame 'status' is not in arm_fd.dbc: "),
     ],
 )
-def test_a_frame_that_the_contract_has_not_is_refused(row, contract, message):
+def test_a_frame_that_the_contract_has_not_is_refused(kind, frame, contract, message):
     with pytest.raises(ConfigError) as refusal:
-        plan_of(row | {"at_s": 0.0}, contract=contract)
+        plan_of({"kind": kind, "node": "drive1", "frame": frame, "at_s": 0.0}, contract=contract)
     assert str(refusal.value).startswith(f"faults[0]: {message}")
 
 

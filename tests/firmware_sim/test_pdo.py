@@ -73,8 +73,6 @@ def test_the_transmission_types_of_the_standard_are_taken_and_no_others(host, re
         (0x1602, entry(0x0004, 32), NOT_MAPPABLE),  # DummyUsage lacks it
         (0x1A02, entry(0x0005, 8), NOT_MAPPABLE),  # dummies are for receiving
         (0x1A02, entry(0x6040, 16), NOT_MAPPABLE),  # rww: for receiving
-        (0x1A02, entry(0x1008, 8), NOT_MAPPABLE),
-        (0x1A02, entry(0x1018, 32, 1), NOT_MAPPABLE),
     ],
 )
 def test_what_can_not_be_mapped_is_refused_with_the_reason(host, record, value, code):

@@ -37,17 +37,12 @@ def aborted(index: int, sub: int, code: int) -> bytes:
     ("node", "index", "sub", "data", "code"),
     [
         (1, 0x5FFF, 0, None, NO_OBJECT),
-        (1, 0x5FFF, 0, b"\0", NO_OBJECT),
         (1, 0x0005, 0, None, NO_OBJECT),  # a dummy is no object
-        (3, 0x6040, 0, None, NO_OBJECT),
         (1, 0x1018, 5, None, NO_SUBINDEX),
-        (1, 0x6064, 1, None, NO_SUBINDEX),
         (1, 0x6040, 1, b"\0\0", NO_SUBINDEX),
         (1, 0x6041, 0, b"\0\0", READ_ONLY),
-        (1, 0x1008, 0, b"name", READ_ONLY),
         (3, 0x6125, 1, None, WRITE_ONLY),
         (1, 0x6040, 0, b"\0", WRONG_LENGTH),
-        (1, 0x6040, 0, b"\0\0\0\0", WRONG_LENGTH),
         (1, 0x1003, 0, b"\x01", VALUE),
         (1, 0x1006, 0, struct.pack("<I", 1050), VALUE),
         (1, 0x1014, 0, struct.pack("<I", 0x85), VALUE),

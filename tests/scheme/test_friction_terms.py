@@ -131,16 +131,6 @@ def test_a_dahl_friction_is_coulomb_friction_and_as_much_of_its_column(place, fa
     np.testing.assert_allclose(learnt, [F_c, F_c], rtol=0.035)
 
 
-@pytest.mark.parametrize("fastest_rad_s", [0.05, 0.3, 1.5])
-def test_bristles_of_a_length_between_the_two_are_a_mixture_of_them(fastest_rad_s):
-    columns_of, friction = seen_columns(fastest_rad_s, 1500), dahl_friction(0.002, fastest_rad_s, 1500)
-    learnt, *_ = np.linalg.lstsq(columns_of, friction)
-    np.testing.assert_allclose(learnt, [1.0, 0.55, 0.5], atol=0.07)
-    left, without = friction - columns_of @ learnt, friction - columns_of[:, 0]
-    assert np.abs(left).max() < 0.11
-    assert np.sqrt(np.mean(left**2)) < 0.09 * np.sqrt(np.mean(without**2))
-
-
 @pytest.mark.parametrize("dq", [0.3, -0.3])
 def test_bristles_bend_over_the_way_not_the_time_and_in_steady_sliding_the_column_is_nothing(dq):
     """After the way d from the opposite direction 2 / e of the reversal is left."""

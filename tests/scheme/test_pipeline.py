@@ -170,8 +170,6 @@ def test_an_output_is_not_changed_by_the_next_cycle(scheme):
         ({"q": np.array((0.0, -2.2))}, FaultReason.LIMIT),
         ({"dq": np.array((-4.5, 0.0))}, FaultReason.LIMIT),
         ({"dq": np.array((0.0, 5.5))}, FaultReason.LIMIT),
-        ({"is_enabled": False}, FaultReason.DRIVE),
-        ({"age_q": (4, 0)}, FaultReason.DATA_AGE),
         ({"fault": FaultReason.SENSOR}, FaultReason.SENSOR),
     ],
 )
