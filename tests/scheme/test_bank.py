@@ -1,54 +1,34 @@
 """The bank of filters against scipy and against one filter alone."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 import scipy.signal
+from excited_arm import NAMES, SETTINGS, kernel_of
 
-from adacd_hil.scheme.memory import Filters, Regressor
 from adacd_hil.scheme.model import filter_bank
-from adacd_hil.structured import packed, zeros_of
 
 T = 1e-3
-CUTOFF = np.array([10.0, 50.0, 200.0])
-COLUMNS = 5
-
-
-@dataclass
-class BankConstants:
-    cutoff: np.ndarray
-
-
-class BankMemory:
-    filters: Filters
-    regressor: Regressor
+CUTOFF = np.array(SETTINGS.certified.cutoffs_rad_s)
+COLUMNS = len(NAMES)
 
 
 class Bank:
-    """Filters at rest, for two joints and COLUMNS parameters."""
+    """The kernel's filters, at rest."""
 
     def __init__(self):
-        sizes = {"n": 2, "p": COLUMNS, "t": 1, "filters": CUTOFF.size, "channels": CUTOFF.size}
-        self.k, self.m = packed(BankConstants(CUTOFF))[0], zeros_of(BankMemory, sizes)[0]
-        filter_bank.discretise(CUTOFF, T, *self.m.filters.rates)
+        self.k, self.m = kernel_of()
+        filter_bank.choose_rates(self.k, self.m, T)
         self.tau_f, self.W_f = self.m.filters.tau_f, self.m.filters.W_f
 
     def take(self, Y_p, Y_h, tau_J, is_seen):
         self.m.regressor.Y_p, self.m.regressor.Y_h = Y_p, Y_h
         filter_bank.take_sample(self.k, self.m, tau_J, is_seen)
 
-    def resume(self, Y_p, Y_h, tau_J):
-        self.take(Y_p, Y_h, tau_J, False)
-
-    def advance(self, Y_p, Y_h, tau_J):
-        self.take(Y_p, Y_h, tau_J, True)
-
     def run(self, Y_p, Y_h, tau_J):
         """Go over samples (n, ...), the first of them after a gap; return tau_f (n, C, 2) and W_f (n, C, 2, p)."""
         history = []
         for k in range(len(tau_J)):
-            (self.advance if k else self.resume)(Y_p[k], Y_h[k], tau_J[k])
+            self.take(Y_p[k], Y_h[k], tau_J[k], is_seen=k > 0)
             history.append((self.tau_f.copy(), self.W_f.copy()))
         return tuple(np.array(values) for values in zip(*history, strict=True))
 
@@ -90,7 +70,7 @@ def test_the_lag_column_is_the_filtered_derivative_of_its_joint_s_torque():
     filtered, got = Bank(), []
     none = np.zeros((2, COLUMNS))
     for k, torque in enumerate(tau_J):
-        (filtered.advance if k else filtered.resume)(none, none, torque)
+        filtered.take(none, none, torque, is_seen=k > 0)
         W_f = np.zeros((3, 2, COLUMNS))
         filter_bank.fill_lag(CUTOFF, torque, filtered.tau_f, 3, W_f)
         got.append(W_f)
@@ -128,6 +108,6 @@ def test_a_gap_leaves_every_residual_where_it_was_whatever_the_parameters():
     filtered = Bank()
     filtered.run(Y_p, Y_h, tau_J)
     before = filtered.tau_f.copy(), filtered.W_f.copy()
-    filtered.resume(Y_p[0] + 7.0, Y_h[0] - 5.0, tau_J[0] + 3.0)
+    filtered.take(Y_p[0] + 7.0, Y_h[0] - 5.0, tau_J[0] + 3.0, is_seen=False)
     np.testing.assert_array_equal(filtered.tau_f, before[0])
     np.testing.assert_array_equal(filtered.W_f, before[1])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from contact_course import Course
-from smooth_motion import PLACES, run_kernel, settings_with
+from smooth_motion import PLACES, PaperKernel, run_kernel, settings_with
 
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.contact.contact_report import integrated_report
@@ -44,30 +44,24 @@ def test_the_strength_does_not_depend_on_the_filter(a, b):
     assert abs(np.max(blocks[:, PLACES["tau_ext_wide_hat"]]) / 3.0 - 1.0) < 0.04
 
 
-class Touch:
+class Touch(PaperKernel):
     """An arm at rest in MONITOR that is touched; steps the compiled kernel and the contact's course together."""
 
     def __init__(self, window_cycles=50):
-        settings = settings_with(detector={"isolation_window_s": window_cycles * T})
-        self.constants, self.memory, self.block, _ = paper_kernel.numbers_of(settings)
-        self.m, self.tau_ext_hat = self.memory[0], self.block[0].tau_ext_hat
-        self.a_rad_s = settings.filter.a_rad_s
-        self.course = Course(settings)
-        self.reports = []
+        self.settings = settings_with(detector={"isolation_window_s": window_cycles * T})
+        super().__init__(self.settings)
+        self.course, self.reports = Course(self.settings), []
 
     def run(self, tau_ext):
-        has_begun = False
+        has_begun, tau_ext_hat = False, self.out.tau_ext_hat
         for torque in tau_ext:
-            self.block[0].tau_J = -torque
             mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.course.m.is_open else 0)
-            joints = (
-                paper_kernel.step(self.constants, self.memory, self.block, 1, 1, mode) >> paper_kernel.CONTACT_SHIFT
-            )
+            joints = self.step(mode, tau_J=-torque) >> paper_kernel.CONTACT_SHIFT
             has_begun = has_begun or joints != 0
             state = SchemeState.REACT if has_begun else SchemeState.MONITOR
-            if self.course.step(joints, self.tau_ext_hat, state=state):
-                report = integrated_report(self.course.m, self.tau_ext_hat, self.m.integral, self.m.peak, self.a_rad_s)
-                self.reports.append(report)
+            if self.course.step(joints, tau_ext_hat, state=state):
+                found = self.course.m, tau_ext_hat, self.m.integral, self.m.peak
+                self.reports.append(integrated_report(*found, self.settings.filter.a_rad_s))
         return self.reports
 
 

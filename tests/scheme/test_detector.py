@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from smooth_motion import PLACES, run_kernel, settings_with
+from smooth_motion import PLACES, PaperKernel, run_kernel, settings_with
 
 from adacd_hil.scheme.detect.external_torque import follow_standstill, joints_over
 from adacd_hil.scheme.kernel import paper_kernel
@@ -81,15 +81,11 @@ def test_each_joint_is_compared_with_its_own_threshold():
 
 
 def test_thresholds_go_out_of_force_when_the_scheme_disarms():
-    memory, block, constants = (
-        paper_kernel.new_memory(7),
-        paper_kernel.new_block(7),
-        paper_kernel.constants_of(settings_with()),
-    )
-    paper_kernel.step(constants, memory, block, 1, 1, paper_kernel.ARMED)
-    assert block[0]["threshold"].tolist() == [0.15, 0.15]
-    paper_kernel.step(constants, memory, block, 1, 1, 0)
-    assert np.all(np.isposinf(block[0]["threshold"]))
+    kernel = PaperKernel(settings_with())
+    kernel.step(paper_kernel.ARMED)
+    assert kernel.out.threshold.tolist() == [0.15, 0.15]
+    kernel.step(0)
+    assert np.all(np.isposinf(kernel.out.threshold))
 
 
 def thresholds(dq, F_c, samples=1000):

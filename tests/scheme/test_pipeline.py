@@ -8,7 +8,7 @@ import pytest
 from excited_arm import SETTINGS as CERTIFIED
 from excited_arm import ExcitedLoop, arm_state
 from planar_arm import PAYLOAD_1KG, THETA
-from smooth_motion import PLACES, settings_with, smooth_motion, torque_of
+from smooth_motion import PLACES, PaperKernel, settings_with, smooth_motion, torque_of
 
 from adacd_hil.control.motions import corner_to_corner
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState, scheme_layout
@@ -224,35 +224,18 @@ def test_the_joints_over_their_threshold_are_named_until_the_push_is_over():
     assert arm.step(500)[-1].contact_joints == 0b00
 
 
-class Learning:
-    """The paper's kernel while it learns, sample by sample."""
-
-    def __init__(self, **sections):
-        self.settings = settings_with(**sections)
-        self.numbers = paper_kernel.numbers_of(self.settings)[:3]
-        self.out = self.numbers[2][0]
-        self.begin()
-
-    def begin(self):
-        paper_kernel.begin_adaptation(*self.numbers)
-
-    def step(self, **sample):
-        for name, value in sample.items():
-            self.out[name] = value
-        return paper_kernel.step(*self.numbers, 1, 1, paper_kernel.LEARN)
-
-
 def test_an_adaptation_begins_without_the_evidence_of_the_last():
-    kernel = Learning(termination={"beta_Nm": 50.0, "hold_s": 0.1, "excitation_Nm2s": 0.0})
+    settings = settings_with(termination={"beta_Nm": 50.0, "hold_s": 0.1, "excitation_Nm2s": 0.0})
+    kernel = PaperKernel(settings)
     q, dq, ddq = smooth_motion(np.arange(3000) * 1e-3)
     for row in zip(q, dq, torque_of(q, dq, ddq, THETA["M"]), strict=True):
-        moving = kernel.step(**dict(zip(("q", "dq", "tau_J"), row, strict=True)))
+        moving = kernel.step(paper_kernel.LEARN, **dict(zip(("q", "dq", "tau_J"), row, strict=True)))
     assert moving & transitions.ADAPTED
     assert kernel.out.excitation > 1e-5
     kernel.begin()
-    kernel.step(dq=0.0)
-    assert kernel.out.quiet_s == kernel.settings.bus.period_s
-    assert not any(kernel.step() & transitions.ADAPTED for _ in range(200))
+    kernel.step(paper_kernel.LEARN, dq=0.0)
+    assert kernel.out.quiet_s == settings.bus.period_s
+    assert not any(kernel.step(paper_kernel.LEARN) & transitions.ADAPTED for _ in range(200))
     assert kernel.out.excitation < 1e-12
 
 
@@ -260,13 +243,14 @@ def test_an_adaptation_begins_without_the_evidence_of_the_last():
 @pytest.mark.parametrize("missing", ["q", "dq"])
 def test_an_adaptation_needs_travel_and_speed_of_its_own(missing, sign):
     """What joint 2 did before this adaptation does not count in it."""
-    kernel = Learning(termination={"beta_Nm": 50.0, "hold_s": 0.1, "excitation_Nm2s": 0.0, "travel_deg": 20.0})
+    easy = {"beta_Nm": 50.0, "hold_s": 0.1, "excitation_Nm2s": 0.0, "travel_deg": 20.0}
+    kernel = PaperKernel(settings_with(termination=easy))
     moves = {"q": [(-0.5, -0.5), (0.5, 0.5)], "dq": [(-1.0, -1.0), (1.0, 1.0)]}
     seen = []
     for this_time in (moves, moves | {missing: [(0.4, sign * 0.3), (0.8, sign * 0.3)]}):
         kernel.begin()
         for k in range(200):
-            found = kernel.step(q=this_time["q"][k % 2], dq=this_time["dq"][k % 2])
+            found = kernel.step(paper_kernel.LEARN, q=this_time["q"][k % 2], dq=this_time["dq"][k % 2])
         seen.append(bool(found & transitions.ADAPTED))
     assert seen == [True, False]
 
@@ -284,11 +268,11 @@ def test_an_adaptation_forgets_what_the_filters_held():
 def test_gravity_is_learnt_where_the_axes_are_not_vertical():
     """2.7 Nm of gravity, all but a fiftieth of it known after 20 s."""
     P0 = [8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5, 50.0, 50.0]
-    kernel = Learning(estimator={"gravity": True, "P0": P0}, arm={"cad_theta": []})
+    kernel = PaperKernel(settings_with(estimator={"gravity": True, "P0": P0}, arm={"cad_theta": []}))
     q, dq, ddq = smooth_motion(np.arange(20_000) * 1e-3)
     tau_J = torque_of(q, dq, ddq, np.append(THETA["M"] * [1, 1, 1, 1, 1, 0, 0], [2.0, 0.7]))
     for k in range(len(q)):
-        kernel.step(q=q[k], dq=dq[k], tau_J=tau_J[k])
+        kernel.step(paper_kernel.LEARN, q=q[k], dq=dq[k], tau_J=tau_J[k])
     assert np.max(np.abs(kernel.out.tau_ext_hat)) < 0.05
     np.testing.assert_allclose(kernel.out.theta_hat[7:], [2.0, 0.7], rtol=0.02)
 
