@@ -1,6 +1,7 @@
 """A host for tests of the emulated devices: frames by hand, SDO by canopen, virtual time, no threads."""
 
 import struct
+from enum import IntEnum
 from functools import cache, cached_property
 from typing import Any
 
@@ -19,14 +20,31 @@ from firmware_sim.scenario.scenario import Scenario
 CODEC = load_codec()
 EDS = {1: "drive.eds", 2: "drive.eds", 3: "torque_sensor.eds", 4: "torque_sensor.eds"}
 PERIOD_NS = 1_000_000
-START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
-SHUTDOWN, SWITCH_ON, ENABLE = 0x06, 0x07, 0x0F
-DISABLE_VOLTAGE, QUICK_STOP, FAULT_RESET = 0x00, 0x02, 0x80
 INVALID = 1 << 31
 """Bit of a COB-ID."""
-DISABLED, READY, SWITCHED_ON, ENABLED = 0x40, 0x21, 0x23, 0x27
-STOPPING, REACTION, FAULT = 0x07, 0x0F, 0x08
-"""Bits 0 to 3, 5 and 6 of the statusword by state, from the standard's table; x in the table is 0 here."""
+
+
+class Nmt(IntEnum):
+    """Commands of NMT."""
+
+    START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
+
+
+class Word(IntEnum):
+    """Controlwords by command."""
+
+    SHUTDOWN, SWITCH_ON, ENABLE = 0x06, 0x07, 0x0F
+    DISABLE_VOLTAGE, QUICK_STOP, FAULT_RESET = 0x00, 0x02, 0x80
+
+
+class State(IntEnum):
+    """Bits 0 to 3, 5 and 6 of the statusword by state, from the standard's table; x in the table is 0 here."""
+
+    DISABLED, READY, SWITCHED_ON, ENABLED = 0x40, 0x21, 0x23, 0x27
+    STOPPING, REACTION, FAULT = 0x07, 0x0F, 0x08
+
+
+ENABLING = (Word.SHUTDOWN, Word.SWITCH_ON, Word.ENABLE)
 
 
 def quiet_scenario(**changes: Any) -> Scenario:
@@ -129,27 +147,29 @@ class BenchHost:
         for joint in joints:
             self.put(0x200 + joint, self.command_frame(joint, controlword, target))
 
-    def sync(self) -> None:
+    def sync(self, times: int = 1) -> None:
         """Send the next SYNC; time moves by one period."""
-        self.t_ns += PERIOD_NS
-        self.put(0x080, bytes([1 + self.cycle % 240]))
-        self.cycle += 1
+        for _ in range(times):
+            self.t_ns += PERIOD_NS
+            self.put(0x080, bytes([1 + self.cycle % 240]))
+            self.cycle += 1
 
-    def step(self, controlword: int, target: int = 0, joints: tuple[int, ...] = (1, 2)) -> None:
+    def step(self, controlword: int, target: int = 0, joints: tuple[int, ...] = (1, 2), times: int = 1) -> None:
         """Command, then SYNC, so that the command acts at this SYNC."""
-        self.command(controlword, target, joints)
-        self.sync()
+        for _ in range(times):
+            self.command(controlword, target, joints)
+            self.sync()
 
     def start(self, mode: int = 10) -> None:
         """Choose the mode and enter Operational."""
         for joint in (1, 2):
             self.write(joint, 0x6060, 0, mode)
-        self.nmt(START)
+        self.nmt(Nmt.START)
 
     def enable(self, mode: int = 10) -> None:
         """Bring both drives to Operation enabled."""
         self.start(mode)
-        for controlword in (SHUTDOWN, SWITCH_ON, ENABLE):
+        for controlword in ENABLING:
             self.step(controlword)
 
     def statusword(self, joint: int = 1) -> int:
@@ -163,7 +183,7 @@ class BenchHost:
         """A field of the latest truth block."""
         return self.truths[-1][2][TRUTH_LAYOUT.slices[name]]
 
-    def wait_until_at_rest(self, controlword: int | None = ENABLE) -> None:
+    def wait_until_at_rest(self, controlword: int | None = Word.ENABLE) -> None:
         """Send SYNCs, with commands or without, until no drive has braked for 20 of them."""
         count = last = 0
         while count - last < 20:
@@ -218,15 +238,13 @@ def in_state(bits: int) -> BenchHost:
         host.write(node, 0x1016, 1, 127 << 16 | 250)
         host.write(node, 0x1017, 0, 100)
     host.start()
-    words = {DISABLED: (), READY: (SHUTDOWN,), SWITCHED_ON: (SHUTDOWN, SWITCH_ON)}
-    for word in words.get(bits, (SHUTDOWN, SWITCH_ON, ENABLE)):
+    words = {State.DISABLED: (), State.READY: (Word.SHUTDOWN,), State.SWITCHED_ON: (Word.SHUTDOWN, Word.SWITCH_ON)}
+    for word in words.get(bits, ENABLING):
         host.step(word)
-    if bits in (STOPPING, REACTION):
-        for _ in range(30):
-            host.step(ENABLE, 300)
-    if bits == STOPPING:
-        host.step(QUICK_STOP)
-    for _ in range({REACTION: 3, FAULT: 20}.get(bits, 0)):
-        host.sync()
+    if bits in (State.STOPPING, State.REACTION):
+        host.step(Word.ENABLE, 300, times=30)
+    if bits == State.STOPPING:
+        host.step(Word.QUICK_STOP)
+    host.sync(times={State.REACTION: 3, State.FAULT: 20}.get(bits, 0))
     assert host.state_bits() == bits
     return host

@@ -7,11 +7,13 @@ import numpy as np
 import pinocchio
 
 from adacd_hil.compiled import compiled
+from adacd_hil.records import TRUTH_LAYOUT
 from firmware_sim.arm.arms import ARMS, EmulatedArm
 from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.joint_forces import gravity_torque
 from firmware_sim.arm.mechanics import integrate_mechanics, observe, work_space
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
+from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_forces import (
     THING,
     THING_STATE,
@@ -21,15 +23,38 @@ from firmware_sim.arm.touch_forces import (
     describe_touch,
 )
 from firmware_sim.arm.touch_settings import TICK_S, contact_table
-from firmware_sim.body.body import initial_touch_state, touch_table
+from firmware_sim.body.body import Body, initial_touch_state, touch_table
 from firmware_sim.scenario.scenario import Scenario
 
+TORQUE, OFF, BRAKE = ((mode, mode) for mode in (DriveMode.TORQUE, DriveMode.OFF, DriveMode.BRAKE))
+"""Modes of both drives."""
 NOBODY = contact_table(())
 RIGID = MechanicsSettings()
 NOTHING = np.zeros(0, THING)
 NO_PAYLOAD = (0.0, (0.0, 0.0), 0.0)
 LOCKED_NM = 1e6
+LENGTH_M = 0.35  # of link 1, in every profile
 SEEN = ("time_s", "q1", "q2", "dq1", "dq2", "force", "link", "index", "power", "energy", "tau1", "tau2")
+
+
+def truth_of(body: Body) -> dict[str, np.ndarray]:
+    """Return the fields of a body's truth, all of which it must fill."""
+    block = np.full(TRUTH_LAYOUT.size, np.nan)
+    body.truth(block)
+    assert np.isfinite(block).all()
+    return {name: block[place] for name, place in TRUTH_LAYOUT.slices.items()}
+
+
+def point_of(link: int, point_m: float, q) -> np.ndarray:
+    """Return where a point of a link is, world x and y."""
+    along = [np.array([np.cos(angle), np.sin(angle)]) for angle in (q[0], q[0] + q[1])]
+    return point_m * along[0] if link == 1 else LENGTH_M * along[0] + point_m * along[1]
+
+
+def normal_of(link: int, q) -> np.ndarray:
+    """Return the normal of a link on the side of +q."""
+    angle = q[0] if link == 1 else q[0] + q[1]
+    return np.array([-math.sin(angle), math.cos(angle)])
 
 
 @compiled
@@ -211,12 +236,6 @@ class TouchedArm(GeneralArm):
         """History of one value of one thing's state."""
         return self.states[:, TOUCH_HEADER:].copy().view(THING_STATE)[name][:, thing]
 
-    def kinetic_J(self, seen: dict[str, np.ndarray]) -> np.ndarray:
-        """Kinetic energy of the arm over time."""
-        m11, m12, m22 = np.array([mass_matrix(self.state, q2) for q2 in seen["q2"]]).T
-        dq1, dq2 = seen["dq1"], seen["dq2"]
-        return 0.5 * m11 * dq1**2 + m12 * dq1 * dq2 + 0.5 * m22 * dq2**2
-
     def mobility(self, link: int, point_m: float, q, normal) -> float:
         """Inverse of the arm's effective mass at a point of a link along a direction, 1/kg."""
         m11, m12, m22 = mass_matrix(self.state, q[1])
@@ -231,11 +250,4 @@ class TouchedArm(GeneralArm):
             return point_m * np.array([[-s1, 0.0], [c1, 0.0]])
         return np.array(
             [[-length1_m * s1 - point_m * s12, -point_m * s12], [length1_m * c1 + point_m * c12, point_m * c12]]
-        )
-
-    def tip(self, q1, q2) -> np.ndarray:
-        """Where the tip is, world x and y."""
-        length1_m, length2_m = self.arm.link_length_m
-        return np.array(
-            [length1_m * np.cos(q1) + length2_m * np.cos(q1 + q2), length1_m * np.sin(q1) + length2_m * np.sin(q1 + q2)]
         )

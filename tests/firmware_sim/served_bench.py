@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 
-from bench_host import CODEC, START, BenchHost, quiet_scenario
+from bench_host import CODEC, BenchHost, Nmt, quiet_scenario
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.wire.bus import Bus, Frame
@@ -13,7 +13,7 @@ from firmware_sim.bench.injector import Departure
 from firmware_sim.cli.service import Service, StopRequest
 
 MS = 1_000_000
-START_ALL = (0x000, bytes([START, 0]))
+START_ALL = (0x000, bytes([Nmt.START, 0]))
 HOST_BEAT = (0x77F, b"\x05")
 Script = list[tuple[int, int, bytes]]
 """Time in ms, identifier, data."""
@@ -60,8 +60,9 @@ def serve(
     stall_at_ms: int = -1,
     on_truth: OnTruth | None = None,
     send_all: Callable[[list[tuple[int, bytes]]], None] | None = None,
+    waiting: Script = (),
 ) -> tuple[ScriptedBus, Bench, VirtualClock]:
-    """Play a script to a bench and let the service run until `end_ms`."""
+    """Play a script to a bench and let the service run until `end_ms`. `waiting`: what was sent before power-on."""
     clock, stop = VirtualClock(), StopRequest()
     bus = ScriptedBus(clock, stop, end_ms * MS)
     if send_all is not None:
@@ -71,6 +72,7 @@ def serve(
         quiet_scenario(), CODEC, departure.send, clock_mode=clock_mode, on_answer=departure.go, on_truth=on_truth
     )
     service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
+    bus.script.extend((t_ms * MS, can_id, data) for t_ms, can_id, data in waiting)
     service.boot()
     bus.stall_at_ns = stall_at_ms * MS
     bus.script.extend((t_ms * MS, can_id, data) for t_ms, can_id, data in script)

@@ -4,7 +4,7 @@ import struct
 from typing import Any
 
 import pytest
-from bench_host import DISABLE_VOLTAGE, ENABLE, ENABLED, SHUTDOWN, SWITCH_ON, SWITCHED_ON, BenchHost, quiet_scenario
+from bench_host import BenchHost, State, Word, quiet_scenario
 
 TORQUE_MODE = 10
 IN_BETWEEN = -1
@@ -21,20 +21,14 @@ def shown_mode(host: BenchHost) -> int:
     return host.read(1, 0x6061)
 
 
-def test_a_drive_without_habits_shows_its_mode_at_once() -> None:
-    host = host_of()
-    host.start()
-    assert shown_mode(host) == TORQUE_MODE
-
-
 def test_a_mode_may_be_shown_only_once_the_drive_is_enabled() -> None:
     host = host_of(shows_mode="enabled")
     host.start()
-    host.step(SHUTDOWN)
-    host.step(SWITCH_ON)
+    host.step(Word.SHUTDOWN)
+    host.step(Word.SWITCH_ON)
     before = shown_mode(host)
-    host.step(ENABLE)
-    host.step(ENABLE)
+    host.step(Word.ENABLE)
+    host.step(Word.ENABLE)
     assert (before, shown_mode(host)) == (0, TORQUE_MODE)
 
 
@@ -44,7 +38,7 @@ def test_a_mode_may_be_shown_long_after_it_was_asked_for(shows_change: bool, mea
     host.enable()
     shown = []
     for _ in range(60):
-        host.step(ENABLE)
+        host.step(Word.ENABLE)
         shown.append(shown_mode(host))
     assert shown[:40] == [meanwhile] * 40
     assert shown[-1] == TORQUE_MODE
@@ -55,22 +49,20 @@ def test_a_drive_may_take_its_time_to_be_enabled() -> None:
     host.enable()
     states = []
     for _ in range(30):
-        host.step(ENABLE)
+        host.step(Word.ENABLE)
         states.append(host.state_bits())
-    assert states[:15] == [SWITCHED_ON] * 15
-    assert states[-1] == ENABLED
+    assert states[:15] == [State.SWITCHED_ON] * 15
+    assert states[-1] == State.ENABLED
 
 
 def test_enabling_that_is_given_up_begins_anew() -> None:
     host = host_of(enable_s=0.02)
     host.enable()
-    for _ in range(15):
-        host.step(ENABLE)
-    for controlword in (DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON):
+    host.step(Word.ENABLE, times=15)
+    for controlword in (Word.DISABLE_VOLTAGE, Word.SHUTDOWN, Word.SWITCH_ON):
         host.step(controlword)
-    for _ in range(10):
-        host.step(ENABLE)
-    assert host.state_bits() == SWITCHED_ON
+    host.step(Word.ENABLE, times=10)
+    assert host.state_bits() == State.SWITCHED_ON
 
 
 @pytest.mark.parametrize(("after_ms", "answers"), [(14, 0), (16, 1)])
@@ -96,7 +88,7 @@ def test_scenario_time_begins_when_both_drives_show_their_mode() -> None:
     host.enable()
     started, modes = [], []
     for _ in range(60):
-        host.step(ENABLE)
+        host.step(Word.ENABLE)
         started.append(host.bench.is_scenario_started)
         modes.append(shown_mode(host))
     assert modes.index(TORQUE_MODE) > 30

@@ -41,12 +41,9 @@ def expected_command(word: int, previous: int) -> DriveEvent | None:
 
 @pytest.mark.parametrize("state", DriveState)
 def test_every_state_is_coded_as_the_standard_codes_it(state: DriveState) -> None:
+    """Before initialisation nothing is claimed."""
     assert fits(STATE_BITS[state], CODING[state])
-
-
-@pytest.mark.parametrize("state", [S.START, S.NOT_READY_TO_SWITCH_ON])
-def test_before_initialisation_nothing_is_claimed(state: DriveState) -> None:
-    assert STATE_BITS[state] == 0
+    assert STATE_BITS[state] == 0 or state not in (S.START, S.NOT_READY_TO_SWITCH_ON)
 
 
 @pytest.mark.parametrize("previous", [0x0000, 0xFFFF])

@@ -4,18 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from general_arm import BRAKE, OFF, TORQUE, truth_of
 
-from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.hardware_settings import SensorSettings
-from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.body.body import Body
 from firmware_sim.body.sensors import NOISE_TICKS, encoder_numbers, read_angle
 from firmware_sim.scenario.scenario import Scenario
-
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
-OFF = (DriveMode.OFF, DriveMode.OFF)
-BRAKE = (DriveMode.BRAKE, DriveMode.BRAKE)
 
 
 def errors_over_a_turn(joint: int, count: int = 4096, **settings) -> np.ndarray:
@@ -90,9 +85,7 @@ def test_encoder_noise_shakes_the_velocity_of_a_resting_arm_and_not_the_arm():
     deviations = np.array(velocities).std(axis=0)
     assert deviations[0] > 5e-3
     assert deviations[1] == 0.0
-    truth = np.zeros(TRUTH_LAYOUT.size)
-    body.truth(truth)
-    assert not truth[TRUTH_LAYOUT.slices["dq"]].any()
+    assert not truth_of(body)["dq"].any()
 
 
 @pytest.mark.parametrize("ticks", [1, NOISE_TICKS - 1, NOISE_TICKS + 1, 257])
@@ -103,10 +96,9 @@ def test_encoder_noise_does_not_depend_on_how_the_ticks_are_asked_for(ticks):
         body = arm(encoder_noise_counts=[20.0, 20.0])
         for first in range(0, 1_500, step):
             body.advance((0.0, 0.0), BRAKE, min(step, 1_500 - first))
-        blocks.append(np.zeros(TRUTH_LAYOUT.size))
-        body.truth(blocks[-1])
-    assert blocks[0][TRUTH_LAYOUT.slices["q"]].all()
-    assert blocks[0].tobytes() == blocks[1].tobytes()
+        blocks.append(truth_of(body))
+    assert blocks[0]["q"].all()
+    assert list(map(bytes, blocks[0].values())) == list(map(bytes, blocks[1].values()))
 
 
 def test_the_velocity_follows_from_the_eccentric_angle():
@@ -117,9 +109,7 @@ def test_the_velocity_follows_from_the_eccentric_angle():
         for body in bodies:
             body.advance((2.0, 0.0), TORQUE)
     perfect, eccentric = (body.drive_velocity_rad_s[0] for body in bodies)
-    truth = np.zeros(TRUTH_LAYOUT.size)
-    bodies[0].truth(truth)
-    q = truth[TRUTH_LAYOUT.slices["q"]][0]
+    q = truth_of(bodies[0])["q"][0]
     assert perfect > 1.0
     # the tracking loop shows the state of 1.6 ms ago, in which the arm turns by a few milliradians
     assert eccentric / perfect - 1.0 == pytest.approx(0.02 * math.cos(q + 0.5), abs=1e-4)

@@ -4,7 +4,7 @@ import statistics
 
 import pytest
 from bench_host import CODEC
-from test_faults import EXAMPLES, UNTIMED, example
+from test_faults import UNTIMED, example
 
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import load_codec
@@ -73,15 +73,6 @@ def test_a_wrong_id_is_there_from_power_on_and_disturbs_nothing_else(kind):
     assert (plan.mask, plan.is_quiet, plan.wait_ns) == (1, True, NEVER_NS)
 
 
-def test_a_row_with_a_count_ends_when_it_has_acted_so_often():
-    plan = active(frame_row("lose", count=3))
-    left = [len(plan.transmit(SENSOR1, 0x183, TORQUE)) for _ in range(6)]
-    assert left == [0, 0, 0, 1, 1, 1]
-    assert not plan.is_quiet
-    assert [edge.begins for edge in plan.advance(PERIOD_NS)] == [False]
-    assert plan.is_quiet
-
-
 def test_it_says_how_long_nothing_will_change():
     plan = plan_of(
         example("silence", at_s=1.0, duration_s=0.25), example("emcy_storm", at_s=2.0, rate_Hz=4.0, duration_s=1.0)
@@ -91,13 +82,6 @@ def test_it_says_how_long_nothing_will_change():
         plan.advance(ms * MS)
         waits[ms] = plan.wait_ns // MS
     assert waits == {0: 1000, 400: 600, 1000: 250, 1250: 750, 2000: 250, 2250: 250, 3000: NEVER_NS // MS}
-
-
-def test_a_plan_is_quiet_before_its_rows_and_without_any():
-    plan = plan_of(*(example(kind) for kind in EXAMPLES if kind not in UNTIMED))
-    plan.advance(-1)
-    assert plan.is_quiet
-    assert plan_of().is_quiet
 
 
 # Frames
@@ -154,21 +138,50 @@ def test_any_frame_of_a_node_is_lost_whatever_else_is_said_of_one_of_them():
     assert plan.receive(DRIVE1, 0x201, TORQUE) == [(0, TORQUE)]
 
 
-def test_a_duplicated_frame_comes_twice_and_a_delayed_one_says_how_late_it_is():
-    assert active(frame_row("duplicate")).transmit(SENSOR1, 0x183, TORQUE) == [(0, 0x183, TORQUE)] * 2
+LATE, MASK = frame_row("delay", delay_us=1.0), frame_row("corrupt", mask="ff")
+
+
+@pytest.mark.parametrize(
+    ("rows", "handed_over"),
+    [
+        ([frame_row("duplicate")], ["11", "22", "33"]),
+        ([frame_row("reorder", count=1)], ["", "21", "3"]),
+        ([frame_row("reorder")], ["", "21", ""]),
+        ([frame_row("lose", count=2)], ["", "", "3"]),
+        ([frame_row("lose"), MASK], ["", "", ""]),
+        ([frame_row("duplicate"), MASK], ["\xce\xce", "\xcd\xcd", "\xcc\xcc"]),
+        ([LATE, LATE, MASK], ["\xce", "\xcd", "\xcc"]),
+    ],
+    ids=["twice", "after the next", "each second one", "so often", "lost", "in their order", "late twice"],
+)
+def test_rows_about_one_frame_act_in_their_order_and_so_often_as_they_say(rows, handed_over):
+    plan = active(*rows)
+    found = [plan.transmit(SENSOR1, 0x183, sent) for sent in (b"1", b"2", b"3")]
+    assert [b"".join(data for _, _, data in frames).decode("latin-1") for frames in found] == handed_over
+    assert {late_ns for frames in found for late_ns, _, _ in frames} <= {1000.0 * rows.count(LATE)}
+    plan.advance(PERIOD_NS)
+    assert plan.is_quiet == any("count" in row for row in rows)
+
+
+def test_frames_of_two_nodes_do_not_swap_with_each_other():
+    plan = active({"kind": "reorder", "node": "all", "frame": "torque"})
+    sent = [(SENSOR1, 0x183, b"a"), (SENSOR2, 0x184, b"b"), (SENSOR2, 0x184, b"c"), (SENSOR1, 0x183, b"d")]
+    found = [[(can_id, data) for _, can_id, data in plan.transmit(*frame)] for frame in sent]
+    assert found == [[], [], [(0x184, b"c"), (0x184, b"b")], [(0x183, b"d"), (0x183, b"a")]]
+
+
+def test_chance_strikes_each_frame_that_is_handed_over():
+    flip = frame_row("corrupt", bits=1)
+    assert len(set(active(frame_row("duplicate"), flip).transmit(SENSOR1, 0x183, bytes(64)))) == 2
+    assert len(set(active(flip, frame_row("duplicate")).transmit(SENSOR1, 0x183, bytes(64)))) == 1
+
+
+def test_a_delayed_frame_says_how_late_it_is():
     plan = active(frame_row("delay", delay_us=100.0, jitter_us=400.0))
     late_us = [plan.transmit(SENSOR1, 0x183, TORQUE)[0][0] / 1e3 for _ in range(2000)]
     assert (min(late_us) >= 100.0, max(late_us) <= 500.0) == (True, True)
     assert statistics.fmean(late_us) == pytest.approx(300.0, abs=10.0)
     assert statistics.stdev(late_us) == pytest.approx(400.0 / 12**0.5, abs=5.0)
-
-
-def test_a_reordered_frame_comes_after_the_next():
-    plan = active(frame_row("reorder", count=1))
-    first, second, third = (bytes([n] * 6) for n in (1, 2, 3))
-    assert plan.transmit(SENSOR1, 0x183, first) == []
-    assert plan.transmit(SENSOR1, 0x183, second) == [(0, 0x183, second), (0, 0x183, first)]
-    assert plan.transmit(SENSOR1, 0x183, third) == [(0, 0x183, third)]
 
 
 def test_a_frame_that_is_held_back_at_the_end_of_its_row_still_comes():
@@ -180,14 +193,6 @@ def test_a_frame_that_is_held_back_at_the_end_of_its_row_still_comes():
     assert plan.transmit(SENSOR1, 0x183, second) == [(0, 0x183, second), (0, 0x183, first)]
     assert plan.is_quiet
     assert plan.transmit(SENSOR1, 0x183, first) == [(0, 0x183, first)]
-
-
-def test_frames_of_two_nodes_do_not_swap_with_each_other():
-    plan = active({"kind": "reorder", "node": "all", "frame": "torque"})
-    assert plan.transmit(SENSOR1, 0x183, b"a") == []
-    assert plan.transmit(SENSOR2, 0x184, b"b") == []
-    assert plan.transmit(SENSOR2, 0x184, b"c") == [(0, 0x184, b"c"), (0, 0x184, b"b")]
-    assert plan.transmit(SENSOR1, 0x183, b"d") == [(0, 0x183, b"d"), (0, 0x183, b"a")]
 
 
 def flipped(before: bytes, after: bytes) -> list[int]:
@@ -216,62 +221,39 @@ def test_a_mask_says_which_bits_flip(mask, data):
 @pytest.mark.parametrize(
     ("contract", "name", "frame", "node"),
     [
-        ("arm", "Sensor1Torque", "torque", "sensor1"),
-        ("arm", "Drive2Command", "command", "drive2"),
-        ("arm_fd", "Drive1Feedback", "feedback", "drive1"),
-        ("arm_fd", "Sensor2Torque", "torque", "sensor2"),
+        ("arm", "Sensor1Torque", "torque", SENSOR1),
+        ("arm", "Drive2Command", "command", DRIVE2),
+        ("arm_fd", "Drive1Feedback", "feedback", DRIVE1),
     ],
 )
 def test_a_frozen_counter_stands_still_under_a_right_crc(contract, name, frame, node):
-    codec = CODEC if contract == "arm" else load_codec(CONTRACTS[contract].path)
-    message = codec.message(name)
-    plan = plan_of({"kind": "freeze_counter", "node": node, "frame": frame, "at_s": 0.0}, contract=contract)
+    message = load_codec(CONTRACTS[contract].path).message(name)
+    node_name = ("drive1", "drive2", "sensor1", "sensor2")[node]
+    plan = plan_of({"kind": "freeze_counter", "node": node_name, "frame": frame, "at_s": 0.0}, contract=contract)
     sender, receiver = message.sender(), message.receiver()
     statuses = []
     for k in range(6):
         if k == 2:
             plan.advance(0)
         data = sender.protect(bytearray([0] * (message.length - 1) + [k]))
-        place = ["drive1", "drive2", "sensor1", "sensor2"].index(node)
-        if frame == "command":
-            ((_, data),) = plan.receive(place, message.can_id, data)
-        else:
-            ((_, _, data),) = plan.transmit(place, message.can_id, data)
+        way = plan.receive if frame == "command" else plan.transmit
+        ((*_, data),) = way(node, message.can_id, data)
         assert data[-1] == k
         statuses.append(receiver.check(data))
     assert statuses == [E2eStatus.OK] * 3 + [E2eStatus.REPEATED] * 3
 
 
 @pytest.mark.parametrize(
-    ("row", "contract", "message"),
+    ("kind", "frame", "contract", "message"),
     [
-        (
-            {"kind": "freeze_counter", "node": "drive1", "frame": "feedback"},
-            "arm",
-            "Drive1Feedback has no counter to freeze in arm.dbc",
-        ),
-        (
-            {"kind": "lose", "node": "drive1", "frame": "status"},
-            "arm_fd",
-            "frame 'status' is not in arm_fd.dbc: ",
-        ),
+        ("freeze_counter", "feedback", "arm", "Drive1Feedback has no counter to freeze in arm.dbc"),
+        ("lose", "status", "arm_fd", "frame 'status' is not in arm_fd.dbc: "),
     ],
 )
-def test_a_frame_that_the_contract_has_not_is_refused(row, contract, message):
+def test_a_frame_that_the_contract_has_not_is_refused(kind, frame, contract, message):
     with pytest.raises(ConfigError) as refusal:
-        plan_of(row | {"at_s": 0.0}, contract=contract)
+        plan_of({"kind": kind, "node": "drive1", "frame": frame, "at_s": 0.0}, contract=contract)
     assert str(refusal.value).startswith(f"faults[0]: {message}")
-
-
-def test_rows_about_one_frame_act_in_their_order():
-    mask = frame_row("corrupt", mask="ff")
-    assert active(frame_row("duplicate"), mask).transmit(SENSOR1, 0x183, b"\0") == [(0, 0x183, b"\xff")] * 2
-    flip = frame_row("corrupt", bits=1)
-    assert len(set(active(frame_row("duplicate"), flip).transmit(SENSOR1, 0x183, bytes(64)))) == 2
-    assert len(set(active(flip, frame_row("duplicate")).transmit(SENSOR1, 0x183, bytes(64)))) == 1
-    late = frame_row("delay", delay_us=1.0)
-    assert active(late, late, mask).transmit(SENSOR1, 0x183, b"\0") == [(2000, 0x183, b"\xff")]
-    assert active(frame_row("lose"), mask).transmit(SENSOR1, 0x183, b"\0") == []
 
 
 # Chance

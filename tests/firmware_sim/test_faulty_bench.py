@@ -1,7 +1,7 @@
 """What a bench sends while a scenario's faults act: SYNCs that nobody hears, and floods."""
 
 import pytest
-from bench_host import ENABLE, PERIOD_NS, BenchHost, quiet_scenario
+from bench_host import PERIOD_NS, BenchHost, Word, quiet_scenario
 
 from adacd_hil.wire.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
 
@@ -14,21 +14,21 @@ def enabled_host(fault: dict[str, object]) -> BenchHost:
     host.put(HOST_MARK, pack_mark(MarkKind.ADVANCE, 0))
     host.enable()
     while not host.bench.is_scenario_started:
-        host.step(ENABLE)
+        host.step(Word.ENABLE)
     host.take()
     return host
 
 
 def answer(host: BenchHost) -> list[int]:
     """Return the identifiers of what a SYNC brings, in their order."""
-    host.step(ENABLE)
+    host.step(Word.ENABLE)
     return [can_id for can_id, _ in host.take()]
 
 
 def test_a_host_in_lockstep_hears_that_a_lost_sync_brings_nothing() -> None:
     host = enabled_host({"kind": "lose", "frame": "sync", "at_s": 0.002, "count": 1})
     answer(host)
-    host.step(ENABLE)
+    host.step(Word.ENABLE)
     marks = [unpack_mark(data) for _, data in host.take()]
     assert marks == [(MarkKind.RELEASE, 0), (MarkKind.END, 0)]
 
@@ -37,8 +37,7 @@ def test_lost_syncs_last_as_long_as_others_and_are_in_the_truth() -> None:
     host = enabled_host({"kind": "lose", "frame": "sync", "at_s": 0.002, "duration_s": 0.3})
     host.truths.clear()
     start_ns, start = host.bench.now_ns, host.bench.cycle
-    for _ in range(310):
-        host.step(ENABLE)
+    host.step(Word.ENABLE, times=310)
     masks = [block[-1] for _, _, block in host.truths]
     assert host.bench.now_ns - start_ns == 310 * PERIOD_NS
     assert [cycle for cycle, _, _ in host.truths] == list(range(start + 1, start + 311))
@@ -52,8 +51,7 @@ def test_by_the_clock_a_drive_that_hears_no_sync_has_nothing_to_count() -> None:
     for node in (1, 2):
         host.nodes[node].sdo[0x2201].raw = 255  # 25 periods: nothing else stops it within the test
     host.enable()
-    for _ in range(20):
-        host.step(ENABLE)
+    host.step(Word.ENABLE, times=20)
     assert [drive.error_code for drive in host.bench.drives] == [0, 0]
 
 
@@ -68,7 +66,7 @@ def test_held_back_frames_go_out_although_a_sync_is_lost() -> None:
     )
     host.enable()
     while not host.bench.is_scenario_started:
-        host.step(ENABLE)
+        host.step(Word.ENABLE)
     host.take()
     answer(host)
     assert answer(host) == [0x183]
@@ -89,7 +87,7 @@ def test_a_node_babbles_on_between_syncs(clock_mode: str) -> None:
     host = BenchHost(quiet_scenario(faults=[{**flood, "at_s": 0.005, "duration_s": 0.01}]), clock_mode)
     host.enable()
     for _ in range(40):
-        host.step(ENABLE)
+        host.step(Word.ENABLE)
         if clock_mode == "wall":
             host.bench.advance_to(host.t_ns + PERIOD_NS - 1)
     frames = [can_id for can_id, _ in host.take() if can_id != DEVICE_MARK]

@@ -15,16 +15,10 @@ CLASSIC(0, b""), FD(0, bytes(12))  # compiled before hypothesis looks at the tim
 BYTES = st.lists(st.sampled_from([0x00, 0xFF, 0x0F, 0xF0, 0x1F, 0xC1, 0x83, 0x55]) | st.integers(0, 255))
 
 
-@settings(max_examples=50)
-@given(st.integers(0, 0x7FF), BYTES.filter(lambda content: len(content) <= 8))
+@settings(max_examples=70)
+@given(st.integers(0, 0x7FF) | st.integers(0x800, 0x1FFFFFFF), BYTES.filter(lambda content: len(content) <= 8))
 def test_a_classic_frame_takes_its_exact_bits(can_id: int, content: list[int]) -> None:
-    data = bytes(content)
-    assert CLASSIC(can_id, data) == exact_frame(can_id, data).duration_ns(RATE)
-
-
-@settings(max_examples=20)
-@given(st.integers(0x800, 0x1FFFFFFF), BYTES.filter(lambda content: len(content) <= 8))
-def test_an_identifier_beyond_11_bits_makes_the_frame_longer(can_id: int, content: list[int]) -> None:
+    """An identifier beyond 11 bits makes it longer."""
     data = bytes(content)
     assert CLASSIC(can_id, data) == exact_frame(can_id, data).duration_ns(RATE)
 

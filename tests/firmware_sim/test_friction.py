@@ -65,17 +65,6 @@ def test_a_bristled_joint_is_a_spring_before_it_slides():
     assert abs(pressed.q[0]) < 0.1 * 0.05 / 2000.0
 
 
-def test_small_swings_of_a_bristled_joint_have_the_frequency_of_its_bristles():
-    arm, inertia = one_joint(COULOMB_NM)
-    settings = MechanicsSettings(sigma0_Nm_rad=(2000.0, 0.0), sigma2_Nm_s=(0.0, 0.0))
-    swinging = GeneralArm(arm, settings, dq=(1e-5, 0.0))
-    velocity = swinging.run(20_000)["dq"][:, 0]
-    upward = np.flatnonzero((velocity[:-1] < 0.0) & (velocity[1:] >= 0.0))
-    crossing = upward - velocity[upward] / (velocity[upward + 1] - velocity[upward])
-    period_s = np.diff(crossing).mean() * TICK_S
-    assert period_s == pytest.approx(2.0 * math.pi * math.sqrt(inertia / 2000.0), rel=1e-4)
-
-
 @pytest.mark.parametrize("start_rad", [0.0, 4e-4, -3e-4])
 @pytest.mark.parametrize("velocity_rad_s", [1e-3, 0.5, -5.0])
 def test_a_bristle_follows_a_steady_speed_as_its_equation_says_with_any_step(start_rad, velocity_rad_s):
@@ -96,38 +85,6 @@ def test_a_stiff_bristle_at_high_speed_stays_stable():
     assert np.all(np.diff(history["dq"][:, 0]) < 0.0)
     assert fast.observe()["friction"][0] == pytest.approx(COULOMB_NM, rel=1e-6)
     assert np.abs(history["bristle_rad"][:, 0]).max() == pytest.approx(COULOMB_NM / 20_000.0, rel=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("is_bristled", [False, True])
-def test_a_joint_drawn_slowly_through_a_spring_sticks_and_slips(is_bristled):
-    """A motor that creeps on draws the link by a soft spring: the spring tightens to F_s, then the link slips.
-
-    A limit cycle: each slip takes the spring below F_c by about as much as it was above, and all cycles last alike.
-    """
-    arm, _ = one_joint(COULOMB_NM)
-    bristles = {"sigma0_Nm_rad": (2e4, 0.0), "sigma1_Nm_s": (60.0, 0.0), "sigma2_Nm_s": (0.0, 0.0)}
-    settings = MechanicsSettings(
-        static_Nm=(STATIC_NM, 0.0),
-        stribeck_velocity_rad_s=(0.005, 0.1),
-        **(bristles if is_bristled else {}),
-        stiffness_Nm_rad=(50.0, 0.0),
-        rotor_inertia_kg_m2=(1e7, 0.0),
-    )
-    drawn = GeneralArm(arm, settings)
-    drawn.state["dq_m"][0] = 0.02
-    history = drawn.run(80_000)
-    velocity, spring_Nm = history["dq"][:, 0], 50.0 * (history["q_m"][:, 0] - history["q"][:, 0])
-    if not is_bristled:
-        assert int(np.argmax(velocity != 0.0)) == pytest.approx(STATIC_NM / 50.0 / 0.02 / TICK_S, abs=2)
-    is_slipping = velocity > 0.02
-    slips = np.flatnonzero(~is_slipping[:-1] & is_slipping[1:])
-    cycles_s = np.diff(slips) * TICK_S
-    assert cycles_s.size >= 3
-    assert np.ptp(cycles_s) < 0.01 * cycles_s.mean()
-    assert (np.abs(velocity) < 1e-3).mean() > 0.3
-    assert spring_Nm.max() == pytest.approx(STATIC_NM, rel=0.1)
-    assert spring_Nm[slips[1] :].min() == pytest.approx(2.0 * COULOMB_NM - spring_Nm.max(), abs=0.05)
 
 
 @pytest.mark.parametrize("speed_rad_s", [0.7, -0.7])

@@ -3,27 +3,7 @@
 import struct
 
 import pytest
-from bench_host import (
-    DISABLE_VOLTAGE,
-    DISABLED,
-    ENABLE,
-    ENABLED,
-    FAULT,
-    FAULT_RESET,
-    INVALID,
-    PRE_OPERATIONAL,
-    QUICK_STOP,
-    READY,
-    RESET_COMMUNICATION,
-    SHUTDOWN,
-    START,
-    STOPPING,
-    SWITCH_ON,
-    SWITCHED_ON,
-    BenchHost,
-    in_state,
-    remap,
-)
+from bench_host import ENABLING, INVALID, BenchHost, Nmt, State, Word, in_state, remap
 from test_object_dictionary import default_of, eds_rows
 
 DEVICE_STATE = 0x08000022
@@ -53,32 +33,32 @@ def refusals(host: BenchHost, node: int) -> dict[tuple[int, int], int]:
     return codes
 
 
-@pytest.mark.parametrize("bits", [ENABLED, STOPPING])
+@pytest.mark.parametrize("bits", [State.ENABLED, State.STOPPING])
 def test_a_powered_drive_refuses_everything_but_to_forget_its_errors(bits):
     codes = refusals(in_state(bits), 1)
     assert len(codes) > 60
     assert {key for key, code in codes.items() if code != DEVICE_STATE} == {CLEAR_HISTORY}
 
 
-@pytest.mark.parametrize("bits", [SWITCHED_ON, FAULT])
+@pytest.mark.parametrize("bits", [State.SWITCHED_ON, State.FAULT])
 def test_a_drive_without_power_refuses_nothing_for_being_at_work(bits):
     assert set(refusals(in_state(bits), 1).values()) == {0}
 
 
 def test_what_was_refused_stays_as_it_was():
-    host = in_state(ENABLED)
+    host = in_state(State.ENABLED)
     for index, sub, value in ((0x1006, 0, 2000), (0x1016, 1, 0), (0x1400, 5, 10_000), (0x2200, 0, 255), (0x605A, 0, 0),
                               (0x6060, 0, 0), (0x6071, 0, 500), (0x6072, 0, 2000)):  # fmt: skip
         before = host.read(1, index, sub)
         assert before != value
         assert host.abort_code(lambda at=(index, sub, value): host.write(1, *at)) == DEVICE_STATE
-        host.step(ENABLE)
+        host.step(Word.ENABLE)
         assert host.read(1, index, sub) == before
-        assert (host.state_bits(), host.bench.drives[0].torque_Nm) == (ENABLED, 0.0)
+        assert (host.state_bits(), host.bench.drives[0].torque_Nm) == (State.ENABLED, 0.0)
 
 
 def test_a_download_in_segments_is_refused_as_well():
-    host = in_state(ENABLED)
+    host = in_state(State.ENABLED)
     host.take()
     host.put(0x601, struct.pack("<BHBI", 0x21, 0x6072, 0, 2))
     host.put(0x601, bytes([0x0B, 0xD0, 0x07, 0, 0, 0, 0, 0]))
@@ -91,13 +71,13 @@ def test_a_limit_that_an_rpdo_brings_is_obeyed_in_operation():
     remap(host, 1, 0x1401, (0x60720010,), can_id=0x301, kind=255)
     host.enable()
     host.put(0x301, struct.pack("<H", 200))
-    host.step(ENABLE, 500)
+    host.step(Word.ENABLE, 500)
     assert host.bench.drives[0].torque_Nm == pytest.approx(2.4)
 
 
-@pytest.mark.parametrize("command", [PRE_OPERATIONAL, RESET_COMMUNICATION])
+@pytest.mark.parametrize("command", [Nmt.PRE_OPERATIONAL, Nmt.RESET_COMMUNICATION])
 def test_a_drive_that_was_taken_out_of_operation_by_nmt_can_be_set_up_at_once(command):
-    host = in_state(ENABLED)
+    host = in_state(State.ENABLED)
     host.nmt(command)
     assert set(refusals(host, 1).values()) == {0}
 
@@ -105,56 +85,67 @@ def test_a_drive_that_was_taken_out_of_operation_by_nmt_can_be_set_up_at_once(co
 @pytest.mark.parametrize("node", [3])
 def test_a_sensor_that_measures_refuses_everything_but_to_forget_its_errors(node):
     host = BenchHost()
-    host.nmt(START)
+    host.nmt(Nmt.START)
     codes = refusals(host, node)
     assert (0x6125, 1) in codes
     assert {key for key, code in codes.items() if code != DEVICE_STATE} == {CLEAR_HISTORY}
-    host.nmt(PRE_OPERATIONAL, node)
+    host.nmt(Nmt.PRE_OPERATIONAL, node)
     assert set(refusals(host, node).values()) == {0}
 
 
-WORDS = (SHUTDOWN, SWITCH_ON, ENABLE, ENABLE | 0x100, FAULT_RESET, FAULT_RESET | ENABLE)
+WORDS = (
+    Word.SHUTDOWN,
+    Word.SWITCH_ON,
+    Word.ENABLE,
+    Word.ENABLE | 0x100,
+    Word.FAULT_RESET,
+    Word.FAULT_RESET | Word.ENABLE,
+)
 
 
 @pytest.mark.parametrize(
     ("bits", "disabled", "stopped"),
-    [(READY, DISABLED, DISABLED), (ENABLED, DISABLED, STOPPING), (STOPPING, DISABLED, STOPPING), (FAULT, FAULT, FAULT)],
+    [
+        (State.READY, State.DISABLED, State.DISABLED),
+        (State.ENABLED, State.DISABLED, State.STOPPING),
+        (State.STOPPING, State.DISABLED, State.STOPPING),
+        (State.FAULT, State.FAULT, State.FAULT),
+    ],
 )
 def test_while_an_rpdo_commands_sdo_only_takes_power_away(bits, disabled, stopped):
     host = in_state(bits)
     for word in WORDS:
         assert host.abort_code(lambda word=word: host.write(1, 0x6040, 0, word)) == DEVICE_STATE
     assert host.state_bits() == bits
-    host.write(1, 0x6040, 0, QUICK_STOP)
+    host.write(1, 0x6040, 0, Word.QUICK_STOP)
     assert host.state_bits() == stopped
-    host.write(1, 0x6040, 0, DISABLE_VOLTAGE)
+    host.write(1, 0x6040, 0, Word.DISABLE_VOLTAGE)
     assert host.state_bits() == disabled
 
 
-@pytest.mark.parametrize("word", [DISABLE_VOLTAGE, QUICK_STOP])
+@pytest.mark.parametrize("word", [Word.DISABLE_VOLTAGE, Word.QUICK_STOP])
 def test_what_sdo_took_away_the_rpdos_next_word_does_not_bring_back(word):
     host = BenchHost()
     host.enable()
-    host.step(ENABLE, 100)
+    host.step(Word.ENABLE, 100)
     host.write(1, 0x6040, 0, word)
-    for _ in range(300):
-        host.step(ENABLE, 100)
-    assert host.state_bits(1) == DISABLED
+    host.step(Word.ENABLE, 100, times=300)
+    assert host.state_bits(1) == State.DISABLED
     assert host.bench.drives[0].torque_Nm == 0.0
-    assert host.state_bits(2) == ENABLED
+    assert host.state_bits(2) == State.ENABLED
 
 
 def test_without_an_rpdo_that_brings_it_the_controlword_goes_by_sdo():
     host = BenchHost()
     remap(host, 1, 0x1400, (0x60710010,), can_id=0x201)
     host.start()
-    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+    for word in ENABLING:
         host.put(0x201, struct.pack("<h", 100))
         host.sync()
         host.write(1, 0x6040, 0, word)
-    assert host.state_bits() == ENABLED
-    host.write(1, 0x6040, 0, SHUTDOWN)
-    assert host.state_bits() == READY
+    assert host.state_bits() == State.ENABLED
+    host.write(1, 0x6040, 0, Word.SHUTDOWN)
+    assert host.state_bits() == State.READY
 
 
 def without_command_pdo(is_operational: bool = True) -> BenchHost:
@@ -163,8 +154,8 @@ def without_command_pdo(is_operational: bool = True) -> BenchHost:
     host.write(1, 0x1400, 1, INVALID | 0x201)
     host.write(1, 0x6060, 0, 10)
     if is_operational:
-        host.nmt(START)
-    for word in (SHUTDOWN, SWITCH_ON):
+        host.nmt(Nmt.START)
+    for word in (Word.SHUTDOWN, Word.SWITCH_ON):
         host.write(1, 0x6040, 0, word)
     host.take()
     return host
@@ -178,10 +169,10 @@ def test_a_drive_that_nobody_can_command_says_why_it_stays_in_switched_on(is_ope
     host = without_command_pdo(is_operational)
     assert host.read(1, 0x2212) == reason
     assert host.statusword() & WARNING == 0
-    host.write(1, 0x6040, 0, ENABLE)
-    assert host.state_bits() == SWITCHED_ON
+    host.write(1, 0x6040, 0, Word.ENABLE)
+    assert host.state_bits() == State.SWITCHED_ON
     assert host.statusword() & WARNING == WARNING
-    host.write(1, 0x6040, 0, ENABLE)
+    host.write(1, 0x6040, 0, Word.ENABLE)
     sent = host.take()
     (emergency,) = [data for can_id, data in sent if can_id == 0x081]
     assert struct.unpack_from("<HBB", emergency) == (0x6320, 0x11, 8)
@@ -190,10 +181,10 @@ def test_a_drive_that_nobody_can_command_says_why_it_stays_in_switched_on(is_ope
     assert (host.read(1, 0x2210, 1), host.read(1, 0x2210, 10)) == (8, 1)
 
 
-@pytest.mark.parametrize("word", [DISABLE_VOLTAGE, SWITCH_ON])
+@pytest.mark.parametrize("word", [Word.DISABLE_VOLTAGE, Word.SWITCH_ON])
 def test_the_warning_ends_when_operation_is_no_longer_asked_for(word):
     host = without_command_pdo()
-    host.write(1, 0x6040, 0, ENABLE)
+    host.write(1, 0x6040, 0, Word.ENABLE)
     host.take()
     host.write(1, 0x6040, 0, word)
     assert struct.unpack_from("<HBB", host.taken(0x081)[0]) == (0, 0, 8)
@@ -202,19 +193,19 @@ def test_the_warning_ends_when_operation_is_no_longer_asked_for(word):
 
 def test_the_warning_ends_when_a_command_pdo_is_there_and_operation_is_enabled_by_it():
     host = without_command_pdo()
-    host.write(1, 0x6040, 0, ENABLE)
+    host.write(1, 0x6040, 0, Word.ENABLE)
     host.write(1, 0x1400, 1, 0x201)
-    host.step(ENABLE)
-    assert host.state_bits() == ENABLED
+    host.step(Word.ENABLE)
+    assert host.state_bits() == State.ENABLED
     assert (host.statusword() & WARNING, host.read(1, 0x2212), host.read(1, 0x1001)) == (0, 0, 0)
 
 
 def test_a_fault_of_another_kind_can_be_reset_beside_the_warning():
     host = without_command_pdo()
-    host.write(1, 0x6040, 0, ENABLE)
+    host.write(1, 0x6040, 0, Word.ENABLE)
     host.bench.drives[0].fail(0x2310, host.bench.now_ns)
     host.bench.drives[0].mend()
     host.wait_until_at_rest(None)
-    assert host.state_bits() == FAULT
-    host.write(1, 0x6040, 0, FAULT_RESET)
-    assert host.state_bits() == DISABLED
+    assert host.state_bits() == State.FAULT
+    host.write(1, 0x6040, 0, Word.FAULT_RESET)
+    assert host.state_bits() == State.DISABLED

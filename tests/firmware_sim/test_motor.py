@@ -5,12 +5,11 @@ import struct
 
 import numpy as np
 import pytest
-from bench_host import DISABLED, ENABLE, ENABLED, FAULT, FAULT_RESET, BenchHost, quiet_scenario
+from bench_host import BenchHost, State, Word, quiet_scenario
+from general_arm import BRAKE, OFF, TORQUE, truth_of
 
-from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.hardware_settings import DriveSettings
-from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body
 from firmware_sim.body.motor import (
@@ -23,9 +22,6 @@ from firmware_sim.body.motor import (
 )
 from firmware_sim.scenario.scenario import Scenario
 
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
-OFF = (DriveMode.OFF, DriveMode.OFF)
-BRAKE = (DriveMode.BRAKE, DriveMode.BRAKE)
 RATED_NM = (12.0, 6.0)
 INTERNAL_LIMIT = 1 << 11
 EXCESS_TEMPERATURE, OVER_CURRENT = 0x4310, 0x2310
@@ -68,9 +64,7 @@ def arm(**drives) -> Body:
 
 
 def true_torque(body: Body) -> np.ndarray:
-    block = np.zeros(TRUTH_LAYOUT.size)
-    body.truth(block)
-    return block[TRUTH_LAYOUT.slices["tau_J"]]
+    return truth_of(body)["tau_J"]
 
 
 @pytest.mark.parametrize("bandwidth_Hz", [20.0, 1_000.0, 5_000.0])
@@ -196,13 +190,6 @@ def test_the_torque_falls_in_a_line_from_the_derating_start_to_nothing(preheat_K
     assert Motors(preheat_K=[preheat_K, 0.0]).available_Nm() == pytest.approx(available_Nm, abs=1e-12)
 
 
-def test_derating_begins_when_the_winding_has_warmed_up_to_it():
-    """25 + 300 (1 − exp(−t / t_w)) = 110."""
-    motors = Motors(winding_rise_K=[300.0, 0.0], winding_time_s=[0.2, 1.0])
-    expected_s = -0.2 * math.log(1.0 - 85.0 / 300.0)
-    assert motors.until_limited(12.0, 12.0) == pytest.approx(expected_s, abs=1.5 * TICK_S)
-
-
 def test_a_derated_drive_finds_the_torque_that_it_can_bear():
     """At 125 °C half the torque is left, and a quarter of 400 K is what that heats."""
     body = arm(winding_rise_K=[400.0, 0.0], winding_time_s=[0.05, 1.0])
@@ -244,8 +231,8 @@ OVERHEATING = {"winding_rise_K": [400.0, 0.0], "winding_time_s": [0.05, 1.0], "o
 def overheat(host: BenchHost) -> int:
     """Ask for rated torque until drive 1 faults; return the SYNCs that it took."""
     for count in range(1, 400):
-        host.step(ENABLE, 1000, joints=(1,))
-        host.command(ENABLE, 0, joints=(2,))
+        host.step(Word.ENABLE, 1000, joints=(1,))
+        host.command(Word.ENABLE, 0, joints=(2,))
         if host.statusword() & 0x08:
             return count
     raise AssertionError("the drive did not fault")
@@ -255,78 +242,44 @@ def test_the_statusword_says_that_a_limit_is_active():
     host = make_host(peak_torque_Nm=[6.0, 0.0])
     words = []
     for target in (500, 501, 700, 500, 300):
-        host.step(ENABLE, target, joints=(1,))
-        host.step(ENABLE, target, joints=(1,))
+        host.step(Word.ENABLE, target, joints=(1,))
+        host.step(Word.ENABLE, target, joints=(1,))
         words.append(bool(host.statusword() & INTERNAL_LIMIT))
     assert words == [False, True, True, False, False]
     assert not host.statusword(2) & INTERNAL_LIMIT
 
 
-def test_a_status_frame_tells_at_once_that_a_limit_has_become_active():
-    host = make_host(peak_torque_Nm=[6.0, 0.0])
-    host.step(ENABLE, 700)
-    host.take()
-    host.step(ENABLE, 700)
-    frames = host.taken(0x281)
-    assert len(frames) == 1
-    assert struct.unpack_from("<H", frames[0])[0] & INTERNAL_LIMIT
-
-
-def test_0x6077_is_what_the_drive_believes():
-    host = make_host(torque_constant_error=[0.2, 0.0])
-    for _ in range(4):
-        host.step(ENABLE, 100)
-    assert host.read(1, 0x6077) == 100
-    assert host.true("tau_J") == pytest.approx([1.44, 0.6], rel=1e-5)
-
-
-def test_an_overheated_motor_faults_its_drive_and_no_other():
+def test_an_overheated_motor_faults_its_drive_and_no_other_until_it_has_cooled_and_is_reset():
     host = make_host(**OVERHEATING)
     host.take()
-    syncs = overheat(host)
-    frames = host.take()
     # 25 + 400 (1 − exp(−t / 50 ms)) = 110 after 12 ms, then ever slower
-    assert 12 < syncs < 60
-    assert host.read(1, 0x603F) == EXCESS_TEMPERATURE
-    assert host.read(1, 0x1001) == 0x09
+    assert 12 < overheat(host) < 60
+    frames = host.take()
+    assert (host.read(1, 0x603F), host.read(1, 0x1001)) == (EXCESS_TEMPERATURE, 0x09)
     emergencies = [struct.unpack("<HBBI", data)[:3] for can_id, data in frames if can_id == 0x081]
     assert emergencies == [(EXCESS_TEMPERATURE, 0x09, 0)]
     assert [data for can_id, data in frames if can_id == 0x082] == []
     statuses = [struct.unpack("<HbhH", data) for can_id, data in frames if can_id == 0x281]
     assert statuses[-1][3] == EXCESS_TEMPERATURE
-    assert host.state_bits(2) == ENABLED
-
-
-def test_an_overheat_fault_stays_latched_and_is_reset_once_the_motor_has_cooled():
-    host = make_host(**OVERHEATING)
-    overheat(host)
-    while host.state_bits() != FAULT:
-        host.step(ENABLE)
-    for _ in range(200):
-        host.step(ENABLE)
-    assert host.state_bits() == FAULT
-    assert host.read(1, 0x603F) == EXCESS_TEMPERATURE
-    host.step(FAULT_RESET)
-    assert host.state_bits() == DISABLED
-    assert host.read(1, 0x603F) == 0
-    assert host.read(1, 0x1001) == 0
+    assert host.state_bits(2) == State.ENABLED
+    host.step(Word.ENABLE, times=400)
+    assert (host.state_bits(), host.read(1, 0x603F)) == (State.FAULT, EXCESS_TEMPERATURE)
+    host.step(Word.FAULT_RESET)
+    assert (host.state_bits(), host.read(1, 0x603F), host.read(1, 0x1001)) == (State.DISABLED, 0, 0)
 
 
 def test_an_overheat_fault_is_not_reset_while_the_motor_is_hot():
-    """0x605E is 2: braking ends before a motor with 20 s of time constant has cooled."""
-    host = make_host(preheat_K=[106.0, 0.0], housing_time_s=[20.0, 1.0])
-    while host.state_bits() != FAULT:
-        host.step(ENABLE)
-    for controlword in (FAULT_RESET, ENABLE, FAULT_RESET):
+    """0x605E is 2: braking ends before a motor with 2 s of time constant has cooled."""
+    host = make_host(preheat_K=[106.0, 0.0], housing_time_s=[2.0, 1.0])
+    while host.state_bits() != State.FAULT:
+        host.step(Word.ENABLE)
+    for controlword in (Word.FAULT_RESET, Word.ENABLE, Word.FAULT_RESET):
         host.step(controlword)
-        assert host.state_bits() == FAULT
-    host.step(ENABLE)
-    # 25 + 106 exp(−t / 20 s) = 110
-    cooling_ms = round(1e3 * 20.0 * math.log(106.0 / 85.0))
-    host.bench._body.advance((0.0, 0.0), OFF, 10 * cooling_ms)
-    host.step(ENABLE)
-    host.step(FAULT_RESET)
-    assert host.state_bits() == DISABLED
+        assert host.state_bits() == State.FAULT
+    # 25 + 106 exp(−t / 2 s) = 110
+    host.step(Word.ENABLE, times=round(1e3 * 2.0 * math.log(106.0 / 85.0)))
+    host.step(Word.FAULT_RESET)
+    assert host.state_bits() == State.DISABLED
 
 
 def test_a_drive_whose_i2t_is_to_fault_reports_over_current():

@@ -2,12 +2,7 @@
 
 import canopen
 import pytest
-from bench_host import (
-    PERIOD_NS,
-    RESET_COMMUNICATION,
-    START,
-    quiet_scenario,
-)
+from bench_host import PERIOD_NS, Nmt, quiet_scenario
 
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
@@ -61,15 +56,15 @@ def test_nmt_to_one_node_addresses_no_other_arm() -> None:
     bus = SharedBus()
     announced = [[can_id for can_id, _ in frames] for frames in bus.frames]
     assert announced == [[0x700 + node for node in nodes] for nodes in NODES]
-    bus.put(0x000, START, 6)
+    bus.put(0x000, Nmt.START, 6)
     assert bus.states() == [[False] * 4, [False, True, False, False]]
-    assert bus.ids(0x000, RESET_COMMUNICATION, 7) == [[], [0x707]]
+    assert bus.ids(0x000, Nmt.RESET_COMMUNICATION, 7) == [[], [0x707]]
 
 
 @pytest.mark.parametrize("contract", ["arm", "arm_fd"])
 def test_one_sync_is_answered_by_both_arms_at_their_own_identifiers(contract: str) -> None:
     bus = SharedBus(contract)
-    bus.put(0x000, START, 0)
+    bus.put(0x000, Nmt.START, 0)
     bus.ids(0x080, 1)
     first, second = bus.ids(0x080, 2)
     assert first == [0x181, 0x182, 0x183, 0x184]
@@ -94,7 +89,7 @@ def test_the_defaults_of_the_object_dictionary_follow_the_node_id() -> None:
 
 def test_a_command_reaches_its_own_arm_only() -> None:
     bus = SharedBus()
-    bus.put(0x000, START, 0)
+    bus.put(0x000, Nmt.START, 0)
     bus.put(0x080, 1)
     message = bus.codecs[1].message("Drive1Command")
     sender = message.sender()
@@ -109,7 +104,7 @@ def test_a_command_reaches_its_own_arm_only() -> None:
 
 def test_each_arm_watches_its_own_host() -> None:
     bus = SharedBus()
-    bus.put(0x000, START, 0)
+    bus.put(0x000, Nmt.START, 0)
     for node, host in ((1, 127), (5, 126)):
         bus.put(0x600 + node, 0x23, 0x16, 0x10, 1, 100, 0, host, 0)
     for can_id in (0x77F, 0x77E):

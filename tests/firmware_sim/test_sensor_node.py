@@ -5,7 +5,7 @@ import struct
 import cantools
 import numpy as np
 import pytest
-from bench_host import CODEC, PRE_OPERATIONAL, RESET_COMMUNICATION, START, BenchHost, quiet_scenario
+from bench_host import CODEC, BenchHost, Nmt, quiet_scenario
 from cantools.autosar import end_to_end
 
 from adacd_hil.wire.codec import contract_folder
@@ -16,8 +16,7 @@ DATABASE = cantools.database.load_file(contract_folder() / "arm.dbc")
 
 def torque_frames(host: BenchHost, count: int, node: int = 3) -> list[bytes]:
     host.take()
-    for _ in range(count):
-        host.sync()
+    host.sync(times=count)
     return host.taken(0x180 + node)
 
 
@@ -28,7 +27,7 @@ def torque_uNm(frame: bytes) -> int:
 @pytest.mark.parametrize("node", [3, 4])
 def test_an_independent_implementation_accepts_the_header_of_every_frame(node):
     host = BenchHost(quiet_scenario(noise=True))
-    host.nmt(START)
+    host.nmt(Nmt.START)
     name = f"Sensor{node - 2}Torque"
     data_ids = CODEC.message(name).data_ids
     frames = torque_frames(host, 40, node)
@@ -41,7 +40,7 @@ def test_an_independent_implementation_accepts_the_header_of_every_frame(node):
 
 def test_the_value_is_the_converters_count_in_micronewtonmetres():
     host = BenchHost(quiet_scenario(torque_offset_Nm=[1.0, -2.0]))
-    host.nmt(START)
+    host.nmt(Nmt.START)
     lsb_uNm = 100e6 / 65536
     assert torque_uNm(torque_frames(host, 1, 3)[0]) == round(round(1e6 / lsb_uNm) * lsb_uNm)
     assert torque_uNm(torque_frames(host, 1, 4)[0]) == round(round(-2e6 / lsb_uNm) * lsb_uNm)
@@ -54,7 +53,7 @@ def test_the_value_is_the_converters_count_in_micronewtonmetres():
 )
 def test_an_overload_is_flagged_in_the_frame_itself_and_in_the_status(offset_Nm, status, value_uNm):
     host = BenchHost(quiet_scenario(torque_offset_Nm=[offset_Nm, 0.0]))
-    host.nmt(START)
+    host.nmt(Nmt.START)
     host.take()
     host.sync()
     frames = host.take()
@@ -67,52 +66,33 @@ def test_an_overload_is_flagged_in_the_frame_itself_and_in_the_status(offset_Nm,
 
 def test_before_the_first_sample_the_value_is_not_valid():
     host = BenchHost()
-    host.nmt(START)
+    host.nmt(Nmt.START)
     assert host.taken(0x283) == [b"\x01\x00"]
     host.sync()
     assert host.taken(0x283) == [b"\x00\x00"]
 
 
-def test_status_comes_every_100_ms():
-    host = BenchHost()
-    host.nmt(START)
-    host.sync()
-    host.take()
-    for _ in range(1000):
-        host.sync()
-    assert len(host.taken(0x284)) == 10
-
-
-def test_frames_come_in_operational_only():
-    host = BenchHost()
-    assert torque_frames(host, 3) == []
-    host.nmt(START)
-    assert len(torque_frames(host, 3)) == 3
-    host.nmt(PRE_OPERATIONAL)
-    assert torque_frames(host, 3) == []
-
-
 def test_the_counter_goes_on_over_a_pause_and_begins_anew_after_reset_communication():
     host = BenchHost()
-    host.nmt(START)
+    host.nmt(Nmt.START)
     torque_frames(host, 3)
-    host.nmt(PRE_OPERATIONAL)
+    host.nmt(Nmt.PRE_OPERATIONAL)
     torque_frames(host, 5)
-    host.nmt(START)
+    host.nmt(Nmt.START)
     assert torque_frames(host, 1)[0][1] & 0x0F == 3
-    host.nmt(RESET_COMMUNICATION)
-    host.nmt(START)
+    host.nmt(Nmt.RESET_COMMUNICATION)
+    host.nmt(Nmt.START)
     assert torque_frames(host, 1)[0][1] & 0x0F == 0
 
 
 def test_autozero_takes_the_mean_of_64_samples_for_zero():
     host = BenchHost(quiet_scenario(noise=True, torque_offset_Nm=[3.0, 0.0]), seed=5)
-    host.nmt(START)
+    host.nmt(Nmt.START)
     before = torque_frames(host, 200)
     assert np.mean([torque_uNm(frame) for frame in before]) == pytest.approx(3e6, abs=10e3)
-    host.nmt(PRE_OPERATIONAL, 3)
+    host.nmt(Nmt.PRE_OPERATIONAL, 3)
     host.write(3, 0x6125, 1, ZERO)
-    host.nmt(START, 3)
+    host.nmt(Nmt.START, 3)
     torque_frames(host, 64)
     after = torque_frames(host, 1000)
     assert np.mean([torque_uNm(frame) for frame in after]) == pytest.approx(0.0, abs=4 * 20e3 / 64**0.5)
@@ -121,5 +101,5 @@ def test_autozero_takes_the_mean_of_64_samples_for_zero():
 def test_a_zeroed_sensor_still_reports_the_overload_of_its_converter():
     host = BenchHost(quiet_scenario(torque_offset_Nm=[50.0, 0.0]))
     host.write(3, 0x6125, 1, ZERO)
-    host.nmt(START)
+    host.nmt(Nmt.START)
     assert torque_frames(host, 65)[-1][1] >> 4 == 0x03

@@ -5,12 +5,13 @@ import struct
 
 import numpy as np
 import pytest
-from bench_host import START, BenchHost, quiet_scenario
+from bench_host import BenchHost, Nmt, quiet_scenario
+from general_arm import OFF
 from scipy import signal
 
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.hardware_settings import SensorSettings
-from firmware_sim.arm.sensing import TORQUE_LSB_NM, DriveMode, TorqueNoise
+from firmware_sim.arm.sensing import TORQUE_LSB_NM, TorqueNoise
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body
 from firmware_sim.body.sensors import (
@@ -23,9 +24,6 @@ from firmware_sim.body.sensors import (
     walk_offset,
 )
 from firmware_sim.scenario.scenario import Scenario
-
-TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
-OFF = (DriveMode.OFF, DriveMode.OFF)
 
 
 class Sensors:
@@ -233,22 +231,6 @@ def test_a_frame_without_a_new_sample_repeats_the_old_one_with_its_noise():
     assert np.count_nonzero(np.diff(at_sync)) > 300
 
 
-def test_the_errors_of_the_sensor_are_measured_and_do_not_move_the_arm():
-    """Commands are given in advance, so nothing of the sensor comes back into the arm."""
-    errors = {"gain_error": [0.1, 0.1], "cross_talk": [0.1, 0.1], "hysteresis_Nm": [1.0, 1.0]}
-    positions, torques = [], []
-    for sensors in ({}, errors):
-        body = Body(parse(Scenario, {"noise": False, "sensors": sensors}))
-        measured = []
-        for _ in range(50):
-            body.advance((3.0, -1.0), TORQUE)
-            measured.append(body.sample())
-        positions.append([row.position_counts for row in measured])
-        torques.append(measured[-1].torque_counts[0])
-    assert positions[0] == positions[1]
-    assert abs(torques[0] - torques[1]) > 50
-
-
 @pytest.mark.parametrize(
     ("offset_Nm", "status", "value_uNm"),
     [(19.9, 0x00, 19.9e6), (20.0, 0x03, 20e6), (35.0, 0x03, 20e6), (-19.9, 0x00, -19.9e6), (-20.0, 0x05, -20e6)],
@@ -256,7 +238,7 @@ def test_the_errors_of_the_sensor_are_measured_and_do_not_move_the_arm():
 def test_a_sensor_of_smaller_range_saturates_and_flags_its_overload_in_the_frame(offset_Nm, status, value_uNm):
     sensors = {"torque_range_Nm": [20.0, 50.0], "torque_bits": [12, 16]}
     host = BenchHost(quiet_scenario(torque_offset_Nm=[offset_Nm, 0.0], sensors=sensors))
-    host.nmt(START)
+    host.nmt(Nmt.START)
     host.take()
     host.sync()
     frame = host.taken(0x183)[0]

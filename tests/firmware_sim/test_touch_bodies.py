@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from general_arm import TouchedArm
+from general_arm import TouchedArm, normal_of, point_of
 
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import MechanicsSettings
@@ -17,24 +17,10 @@ from firmware_sim.arm.touch_settings import (
     contact_table,
     contact_torque,
 )
-from firmware_sim.body.body import initial_touch_state, largest_rate_rad_s, touch_table
+from firmware_sim.body.body import largest_rate_rad_s, touch_table
 
 POSE = (0.3, 0.7)
 SOFT = {"mass_kg": 1.5, "stiffness_N_m": 2000.0}
-
-
-def normal_of(link: int, q) -> np.ndarray:
-    """Normal of a link on the side of +q."""
-    angle = q[0] if link == 1 else q[0] + q[1]
-    return np.array([-math.sin(angle), math.cos(angle)])
-
-
-def point_of(link: int, point_m: float, q) -> np.ndarray:
-    reach_m = point_m if link == 1 else 0.35
-    elbow = reach_m * np.array([math.cos(q[0]), math.sin(q[0])])
-    if link == 1:
-        return elbow
-    return elbow + point_m * np.array([math.cos(q[0] + q[1]), math.sin(q[0] + q[1])])
 
 
 def beside(
@@ -67,10 +53,8 @@ def reduced_mass(arm: TouchedArm, body: BodySettings, point_m: float) -> float:
 # Blows of 10 mm/s move the arm so little that its effective mass is constant; the model is linear in the speed.
 BLOWS = [
     ("P", 2, 0.2, 1, {"region": "skull_forehead"}),
-    ("P", 2, 0.3, -1, {"region": "hand_finger", "radius_m": 0.03}),
     ("P", 1, 0.25, 1, {"region": "chest"}),
-    ("S", 2, 0.15, -1, {"region": "lower_leg", "radius_m": 0.05}),
-    ("M", 1, 0.30, -1, {"mass_kg": 0.3, "stiffness_N_m": 5e4}),
+    ("M", 1, 0.30, -1, {"mass_kg": 0.3, "stiffness_N_m": 5e4, "radius_m": 0.05}),
 ]
 
 
@@ -93,9 +77,9 @@ def test_an_elastic_blow_has_the_force_time_and_speeds_of_two_masses(profile, li
     assert set(seen["link"][touched]) == {link}
 
 
-@pytest.mark.parametrize("damping_ratio", [0.2])
-def test_a_damped_blow_has_the_restitution_of_spring_and_damper_that_part_without_pull(damping_ratio):
+def test_a_damped_blow_has_the_restitution_of_spring_and_damper_that_part_without_pull():
     """δ = (v/ω_d) e^(−ζωt) sin ω_d t; they part where K δ + c δ̇ = 0."""
+    damping_ratio = 0.2
     bare = beside(**SOFT)
     mass_kg = reduced_mass(TouchedArm(q=POSE), bare, 0.2)
     rate = math.sqrt(2000.0 / mass_kg)
@@ -106,38 +90,6 @@ def test_a_damped_blow_has_the_restitution_of_spring_and_damper_that_part_withou
     parting = math.pi - math.atan2(2.0 * damping_ratio * damped, 1.0 - 2.0 * damping_ratio**2)
     restitution = math.exp(-damping_ratio / damped * parting)
     assert arm.own(0, "shift_rate_m_s")[-1] == pytest.approx(0.001 * (1.0 + restitution) * mass_kg / 1.5, rel=2e-3)
-
-
-def depth_of(body: BodySettings, arm: TouchedArm, seen) -> np.ndarray:
-    """Penetration over time, by the foot of the perpendicular."""
-    free = normal_of(body.link, POSE)
-    depths = []
-    for q1, q2, shift in zip(seen["q1"], seen["q2"], arm.own(0, "shift_m"), strict=True):
-        center = np.array([body.x_m, body.y_m]) + shift * free
-        off = center - point_of(2, 0.0, (q1, q2))
-        depths.append(body.radius_m - off @ normal_of(2, (q1, q2)))
-    return np.maximum(np.array(depths), 0.0)
-
-
-@pytest.mark.parametrize("damping_N_s_m", [12.0])
-def test_what_the_arm_gives_is_the_bodys_motion_its_spring_and_its_heat(damping_N_s_m):
-    body = beside(**SOFT, damping_N_s_m=damping_N_s_m, radius_m=0.05)
-    # The damper's force jumps at the first touch: a step that holds it is wrong by up to its own share of the impulse.
-    arm = strike(body, 0.2, speed_m_s=0.6, substeps=16)
-    seen = arm.play(0.12)
-    touched = depth_of(body, arm, seen) > 0.0
-    depth_m, force_N = depth_of(body, arm, seen), seen["force"]
-    spring_J = 0.5 * 2000.0 * depth_m**2
-    # The interval of the first touch has the force of its end.
-    mean_N = np.where(touched[:-1], 0.5 * (force_N[1:] + force_N[:-1]), force_N[1:])
-    heat_J = np.cumsum((mean_N - 1000.0 * (depth_m[1:] + depth_m[:-1])) * np.diff(depth_m))
-    heat_J = np.concatenate([[0.0], heat_J])
-    motion_J = 0.5 * 1.5 * arm.own(0, "shift_rate_m_s") ** 2
-    assert 100 < np.count_nonzero(touched) < len(touched)
-    assert np.diff(heat_J).min() > -1e-9
-    assert (motion_J + spring_J + heat_J)[touched] == pytest.approx(seen["energy"][touched], abs=2e-3 * motion_J.max())
-    lost_J = arm.kinetic_J(seen)[0] - arm.kinetic_J(seen)
-    assert lost_J[touched] == pytest.approx(seen["energy"][touched], abs=2e-4 * motion_J.max())
 
 
 @pytest.mark.parametrize("damping_N_s_m", [0.0, 3000.0])
@@ -254,14 +206,6 @@ def test_a_deep_push_does_not_throw_the_body_through_the_link():
     assert seen["force"].max() > 2.0 * 300.0 * 0.01
     assert seen["tau1"].max() <= 0.0
     assert seen["dq1"][-1] < 0.0
-
-
-def test_an_empty_table_touches_nothing_and_writes_nothing():
-    things = touch_table(TouchedArm().scenario)
-    rates = np.full(1, 7.0)
-    assert (things.size, initial_touch_state(things).size, largest_rate_rad_s(things)) == (0, 1, 0.0)
-    assert touch(things, 1.0, 0.1, 0.2, 3.0, 4.0, np.zeros(1), rates) == (0.0, 0.0)
-    assert rates.tolist() == [7.0]
 
 
 @pytest.mark.parametrize(("profile", "region"), [("P", "skull_forehead"), ("M", "abdomen")])

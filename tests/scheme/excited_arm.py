@@ -11,7 +11,7 @@ from played_record import play_record
 from adacd_hil.compiled import compiled
 from adacd_hil.control.motions import Excitation
 from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
-from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration import Settings, load_settings
 
@@ -20,6 +20,10 @@ SETTINGS = load_settings("certified", "P")
 SETTINGS = replace(SETTINGS, safety=replace(SETTINGS.safety, commission_s=0.01))
 NAMES = certified_memory.parameter_names(SETTINGS)
 OFFSETS = [NAMES.index("offset1"), NAMES.index("offset2")]
+FREE = replace(
+    SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.1)
+)
+"""Of an arm without brakes: its reading at rest anchors the sensors' offsets."""
 
 
 class Record(NamedTuple):
@@ -62,6 +66,14 @@ def follow(theta, q_d, dq_d, Kp, Kd, tau_ext, noise, q, dq, tau_J):
         tau[:] = tau_next
         tau_next[:] = Kp * (q_d[k] - q[k]) + Kd * (dq_d[k] - dq[k])
         advance(at, speed, tracked_q, tracked_dq, tau + tau_ext[k], theta[k], PERIOD_S)
+
+
+def added(**parameters) -> np.ndarray:
+    """Return what a hand that drags, or moves like a mass, adds to the arm's parameters (7,)."""
+    theta = np.zeros(7)
+    for name, value in parameters.items():
+        theta[NAMES.index(name)] = value
+    return theta
 
 
 def record(theta, seconds, tau_ext=None, added=None, added_at_s=0.0, motion=None, seed=1) -> Record:
@@ -231,15 +243,36 @@ class TouchedLoop(ExcitedLoop):
         self.tau_ext[joint] = 0.0
         return outputs
 
+    def hold(self, hand, seconds):
+        """Let a hand hold the arm whose torque is a change of parameters."""
+        free = self.theta
+        self.theta = free + hand
+        outputs = self.run(round(seconds / PERIOD_S))
+        self.theta = free
+        return outputs
+
+    def learn(self, seconds):
+        self.run_until(SchemeState.ADAPT)
+        return self.run(round(seconds / PERIOD_S))
+
+    def error_of(self, name):
+        place = NAMES.index(name)
+        return abs(self.model_theta[place] - self.theta[place])
+
     @property
     def kernel(self):
         """The kernel's constants and memory, as its functions take them."""
         return self.pipeline.numbers[:2]
 
     @property
+    def m(self):
+        """The memory's one record."""
+        return self.pipeline.numbers.memory[0]
+
+    @property
     def model_theta(self):
         """The parameters of the model in use (p,)."""
-        return self.pipeline.numbers.memory[0].models.theta
+        return self.m.models.theta
 
     @property
     def offset_error_Nm(self):
@@ -273,3 +306,45 @@ def arm_state(cycle, q=(0.0, 0.0), dq=(0.0, 0.0), tau_J=(0.0, 0.0), **changes) -
         is_complete=True, fault=FaultReason.NONE,
     )  # fmt: skip
     return state._replace(**changes)
+
+
+def states(outputs) -> set[SchemeState]:
+    return {output.state for output in outputs}
+
+
+def learnt_s(outputs) -> float:
+    """Return how long the arm has learnt and been tested."""
+    return PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
+
+
+def kernel_of(settings: Settings = SETTINGS):
+    """Return the certified kernel's constants and a new memory, as its functions take them."""
+    return certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
+
+
+class Kernel:
+    """The compiled step with its constants, memory and block, sample by sample."""
+
+    def __init__(self, settings=SETTINGS, theta=None, P=None):
+        self.constants = certified_memory.constants_of(settings)
+        self.memory, self.block = certified_memory.new_memory(settings), certified_memory.new_block(settings)
+        certified_kernel.begin_adaptation(self.constants, self.memory, False, True)
+        self.m, self.out = self.memory[0], self.block[0]
+        if theta is not None:
+            self.m.models.theta[: len(theta)] = theta
+            self.m.models.theta[len(theta) :] = 0.0
+        if P is not None:
+            self.m.models.P[:] = P
+
+    def step(self, q, dq, tau_J, mode=0, is_complete=1, periods=1, period_s=0.0):
+        self.out.q, self.out.dq, self.out.tau_J, self.out.period_s = q, dq, tau_J, period_s
+        return certified_kernel.step(self.constants, self.memory, self.block, is_complete, periods, mode)
+
+    def run(self, q, dq, tau_J, mode=0, period_s=None):
+        """Return observations (n,) and bare residuals (n, C, 2)."""
+        observations, residuals = [], []
+        for k in range(len(q)):
+            each_s = 0.0 if period_s is None else period_s[k]
+            observations.append(self.step(q[k], dq[k], tau_J[k], mode, period_s=each_s))
+            residuals.append(self.m.filters.r.copy())
+        return np.array(observations), np.array(residuals)

@@ -35,18 +35,33 @@ def torque_of(q, dq, ddq, theta, tau_ext=None):
     return tau if tau_ext is None else tau - tau_ext
 
 
+class PaperKernel:
+    """The paper's compiled step with its arrays, sample by sample."""
+
+    def __init__(self, settings):
+        self.numbers = paper_kernel.numbers_of(settings)
+        self.m, self.out = self.numbers.memory[0], self.numbers.block[0]
+        self.begin()
+
+    def begin(self):
+        paper_kernel.begin_adaptation(*self.numbers[:3])
+
+    def step(self, mode, is_fresh=1, periods=1, **sample):
+        """Take in a sample, of which what isn't given stays as it was."""
+        for name, value in sample.items():
+            self.out[name] = value
+        return paper_kernel.step(*self.numbers[:3], is_fresh, periods, mode)
+
+
 def run_kernel(settings, q, dq, tau_J, theta_hat, mode, is_complete=None, periods=None, period_s=None):
     """Run the compiled step over a record; return blocks (n, size)."""
-    count = q.shape[0]
-    numbers = paper_kernel.numbers_of(settings)
-    paper_kernel.begin_adaptation(numbers.constants, numbers.memory, numbers.block)
-    numbers.block["theta_hat"] = theta_hat
-    blocks = np.zeros((count, numbers.values.size))
-    out = numbers.block[0]
+    kernel, count = PaperKernel(settings), q.shape[0]
+    kernel.out.theta_hat = theta_hat
+    blocks = np.zeros((count, kernel.numbers.values.size))
     for k in range(count):
-        out.q, out.dq, out.tau_J = q[k], dq[k], tau_J[k]
-        out.period_s = 0.0 if period_s is None else period_s[k]
         is_fresh = 1 if is_complete is None else int(is_complete[k])
-        paper_kernel.step(*numbers[:3], is_fresh, 1 if periods is None else int(periods[k]), mode)
-        blocks[k] = numbers.values
+        each_s = 0.0 if period_s is None else period_s[k]
+        sample = {"q": q[k], "dq": dq[k], "tau_J": tau_J[k], "period_s": each_s}
+        kernel.step(mode, is_fresh, 1 if periods is None else int(periods[k]), **sample)
+        blocks[k] = kernel.numbers.values
     return blocks

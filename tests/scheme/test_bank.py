@@ -1,54 +1,34 @@
 """The bank of filters against scipy and against one filter alone."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 import scipy.signal
+from excited_arm import NAMES, SETTINGS, kernel_of
 
-from adacd_hil.scheme.memory import Filters, Regressor
 from adacd_hil.scheme.model import filter_bank
-from adacd_hil.structured import packed, zeros_of
 
 T = 1e-3
-CUTOFF = np.array([10.0, 50.0, 200.0])
-COLUMNS = 5
-
-
-@dataclass
-class BankConstants:
-    cutoff: np.ndarray
-
-
-class BankMemory:
-    filters: Filters
-    regressor: Regressor
+CUTOFF = np.array(SETTINGS.certified.cutoffs_rad_s)
+COLUMNS = len(NAMES)
 
 
 class Bank:
-    """Filters at rest, for two joints and COLUMNS parameters."""
+    """The kernel's filters, at rest."""
 
     def __init__(self):
-        sizes = {"n": 2, "p": COLUMNS, "t": 1, "filters": CUTOFF.size, "channels": CUTOFF.size}
-        self.k, self.m = packed(BankConstants(CUTOFF))[0], zeros_of(BankMemory, sizes)[0]
-        filter_bank.discretise(CUTOFF, T, *self.m.filters.rates)
+        self.k, self.m = kernel_of()
+        filter_bank.choose_rates(self.k, self.m, T)
         self.tau_f, self.W_f = self.m.filters.tau_f, self.m.filters.W_f
 
     def take(self, Y_p, Y_h, tau_J, is_seen):
         self.m.regressor.Y_p, self.m.regressor.Y_h = Y_p, Y_h
         filter_bank.take_sample(self.k, self.m, tau_J, is_seen)
 
-    def resume(self, Y_p, Y_h, tau_J):
-        self.take(Y_p, Y_h, tau_J, False)
-
-    def advance(self, Y_p, Y_h, tau_J):
-        self.take(Y_p, Y_h, tau_J, True)
-
     def run(self, Y_p, Y_h, tau_J):
         """Go over samples (n, ...), the first of them after a gap; return tau_f (n, C, 2) and W_f (n, C, 2, p)."""
         history = []
         for k in range(len(tau_J)):
-            (self.advance if k else self.resume)(Y_p[k], Y_h[k], tau_J[k])
+            self.take(Y_p[k], Y_h[k], tau_J[k], is_seen=k > 0)
             history.append((self.tau_f.copy(), self.W_f.copy()))
         return tuple(np.array(values) for values in zip(*history, strict=True))
 
@@ -84,28 +64,13 @@ def test_each_filter_of_the_regressor_differentiates_the_momentum(c):
     np.testing.assert_allclose(W_f[:, c], derivative + held_by_scipy(CUTOFF[c], Y_h), rtol=1e-8, atol=1e-8)
 
 
-def test_the_filters_do_not_know_of_each_other():
-    Y_p, Y_h, tau_J = signals()
-    tau_f, W_f = Bank().run(Y_p, Y_h, tau_J)
-    for c, a in enumerate(CUTOFF):
-        hold = filter_bank.first_order_hold(a, a, T)
-        tau_old, alone_f = tau_J[0].copy(), np.zeros(2)
-        input_old, S, W_alone = (np.zeros((2, COLUMNS)) for _ in range(3))
-        filter_bank.resume(a, a, Y_p[0], Y_h[0], tau_J[0], input_old, tau_old, S, W_alone)
-        for k in range(1, len(tau_J)):
-            filter_bank.advance_torque(hold, tau_old, tau_J[k], alone_f)
-            filter_bank.advance_regressor(hold, a, a, Y_p[k], Y_h[k], input_old, S, W_alone)
-        np.testing.assert_array_equal(tau_f[-1, c], alone_f)
-        np.testing.assert_array_equal(W_f[-1, c], W_alone)
-
-
 def test_the_lag_column_is_the_filtered_derivative_of_its_joint_s_torque():
     _, _, tau_J = signals()
     tau_J -= tau_J[0]
     filtered, got = Bank(), []
     none = np.zeros((2, COLUMNS))
     for k, torque in enumerate(tau_J):
-        (filtered.advance if k else filtered.resume)(none, none, torque)
+        filtered.take(none, none, torque, is_seen=k > 0)
         W_f = np.zeros((3, 2, COLUMNS))
         filter_bank.fill_lag(CUTOFF, torque, filtered.tau_f, 3, W_f)
         got.append(W_f)
@@ -127,15 +92,6 @@ def test_the_cross_talk_column_is_the_other_joint_s_filtered_torque():
     assert np.count_nonzero(W_f) == 6
 
 
-def test_a_push_toward_positive_q_is_a_positive_external_torque():
-    """The arm needs W theta, and the joint gives less: the environment gives the rest."""
-    random = np.random.default_rng(2)
-    W_f, theta = random.standard_normal((3, 2, COLUMNS)), random.standard_normal(COLUMNS)
-    tau_ext, tau_ext_hat = np.array([[0.5, 0.1], [0.6, 0.2], [0.7, 0.3]]), np.zeros((3, 2))
-    filter_bank.estimate_external(W_f @ theta - tau_ext, W_f, theta, tau_ext_hat)
-    np.testing.assert_allclose(tau_ext_hat, tau_ext, atol=1e-12)
-
-
 def test_smoothed_channels_come_first_and_all_but_the_slowest_are_there_bare_too():
     r = np.random.default_rng(3).standard_normal((100, 3, 2))
     y, got, smoothing = np.zeros((5, 2)), [], np.exp(-0.2)
@@ -152,21 +108,6 @@ def test_a_gap_leaves_every_residual_where_it_was_whatever_the_parameters():
     filtered = Bank()
     filtered.run(Y_p, Y_h, tau_J)
     before = filtered.tau_f.copy(), filtered.W_f.copy()
-    filtered.resume(Y_p[0] + 7.0, Y_h[0] - 5.0, tau_J[0] + 3.0)
+    filtered.take(Y_p[0] + 7.0, Y_h[0] - 5.0, tau_J[0] + 3.0, is_seen=False)
     np.testing.assert_array_equal(filtered.tau_f, before[0])
     np.testing.assert_array_equal(filtered.W_f, before[1])
-
-
-def test_after_a_gap_the_residual_of_the_true_parameters_stays_zero():
-    """Momentum and torque jump in the gap; what acted meanwhile is cut out of time."""
-    theta = np.array([0.4, -0.2, 0.1, 0.3, 0.2])
-    t_s = np.arange(150) * T
-    slope = np.random.default_rng(4).standard_normal((2, COLUMNS))
-    Y_p = slope * t_s[:, None, None]
-    Y_h = np.tile(slope + 1.0, (len(t_s), 1, 1))
-    tau_J = np.tile((slope + slope + 1.0) @ theta, (len(t_s), 1))
-    filtered, residual = Bank(), np.zeros((3, 2))
-    for offset in (0.0, 8.0):
-        filtered.run(Y_p + offset, Y_h, tau_J)
-        filter_bank.estimate_external(filtered.tau_f, filtered.W_f, theta, residual)
-        np.testing.assert_allclose(residual, 0.0, atol=1e-12)

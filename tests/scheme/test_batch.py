@@ -8,7 +8,7 @@ from excited_arm import PERIOD_S, SETTINGS, record
 from planar_arm import PAYLOAD_1KG, THETA
 
 from adacd_hil.control.motions import Excitation
-from adacd_hil.records import ArmBatch, Request, SchemeState, certified_layout, scheme_layout
+from adacd_hil.records import ArmBatch, Request, SchemeState
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.pipeline.pipeline import arm_at, layout_of
 
@@ -176,14 +176,6 @@ def test_the_life_has_all_of_it(lived):
         assert [event.name for event in events] == ["certificate", "touch"]
 
 
-def test_a_batch_decides_as_single_steps_do(life, lived):
-    scheme, remembered, outputs, _ = lived
-    again = pipeline_of(scheme)
-    batch = again.run(*life)
-    assert rows_of_batches([batch]) == rows_of(outputs)
-    assert state_of(again) == remembered
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_it_may_be_split_anywhere_and_mixed_with_single_steps(life, lived, seed):
     scheme, remembered, outputs, _ = lived
@@ -201,8 +193,3 @@ def test_it_may_be_split_anywhere_and_mixed_with_single_steps(life, lived, seed)
         begin = end
     assert rows == rows_of(outputs)
     assert state_of(again) == remembered
-
-
-def test_the_layout_is_that_of_the_scheme():
-    assert layout_of(settings_of("paper")) == scheme_layout(7)
-    assert layout_of(settings_of("certified")) == certified_layout(7, SETTINGS.further_count, SETTINGS.channel_count)

@@ -5,22 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.optimize
-from excited_arm import NAMES, SETTINGS
+from excited_arm import NAMES, SETTINGS, kernel_of
 from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.scheme.identify import belief
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.model import filter_bank, regressor
 
-CONSTANTS = certified_memory.constants_of(SETTINGS)
-K = CONSTANTS[0]
+K, _ = kernel_of()
 COUNT = len(NAMES)
 EVERY = SETTINGS.certified.learn_every
 WAITING = round(SETTINGS.certified.hold_back_s / (EVERY * SETTINGS.bus.period_s))
 
 
 def prior():
-    return certified_memory.new_memory(SETTINGS)[0]
+    return kernel_of()[1]
 
 
 def samples(count=400, seed=1):
@@ -39,13 +38,6 @@ def learn(m, W_f, tau_f, held=0.0):
 def teach(m, W_f, tau_f, held=0.0):
     held = np.broadcast_to(held, tau_f.shape)
     return [learn(m, *sample) for sample in zip(W_f, tau_f, held, strict=True)]
-
-
-def test_a_belief_begins_with_the_prior():
-    theta, P = np.full(3, 9.0), np.full((3, 3), 9.0)
-    belief.begin(np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]), theta, P)
-    assert theta.tolist() == [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(P, np.diag([0.01, 0.04, 0.09]))
 
 
 def test_nothing_is_expected_of_an_arm_but_the_velocity_s_usual_lag():
@@ -91,20 +83,6 @@ def test_the_belief_tells_when_it_has_changed():
     W_f, tau_f = samples()
     changed = np.flatnonzero(teach(prior(), W_f, tau_f))
     np.testing.assert_array_equal(changed, np.arange((WAITING + 1) * EVERY - 1, len(W_f), EVERY))
-
-
-def test_a_sample_is_not_learnt_before_it_has_waited():
-    W_f, tau_f = samples()
-    touched = tau_f.copy()
-    at = 200 + EVERY - 1
-    touched[at:] += 5.0
-    untouched_belief, belief_hat = prior(), prior()
-    wait = WAITING * EVERY
-    for k in range(at + wait + 1):
-        assert np.array_equal(untouched_belief.models.belief, belief_hat.models.belief)
-        learn(untouched_belief, W_f[k], tau_f[k])
-        learn(belief_hat, W_f[k], touched[k])
-    assert np.max(np.abs(untouched_belief.models.belief - belief_hat.models.belief)) > 1e-3
 
 
 def test_samples_that_wait_are_thrown_away_when_they_turn_out_to_be_a_touch():

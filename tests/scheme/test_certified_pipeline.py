@@ -74,10 +74,15 @@ def streamed():
     return at_rest + moving, *outputs, play(samples, at_rest=BEFORE)
 
 
-def test_an_arm_learns_is_tested_and_monitors(whole):
+def test_an_arm_learns_is_tested_and_monitors_and_what_passed_the_test_is_fed_forward(whole):
     learnt, _, _ = whole
     assert names(learnt) == ["COMMISSION", "ENABLE", "ADAPT", "CERTIFY", "MONITOR"]
-    assert (first_in(learnt, SchemeState.MONITOR) - first_in(learnt, SchemeState.ADAPT)) * PERIOD_S <= 2.5
+    armed, tested = first_in(learnt, SchemeState.MONITOR), first_in(learnt, SchemeState.CERTIFY)
+    assert (armed - first_in(learnt, SchemeState.ADAPT)) * PERIOD_S <= 2.5
+    assert not any(output.is_model_valid or np.any(output.theta_ff) for output in learnt[:armed])
+    assert all(output.is_model_valid for output in learnt[armed:])
+    np.testing.assert_array_equal(learnt[armed].theta_ff, learnt[tested + 1].theta_hat)
+    np.testing.assert_array_equal(learnt[armed].theta_ff, learnt[armed].theta_hat)
 
 
 def test_each_test_of_a_fit_takes_its_whole_time(whole):
@@ -87,107 +92,57 @@ def test_each_test_of_a_fit_takes_its_whole_time(whole):
         assert len(tested) == round(test_s / PERIOD_S)
 
 
-def test_nothing_is_fed_forward_before_the_certificate(whole):
-    learnt, _, _ = whole
-    armed = first_in(learnt, SchemeState.MONITOR)
-    assert not any(output.is_model_valid for output in learnt[:armed])
-    assert not any(np.any(output.theta_ff) for output in learnt[:armed])
-    assert all(output.is_model_valid for output in learnt[armed:])
-
-
-def test_what_is_fed_forward_is_what_passed_the_test(whole):
-    learnt, _, _ = whole
-    armed = first_in(learnt, SchemeState.MONITOR)
-    tested = first_in(learnt, SchemeState.CERTIFY)
-    np.testing.assert_array_equal(learnt[armed].theta_ff, learnt[tested + 1].theta_hat)
-    np.testing.assert_array_equal(learnt[armed].theta_ff, learnt[armed].theta_hat)
-
-
-def test_a_push_while_it_monitors_is_reacted_to_and_clears(whole):
-    _, pushed, _ = whole
-    assert names(pushed) == ["MONITOR", "REACT", "MONITOR"]
-    reacting = pushed[first_in(pushed, SchemeState.REACT)]
-    assert first_in(pushed, SchemeState.REACT) <= 20
-    assert reacting.contact_joints & 0b01
-    assert reacting.reaction is Reaction.STOP
-    assert pushed[-1].reaction is Reaction.NONE
-    assert pushed[-1].is_model_valid
-
-
-def test_its_report_begins_with_the_reaction_and_becomes_final(whole):
-    _, pushed, _ = whole
-    reports = reports_of(pushed)
-    begin = pushed[first_in(pushed, SchemeState.REACT)].cycle
-    assert [report.is_final for report in reports[:-1]] == [False] * (len(reports) - 1)
-    assert len(reports) > 1
-    assert reports[-1].is_final
-    assert {report.cycle for report in reports} == {begin}
-    assert (reports[-1].link, reports[-1].direction, reports[-1].level) == (1, (1, 0), ContactLevel.CONTACT)
-    assert abs(reports[-1].tau_ext_peak[0] - 1.0) < 0.3
-
-
-def test_a_push_leaves_the_model_in_use_as_it_was(whole):
+def test_a_push_while_it_monitors_is_reacted_to_reported_and_clears_and_leaves_the_model_as_it_was(whole):
     learnt, pushed, _ = whole
+    assert names(pushed) == ["MONITOR", "REACT", "MONITOR"]
+    begin = first_in(pushed, SchemeState.REACT)
+    assert begin <= 20
+    assert pushed[begin].contact_joints & 0b01
+    assert (pushed[begin].reaction, pushed[-1].reaction) == (Reaction.STOP, Reaction.NONE)
+    *first, final = reports_of(pushed)
+    assert {report.is_final for report in first} == {False}
+    assert final.is_final
+    assert {report.cycle for report in (*first, final)} == {pushed[begin].cycle}
+    assert (final.link, final.direction, final.level) == (1, (1, 0), ContactLevel.CONTACT)
+    assert abs(final.tau_ext_peak[0] - 1.0) < 0.3
+    assert pushed[-1].is_model_valid
     theta = column(pushed, "theta_hat")
-    np.testing.assert_array_equal(theta, np.tile(theta[0], (len(theta), 1)))
-    np.testing.assert_array_equal(theta[0], learnt[-1].theta_hat)
+    np.testing.assert_array_equal(theta, np.tile(learnt[-1].theta_hat, (len(theta), 1)))
 
 
 def test_a_payload_is_learnt_on_top_of_the_certified_arm_in_a_second(whole):
+    """Meanwhile the model before it is fed forward."""
     _, pushed, fitted = whole
     assert names(fitted) == ["PAYLOAD", "ADAPT", "CERTIFY", "MONITOR"]
     begin, armed = first_in(fitted, SchemeState.ADAPT), first_in(fitted, SchemeState.MONITOR)
     assert (armed - begin) * PERIOD_S <= 1.0
     np.testing.assert_array_equal(fitted[begin + 1].theta_hat, pushed[-1].theta_hat)
     np.testing.assert_allclose(fitted[-1].theta_hat[:3] - pushed[-1].theta_hat[:3], PAYLOAD_1KG[:3], atol=0.02)
-
-
-def test_while_the_payload_is_learnt_the_model_before_it_is_fed_forward(whole):
-    _, pushed, fitted = whole
     for output in fitted[:-1]:
         np.testing.assert_array_equal(output.theta_ff, pushed[-1].theta_ff)
     np.testing.assert_array_equal(fitted[-1].theta_ff, fitted[-1].theta_hat)
 
 
-def test_a_touch_while_it_learns_is_flagged_reacted_to_and_reported(interrupted):
+def test_a_touch_while_it_learns_is_reported_and_the_arm_is_learnt_anew_from_nothing(whole, interrupted):
+    """As well as without the touch, by what its parameters differ in: inertia as large as 5 % of the arm's."""
     assert names(interrupted)[2:] == ["ADAPT", "REACT", "ADAPT", "CERTIFY", "MONITOR"]
-    assert first_in(interrupted, SchemeState.REACT) - 711 <= 50
+    touched, armed = first_in(interrupted, SchemeState.REACT), first_in(interrupted, SchemeState.MONITOR)
+    assert touched - 711 <= 50
     reports = reports_of(interrupted)
     assert (reports[0].is_final, reports[-1].is_final) == (False, True)
-    assert reports[-1].link == 1
-    assert reports[-1].direction[0] == 1
-
-
-def again_in(outputs, state, after):
-    """Return the first output in a state once `after` has been seen."""
-    begin = first_in(outputs, after)
-    return begin + first_in(outputs[begin:], state)
-
-
-def test_after_a_touch_it_learns_anew_from_nothing(interrupted):
-    again = again_in(interrupted, SchemeState.ADAPT, SchemeState.REACT)
-    theta = np.concatenate([interrupted[again + 1].theta_hat, interrupted[again + 1].block[PLACES["theta_further"]]])
+    assert (reports[-1].link, reports[-1].direction[0]) == (1, 1)
+    again = interrupted[touched + first_in(interrupted[touched:], SchemeState.ADAPT) + 1]
+    theta = np.concatenate([again.theta_hat, again.block[PLACES["theta_further"]]])
     np.testing.assert_array_equal(theta, PRIOR)
-    before = interrupted[first_in(interrupted, SchemeState.REACT)].theta_hat
-    assert np.max(np.abs(before)) > 0.01
-    assert interrupted[again + 1].block[PLACES["excitation"]] == 0.0
-
-
-def test_what_is_certified_after_a_touch_is_as_good_as_without_one(whole, interrupted):
-    """By what its parameters differ in: inertia as large as 5 % of the arm's."""
-    untouched = whole[0][-1].theta_hat
-    np.testing.assert_allclose(interrupted[-1].theta_hat[:3], untouched[:3], atol=0.01)
-
-
-def test_a_certificate_is_of_the_attempt_that_passed(interrupted):
-    armed = first_in(interrupted, SchemeState.MONITOR)
+    assert np.max(np.abs(interrupted[touched].theta_hat)) > 0.01
+    assert again.block[PLACES["excitation"]] == 0.0
+    np.testing.assert_allclose(interrupted[-1].theta_hat[:3], whole[0][-1].theta_hat[:3], atol=0.01)
     assert not any(output.is_model_valid for output in interrupted[:armed])
     assert interrupted[armed].is_model_valid
 
 
 def test_a_model_that_fails_its_test_is_learnt_anew_from_nothing():
-    strict = replace(SETTINGS, certified=replace(SETTINGS.certified, beta_Nm=0.001))
-    loop = ExcitedLoop(strict)
+    loop = ExcitedLoop(replace(SETTINGS, certified=replace(SETTINGS.certified, beta_Nm=0.001)))
     outputs = loop.run_until(SchemeState.CERTIFY) + loop.run_until(SchemeState.ADAPT) + loop.run(1)
     assert names(outputs)[2:] == ["ADAPT", "CERTIFY", "ADAPT"]
     np.testing.assert_array_equal(outputs[-1].theta_hat, PRIOR[:7])
@@ -222,7 +177,7 @@ def test_the_pipeline_decides_as_the_compiled_step_does_on_the_same_samples(stre
     np.testing.assert_array_equal(bank, played.y)
 
 
-def test_the_paper_beside_gives_the_bits_of_the_paper_alone(streamed):
+def test_the_paper_beside_gives_the_bits_of_the_paper_alone_and_is_armed_later(streamed):
     _, outputs, paper, _ = streamed
     assert paper[-1].state is SchemeState.MONITOR
     alone = scheme_layout(7).slices
@@ -232,6 +187,9 @@ def test_the_paper_beside_gives_the_bits_of_the_paper_alone(streamed):
     armed = np.array([output.state is SchemeState.MONITOR for output in paper])
     np.testing.assert_array_equal(column(outputs, "paper_is_armed")[:, 0], armed)
     np.testing.assert_array_equal(column(outputs, "paper_threshold")[armed][1:], blocks[armed][1:, alone["threshold"]])
+    first = first_in(outputs, SchemeState.MONITOR)
+    assert first_in(paper, SchemeState.MONITOR) - first > 2500
+    assert np.all(np.isinf(column(outputs, "paper_threshold")[first]))
 
 
 def test_both_schemes_count_by_the_stamps(streamed):
@@ -246,13 +204,6 @@ def test_both_schemes_count_by_the_stamps(streamed):
     np.testing.assert_array_equal(column(outputs, "period_s")[1:, 0], (1_000_000 + np.diff(late_ns)) * 1e-9)
     for name in ("tau_ext_hat", "paper_tau_ext_hat"):
         assert np.max(np.abs(column(outputs, name) - column(nominal[:600], name))) > 1e-5
-
-
-def test_this_scheme_is_armed_while_the_paper_s_still_adapts(streamed):
-    _, outputs, paper, _ = streamed
-    armed = first_in(outputs, SchemeState.MONITOR)
-    assert first_in(paper, SchemeState.MONITOR) - armed > 2500
-    assert np.all(np.isinf(column(outputs, "paper_threshold")[armed]))
 
 
 def test_the_block_is_laid_out_as_the_records_say():

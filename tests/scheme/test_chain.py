@@ -1,5 +1,7 @@
 """The dynamics of a serial arm: against the planar closed form, against itself, and its base parameters."""
 
+import math
+
 import numpy as np
 import pytest
 from serial_arms import PLANAR_LENGTH_M, planar_chain, random_chain, random_state, seven_joint_arm
@@ -26,10 +28,10 @@ def full_parts(arm, q, dq):
     return parts(arm, chain.all_columns(arm), q, dq, 10 * q.size)
 
 
-def closed_parts(q, dq, count):
+def closed_parts(q, dq, count, level_rad):
     Y_p, Y_h = np.zeros((2, count)), np.zeros((2, count))
     regressor.fill_momentum(q, dq, Y_p)
-    regressor.fill_remainder(q, dq, 0.0, Y_h)
+    regressor.fill_remainder(q, dq, level_rad, Y_h)
     return Y_p, Y_h
 
 
@@ -50,19 +52,25 @@ INERTIA = {
 GRAVITY = {"a4": unit(mx_1=1.0 / G_M_S2), "a5": unit(mx_2=1.0 / G_M_S2)}
 
 
+@pytest.mark.parametrize("level_rad", [0.0, 1.3, -2.5])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_planar_closed_form_is_a_chain_of_two(seed):
-    """Y_p and Y_h column by column, friction included; a4 and a5 by what gravity alone adds."""
+def test_the_planar_closed_form_is_a_chain_of_two_however_it_is_mounted(seed, level_rad):
+    """Y_p and Y_h column by column, friction included; a4 and a5 by what gravity alone adds; and its mass matrix."""
     q, dq, _ = random_state(seed, 2)
     Y_p, Y_h = (np.zeros((2, 9)) for _ in range(2))
-    level, upright = full_parts(planar_chain((0.0, 0.0, 0.0)), q, dq), full_parts(planar_chain(UPWARD), q, dq)
+    pull = np.array([math.sin(level_rad), -math.cos(level_rad), 0.0])
+    level, mounted = planar_chain((0.0, 0.0, 0.0)), planar_chain(G_M_S2 * pull)
+    theta = np.array([0.4, 0.07, 0.04])
+    body = theta @ np.array(list(INERTIA.values()))
+    np.testing.assert_allclose(regressor.mass_matrix(q, theta), chain.mass_matrix(level, q, body), rtol=1e-12)
+    level, upright = full_parts(level, q, dq), full_parts(mounted, q, dq)
     for name, change in INERTIA.items():
         Y_p[:, CLOSED_NAMES.index(name)] = level[0] @ change
         Y_h[:, CLOSED_NAMES.index(name)] = level[1] @ change
     for name, change in GRAVITY.items():
         Y_h[:, CLOSED_NAMES.index(name)] = (upright[1] - level[1]) @ change
     chain.fill_friction(dq, CLOSED_NAMES.index("F_v1"), Y_h)
-    expected = closed_parts(q, dq, 9)
+    expected = closed_parts(q, dq, 9, level_rad)
     np.testing.assert_allclose(Y_p, expected[0], rtol=1e-10, atol=1e-13)
     np.testing.assert_allclose(Y_h, expected[1], rtol=1e-10, atol=1e-13)
 

@@ -47,12 +47,6 @@ def test_a_hand_that_changes_sides_still_pushes():
     assert classify(tau, SIGMA, PERIOD_S) is ContactKind.PUSH
 
 
-def test_what_is_left_is_a_part_of_the_largest():
-    tau = np.zeros((100, 2))
-    tau[40], tau[-10:] = (-4.0, 1.0), (-1.0, 0.25)
-    assert share_left(tau, np.ones(2), 10) == pytest.approx(0.25)
-
-
 def test_nothing_at_all_leaves_nothing():
     assert share_left(np.zeros((5, 2)), np.ones(2), 10) == 0.0
     assert math.isfinite(share_left(np.ones((1, 2)), np.ones(2), 10))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from contact_course import Course
-from smooth_motion import PLACES, run_kernel, settings_with
+from smooth_motion import PLACES, PaperKernel, run_kernel, settings_with
 
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.contact.contact_report import integrated_report
@@ -44,30 +44,24 @@ def test_the_strength_does_not_depend_on_the_filter(a, b):
     assert abs(np.max(blocks[:, PLACES["tau_ext_wide_hat"]]) / 3.0 - 1.0) < 0.04
 
 
-class Touch:
+class Touch(PaperKernel):
     """An arm at rest in MONITOR that is touched; steps the compiled kernel and the contact's course together."""
 
     def __init__(self, window_cycles=50):
-        settings = settings_with(detector={"isolation_window_s": window_cycles * T})
-        self.constants, self.memory, self.block, _ = paper_kernel.numbers_of(settings)
-        self.m, self.tau_ext_hat = self.memory[0], self.block[0].tau_ext_hat
-        self.a_rad_s = settings.filter.a_rad_s
-        self.course = Course(settings)
-        self.reports = []
+        self.settings = settings_with(detector={"isolation_window_s": window_cycles * T})
+        super().__init__(self.settings)
+        self.course, self.reports = Course(self.settings), []
 
     def run(self, tau_ext):
-        has_begun = False
+        has_begun, tau_ext_hat = False, self.out.tau_ext_hat
         for torque in tau_ext:
-            self.block[0].tau_J = -torque
             mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.course.m.is_open else 0)
-            joints = (
-                paper_kernel.step(self.constants, self.memory, self.block, 1, 1, mode) >> paper_kernel.CONTACT_SHIFT
-            )
+            joints = self.step(mode, tau_J=-torque) >> paper_kernel.CONTACT_SHIFT
             has_begun = has_begun or joints != 0
             state = SchemeState.REACT if has_begun else SchemeState.MONITOR
-            if self.course.step(joints, self.tau_ext_hat, state=state):
-                report = integrated_report(self.course.m, self.tau_ext_hat, self.m.integral, self.m.peak, self.a_rad_s)
-                self.reports.append(report)
+            if self.course.step(joints, tau_ext_hat, state=state):
+                found = self.course.m, tau_ext_hat, self.m.integral, self.m.peak
+                self.reports.append(integrated_report(*found, self.settings.filter.a_rad_s))
         return self.reports
 
 
@@ -78,52 +72,37 @@ def on_joints(first, second):
 STEP = np.where(np.arange(400) >= 100, 1.0, 0.0)
 
 
-def test_a_report_is_given_at_once_and_again_when_the_window_ends():
-    reports = Touch().run(on_joints(STEP, 0.0 * STEP))
-    assert [report.is_final for report in reports] == [False, True]
-
-
-def test_both_reports_carry_the_cycle_of_detection():
-    reports = Touch().run(on_joints(STEP, 0.0 * STEP))
-    assert [report.cycle for report in reports] == [116, 116]  # 16.3 ms after the step, which is between 99 and 100
-
-
-def test_without_a_window_the_first_report_is_final():
-    reports = Touch(window_cycles=0).run(on_joints(STEP, 0.0 * STEP))
-    assert [report.is_final for report in reports] == [True]
-
-
-def test_torque_on_joint_1_alone_is_a_contact_of_link_1():
-    reports = Touch().run(on_joints(STEP, 0.1 * STEP))
-    assert [report.link for report in reports] == [1, 1]
-
-
-def test_torque_on_joint_2_that_crosses_later_makes_it_link_2():
-    reports = Touch().run(on_joints(STEP, 0.5 * STEP))
-    assert [report.link for report in reports] == [1, 2]
-
-
-def test_torque_on_joint_2_that_crosses_after_the_window_comes_too_late():
-    reports = Touch(window_cycles=10).run(on_joints(STEP, 0.5 * STEP))
-    assert [report.link for report in reports] == [1, 1]
+@pytest.mark.parametrize(
+    ("second", "window_cycles", "links"),
+    [
+        (0.1 * STEP, 50, [1, 1]),
+        (-0.5 * STEP, 50, [1, 2]),
+        (0.5 * STEP, 10, [1, 1]),
+        (0.1 * STEP, 0, [1]),
+    ],
+    ids=["below", "crosses later", "crosses after the window", "no window"],
+)
+def test_a_report_is_given_at_once_and_again_when_the_window_ends_with_joint_2s_say_in_the_link(
+    second, window_cycles, links
+):
+    """Detected 16.3 ms after the step, which is between 99 and 100."""
+    reports = Touch(window_cycles).run(on_joints(STEP, second))
+    assert [report.is_final for report in reports] == [False, True][-len(links) :]
+    assert {report.cycle for report in reports} == {116}
+    assert [report.link for report in reports] == links
+    assert reports[0].direction == (1, 0)
 
 
 def test_torque_on_joint_2_that_is_gone_before_the_window_ends_still_counts():
     """0.3 Nm for 80 ms is over the threshold from 69 ms to 100 ms only."""
     brief = np.where((np.arange(400) >= 40) & (np.arange(400) < 120), 0.3, 0.0)
-    reports = Touch(window_cycles=100).run(on_joints(STEP, brief))
-    assert reports[-1].link == 2
+    assert Touch(window_cycles=100).run(on_joints(STEP, brief))[-1].link == 2
 
 
 @pytest.mark.parametrize(("first", "second"), [(1.0, 0.5), (-1.0, 0.5), (1.0, -0.5), (-1.0, -0.5), (1.0, 0.0)])
 def test_the_direction_is_the_sign_of_each_joint_torque(first, second):
     reports = Touch().run(on_joints(first * STEP, second * STEP))
     assert reports[-1].direction == (np.sign(first), np.sign(second))
-
-
-def test_the_first_report_says_nothing_of_a_joint_below_its_threshold():
-    reports = Touch().run(on_joints(STEP, -0.5 * STEP))
-    assert reports[0].direction == (1, 0)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 import scipy.signal
+from planar_arm import THETA as ARMS
+from smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.lab.detectors.detectors import (
     DetectorBankSettings,
@@ -17,10 +19,10 @@ from adacd_hil.lab.detectors.detectors import (
     record,
     register,
 )
-from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.schema import ConfigError
 
 T = 1e-3
+THETA = ARMS["M"]
 SETTINGS = DetectorBankSettings(onset_samples=(4, 16))
 CHANNELS = SETTINGS.channels
 WEIGHTS = np.random.default_rng(4).standard_normal((2, 2, 24))
@@ -139,19 +141,11 @@ def test_what_cannot_be_designed_is_refused(call, words):
         call()
 
 
-THETA = np.array([0.3841, 0.06825, 0.04035, 0.12, 0.06, 0.15, 0.08])
-
-
 def moving_arm(lag_s=0.0):
     """A free motion with its exact torque, the velocity `lag_s` old."""
     t_s = np.arange(3000) * T
-    w = np.array([1.5, 2.5])
-
-    def at(s):
-        return 0.5 * np.sin(np.outer(s, w)), 0.5 * w * np.cos(np.outer(s, w)), -0.5 * w**2 * np.sin(np.outer(s, w))
-
-    tau = np.array([inverse_dynamics(*row, THETA, 0.0) for row in zip(*at(t_s), strict=True)])
-    return at(t_s)[0], at(t_s - lag_s)[1], tau
+    motion = smooth_motion(t_s)
+    return motion[0], smooth_motion(t_s - lag_s)[1], torque_of(*motion, THETA)
 
 
 def test_the_stream_of_a_free_arm_is_zero_but_for_the_reversals():

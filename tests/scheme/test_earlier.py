@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop
+from excited_arm import FREE, NAMES, OFFSETS, PERIOD_S, TouchedLoop, added, kernel_of, learnt_s, states
 from long_cases import long_but
 from planar_arm import THETA
 
@@ -14,41 +14,9 @@ from adacd_hil.scheme.identify import anchor, certificate, earlier, evidence, fi
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD, CertificateWatch
 
-FREE = replace(
-    SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.1)
-)
 UNKNOWN = replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=None))
+BRAKED = replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=(8.0, 8.0)))
 VISCOUS, COULOMB, INERTIA = NAMES.index("F_v1"), NAMES.index("F_c1"), NAMES.index("a1")
-
-
-def added(**parameters):
-    theta = np.zeros(7)
-    for name, value in parameters.items():
-        theta[NAMES.index(name)] = value
-    return theta
-
-
-class HeldLoop(TouchedLoop):
-    """An arm under a hand whose torque is a change of parameters: one that drags, or moves like a mass."""
-
-    def hold(self, hand, seconds):
-        free = self.theta
-        self.theta = free + hand
-        outputs = self.run(round(seconds / PERIOD_S))
-        self.theta = free
-        return outputs
-
-    def learn(self, seconds):
-        self.run_until(SchemeState.ADAPT)
-        return self.run(round(seconds / PERIOD_S))
-
-    def error_of(self, name):
-        place = NAMES.index(name)
-        return abs(self.pipeline.numbers.memory[0].models.theta[place] - self.theta[place])
-
-
-def states(outputs):
-    return {output.state for output in outputs}
 
 
 @pytest.mark.parametrize(
@@ -60,23 +28,25 @@ def states(outputs):
     ],
 )
 def test_a_hand_that_begins_to_hold_while_the_arm_learns_gets_no_certificate_and_is_named(hand, named):
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.learn(1.0)
     held = loop.hold(hand, 8.0)
     assert SchemeState.MONITOR not in states(held)
     said = loop.said("touch")
     assert any(re.search(named, text) for text in said)
     assert any("a touch that began then has not been seen to end" in text for text in said)
+    assert earlier.is_keeping(loop.m)
     released_at = loop.cycle
     loop.recover()
     assert (loop.cycle - released_at) * PERIOD_S < 6.5
+    assert not earlier.is_keeping(loop.m)
     for name in ("a1", "F_v1", "F_c1", "F_v2"):
         assert loop.error_of(name) < 0.02
 
 
 @pytest.mark.long
 def test_a_hand_that_dragged_and_lets_go_leaves_less_and_less_is_the_arms_once_enough_fits_agree():
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.run_until(SchemeState.ADAPT)
     loop.hold(added(F_c1=0.4), 1.0)
     loop.recover(within_s=12.0)
@@ -85,7 +55,7 @@ def test_a_hand_that_dragged_and_lets_go_leaves_less_and_less_is_the_arms_once_e
 
 
 def test_a_hand_that_helps_the_motion_after_a_reported_contact_gets_no_certificate_and_is_named():
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.learn(1.0)
     helped = loop.hold(added(F_c1=-0.3), 8.0)
     assert any(output.contact is not None for output in helped)
@@ -97,16 +67,17 @@ def test_a_hand_that_helps_the_motion_after_a_reported_contact_gets_no_certifica
 
 def test_a_touch_within_the_fit_that_no_threshold_saw_is_no_certificate():
     """What was half learnt would hold its half: neither the arm nor the hand."""
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.learn(0.55)
     loop.hold(added(a1=0.04, a2=0.02, a3=0.016), 0.3)
     loop.recover()
     assert loop.error_of("a1") < 0.005
 
 
-@pytest.mark.long
-def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_the_offset_before():
-    loop = HeldLoop(UNKNOWN)
+@pytest.mark.parametrize("settings", long_but(1, [BRAKED, UNKNOWN]), ids=["brakes leave it open", "no anchor"])
+def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_the_offset_before(settings):
+    """What was kept is not forgotten for the word of an anchor that bounds nothing."""
+    loop = TouchedLoop(settings)
     loop.learn(1.0)
     leant = loop.lean(0, 0.5, 6.0)
     assert SchemeState.MONITOR not in states(leant)
@@ -115,16 +86,8 @@ def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_t
     assert abs(loop.offset_error_Nm[0]) < 0.03
 
 
-def test_an_anchor_that_a_brake_leaves_open_is_none_for_a_lean_that_begins_while_the_arm_learns():
-    """What was kept is not forgotten for the word of an anchor that bounds nothing."""
-    loop = HeldLoop(replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=(8.0, 8.0))))
-    loop.learn(1.0)
-    assert SchemeState.MONITOR not in states(loop.lean(0, 0.5, 6.0))
-    assert loop.said("touch")[0].startswith("torque offset of joint 1 is 0.50")
-
-
 def test_what_was_learnt_under_a_lean_judges_nothing_once_the_lean_has_gone():
-    loop = HeldLoop(FREE, theta=THETA["S"])
+    loop = TouchedLoop(FREE, theta=THETA["S"])
     loop.run_until(SchemeState.ADAPT)
     loop.lean(1, 0.44, 0.35)
     released_at = loop.cycle
@@ -134,7 +97,7 @@ def test_what_was_learnt_under_a_lean_judges_nothing_once_the_lean_has_gone():
 
 @pytest.mark.long
 def test_the_word_of_the_user_that_nobody_touches_the_arm_ends_the_comparison():
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.learn(1.0)
     loop.theta = loop.theta + added(F_c1=0.4)  # a brake that drags from now on
     outputs = loop.run(6000)
@@ -147,7 +110,7 @@ def test_the_word_of_the_user_that_nobody_touches_the_arm_ends_the_comparison():
 
 
 def test_a_hand_that_never_lets_go_is_a_fault_that_says_what_contradicts_what():
-    loop = HeldLoop(replace(FREE, termination=replace(FREE.termination, timeout_s=6.0)))
+    loop = TouchedLoop(replace(FREE, termination=replace(FREE.termination, timeout_s=6.0)))
     loop.learn(1.0)
     outputs = loop.hold(added(F_c1=0.4), 12.0)
     assert outputs[-1].fault is FaultReason.ADAPT_TIMEOUT
@@ -157,42 +120,24 @@ def test_a_hand_that_never_lets_go_is_a_fault_that_says_what_contradicts_what():
     assert "`accept` says that nobody touches the arm" in lines
 
 
-def test_an_arm_that_learns_in_circles_says_again_why():
-    loop = HeldLoop(FREE)
-    loop.learn(1.0)
-    loop.hold(added(F_c1=0.4), 11.0)
-    first, again = loop.said("touch")
-    assert re.search(r"friction of joint 1 at .* more than .*; no certificate", first)
-    assert re.search(r"friction of joint 1 at .* more than .*; the 5th fit in a row that is refused; no certif", again)
-
-
-def test_a_certificate_forgets_what_was_kept():
-    loop = HeldLoop(FREE)
-    loop.learn(1.0)
-    loop.lean(0, 1.0, 0.2)
-    assert earlier.is_keeping(loop.pipeline.numbers.memory[0])
-    loop.recover()
-    assert not earlier.is_keeping(loop.pipeline.numbers.memory[0])
-
-
 @pytest.mark.parametrize("profile", ["P", "S", "M"])
-def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound(profile):
-    loop = HeldLoop(FREE, theta=THETA[profile], seed=5)
+def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound_whatever_its_offset(profile):
+    loop = TouchedLoop(FREE, (0.2, -0.2), theta=THETA[profile], seed=5)
     outputs = loop.run_until(SchemeState.CERTIFY)
-    m = loop.pipeline.numbers.memory[0]
+    m = loop.m
     furthest = max(fit_check.distance(m, s) for s in range(int(m.fit_check.steps_used)))
     assert furthest < 0.5 * fit_check.STEADY * fit_check.SMALLEST_SQUARE
     outputs += loop.run_until(SchemeState.MONITOR)
-    learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
-    assert learnt_s == pytest.approx(2.0, abs=0.01)
-    assert loop.said("touch") == []
+    assert learnt_s(outputs) == pytest.approx(2.0, abs=0.01)
+    assert loop.said("touch") + loop.said("anchor") == []
+    assert np.abs(loop.offset_error_Nm).max() < 0.02
 
 
 class Compared:
     """A kernel's memory with a fit and something kept, both known to `std` in every parameter."""
 
     def __init__(self, settings=FREE, std=0.01):
-        self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
+        self.k, self.m = kernel_of(settings)
         self.m.models.P_belief = std**2 * np.eye(len(NAMES))
         self.m.models.belief = 0.1
         self.m.fit_check.fit_square, self.m.fit_check.fit_rows = 1.0, fit_check.HARD  # u = 1
@@ -282,12 +227,8 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
     earlier.forget(m)
     m.fit_check.steps_used, m.fit_check.steps_theta[:2] = 2.0, 0.1
     m.fit_check.steps_P[:2] = 0.02**2 * np.eye(len(NAMES))
-    m.fit_check.steps_square[:2], m.fit_check.steps_rows[:2], m.fit_check.fit_square, m.fit_check.fit_rows = (
-        0.0,
-        50.0,
-        0.0,
-        100.0,
-    )
+    m.fit_check.steps_square[:2], m.fit_check.steps_rows[:2] = 0.0, 50.0
+    m.fit_check.fit_square, m.fit_check.fit_rows = 0.0, 100.0
     added_variance = (1.0 + fit_check.REGULAR) * 0.02**2 - 0.01**2
     m.models.belief[INERTIA] += share * np.sqrt(fit_check.STEADY * fit_check.SMALLEST_SQUARE * added_variance)
     assert (fit_check.last_unsteady_step(m) == fit_check.NONE) is is_steady
@@ -305,7 +246,7 @@ class Halves:
     """A fit whose steps had each half of its information, or less; all its samples are of parameters 0 and 1 alone."""
 
     def __init__(self, steps_used=2, settings=FREE):
-        self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
+        self.k, self.m = kernel_of(settings)
         count = len(certified_memory.parameter_names(settings))
         random = np.random.default_rng(5)
         root = random.standard_normal((count, count))
@@ -392,12 +333,8 @@ def test_a_fit_with_noise_may_differ_by_more():
 def test_a_fit_whose_learnt_residuals_are_large_may_differ_by_a_share_of_the_better_part_of_them(share, is_borne_out):
     fit = Halves(steps_used=1)
     m, unit = fit.m, np.eye(len(NAMES))[1]
-    m.fit_check.steps_square[0], m.fit_check.steps_rows[0], m.fit_check.fit_square, m.fit_check.fit_rows = (
-        2.0,
-        50.0,
-        2.5,
-        100.0,
-    )
+    m.fit_check.steps_square[0], m.fit_check.steps_rows[0] = 2.0, 50.0
+    m.fit_check.fit_square, m.fit_check.fit_rows = 2.5, 100.0
     noise_Nm = fit_check.LEARNT_SHARE * FREE.certified.residual_Nm * np.sqrt(0.5 / 50.0)
     far = np.abs(Halves().differ(0, unit)[:2]).max()
     fit.differ(0, share * (fit_check.LATER_NM + noise_Nm) / far * unit)
@@ -405,9 +342,9 @@ def test_a_fit_whose_learnt_residuals_are_large_may_differ_by_a_share_of_the_bet
 
 
 def test_what_is_kept_is_from_before_the_contact():
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.learn(1.1)
-    m = loop.pipeline.numbers.memory[0]
+    m = loop.m
     steps, of_steps = int(m.fit_check.steps_used), m.fit_check.steps_theta.copy()
     kept = steps - earlier.YOUNG_STEPS
     loop.lean(0, 3.0, 0.05)
@@ -420,9 +357,9 @@ def test_what_is_kept_is_from_before_the_contact():
 
 
 def test_nothing_is_kept_of_a_fit_that_is_as_young_as_a_touch_of_its_beginning():
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.learn(0.3)
-    m = loop.pipeline.numbers.memory[0]
+    m = loop.m
     assert m.fit_check.steps_used == 1.0
     outputs = loop.lean(0, 5.0, 0.05)
     assert any(output.contact is not None for output in outputs)
@@ -512,7 +449,7 @@ def test_a_kept_belief_that_was_leant_on_is_forgotten_and_the_others_go_on_judgi
 
 @pytest.mark.parametrize(("begins_s", "drag_Nm"), long_but(1, [(0.87, 0.14), (0.55, 0.27)]))
 def test_a_drag_that_the_first_fit_has_learnt_half_of_is_not_certified_by_the_second(begins_s, drag_Nm):
-    loop = HeldLoop(FREE, theta=THETA["S"], seed=83115)
+    loop = TouchedLoop(FREE, theta=THETA["S"], seed=83115)
     loop.learn(begins_s)
     outputs = loop.hold(added(F_c2=drag_Nm), 6.0)
     assert SchemeState.MONITOR not in states(outputs)

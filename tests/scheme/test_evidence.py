@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from excited_arm import NAMES, SETTINGS
+from excited_arm import NAMES, kernel_of
 
 from adacd_hil.scheme.identify import evidence
 from adacd_hil.scheme.identify.evidence import FRICTIONS, KEPT, LAST, OFFSETS, QUANTITIES, REFUSED, VISCOUS
-from adacd_hil.scheme.kernel import certified_memory
 
 ANCHOR, INERTIA, OFFSET, DRAG = 0, FRICTIONS, OFFSETS, 0
 
@@ -15,7 +14,7 @@ class Table:
     """A table in which one source says of one quantity that it is 1, to a variance, and the fit says otherwise."""
 
     def __init__(self, s, q, variance=0.0, floor=0.0, slack=0.0, fitted_variance=0.0):
-        self.k, self.m = certified_memory.constants_of(SETTINGS)[0], certified_memory.new_memory(SETTINGS)[0]
+        self.k, self.m = kernel_of()
         self.s, self.q, self.fitted_variance = s, q, fitted_variance
         evidence.set_row(self.m, s, q, 1.0, variance, floor, slack)
 
@@ -73,7 +72,7 @@ def test_of_several_sources_the_one_that_contradicts_most_is_named():
 
 
 def test_each_quantity_is_a_column_of_the_parameters():
-    k = certified_memory.constants_of(SETTINGS)[0]
+    k, _ = kernel_of()
     theta = np.arange(1.0, len(NAMES) + 1.0)
     of = dict(zip(NAMES, theta, strict=True))
     friction = [of[f"F_c{i}"] + v * of[f"F_v{i}"] for i in (1, 2) for v in evidence.SPEEDS_RAD_S]

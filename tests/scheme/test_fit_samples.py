@@ -2,20 +2,18 @@
 
 import numpy as np
 import pytest
-from excited_arm import NAMES, PERIOD_S
+from excited_arm import FREE, NAMES, PERIOD_S, TouchedLoop, kernel_of, states
 from planar_arm import THETA
-from test_earlier import FREE, HeldLoop, states
 
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.identify import fit_check
-from adacd_hil.scheme.kernel import certified_memory
 
 
 class Fit:
     """A kernel's memory with a fit that explains what it has learnt, but for noise of 0.01 Nm."""
 
     def __init__(self, learnt=300):
-        self.k, self.m = certified_memory.constants_of(FREE)[0], certified_memory.new_memory(FREE)[0]
+        self.k, self.m = kernel_of(FREE)
         fit_check.begin(self.m)
         random = np.random.default_rng(1)
         self.W = random.standard_normal((learnt, 2, len(NAMES)))
@@ -66,7 +64,7 @@ def test_a_payloads_fit_is_not_asked():
 
 
 def test_a_lean_at_the_start_too_short_for_the_thresholds_is_named_and_not_certified():
-    loop = HeldLoop(FREE, theta=THETA["M"], seed=91161)
+    loop = TouchedLoop(FREE, theta=THETA["M"], seed=91161)
     loop.run_until(SchemeState.ADAPT)
     outputs = loop.lean(0, -0.5, 0.06)
     outputs += loop.run(round(2.3 / PERIOD_S))

@@ -51,12 +51,6 @@ def test_the_columns_follow_the_order_of_the_settings():
     np.testing.assert_array_equal(both, np.hstack([columns([LOAD]), columns([STRIBECK])]))
 
 
-def test_columns_before_the_first_are_left_alone():
-    Y_h = np.full((2, 7), 9.0)
-    fill_terms(DQ, TAU_J, np.array([1.0]), (STILL, NO_WIDTH, V_S), BENT, 5, Y_h)
-    np.testing.assert_array_equal(Y_h[:, :5], 9.0)
-
-
 def test_the_width_column_is_what_a_wider_tanh_would_change():
     """d/d(log width) of tanh(dq / width), by finite differences."""
     width, step = 0.1, 1e-6
@@ -135,16 +129,6 @@ def test_a_dahl_friction_is_coulomb_friction_and_as_much_of_its_column(place, fa
     assert np.abs(without).max() > 1.9 * F_c
     learnt, *_ = np.linalg.lstsq(columns_of[:, [0, 1 + place]], friction_Nm)
     np.testing.assert_allclose(learnt, [F_c, F_c], rtol=0.035)
-
-
-@pytest.mark.parametrize("fastest_rad_s", [0.05, 0.3, 1.5])
-def test_bristles_of_a_length_between_the_two_are_a_mixture_of_them(fastest_rad_s):
-    columns_of, friction = seen_columns(fastest_rad_s, 1500), dahl_friction(0.002, fastest_rad_s, 1500)
-    learnt, *_ = np.linalg.lstsq(columns_of, friction)
-    np.testing.assert_allclose(learnt, [1.0, 0.55, 0.5], atol=0.07)
-    left, without = friction - columns_of @ learnt, friction - columns_of[:, 0]
-    assert np.abs(left).max() < 0.11
-    assert np.sqrt(np.mean(left**2)) < 0.09 * np.sqrt(np.mean(without**2))
 
 
 @pytest.mark.parametrize("dq", [0.3, -0.3])

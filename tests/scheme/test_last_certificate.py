@@ -5,14 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import NAMES, PERIOD_S
+from excited_arm import FREE, NAMES, TouchedLoop, added, kernel_of, learnt_s, states
 from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA
-from test_earlier import FREE, HeldLoop, added, states
 
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.scheme.identify import certificate, evidence, fit_check
-from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD, THIS_RUN_ONLY
 
 DATE = "2026-11-22T10:00:00Z"
@@ -39,10 +37,9 @@ def known(theta, settings=FREE):
 
 @pytest.mark.parametrize("profile", long_but(1, ["P", "S", "M"]))
 def test_an_arm_that_nobody_touches_is_certified_as_ever_and_its_certificate_says_what_it_was_compared_with(profile):
-    loop = HeldLoop(known(THETA[profile]), theta=THETA[profile])
+    loop = TouchedLoop(known(THETA[profile]), theta=THETA[profile])
     outputs = loop.run_until(SchemeState.MONITOR)
-    learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
-    assert learnt_s == pytest.approx(2.0, abs=0.01)
+    assert learnt_s(outputs) == pytest.approx(2.0, abs=0.01)
     assert loop.said("touch") == []
     assert loop.said("certificate")[0].endswith(f"; friction and inertia: within what the certificate of {DATE} allows")
 
@@ -59,7 +56,7 @@ def test_an_arm_that_nobody_touches_is_certified_as_ever_and_its_certificate_say
     ),
 )
 def test_a_hand_from_before_the_first_motion_is_more_than_the_last_certificate_said(hand, named):
-    loop = HeldLoop(known(THETA["P"]))
+    loop = TouchedLoop(known(THETA["P"]))
     loop.theta = THETA["P"] + hand
     assert SchemeState.MONITOR not in states(loop.run(6000))
     assert re.search(rf"{named} than in the certificate of {DATE}, bound 0\.\d\d\d", loop.said("touch")[0])
@@ -71,7 +68,7 @@ def test_a_hand_from_before_the_first_motion_is_more_than_the_last_certificate_s
 
 
 def test_without_a_last_certificate_the_same_hand_is_learnt_and_the_certificate_says_so():
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.theta = THETA["P"] + added(F_c1=0.2)
     loop.recover()
     assert loop.error_of("F_c1") < 0.02
@@ -79,7 +76,7 @@ def test_without_a_last_certificate_the_same_hand_is_learnt_and_the_certificate_
 
 
 def test_an_arm_that_has_changed_is_certified_at_the_users_word_and_carries_it():
-    loop = HeldLoop(known(THETA["P"]))
+    loop = TouchedLoop(known(THETA["P"]))
     loop.theta = THETA["P"] + added(F_c1=0.3)  # a new seal
     loop.run(4000)
     loop.request = Request.ACCEPT
@@ -91,13 +88,13 @@ def test_an_arm_that_has_changed_is_certified_at_the_users_word_and_carries_it()
 
 
 def test_less_is_the_arms():
-    loop = HeldLoop(known(THETA["P"] + added(F_c1=0.3, F_v2=0.1, a1=0.1)))
+    loop = TouchedLoop(known(THETA["P"] + added(F_c1=0.3, F_v2=0.1, a1=0.1)))
     loop.recover()
     assert loop.said("touch") == []
 
 
 def test_a_payload_that_is_announced_is_not_compared():
-    loop = HeldLoop(known(THETA["P"]))
+    loop = TouchedLoop(known(THETA["P"]))
     loop.run_until(SchemeState.MONITOR)
     loop.request = Request.PAYLOAD
     loop.run_until(SchemeState.PAYLOAD)
@@ -112,7 +109,7 @@ def test_a_payload_that_is_announced_is_not_compared():
 
 
 def test_what_a_certificate_says_of_the_arm_is_the_model_at_the_quantities_that_are_compared():
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.run_until(SchemeState.MONITOR)
     (certificate,) = loop.pipeline.certificates
     np.testing.assert_allclose(certificate.friction_Nm, friction_of(THETA["P"]), atol=0.02)
@@ -123,7 +120,7 @@ def test_what_a_certificate_says_of_the_arm_is_the_model_at_the_quantities_that_
 
 
 def test_a_certificate_that_is_taken_back_is_none():
-    loop = HeldLoop(FREE)
+    loop = TouchedLoop(FREE)
     loop.run_until(SchemeState.MONITOR)
     loop.run(500)
     loop.theta = loop.theta + added(F_c1=0.3)
@@ -143,7 +140,7 @@ class Asked:
         settings = known(np.full(7, 0.1))
         history = replace(settings.history, friction_std_Nm=(0.0,) * 6, inertia_std_kgm2=(0.0,) * 3, **shares)
         settings = replace(settings, history=history)
-        self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
+        self.k, self.m = kernel_of(settings)
         self.m.models.P_belief = (std**2 + 1e-12) * np.eye(len(NAMES))
         self.m.fit_check.fit_square, self.m.fit_check.fit_rows = 1.0, 4.0
 

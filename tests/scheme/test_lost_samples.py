@@ -2,20 +2,20 @@
 
 import numpy as np
 import pytest
-from excited_arm import PERIOD_S, SETTINGS, record
+from excited_arm import PERIOD_S, Kernel, kernel_of, record
 from planar_arm import THETA
 
 from adacd_hil.scheme.detect import sensitivity
-from adacd_hil.scheme.kernel import certified_kernel, certified_memory
+from adacd_hil.scheme.kernel import certified_kernel
 from adacd_hil.scheme.supervisor import transitions
 
-K = certified_memory.constants_of(SETTINGS)[0]
+K, _ = kernel_of()
 MODE = certified_kernel.WATCH | certified_kernel.REFINE
 
 
 def followed(steps, dq=(0.3, 0.3), is_seen=True, lost_Nm2=0.0):
     """Return G (3, 2) after a sample that came so many periods after the last, which had 0.3 rad/s."""
-    m = certified_memory.new_memory(SETTINGS)[0]
+    _, m = kernel_of()
     m.gaps.last[1] = 0.3
     m.sensitivity.hold[:] = 0.1
     m.regressor.M[:] = np.eye(2)
@@ -44,35 +44,29 @@ def test_a_gap_that_is_cut_out_leaves_the_velocity_s_noise():
     np.testing.assert_allclose(followed(20, is_seen=False), np.tile(expected[:, None], (1, 2)), rtol=1e-12)
 
 
-class LossyArm:
+class LossyArm(Kernel):
     """The arm as certified, on the excitation, of whose samples some are lost."""
 
     def __init__(self, lost, seconds=6.0):
-        measured = record(THETA["P"], seconds, seed=5)
-        self.m = certified_memory.new_memory(SETTINGS)
-        self.block = certified_memory.new_block(SETTINGS)
-        constants = certified_memory.constants_of(SETTINGS)
-        certified_kernel.begin_adaptation(constants, self.m, False, True)
+        super().__init__()
         self.found, self.h, self.dq, self.still, self.roughness = [], [], [], [], []
         since, mode = 1, certified_kernel.WATCH | certified_kernel.LEARN
-        for k, (q, dq, tau_J) in enumerate(zip(*measured, strict=True)):
-            self.block["q"], self.block["dq"], self.block["tau_J"] = q, dq, tau_J
-            self.block["period_s"] = since * PERIOD_S
+        for k, sample in enumerate(zip(*record(THETA["P"], seconds, seed=5), strict=True)):
             is_lost = lost(k) and mode == MODE
-            found = certified_kernel.step(constants, self.m, self.block, 0 if is_lost else 1, since, mode)
+            found = self.step(*sample, mode, 0 if is_lost else 1, since, since * PERIOD_S)
             since = since + 1 if is_lost else 1
             if found & transitions.FITTED:
-                certified_kernel.begin_test(constants, self.m)
+                certified_kernel.begin_test(self.constants, self.memory)
                 mode = certified_kernel.WATCH | certified_kernel.TEST
             elif found & transitions.CERTIFIED:
-                certified_kernel.begin_refinement(constants, self.m)
+                certified_kernel.begin_refinement(self.constants, self.memory)
                 mode = MODE
             elif mode == MODE:
                 self.found.append(found)
-                self.h.append(self.m[0].sensitivity.h.copy())
-                self.dq.append(dq)
-                self.still.append(self.m[0].sensitivity.still.copy())
-                self.roughness.append(self.m[0].sensitivity.velocity_roughness.copy())
+                self.h.append(self.m.sensitivity.h.copy())
+                self.dq.append(sample[1])
+                self.still.append(self.m.sensitivity.still.copy())
+                self.roughness.append(self.m.sensitivity.velocity_roughness.copy())
 
 
 @pytest.mark.parametrize("burst", [1, 4, 8])

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import SETTINGS, TouchedLoop, play, record
+from excited_arm import FREE, SETTINGS, Kernel, TouchedLoop, play, record, states
 from planar_arm import THETA
 
 from adacd_hil.records import CERTIFICATE_EVENTS, POSITION_TERMS, Request, SchemeState
@@ -14,7 +14,6 @@ from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.configuration import load_settings
 
-FREE = replace(SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)))
 TOLD = replace(FREE, arm=replace(FREE.arm, position_torque_Nm=0.15))
 CABLE_NM = 0.1
 REMEDY = "if it is the arm's, `arm.position_torque_Nm` lets the model have it, from the next start on"
@@ -38,13 +37,9 @@ def cabled(seconds, cable_Nm=CABLE_NM, lean_Nm=0.0):
 
 def learnt(settings, measured):
     """Let an adaptation take in a record, contacts or not; return the kernel's arrays."""
-    constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
-    block = certified_memory.new_block(settings)
-    certified_kernel.begin_adaptation(constants, memory, False, True)
-    for q, dq, tau_J in zip(*measured, strict=True):
-        block["q"], block["dq"], block["tau_J"], block["period_s"] = q, dq, tau_J, 0.0
-        certified_kernel.step(constants, memory, block, 1, 1, certified_kernel.LEARN)
-    return constants, memory
+    kernel = Kernel(settings)
+    kernel.run(*measured, certified_kernel.LEARN)
+    return kernel.constants, kernel.memory
 
 
 def test_columns_are_those_of_a_tilted_base_and_of_cables():
@@ -143,7 +138,7 @@ def test_a_model_that_is_told_of_a_cable_is_certified_with_it_and_says_how_much(
     assert found is not None
     assert all(0.02 < float(torque_Nm) < 0.15 for torque_Nm in found.groups())
     outputs = loop.run(10_000)
-    assert {output.state for output in outputs} == {SchemeState.MONITOR}
+    assert states(outputs) == {SchemeState.MONITOR}
 
 
 @pytest.mark.slow
@@ -152,7 +147,7 @@ def test_a_model_that_is_told_of_a_cable_takes_no_lean_for_one(lean_Nm):
     loop = TouchedLoop(TOLD)
     loop.run_until(SchemeState.ENABLE)
     leant = loop.lean(0, lean_Nm, 3.5)
-    assert SchemeState.MONITOR not in {output.state for output in leant}
+    assert SchemeState.MONITOR not in states(leant)
     said = loop.said("position") + loop.said("anchor")
     assert re.search(r"joint 1 has a (torque of up to \d\.\d+ Nm that depends on where|fitted torque offset)", said[0])
 

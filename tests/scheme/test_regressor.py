@@ -41,11 +41,6 @@ def test_momentum_and_remainder_make_up_the_torque(seed, parameter_count):
     np.testing.assert_allclose(W, regressor(q, dq, ddq, parameter_count, 0.0), atol=1e-7)
 
 
-@pytest.mark.parametrize("profile", ["P", "S", "M"])
-def test_an_arm_that_exists_is_positive_definite(profile):
-    assert is_positive_definite(THETA[profile])
-
-
 @pytest.mark.parametrize(
     "inertia",
     [

@@ -91,15 +91,6 @@ def test_across_gaps_the_true_model_still_leaves_nothing(motion, gap):
     assert np.max(np.abs(tau_ext_hat_of(blocks))) < LEFT_NM
 
 
-def test_a_push_is_still_felt_after_a_gap(motion):
-    t_s, q, dq, ddq = motion
-    tau_ext = np.full((t_s.size, 2), 0.5)
-    periods = np.ones(t_s.size, dtype=np.int64)
-    periods[1000] = 6
-    blocks = run_kernel(settings_with(), q, dq, torque_of(q, dq, ddq, SMOOTH, tau_ext), SMOOTH, 0, periods=periods)
-    np.testing.assert_allclose(tau_ext_hat_of(blocks)[1000], tau_ext_hat_of(blocks)[999], rtol=1e-9)
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("signal", [0, 1, 2])
 def test_one_bad_number_does_not_stay_in_the_filters(motion, signal, value):

@@ -4,15 +4,13 @@ import re
 
 import numpy as np
 import pytest
-from excited_arm import SETTINGS, TouchedLoop
+from excited_arm import PERIOD_S, SETTINGS, TouchedLoop, kernel_of
 
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.scheme.detect import margin, sensitivity
-from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.model import filter_bank
 
 FILTERS = SETTINGS.filter_count
-PERIOD_S = SETTINGS.bus.period_s
 
 
 def pushes(y, h):
@@ -32,7 +30,7 @@ def tested():
     loop = TouchedLoop(SETTINGS)
     loop.run_until(SchemeState.CERTIFY)
     y, h = [], []
-    m = loop.pipeline.numbers.memory[0]
+    m = loop.m
     while loop.step().state is SchemeState.CERTIFY:
         y.append(m.filters.y.copy())
         h.append(m.sensitivity.h.copy())
@@ -56,17 +54,17 @@ def test_a_certificate_states_the_smallest_push_and_the_thresholds_of_its_test(t
 
 @pytest.mark.parametrize("value_Nm", [1e-5, 0.0123, 0.4, 100.0])
 def test_a_threshold_that_is_always_the_same_is_said_as_it_is(value_Nm):
-    m = certified_memory.new_memory(SETTINGS)[0]
+    k, m = kernel_of()
     m.sensitivity.wide_threshold, m.sensitivity.h = value_Nm, value_Nm
     for _ in range(10):
-        margin.follow_test(certified_memory.constants_of(SETTINGS)[0], m)
+        margin.follow_test(k, m)
     pair = f"{value_Nm:.3f} / {value_Nm:.3f}"
     assert f"thresholds {pair} Nm in the middle, {pair} in 99 %, {pair} at worst" in margin.describe_sight(m)
 
 
 def test_the_next_test_begins_with_nothing_seen(tested):
     m = tested[0].pipeline.numbers.memory.copy()[0]
-    margin.follow_sight(certified_memory.constants_of(SETTINGS)[0], m)
+    margin.follow_sight(kernel_of()[0], m)
     for name in ("seen", "seen_push_Nm", "sum_cycles"):
         assert m.margin[name].any()
     margin.begin_sight(m)
@@ -74,29 +72,39 @@ def test_the_next_test_begins_with_nothing_seen(tested):
         assert not m.margin[name].any()
 
 
-def test_a_monitor_that_sees_less_than_was_certified_says_so_once():
+def test_a_monitor_that_sees_less_than_was_certified_says_so_once_each_time_and_with_each_certificate():
     loop = TouchedLoop(SETTINGS)
     loop.run_until(SchemeState.MONITOR)
-    m = loop.pipeline.numbers.memory[0]
     loop.run(3000)
     assert loop.said("sight") == []
-    m.sensitivity.roughness[1] = 400.0  # noise of the torque sensor, of variance
-    loop.run(2500)
+
+    def see(roughness, cycles):
+        """Let the torque sensor of joint 2 have noise of so many times the variance."""
+        loop.m.sensitivity.roughness[1] = roughness
+        loop.run(cycles)
+
+    see(400.0, 2500)
     (text,) = loop.said("sight")
     found = re.match(r"joint 2 .* pushes from ([\d.]+) Nm on within 100 ms, in the test from ([\d.]+) Nm", text)
     assert float(found[1]) > margin.LESS * float(found[2])
-    assert float(found[2]) == pytest.approx(m.margin.seen_push_Nm[1], abs=0.005)
-    m.sensitivity.roughness[1] = 1.0
-    loop.run(3000)
-    m.sensitivity.roughness[1] = 400.0
-    loop.run(2500)
+    assert float(found[2]) == pytest.approx(loop.m.margin.seen_push_Nm[1], abs=0.005)
+    see(1.0, 3000)
+    see(400.0, 2500)
     assert len(loop.said("sight")) == 2
+    loop.request = Request.PAYLOAD
+    loop.run_until(SchemeState.PAYLOAD)
+    see(1.0, 0)
+    loop.request = Request.PAYLOAD_CHANGED
+    loop.run_until(SchemeState.MONITOR)
+    assert len(loop.said("sight")) == 2
+    see(400.0, 2500)
+    assert len(loop.said("sight")) == 3
 
 
 def test_a_joint_that_sees_less_for_some_seconds_takes_the_certificate_back():
     loop = TouchedLoop(SETTINGS)
     loop.run_until(SchemeState.MONITOR)
-    m = loop.pipeline.numbers.memory[0]
+    m = loop.m
     loop.run(1000)
     m.sensitivity.roughness[1] = 400.0
     outputs = loop.run_until(SchemeState.STOPPED, 6000)
@@ -112,7 +120,7 @@ def test_a_joint_that_sees_less_for_some_seconds_takes_the_certificate_back():
 
 def test_a_joint_that_rests_is_not_asked_what_it_sees():
     """There friction holds what it can."""
-    k, m = certified_memory.constants_of(SETTINGS)[0], certified_memory.new_memory(SETTINGS)[0]
+    k, m = kernel_of()
     m.sensitivity.h, m.margin.seen_push_Nm = 1.0, 0.1
     m.sensitivity.still[:, 0] = 1.0
     for _ in range(int(k.margin.mean_cycles) - 1):  # too little motion to tell
@@ -137,7 +145,7 @@ def test_a_joint_that_rests_is_not_asked_what_it_sees():
     ],
 )
 def test_what_has_raised_the_thresholds_is_named(change, cause):
-    m = certified_memory.new_memory(SETTINGS)[0]
+    _, m = kernel_of()
     m.sensitivity.h_model[:] = 1.0
     m.margin.dim_s[0] = 1.0
     for name, value in change.items():
@@ -154,20 +162,3 @@ def test_the_rate_under_a_gaussian_tail_is_that_of_the_floor():
         assert margin.rate_per_h(nu_Hz, seen_s, share) == pytest.approx(3600.0 * margin.RATE_HZ)
         assert margin.rate_per_h(nu_Hz, seen_s, 0.5 * share) < 1e-6
     assert margin.rate_per_h(3.2, 50.0, 0.0) == 0.0
-
-
-def test_a_new_certificate_that_sees_less_again_is_told_again():
-    loop = TouchedLoop(SETTINGS)
-    loop.run_until(SchemeState.MONITOR)
-    m = loop.pipeline.numbers.memory[0]
-    m.sensitivity.roughness[1] = 400.0
-    loop.run(2500)
-    loop.request = Request.PAYLOAD
-    loop.run_until(SchemeState.PAYLOAD)
-    m.sensitivity.roughness[1] = 1.0
-    loop.request = Request.PAYLOAD_CHANGED
-    loop.run_until(SchemeState.MONITOR)
-    assert len(loop.said("sight")) == 1
-    m.sensitivity.roughness[1] = 400.0
-    loop.run(2500)
-    assert len(loop.said("sight")) == 2

@@ -5,8 +5,7 @@ import re
 import numpy as np
 import pytest
 import scipy.signal
-from excited_arm import SETTINGS
-from test_certified_kernel import COUNT, RECOVER, Kernel
+from excited_arm import NAMES, SETTINGS, Kernel
 
 from adacd_hil.scheme.detect import margin, sensitivity
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
@@ -15,6 +14,8 @@ from adacd_hil.scheme.supervisor import transitions
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
 PERIOD_S = SETTINGS.bus.period_s
+COUNT = len(NAMES)
+RECOVER = round(SETTINGS.certified.recover_s / PERIOD_S)
 CUTOFFS = np.array(SETTINGS.certified.cutoffs_rad_s)
 NU_HZ = np.concatenate([CUTOFFS, CUTOFFS[1:]]) / np.pi
 BLOCK = round(margin.BLOCK_S / PERIOD_S)
@@ -54,7 +55,7 @@ class Tailed:
             self.see(y, 2)
 
 
-@pytest.mark.parametrize("seen_s", [0.1, 1.0, 10.0, 600.0, HOUR_S, 2.0 * HOUR_S])
+@pytest.mark.parametrize("seen_s", [0.1, 10.0, 600.0, HOUR_S, 2.0 * HOUR_S])
 def test_the_floor_is_the_largest_residual_times_the_formula_s_factor(seen_s):
     tailed = Tailed()
     largest = np.random.default_rng(1).uniform(-0.3, 0.3, (5, 2))
@@ -63,13 +64,6 @@ def test_the_floor_is_the_largest_residual_times_the_formula_s_factor(seen_s):
     tailed.see(0.5 * largest, BLOCK)
     expected = factor(NU_HZ, seen_s)[:, None] * np.abs(largest)
     np.testing.assert_allclose(tailed.m.margin.tail_Nm, expected, rtol=1e-10)
-
-
-def test_the_factor_falls_from_its_bound_to_one_after_an_hour():
-    factors = [margin.tail_factor(4.0 / np.pi, seen_s) for seen_s in (0.0, 1.0, 60.0, 600.0, HOUR_S, 1e6)]
-    assert factors[:2] == [margin.LARGEST] * 2
-    assert np.all(np.diff(factors[1:5]) < 0.0)
-    assert factors[4:] == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("seen_s", [10.0, 60.0])
