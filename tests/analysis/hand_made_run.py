@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.logged_run import CertifiedStream, CycleColumns, PaperStream, Run, Truth
+from adacd_hil.log.logged_run import CertifiedStream, CycleColumns, PaperStream, Run, Truth, columns_of_records
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
 from adacd_hil.records import (
@@ -185,6 +185,12 @@ def like_an_old_log(run: Run) -> Run:
     """Take away what /cycle did not have at first."""
     names = ("cycle", "lateness_ns", "feedback_ns", "command_ns", "overruns", "frames_missing", "commands_late")
     return replace(run, timing=replace(run.timing, columns={name: run.timing[name] for name in names}))
+
+
+def without_cycles(run: Run) -> Run:
+    """Give a log that ended before its first cycle."""
+    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
+    return replace(run, timing=columns_of_records([], []), **{name: getattr(run, name)[:0] for name in names})
 
 
 def record(path: Path, run: Run, attachments: dict[str, bytes], clock: str = "lockstep") -> None:

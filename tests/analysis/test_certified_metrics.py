@@ -2,14 +2,13 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hand_made_run import FIRST_CYCLE, A, C, M, P, R, S, contact_report, make_certified_run, make_run, react, touch
 
 from adacd_hil.lab.report.page import paper_cells, paper_head
-from adacd_hil.lab.report.report_files import Report
+from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.logged_run import split_sections
@@ -66,7 +65,7 @@ def test_a_contact_while_adapting_has_its_delay_and_is_not_missed():
     assert metrics.missed == 0
 
 
-@pytest.mark.parametrize("row", [300, 800, 3000, 5200])
+@pytest.mark.parametrize("row", [800, 5200])
 def test_a_detection_without_contact_is_a_false_alarm_in_every_state(row):
     assert evaluate(react(make_certified_run(), row, 20)).false_alarms == 1
 
@@ -133,7 +132,9 @@ def certificates(*levels):
 def test_a_verdict_says_that_nothing_anchors_the_offsets_of_some_certificate():
     metrics = evaluate(certificates("info", "warning"))
     assert not metrics.evidence.is_anchored
-    assert "after the payload change, with torque offsets that nothing anchors; the paper's scheme" in metrics.verdict
+    assert (
+        "offsets that nothing anchors; the paper's scheme on the same stream took 2.00 s and 2.00 s" in metrics.verdict
+    )
     assert "anchors" not in evaluate(certificates("info", "info")).verdict
 
 
@@ -145,10 +146,6 @@ def test_a_certificate_that_was_taken_back_is_what_the_verdict_begins_with_and_t
     assert metrics.verdict.startswith(f"{why}; ")
     assert not metrics.is_clean
     assert evaluate(make_certified_run()).is_clean
-
-
-def test_a_verdict_compares_with_the_papers_scheme():
-    assert "the paper's scheme on the same stream took 2.00 s and 2.00 s" in evaluate(make_certified_run()).verdict
 
 
 def touched_beside(row, crossing):
@@ -232,7 +229,7 @@ def test_a_step_behind_two_equal_low_passes_takes_as_long_as_it_should():
     assert two_pole_delay_s(-2.0, 1.0, 100.0, 100.0) == pytest.approx(0.0167835, rel=1e-4)
 
 
-@pytest.mark.parametrize("tau_ext_Nm", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("tau_ext_Nm", [0.0, 1.0])
 def test_a_step_below_the_threshold_never_passes_two_low_passes(tau_ext_Nm):
     assert two_pole_delay_s(tau_ext_Nm, 1.0, 10.0, 200.0) is None
 
@@ -251,20 +248,8 @@ def test_the_law_is_that_of_the_fastest_channel():
     assert contact.ideal_ms == pytest.approx(1.0)
 
 
-def report_of(run):
-    """Make a report without figures and files."""
-    folder = Path("nowhere")
-    return Report(evaluate(run), run.metadata, ReportSource("run.mcap"), folder / "a.html", folder / "a.json", ())
-
-
-def reported_run():
-    run = touched_beside(3000, 3005)
-    made = contact_report(int(run.cycle[3001]), location=Location.LINK_1, force_N=14.2, force_sigma=0.5)
-    return replace(run, reports=(made,))
-
-
 def test_the_table_puts_three_columns_side_by_side():
-    metrics = evaluate(reported_run())
+    metrics = evaluate(touched_beside(3000, 3005))
     first = next(cells for cells in paper_cells(metrics) if cells[0] == "First adaptation")
     assert (paper_head(metrics)[-1], first[1:]) == ("certified", ("5.2 s", "2.00 s", "1.00 s"))
 
@@ -273,10 +258,8 @@ def test_the_table_puts_three_columns_side_by_side():
     ("location", "words"),
     [
         (Location.KNOWN, "force at right angles</dt><dd>−14.2 ± 0.5 N"),
-        (Location.UNCERTAIN, "force at right angles</dt><dd>−14.2 ± 0.5 N"),
         (Location.LINK_1, "force</dt><dd>≥ 14.2 ± 0.5 N"),
         (Location.BEYOND_TIP, "force</dt><dd>not known"),
-        (Location.INCONSISTENT, "force</dt><dd>not known"),
     ],
 )
 def test_a_force_is_told_as_far_as_it_is_known(location, words):
@@ -289,10 +272,11 @@ def test_a_force_is_told_as_far_as_it_is_known(location, words):
 def test_the_page_marks_a_margin_below_one():
     run = make_certified_run()
     run.certified.tau_ext[3000, 4] = 0.2
-    assert '<td data-head="margin" class="bad">0.5 / 0.5</td>' in report_page(
-        evaluate(run), run, ReportSource("run.mcap")
-    )
+    html = report_page(evaluate(run), run, ReportSource("run.mcap"))
+    assert '<td data-head="margin" class="bad">0.5 / 0.5</td>' in html
 
 
 def test_a_margin_without_bound_is_null_in_the_table():
-    assert report_of(make_certified_run()).as_json()["certified"]["smallest_margin"] is None
+    run = make_certified_run()
+    table = report_json(evaluate(run), run.metadata, ReportSource("run.mcap"))
+    assert table["certified"]["smallest_margin"] is None

@@ -19,10 +19,11 @@ from hand_made_run import (
     react,
     touch,
     touched_run,
+    without_cycles,
 )
 
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.log.logged_run import Span, columns_of_records, section_label, split_sections
+from adacd_hil.log.logged_run import Span, section_label, split_sections
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.score.judge import detection_delay_s, filtered
 
@@ -73,7 +74,7 @@ def test_what_interrupts_a_section(stays, kinds):
     assert [section.kind for section in split_sections(make_run(*stays))] == kinds
 
 
-@pytest.mark.parametrize(("index", "label"), [(0, "A"), (25, "Z"), (26, "AA"), (27, "AB"), (52, "BA")])
+@pytest.mark.parametrize(("index", "label"), [(0, "A"), (25, "Z"), (26, "AA"), (52, "BA")])
 def test_sections_are_lettered_beyond_z(index, label):
     assert section_label(index) == label
 
@@ -98,13 +99,13 @@ def test_a_fault_has_its_name_and_its_time():
     assert (evaluate(run).fault, evaluate(run).fault_s) == ("ADAPT_TIMEOUT", pytest.approx(0.010))
 
 
-@pytest.mark.parametrize(("tau_ext_Nm", "delay_ms"), [(0.2, 138.6), (-0.5, 35.7), (5.0, 3.0)])
+@pytest.mark.parametrize(("tau_ext_Nm", "delay_ms"), [(0.2, 138.6), (-0.5, 35.7)])
 def test_the_law_gives_the_known_delays(tau_ext_Nm, delay_ms):
     delay_s = detection_delay_s(tau_ext_Nm, 0.15, 10.0)
     assert delay_s * 1e3 == pytest.approx(delay_ms, abs=0.05)
 
 
-@pytest.mark.parametrize("tau_ext_Nm", [0.0, 0.1, 0.15])
+@pytest.mark.parametrize("tau_ext_Nm", [0.0, 0.15])
 def test_the_law_says_never_up_to_the_threshold(tau_ext_Nm):
     assert detection_delay_s(tau_ext_Nm, 0.15, 10.0) is None
 
@@ -140,13 +141,6 @@ def test_a_contact_is_described(changes, told):
     assert found == {
         name: pytest.approx(value, abs=1e-4) if isinstance(value, float) else value for name, value in told.items()
     }
-
-
-def test_two_contacts_that_follow_at_once_are_two():
-    run = make_run()
-    touch(run, 2000, 100, (5.0, 0.0), index=0)
-    touch(run, 2100, 100, (-5.0, 0.0), index=1)
-    assert len(evaluate(run).contacts) == 2
 
 
 def test_the_delay_counts_skipped_cycles():
@@ -189,8 +183,8 @@ def test_the_threshold_in_force_counts_not_the_configured_one():
 
 @pytest.mark.parametrize(
     ("row", "is_armed"),
-    [(500, False), (1050, False), (1051, True), (2000, True), (5200, False), (5700, False)],
-    ids=["first adaptation", "in the cycle that arms", "one later", "watching", "payload", "second adaptation"],
+    [(1050, False), (1051, True), (5200, False)],
+    ids=["in the cycle that arms", "one later", "payload"],
 )
 def test_a_contact_is_missed_if_it_is_not_found_and_began_while_detection_was_armed(row, is_armed):
     run = make_run()
@@ -215,45 +209,27 @@ def test_an_arm_that_is_held_because_its_host_is_late_is_no_false_alarm():
 
 
 @pytest.mark.parametrize(
-    ("payload_from", "has_gravity", "false_alarms"),
-    [(5100, True, 0), (5100, False, 1), (0, True, 1), (5300, True, 1)],
-    ids=["its weight", "no weight", "no other payload", "fitted later"],
+    ("row", "payload_from", "has_gravity", "false_alarms"),
+    [(5200, 5100, True, 0), (5200, 5100, False, 1), (5200, 0, True, 1), (5200, 5300, True, 1), (3000, 2900, True, 1)],
+    ids=["its weight", "no weight", "no other payload", "fitted later", "not announced"],
 )
-def test_the_weight_of_a_payload_that_is_fitted_is_no_false_alarm(payload_from, has_gravity, false_alarms):
-    run = react(make_run(), 5200)
+def test_the_weight_of_a_payload_that_is_fitted_is_no_false_alarm(row, payload_from, has_gravity, false_alarms):
+    run = react(make_run(), row)
     run = upright(run) if has_gravity else run
     run.truth.payload_kg[payload_from:] = 1.0
     assert evaluate(run).false_alarms == false_alarms
 
 
-def test_an_alarm_about_a_payload_that_was_not_announced_is_false():
-    run = upright(react(make_run(), 3000))
-    run.truth.payload_kg[2900:] = 1.0
-    assert evaluate(run).false_alarms == 1
-
-
-def test_a_detection_without_contact_is_a_false_alarm_with_its_time():
-    metrics = evaluate(react(make_run(), 2000))
-    assert (metrics.false_alarms, metrics.false_alarms_s) == (1, pytest.approx([1.95]))
-
-
 # Of 5 Nm for 0.25 s 4.59 Nm are in the filter; they are back at 0.15 Nm after 342 ms, and one time constant is 100 ms.
 @pytest.mark.parametrize(
     ("row", "false_alarms"),
-    [(1999, 1), (2000, 0), (2005, 0), (2690, 0), (2693, 1)],
-    ids=["before", "onset", "during", "decay", "long after"],
+    [(1999, 1), (2690, 0), (2693, 1)],
+    ids=["before", "decay", "long after"],
 )
 def test_a_detection_belongs_to_a_contact_from_its_onset_until_it_is_forgotten(row, false_alarms):
     run = make_run()
     touch(run, 2000, 250, (5.0, 0.0))
     assert evaluate(react(run, row)).false_alarms == false_alarms
-
-
-def test_of_two_detections_of_one_contact_the_first_gives_the_delay_and_none_is_false():
-    run = make_run()
-    touch(run, 2000, 400, (5.0, 0.0))
-    metrics = evaluate(react(react(run, 2005), 2300))
-    assert (metrics.false_alarms, metrics.contacts[0].delay_ms) == (0, pytest.approx(5.0))
 
 
 def test_a_contact_has_the_link_of_the_first_report_and_that_of_the_final_one():
@@ -298,7 +274,7 @@ def test_a_run_with_a_contact_on_a_link_that_nobody_touched_or_in_a_wrong_direct
 
 @pytest.mark.parametrize(
     ("direction", "is_right"),
-    [((1, -1), True), ((1, 0), True), ((0, -1), True), ((-1, -1), False), ((1, 1), False), ((0, 0), False)],
+    [((1, -1), True), ((1, 0), True), ((1, 1), False), ((0, 0), False)],
 )
 def test_a_direction_is_right_if_every_joint_with_one_was_pushed_that_way(direction, is_right):
     assert one_contact(tau_ext=(5.0, -3.0), link=2, direction=direction).direction_ok is is_right
@@ -395,20 +371,17 @@ def test_a_section_that_is_all_contact_has_no_residual():
     assert residual(run) is None
 
 
-def test_a_real_arm_lists_its_detections():
-    (contact,) = evaluate(real_arm()).contacts
-    assert (contact.detected_s, contact.link_detected) == (pytest.approx((3000 - ZERO_ROW) * 1e-3), 2)
-
-
 def test_an_adaptation_after_a_fault_is_not_said_to_follow_a_change_of_the_payload():
     run = make_run((A, 1000), (M, 500), (SchemeState.FAULT, 5), (A, 800), (M, 500), has_truth=False)
     assert "identified in 1.00 s and again in 0.80 s after it began anew" in evaluate(run).verdict
 
 
-def test_a_real_arm_knows_no_truth():
+def test_a_real_arm_lists_its_detections_and_knows_no_truth():
     metrics = evaluate(real_arm())
+    (contact,) = metrics.contacts
+    assert (contact.detected_s, contact.link_detected) == (pytest.approx((3000 - ZERO_ROW) * 1e-3), 2)
     of_truth = ("link", "onset_s", "end_s", "delay_ms", "law_ms", "ideal_ms", "link_ok", "direction_ok", "tau_ext_Nm")
-    assert {getattr(metrics.contacts[0], name) for name in (*of_truth, "torque_error_ratio")} == {None}
+    assert {getattr(contact, name) for name in (*of_truth, "torque_error_ratio")} == {None}
     assert (metrics.false_alarms, metrics.false_alarms_s, metrics.missed) == (None, None, None)
     assert metrics.parameters["A"]["a1"][0] is None
 
@@ -428,41 +401,28 @@ def test_the_parameters_of_an_unfinished_adaptation_are_its_last():
     assert evaluate(run).parameters["A"]["a1"][1] == 0.17
 
 
-def test_the_payload_is_that_of_each_adaptation():
-    run = make_run()
-    run.truth.payload_kg[5300:] = 1.0
-    assert evaluate(run).payload_kg == {"A": 0.0, "D": 1.0}
+def paper_values(run):
+    return {row.quantity: row.measured for row in evaluate(run).paper}
 
 
-def test_clock_and_scheduler_come_from_the_log():
-    cycle = evaluate(make_run(clock="realtime")).cycle
-    assert (cycle.clock, cycle.scheduler) == ("realtime", "SCHED_FIFO 80")
-
-
-def paper_value(run, quantity):
-    return next(row.measured for row in evaluate(run).paper if row.quantity == quantity)
-
-
-@pytest.mark.parametrize(
-    ("quantity", "measured"),
-    [
-        ("First adaptation", "1.00 s"),
-        ("Adaptation after the payload change", "0.80 s"),
-        ("Payload", "1 kg"),
-        ("Frozen residual without payload, joints 1 / 2", "0.020 / 0.020 Nm"),
-        ("The CAD model's, with payload", "0.400 / 0.400 Nm"),
-        ("First contact detected at", "1.96 s"),
-        ("Threshold, joints 1 / 2", "0.15 Nm"),
-        ("Filter a / b", "10 / 10 rad/s"),
-        ("Control rate", "1 kHz"),
-    ],
-)
-def test_the_paper_table_gives_what_was_measured(quantity, measured):
-    assert paper_value(touched_run(), quantity) == measured
-
-
-def test_an_adaptation_that_did_not_finish_says_so_beside_the_paper():
-    assert paper_value(make_run((A, 10)), "First adaptation") == "not finished"
+def test_the_paper_table_gives_what_was_measured():
+    found = paper_values(touched_run())
+    assert (
+        found
+        | {
+            "First adaptation": "1.00 s",
+            "Adaptation after the payload change": "0.80 s",
+            "Payload": "1 kg",
+            "Frozen residual without payload, joints 1 / 2": "0.020 / 0.020 Nm",
+            "The CAD model's, with payload": "0.400 / 0.400 Nm",
+            "First contact detected at": "1.96 s",
+            "Threshold, joints 1 / 2": "0.15 Nm",
+            "Filter a / b": "10 / 10 rad/s",
+            "Control rate": "1 kHz",
+        }
+        == found
+    )
+    assert paper_values(make_run((A, 10)))["First adaptation"] == "not finished"
 
 
 def detected_run():
@@ -498,92 +458,43 @@ def faulted():
     return run
 
 
+def touched_in_the_only_adaptation():
+    run = make_run((A, 1000))
+    touch(run, 500, 50, (5.0, 0.0))
+    return run
+
+
+NO_CONTACT = "o contact while the arm was watched, no false alarm"
+TWICE = "identified in 1.00 s and again in 0.80 s after"
+
+
 @pytest.mark.parametrize(
-    ("run", "verdict"),
+    ("run", "parts", "is_clean"),
     [
         (
             detected_run(),
-            "All 2 contacts detected within 5 ms, none false; the model was identified in 1.00 s and again in 0.80 s "
-            "after 1 kg.",
+            ("All 2 contacts detected within 5 ms, none false", f"{TWICE} 1 kg; no cyclic data was"),
+            True,
         ),
-        (
-            touched_run(),
-            "2 of 3 contacts detected within 5 ms, 1 missed, 1 false alarm; the model was identified in 1.00 s and "
-            "again in 0.80 s after 1 kg.",
-        ),
-        (
-            contact_in_adaptation(),
-            "All 2 contacts detected within 5 ms, 1 more while it was not watched, none false; the model was "
-            "identified in 1.00 s and again in 0.80 s after 1 kg.",
-        ),
-        (
-            payload_taken_off(),
-            "No contact while the arm was watched, no false alarm; the model was identified in 1.00 s and again in "
-            "0.80 s after taking off 1.5 kg.",
-        ),
-        (one_detected(), "The one contact detected within 5 ms, none false; the model was identified in 1.00 s."),
-        (
-            real_arm(),
-            "1 detection, whose truth is not recorded; the model was identified in 1.00 s and again in 0.80 s after "
-            "the payload change.",
-        ),
-        (
-            make_run((A, 1000)),
-            "The arm was not watched for contacts; the model was not identified.",
-        ),
-        (
-            make_run((A, 1000), (M, 10), (P, 10), (A, 10)),
-            "No contact while the arm was watched, no false alarm; the model was identified in 1.00 s, but not again "
-            "after the payload change.",
-        ),
-        (
-            faulted(),
-            "The run ended in FAULT (DATA_AGE) at 1.50 s; no contact while the arm was watched, no false alarm; the "
-            "model was identified in 1.00 s.",
-        ),
-        (
-            make_run((SchemeState.COMMISSION, 10)),
-            "The arm was not watched for contacts; the arm never moved to adapt.",
-        ),
+        (touched_run(), ("2 of 3 contacts detected within 5 ms, 1 missed, 1 false alarm", f"{TWICE} 1 kg"), False),
+        (contact_in_adaptation(), ("All 2 contacts", "1 more while it was not watched, none false"), True),
+        (react(detected_run(), 8000), ("All 2 contacts", "1 false alarm"), False),
+        (payload_taken_off(), (NO_CONTACT, f"{TWICE} taking off 1.5 kg"), True),
+        (one_detected(), ("The one contact detected within 5 ms, none false", "identified in 1.00 s;"), True),
+        (real_arm(), ("1 detection, whose truth is not recorded", f"{TWICE} the payload change"), True),
+        (make_run((A, 1000)), ("The arm was not watched", "the model was not identified"), False),
+        (touched_in_the_only_adaptation(), ("1 more while it was not watched",), False),
+        (make_run((A, 1000), (M, 10), (P, 10), (A, 10)), (NO_CONTACT, "but not again after the payload"), False),
+        (faulted(), ("The run ended in FAULT (DATA_AGE) at 1.50 s", NO_CONTACT), False),
+        (make_run((SchemeState.COMMISSION, 10)), ("The arm was not watched", "the arm never moved to adapt"), False),
     ],
 )
-def test_the_verdict_says_how_it_went(run, verdict):
-    assert evaluate(run).verdict.replace("; no cyclic data was late or lost", "") == verdict
-
-
-def test_a_contact_of_a_run_that_never_watched_is_told():
-    run = make_run((A, 1000))
-    touch(run, 500, 50, (5.0, 0.0))
-    assert "1 more while it was not watched" in evaluate(run).verdict
-
-
-def test_a_verdict_ends_with_what_was_late_or_lost():
-    assert evaluate(detected_run()).verdict.endswith("after 1 kg; no cyclic data was late or lost.")
-
-
-@pytest.mark.parametrize(
-    ("run", "is_clean"),
-    [
-        (detected_run(), True),
-        (touched_run(), False),
-        (react(detected_run(), 8000), False),
-        (faulted(), False),
-        (make_run((A, 1000)), False),
-        (make_run((SchemeState.COMMISSION, 10)), False),
-        (real_arm(), True),
-    ],
-    ids=["all detected", "missed", "false alarm", "fault", "not identified", "never moved", "real arm"],
-)
-def test_a_run_is_clean_if_nothing_went_wrong(run, is_clean):
-    assert evaluate(run).is_clean is is_clean
-
-
-def empty_run():
-    run = make_run((A, 1))
-    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
-    return replace(run, timing=columns_of_records([], []), **{name: getattr(run, name)[:0] for name in names})
+def test_the_verdict_says_how_it_went_and_a_run_is_clean_if_nothing_went_wrong(run, parts, is_clean):
+    metrics = evaluate(run)
+    assert [part for part in parts if part not in metrics.verdict] == []
+    assert metrics.is_clean is is_clean
 
 
 def test_a_log_without_cycles_has_no_sections():
-    metrics = evaluate(empty_run())
+    metrics = evaluate(without_cycles(make_run((A, 1))))
     assert (metrics.sections, metrics.cycle.count) == ((), 0)
