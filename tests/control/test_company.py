@@ -28,6 +28,25 @@ def reason(log: RunLog) -> str:
     return text
 
 
+def rig_with(folder: Path, section: str, **changes: int) -> SessionRig:
+    """Make a rig whose session differs in a section of the settings."""
+    rig = SessionRig(folder)
+    settings = rig.session.settings
+    changed = dataclasses.replace(getattr(settings, section), **changes)
+    rig.session.settings = dataclasses.replace(settings, **{section: changed})
+    return rig
+
+
+def play(rig: SessionRig) -> tuple[FaultReason, RunLog]:
+    summary, log = rig.run()
+    assert summary.result is not None
+    return summary.result.fault, log
+
+
+def messages(log: RunLog, name: str) -> list[str]:
+    return [entry.event.message for entry in log.events if entry.event.name == name]
+
+
 def forged_command() -> bytes:
     """Make a command as this host makes them: right CRC, a counter that fits now and then."""
     message = CODEC.message("Drive1Command")
@@ -53,21 +72,19 @@ def test_a_frame_that_only_this_host_sends_is_named_and_faults_at_once(
 ) -> None:
     rig = SessionRig(tmp_path)
     rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(can_id, data)
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.FOREIGN_FRAMES
+    fault, log = play(rig)
+    assert fault is FaultReason.FOREIGN_FRAMES
     assert faulted(log) <= TROUBLE_CYCLE + 1
     assert says in reason(log)
-    assert [entry.event.message for entry in log.events if entry.event.name == "bus"] == [says]
+    assert messages(log, "bus") == [says]
     assert np.count_nonzero(torques_from(log, TROUBLE_CYCLE + 2)) == 0
 
 
 def test_who_only_reads_objects_is_named_and_harmless(tmp_path: Path) -> None:
     rig = SessionRig(tmp_path)
     rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x602, SDO_READ)
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.NONE
+    fault, log = play(rig)
+    assert fault is FaultReason.NONE
     said = [entry.event for entry in log.events if entry.event.name == "bus"]
     assert [(event.level, event.message) for event in said] == [
         ("warning", "somebody else reads objects of drive 2 (0x602)")
@@ -78,18 +95,14 @@ def test_an_arm_that_somebody_commands_before_it_is_enabled_is_not_enabled(tmp_p
     rig = SessionRig(tmp_path)
     for cycle in range(50, 6000, 500):
         rig.before_sync[cycle] = lambda: rig.bus.deliver(0x201, forged_command())
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.COMMISSION_TIMEOUT
+    fault, log = play(rig)
+    assert fault is FaultReason.COMMISSION_TIMEOUT
     assert "fault FOREIGN_FRAMES in" in reason(log)
     assert not np.any(log.scheme["state"] == SchemeState.ENABLE)
 
 
 def test_a_drive_that_does_not_hear_the_quick_stop_is_taken_out_of_operation_by_nmt(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-    settings = rig.session.settings
-    bus = dataclasses.replace(settings.bus, command_patience_cycles=250)
-    rig.session.settings = dataclasses.replace(settings, bus=bus)
+    rig = rig_with(tmp_path, "bus", command_patience_cycles=250)
     hear, is_deaf = rig.bench.on_frame, [False]
 
     def on_frame(frame) -> None:  # type: ignore[no-untyped-def]
@@ -103,9 +116,8 @@ def test_a_drive_that_does_not_hear_the_quick_stop_is_taken_out_of_operation_by_
         rig.tamper = lambda cycle, can_id, data: None if can_id == 0x183 else data
 
     rig.before_sync[TROUBLE_CYCLE] = trouble
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.DATA_AGE
+    fault, log = play(rig)
+    assert fault is FaultReason.DATA_AGE
     at = faulted(log)
     sent = [
         (int(frame["t_ns"]) // 1_000_000, bytes(frame["data"][:2]))
@@ -114,8 +126,7 @@ def test_a_drive_that_does_not_hear_the_quick_stop_is_taken_out_of_operation_by_
     ]
     stops = [time_ms - at for time_ms, data in sent if data == bytes((0x80, 1)) and time_ms > at]
     assert stops[0] == 10
-    said = [entry.event.message for entry in log.events if entry.event.name == "stop"]
-    assert said[0] == "Drive1 is in Operation enabled 10 cycles after FAULT: NMT pre-operational"
+    assert messages(log, "stop")[0] == "Drive1 is in Operation enabled 10 cycles after FAULT: NMT pre-operational"
 
 
 def test_a_drive_whose_torque_is_not_the_commanded_one_faults(tmp_path: Path) -> None:
@@ -127,38 +138,30 @@ def test_a_drive_whose_torque_is_not_the_commanded_one_faults(tmp_path: Path) ->
         return data[:3] + (700).to_bytes(2, "little", signed=True) + data[5:]
 
     rig.tamper = overstate
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.TORQUE
+    fault, log = play(rig)
+    assert fault is FaultReason.TORQUE
     assert TROUBLE_CYCLE < faulted(log) <= TROUBLE_CYCLE + 210
     assert "Drive1: torque 70.0 % of 12 Nm rated at the joint, " in reason(log)
     assert np.count_nonzero(log.scheme["request"] == Request.FAULT_TORQUE) > 0
 
 
 def test_a_device_that_has_lost_its_set_up_faults(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-    settings = rig.session.settings
-    devices = dataclasses.replace(settings.devices, reread_ms=2)
-    rig.session.settings = dataclasses.replace(settings, devices=devices)
+    rig = rig_with(tmp_path, "devices", reread_ms=2)
     rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bench.devices[1].take_over(0x2200, 0, 200)
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.TAMPERED
+    fault, log = play(rig)
+    assert fault is FaultReason.TAMPERED
     assert "Drive2 (node 2): 0x2200 " in reason(log)
     assert "is 0xC8, 0xA was set up" in reason(log)
 
 
 def test_the_set_up_is_read_again_while_the_arm_runs_and_differs_in_nothing(tmp_path: Path) -> None:
-    rig = SessionRig(tmp_path)
-    settings = rig.session.settings
-    rig.session.settings = dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, reread_ms=2))
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.NONE
+    rig = rig_with(tmp_path, "devices", reread_ms=2)
+    fault, log = play(rig)
+    assert fault is FaultReason.NONE
     asked = {
         (int(frame["can_id"]), bytes(frame["data"][1:4]))
         for frame in log.frames
         if frame["is_tx"] and 0x601 <= frame["can_id"] <= 0x604 and frame["t_ns"] > 500_000_000
     }
     assert len(asked) > 80
-    assert [entry.event for entry in log.events if entry.event.name == "parameters"] == []
+    assert messages(log, "parameters") == []

@@ -50,19 +50,14 @@ class Follower:
         self.bus.clock.sleep_until_ns(self.bus.clock.now_ns() + duration_ns)
 
 
-def test_each_sync_begins_a_cycle_at_the_time_it_came() -> None:
-    follower = Follower([17, 18, 19])
+def test_each_sync_begins_a_cycle_at_the_time_it_came_also_where_the_counter_wraps() -> None:
+    follower = Follower([239, 240, 1])
     ticks = [follower.pacer.next() for _ in range(3)]
     assert [(tick.cycle, tick.t_ns, tick.periods) for tick in ticks] == [
         (0, PERIOD_NS, 1),
         (1, 2 * PERIOD_NS, 1),
         (2, 3 * PERIOD_NS, 1),
     ]
-
-
-def test_the_counter_wraps_after_240() -> None:
-    follower = Follower([239, 240, 1, 2])
-    assert [follower.pacer.next().cycle for _ in range(4)] == [0, 1, 2, 3]
 
 
 def test_of_several_syncs_that_wait_the_last_one_counts() -> None:
@@ -119,18 +114,11 @@ def test_an_error_frame_is_no_sync() -> None:
 def test_a_silent_producer_is_an_error_within_the_timeout() -> None:
     follower = Follower([1])
     follower.pacer.next()
+    for t_ms in range(10, 50, 10):  # other frames don't put it off
+        follower.bus.put(PERIOD_NS + t_ms * 1_000_000, FEEDBACK, 0)
     with pytest.raises(BusError, match="no SYNC on timed within 50 ms: the host that sends it begins first"):
         follower.pacer.next()
     assert follower.bus.clock.now_ns() == PERIOD_NS + TIMEOUT_NS
-
-
-def test_other_frames_do_not_put_off_the_timeout() -> None:
-    follower = Follower([])
-    for t_ms in range(0, 200, 10):
-        follower.bus.put(t_ms * 1_000_000, FEEDBACK, 0)
-    with pytest.raises(BusError, match="no SYNC"):
-        follower.pacer.next()
-    assert follower.bus.clock.now_ns() <= TIMEOUT_NS + 10_000_000
 
 
 def test_a_frame_that_is_put_back_is_the_next_one() -> None:

@@ -27,14 +27,14 @@ def test_each_joint_is_in_its_corner_every_half_period(
     np.testing.assert_allclose(q_deg, expected, atol=1e-9)
 
 
-def test_the_peak_speeds_are_the_papers() -> None:
-    speeds = np.degrees([np.abs(motion(t)[1]) for t in np.linspace(0.0, 9.0, 9001)])
-    np.testing.assert_allclose(speeds.max(axis=0), [100.0, 50.0], rtol=1e-5)
-
-
-def test_the_synchronous_motion_has_the_speeds_swapped() -> None:
-    speeds = np.degrees([np.abs(motion(t, np.array([2.25, 2.25]))[1]) for t in np.linspace(0.0, 9.0, 9001)])
-    np.testing.assert_allclose(speeds.max(axis=0), [50.0, 100.0], rtol=1e-5)
+@pytest.mark.parametrize(
+    ("half_period_s", "peak_deg_s"),
+    [(AS_PRINTED_S, (100, 50)), (np.array([2.25, 2.25]), (50, 100))],
+    ids=["", "synchronous"],
+)
+def test_the_peak_speeds_are_the_papers(half_period_s: np.ndarray, peak_deg_s: tuple[int, int]) -> None:
+    speeds = np.degrees([np.abs(motion(t, half_period_s)[1]) for t in np.linspace(0.0, 9.0, 9001)])
+    np.testing.assert_allclose(speeds.max(axis=0), peak_deg_s, rtol=1e-5)
 
 
 @pytest.mark.parametrize("elapsed_s", [0.3, 1.3, 5.0, 7.77])
@@ -62,12 +62,6 @@ def moves() -> list[tuple[QuinticMove, np.ndarray, np.ndarray, np.ndarray]]:
     return found
 
 
-def test_a_move_leads_from_rest_to_rest() -> None:
-    for _, start, end, motion in moves():
-        np.testing.assert_allclose(motion[0], [start, np.zeros(2), np.zeros(2)], atol=1e-12)
-        np.testing.assert_allclose(motion[-1], [end, np.zeros(2), np.zeros(2)], atol=1e-12)
-
-
 def test_a_move_uses_its_speed_or_its_acceleration_limit_and_no_more() -> None:
     used = []
     for move, _, _, motion in moves():
@@ -77,7 +71,9 @@ def test_a_move_uses_its_speed_or_its_acceleration_limit_and_no_more() -> None:
     assert min(used) > 0.99
 
 
-def test_a_move_stays_between_its_ends() -> None:
+def test_a_move_leads_from_rest_to_rest_and_stays_between_its_ends() -> None:
     for _, start, end, motion in moves():
+        np.testing.assert_allclose(motion[0], [start, np.zeros(2), np.zeros(2)], atol=1e-12)
+        np.testing.assert_allclose(motion[-1], [end, np.zeros(2), np.zeros(2)], atol=1e-12)
         assert np.all(motion[:, 0] >= np.minimum(start, end) - 1e-12)
         assert np.all(motion[:, 0] <= np.maximum(start, end) + 1e-12)

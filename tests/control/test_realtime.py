@@ -26,40 +26,23 @@ class LateClock(VirtualClock):
         super().sleep_until_ns(t_ns + (self._lateness_ns.pop(0) if self._lateness_ns else 0))
 
 
-def test_lockstep_cycles_are_one_period_apart_in_virtual_time() -> None:
-    pacer = GridPacer(VirtualClock(), PERIOD_NS)
-    assert [pacer.next() for _ in range(3)] == [Tick(k, k * PERIOD_NS, 1, 0) for k in range(3)]
-
-
-def test_a_late_tick_does_not_move_the_grid() -> None:
-    pacer = GridPacer(LateClock([0, 400_000, 0]), PERIOD_NS)
-    ticks = [pacer.next() for _ in range(3)]
-    assert [tick.t_ns - ticks[0].t_ns for tick in ticks] == [0, 1_400_000, 2_000_000]
-
-
-def test_lateness_is_counted_from_the_grid() -> None:
-    pacer = GridPacer(LateClock([0, 400_000, 0]), PERIOD_NS)
-    assert [pacer.next().lateness_ns for _ in range(3)] == [0, 400_000, 0]
-
-
-def test_an_overrun_skips_whole_periods_and_keeps_phase() -> None:
-    pacer = GridPacer(LateClock([0, 2_300_000, 0]), PERIOD_NS)
-    ticks = [pacer.next() for _ in range(3)]
-    assert [(tick.cycle, tick.periods, tick.lateness_ns) for tick in ticks] == [(0, 1, 0), (3, 3, 300_000), (4, 1, 0)]
-
-
-def test_skipped_periods_are_counted() -> None:
-    pacer = GridPacer(LateClock([0, 2_300_000, 0, 1_000_000]), PERIOD_NS)
-    for _ in range(4):
-        pacer.next()
-    assert pacer.overruns == 3
-
-
-def test_being_late_by_just_less_than_a_period_is_no_overrun() -> None:
-    pacer = GridPacer(LateClock([0, 999_999]), PERIOD_NS)
-    for _ in range(2):
-        pacer.next()
-    assert pacer.overruns == 0
+@pytest.mark.parametrize(
+    ("late_ns", "ticks", "overruns"),
+    [
+        ([], [(0, 0, 1, 0), (1, 1_000_000, 1, 0), (2, 2_000_000, 1, 0)], 0),
+        ([0, 400_000], [(0, 0, 1, 0), (1, 1_400_000, 1, 400_000), (2, 2_000_000, 1, 0)], 0),
+        ([0, 999_999], [(0, 0, 1, 0), (1, 1_999_999, 1, 999_999), (2, 2_000_000, 1, 0)], 0),
+        ([0, 2_300_000], [(0, 0, 1, 0), (3, 3_300_000, 3, 300_000), (4, 4_000_000, 1, 0)], 2),
+        ([0, 1_000_000, 1_000_000], [(0, 0, 1, 0), (2, 2_000_000, 2, 0), (4, 4_000_000, 2, 0)], 2),
+    ],
+    ids=["on time", "late", "late by just less than a period", "an overrun keeps the phase", "two overruns"],
+)
+def test_a_late_tick_does_not_move_the_grid_and_skips_whole_periods(
+    late_ns: list[int], ticks: list[tuple[int, int, int, int]], overruns: int
+) -> None:
+    pacer = GridPacer(LateClock(late_ns), PERIOD_NS)
+    assert [pacer.next() for _ in range(3)] == [Tick(*tick) for tick in ticks]
+    assert pacer.overruns == overruns
 
 
 def test_a_pause_that_is_meant_is_no_overrun_and_keeps_the_grid() -> None:

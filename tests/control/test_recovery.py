@@ -62,7 +62,14 @@ def test_an_acknowledged_fault_begins_again_with_the_first_check(recovered: Reco
     assert summary.result is not None
     assert summary.result.fault is FaultReason.NONE
     way_up = [SchemeState.COMMISSION, SchemeState.ENABLE, SchemeState.ADAPT]
-    assert states(recovered.log) == [*way_up, SchemeState.FAULT, *way_up]
+    log, first = recovered.log, recovered.first
+    assert states(log) == [*way_up, SchemeState.FAULT, *way_up]
+    assert messages(log, "recovery") == ["fault acknowledged", "transmit queue emptied"]
+    # What the devices said before the recovery is not taken for fresh, and the wait is no part of the run.
+    assert log.cycle["frames_missing"][log.cycle["cycle"] == log.scheme["cycle"][first]] == [0]
+    (acknowledged,) = [entry.t_ns for entry in log.events if entry.event.message == "fault acknowledged"]
+    gap = int(np.argmax(np.diff(log.cycle.t_ns)))
+    assert log.cycle.t_ns[gap] < acknowledged <= log.cycle.t_ns[gap + 1]
 
 
 def test_a_fault_that_nobody_acknowledges_ends_the_run(tmp_path: Path) -> None:
@@ -82,24 +89,17 @@ def test_the_second_fault_is_latched_when_one_may_be_acknowledged(tmp_path: Path
     assert (summary.recoveries, states(log)[-1]) == (1, SchemeState.FAULT)
 
 
-def test_after_a_recovery_there_is_no_torque_until_the_drives_are_enabled_again(recovered: Recovered) -> None:
-    log = recovered.log
+def test_torque_begins_with_zero_where_the_arm_is_once_the_drives_are_enabled_again(recovered: Recovered) -> None:
+    log, start = recovered.log, recovered.adapt
     quiet = slice(log.scheme.t_ns[recovered.fault], log.scheme.t_ns[recovered.adapt])
     command = log.decoded["Drive1Command"]
     is_quiet = (command.t_ns >= quiet.start) & (command.t_ns < quiet.stop)
     assert np.count_nonzero(is_quiet) > 200
     assert np.count_nonzero(command["target_torque"][is_quiet]) == 0
-
-
-def test_the_arm_is_enabled_where_it_is_with_zero_torque_first(recovered: Recovered) -> None:
-    log, start = recovered.log, recovered.adapt
     np.testing.assert_allclose(log.control["q_d"][start], log.scheme["q"][start], atol=1e-4)
     assert np.abs(log.control["tau_c"][start]).max() < 0.2
     assert np.degrees(np.abs(log.scheme["q"][start])).max() > 5.0  # not the place where the run began
-
-
-def test_the_bus_is_emptied_before_the_devices_are_booted_again(recovered: Recovered) -> None:
-    assert messages(recovered.log, "recovery") == ["fault acknowledged", "transmit queue emptied"]
+    assert np.any(torques_from(log, int(log.cycle["cycle"][-1]) - 1500) != 0)
 
 
 @pytest.mark.long
@@ -117,21 +117,3 @@ def test_a_bus_that_fails_in_operation_is_emptied_at_once_and_comes_back_after_a
     assert messages(log, "run") == ["transmit queue of can0 stayed full"]
     assert messages(log, "recovery") == ["transmit queue emptied", "fault acknowledged", "transmit queue emptied"]
     assert controlwords(log)[-40] == ENABLE_OPERATION
-
-
-def test_what_the_devices_said_before_the_recovery_is_not_taken_for_fresh(recovered: Recovered) -> None:
-    log, first = recovered.log, recovered.first
-    assert log.scheme["state"][first] == SchemeState.COMMISSION
-    assert log.cycle["frames_missing"][log.cycle["cycle"] == log.scheme["cycle"][first]] == [0]
-
-
-def test_torque_flows_again_after_the_recovery(recovered: Recovered) -> None:
-    last_cycle = int(recovered.log.cycle["cycle"][-1])
-    assert np.any(torques_from(recovered.log, last_cycle - 1500) != 0)
-
-
-def test_the_time_of_the_wait_is_not_lived_through_twice(recovered: Recovered) -> None:
-    log = recovered.log
-    (acknowledged,) = [entry.t_ns for entry in log.events if entry.event.message == "fault acknowledged"]
-    gap = int(np.argmax(np.diff(log.cycle.t_ns)))
-    assert log.cycle.t_ns[gap] < acknowledged <= log.cycle.t_ns[gap + 1]

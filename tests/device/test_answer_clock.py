@@ -19,11 +19,8 @@ def settled(is_counted: bool = False) -> AnswerClock:
 LAST = USUAL_ANSWERS
 
 
-def test_a_frame_in_time_answers_the_last_sync() -> None:
+def test_a_frame_in_time_and_the_first_of_all_answer_the_last_sync() -> None:
     assert settled().find(LAST + 1, USUAL_NS, None) == LAST + 1
-
-
-def test_the_first_frame_of_all_answers_the_last_sync_however_many_came_before() -> None:
     assert AnswerClock().find(17, USUAL_NS, None) == 17
 
 
@@ -41,17 +38,11 @@ def test_frames_that_are_late_all_the_time_stay_late_until_two_come_on_one_sync(
     assert clock.find(LAST + 29, USUAL_NS, 1) == LAST + 29
 
 
-@pytest.mark.parametrize("sooner_ns", [51_000, 200_000])
-def test_without_a_counter_a_frame_that_comes_sooner_than_any_before_is_a_late_one(sooner_ns: int) -> None:
-    assert settled().find(LAST + 2, USUAL_NS - sooner_ns, None) == LAST + 1
-
-
-def test_without_a_counter_a_frame_at_the_usual_time_follows_a_lost_one() -> None:
-    assert settled().find(LAST + 2, USUAL_NS, None) == LAST + 2
-
-
-def test_without_a_counter_a_frame_after_the_usual_time_is_a_late_one() -> None:
-    assert settled().find(LAST + 2, USUAL_NS + 51_000, None) == LAST + 1
+@pytest.mark.parametrize(("off_ns", "answers"), [(-200_000, 1), (-51_000, 1), (0, 2), (51_000, 1)])
+def test_without_a_counter_a_frame_off_the_usual_time_is_late_and_one_at_it_follows_a_lost_one(
+    off_ns: int, answers: int
+) -> None:
+    assert settled().find(LAST + 2, USUAL_NS + off_ns, None) == LAST + answers
 
 
 @pytest.mark.parametrize(("periods", "answers"), [(1, LAST + 1), (2, LAST + 2)])

@@ -1,5 +1,7 @@
 """One joint torque sensor as the host sees it."""
 
+import pytest
+
 from adacd_hil.device.contract import compose
 from adacd_hil.device.profile import place_devices
 from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
@@ -33,23 +35,13 @@ def int32(torque: float) -> bytes:
     return bytes(STOCK.message("Sensor1Torque").encode(torque))
 
 
-def test_a_valid_frame_is_taken_with_its_cycle() -> None:
+def test_a_valid_frame_is_taken_with_its_cycle_and_its_status() -> None:
     rig = Protected()
     assert rig.sensor.accept_cyclic(rig.frame(1.5), 7)
     assert (rig.sensor.values[0], rig.sensor.sample_cycle, rig.sensor.status) == (1.5, 7, 0)
-
-
-def test_the_status_in_the_header_counts_in_the_very_frame() -> None:
-    rig = Protected()
-    rig.sensor.accept_cyclic(rig.frame(20.0, status=3), 0)
-    assert rig.sensor.status == OVERLOADED
-
-
-def test_a_saturated_sensor_is_fresh_and_overloaded() -> None:
-    rig = Protected()
-    for cycle in range(20):
+    for cycle in range(8, 28):
         rig.sensor.accept_cyclic(rig.frame(20.0, status=3), cycle)
-    assert (rig.sensor.sample_cycle, rig.sensor.status, rig.sensor.values[0]) == (19, OVERLOADED, 20.0)
+        assert (rig.sensor.sample_cycle, rig.sensor.status, rig.sensor.values[0]) == (cycle, OVERLOADED, 20.0)
 
 
 def test_a_sensor_that_repeats_its_frame_ages() -> None:
@@ -76,22 +68,17 @@ def test_a_jump_of_unprotected_torque_changes_nothing() -> None:
     assert (sensor.values[0], sensor.sample_cycle, sensor.implausible_frames) == (1.0, 0, 1)
 
 
-def test_a_true_step_of_unprotected_torque_is_taken_with_the_second_frame() -> None:
+@pytest.mark.parametrize(
+    ("torque", "cycles", "taken"),
+    [(25.0, (1, 2), [False, True]), (25.0, (2,), [True]), (0.5, (0,), [True])],
+    ids=["a true step, with its second frame", "after a gap", "a late frame and the next in one cycle"],
+)
+def test_the_bound_of_unprotected_torque_widens_with_the_cycles(
+    torque: float, cycles: tuple[int, ...], taken: list[bool]
+) -> None:
     sensor = unprotected()
     sensor.accept_cyclic(int32(0.0), 0)
-    assert [sensor.accept_cyclic(int32(25.0), cycle) for cycle in (1, 2)] == [False, True]
-
-
-def test_a_gap_of_cycles_widens_the_bound() -> None:
-    sensor = unprotected()
-    sensor.accept_cyclic(int32(0.0), 0)
-    assert sensor.accept_cyclic(int32(25.0), 2)
-
-
-def test_a_late_frame_and_the_next_may_share_a_cycle() -> None:
-    sensor = unprotected()
-    sensor.accept_cyclic(int32(0.0), 5)
-    assert sensor.accept_cyclic(int32(0.5), 5)
+    assert [sensor.accept_cyclic(int32(torque), cycle) for cycle in cycles] == taken
 
 
 def test_the_end_of_its_range_is_the_overload_of_a_sensor_without_status() -> None:
@@ -111,26 +98,19 @@ def test_a_frame_of_the_wrong_length_changes_nothing() -> None:
     assert (sensor.sample_cycle, sensor.implausible_frames, sensor.status) == (-1, 1, 0)
 
 
-def test_what_the_status_frame_says_outlives_torque_frames_that_say_otherwise() -> None:
+@pytest.mark.parametrize("taken_back", [False, True])
+def test_what_the_status_frame_says_outlives_torque_frames_that_say_otherwise_unless_taken_back(
+    taken_back: bool,
+) -> None:
     rig = Protected()
     rig.sensor.accept_status(bytes((0x01, 0)), 0)
     states = []
     for cycle in range(5):
         rig.sensor.accept_cyclic(rig.frame(1.5), cycle)
         states.append(rig.sensor.status)
-    assert states == [0] + [SensorStatus.NOT_VALID] * 4
-
-
-def test_a_status_frame_that_is_taken_back_at_once_does_not_count() -> None:
-    rig = Protected()
-    rig.sensor.accept_status(bytes((0x01, 0)), 0)
-    rig.sensor.accept_cyclic(rig.frame(1.5), 1)
-    rig.sensor.accept_status(bytes((0x00, 0)), 1)
-    states = []
-    for cycle in range(2, 5):
-        rig.sensor.accept_cyclic(rig.frame(1.5), cycle)
-        states.append(rig.sensor.status)
-    assert states == [0, 0, 0]
+        if taken_back and cycle == 0:
+            rig.sensor.accept_status(bytes((0x00, 0)), 0)
+    assert states == [0] + [0 if taken_back else SensorStatus.NOT_VALID] * 4
 
 
 def test_what_the_torque_frame_says_outlives_a_status_frame_that_says_otherwise() -> None:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 from hang import HANG_S
+from made_log import MemorySink
 from mcap.reader import make_reader
 from recorded_run import CODEC, Run
-from reference_writer import MemorySink
 
 from adacd_hil.lab.live.client import LiveClient, LiveMessage
 from adacd_hil.lab.live.feed import LiveFeed

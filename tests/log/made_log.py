@@ -1,13 +1,16 @@
-"""Small logs made by hand, and surgery on their records that leaves everything else as it must be."""
+"""Small recordings made by hand, and surgery on the records of a log that leaves everything else as it must be."""
 
 import io
 import struct
 import zlib
 from dataclasses import dataclass
 
+import can
 import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, MetadataIndex, Schema
 from mcap.records import SummaryOffset as GroupOffset
 
@@ -24,8 +27,8 @@ RUN = {"epoch_ns": "0", "parameter_count": "7", "name": "Prüfung"}
 SUMMARY = {"messages": "20", "frames": "0", "dropped": "0", "ending": "closed"}
 
 
-class MemoryTarget(io.BytesIO):
-    """What a ChunkedFile is written to."""
+class MemorySink(io.BytesIO):
+    """What a log is written to, by our writers and mcap's."""
 
     def write(self, data, packets=0):
         return super().write(data)
@@ -53,7 +56,7 @@ def make_log(
     profile="",
 ):
     """Make a log: in each chunk a message of every topic for each of its numbers; `times`: log and publish time."""
-    target = MemoryTarget()
+    target = MemorySink()
     file = ChunkedFile(target, library, profile)
     for name, data in attachments.items():
         file.add_attachment(Attachment(create_time=0, log_time=0, name=name, media_type="text/plain", data=data))
@@ -175,9 +178,56 @@ def _set_crcs(parts):
 
 def rechunk(part, edit):
     """Change what a chunk holds."""
-    import zstandard
-
     chunk = part.read(Chunk)
     data = edit(zstandard.decompress(chunk.data))
     chunk.data, chunk.uncompressed_size, chunk.uncompressed_crc = zstandard.compress(data), len(data), zlib.crc32(data)
     part.body = new(chunk).body
+
+
+def write_parts(folder, endings=("continued", "closed"), runs=None, summary=SUMMARY, **options):
+    """Write a log of a part per ending, of 20 messages each; none where the ending is None."""
+    for number, ending in enumerate(endings):
+        if ending is None:
+            continue
+        start = 10 * number
+        chunks = ((start, start + 5), (start + 5, start + 10))
+        run = {**(runs[number] if runs else RUN), "part": str(number)}
+        data = make_log(chunks=chunks, run=run, summary={**summary, "ending": ending}, **options)
+        (folder / (f"run_{number:03d}.mcap" if number else "run.mcap")).write_bytes(data)
+    return folder / "run.mcap"
+
+
+def read_by_mcap(path):
+    """Read a log with mcap: messages as (topic, log time, publish time, payload), attachments, metadata."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found = reader.iter_messages(log_time_order=False)
+        messages = [
+            (channel.topic, message.log_time, message.publish_time, message.data) for _, channel, message in found
+        ]
+        attachments = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
+        return messages, attachments, {record.name: record.metadata for record in reader.iter_metadata()}
+
+
+BLF_FRAME, BLF_ERROR, BLF_MARKER = 86, 73, 96
+
+
+def blf_object(kind, body, version=1, flags=2, t_ns=0, size=None):
+    head = struct.pack("<LHHQ", flags, 0, 0, t_ns)
+    size = 32 + len(body) if size is None else size
+    record = struct.pack("<4sHHLL", b"LOBJ", 32, version, size, kind) + head + body
+    return record + bytes(len(record) % 4)
+
+
+def blf_frame(number=0):
+    return blf_object(BLF_FRAME, struct.pack("<HBBL8s", 1, 0, 8, 0x181, bytes([number % 256] * 8)), t_ns=number)
+
+
+def write_blf(path, inner, method=2, size=None, cut=0):
+    """Write a BLF of one container that holds `inner`, `cut` bytes short; `size`: of the container, as it says."""
+    with can.BLFWriter(path):
+        pass
+    packed = struct.pack("<H6xI4x", method, len(inner)) + (zlib.compress(inner) if method == 2 else inner)
+    container = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(packed) if size is None else size, 10) + packed
+    path.write_bytes((path.read_bytes()[:144] + container + bytes(len(container) % 4))[: -cut or None])
+    return path

@@ -1,10 +1,16 @@
-"""A run made of random numbers, and a recorder that is fed with it; every field has a value of its own."""
+"""A run made of random numbers, a recorder that is fed with it, and the log as others read it.
 
+Every field has a value of its own.
+"""
+
+import collections
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
 from adacd_hil.log.reader import Series
@@ -23,7 +29,7 @@ from adacd_hil.records import (
     scheme_layout,
 )
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.codec import Codec, load_codec, parse_codec
 from adacd_hil.wire.frame_lengths import FD_LENGTHS
 
 PERIOD_NS = 1_000_000
@@ -79,7 +85,12 @@ class Run:
 
     @property
     def frames(self):
-        return [(is_tx, frame) for cycle in self.cycles for is_tx, frame in cycle.frames]
+        """List (t_ns of the cycle, is_tx, frame)."""
+        return [
+            (cycle.t_ns, is_tx, frame._replace(data=bytes(frame.data)))
+            for cycle in self.cycles
+            for is_tx, frame in cycle.frames
+        ]
 
 
 def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123, has_fd=False):
@@ -165,7 +176,7 @@ def _frames(generator, t_ns, number):
 
 
 def _long_frames(generator, t_ns, number):
-    """Make an FD frame each way, of every length in turn, of which the first is in the DBC of `fd_contract`."""
+    """Make an FD frame each way, of every length in turn, of which the first is in the DBC of `fd_codec`."""
     length = FD_LENGTHS[number % len(FD_LENGTHS)]
     return [
         (number % 2 == 0, Frame(LONG_ID, generator.bytes(length), t_ns + 25)),
@@ -173,17 +184,18 @@ def _long_frames(generator, t_ns, number):
     ]
 
 
-def fd_contract(folder: Path) -> Path:
-    """Write a DBC with one more message, `Long`, of 24 bytes."""
-    signals = "".join(f' SG_ part{n} : {32 * n}|32@1- (0.5,0) [0|0] "Nm" HOST\n' for n in range(6))
-    message = f"BO_ {LONG_ID} Long: 24 Drive1\n{signals}\n"
+LONG = f"BO_ {LONG_ID} Long: 24 Drive1\n" + "".join(
+    f' SG_ part{n} : {32 * n}|32@1- (0.5,0) [0|0] "Nm" HOST\n' for n in range(6)
+)
+
+
+def fd_codec(more: str = "") -> Codec:
+    """Return the contract with `Long`, an FD message of 24 bytes, and with `more` messages."""
     text = CODEC.text.decode()
     place = text.index("BO_ ")
-    path = folder / "fd.dbc"
     kinds = ",".join(['"StandardCAN"', *['"other"'] * 13, '"StandardCAN_FD"'])
     is_fd = f'BA_DEF_ BO_ "VFrameFormat" ENUM {kinds};\nBA_ "VFrameFormat" BO_ {LONG_ID} 14;\n'
-    path.write_text(text[:place] + message + text[place:] + is_fd)
-    return path
+    return parse_codec((text[:place] + LONG + "\n" + more + text[place:] + is_fd).encode(), CODEC.path)
 
 
 def start(path: Path, run: Run, **options) -> Recorder:
@@ -217,7 +229,29 @@ def payloads(series: Series) -> bytes:
 
 
 def wait_until_taken(recorder: Recorder) -> None:
-    """Wait until the writer has taken every packet from the ring."""
+    """Wait until the writer has taken every packet of a recorder in real time."""
     recorder.flush()
-    while recorder._ring.waiting:
+    while recorder.waiting_bytes:
         os.sched_yield()
+
+
+def by_others(path: Path) -> dict[str, list]:
+    """Read each topic's messages as (message, decoded) with mcap and mcap_ros2."""
+    messages = collections.defaultdict(list)
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
+        for _, channel, message, decoded in reader.iter_decoded_messages(log_time_order=False):
+            messages[channel.topic].append((message, decoded))
+    return messages
+
+
+def plain_frames(frames: np.ndarray) -> list[tuple[int, bool, Frame]]:
+    """List frames of a log as (t_ns of the cycle, is_tx, frame)."""
+    return [
+        (
+            int(f["cycle_t_ns"]),
+            bool(f["is_tx"]),
+            Frame(int(f["can_id"]), f["data"].tobytes()[: f["length"]], int(f["t_ns"]), bool(f["is_error"])),
+        )
+        for f in frames
+    ]

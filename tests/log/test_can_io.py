@@ -19,7 +19,6 @@ from mcap_ros2.decoder import DecoderFactory
 
 from adacd_hil.log.frames.can_io import McapReader, McapWriter, TimedMessage, to_messages
 from adacd_hil.log.frames.frame_log import read_frames
-from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.message_types import CAN_FRAME, ENCAPSULATION, FD_FRAME
 
@@ -126,6 +125,8 @@ def test_a_time_that_somebody_changed_counts(tmp_path):
 
 
 def test_logconvert_to_blf_and_back_keeps_all_but_the_direction_of_error_frames(messages, path, tools, tmp_path):
+    copy = list(McapReader(tools(path, tmp_path / "copy.mcap")))
+    assert [message.t_ns for message in copy] == [message.t_ns for message in messages]
     back = tools(tools(path, tmp_path / "bus.blf"), tmp_path / "back.mcap")
     read = list(McapReader(back))
     assert [content(message) for message in read] == [content(message) for message in messages]
@@ -152,11 +153,6 @@ def test_logconvert_of_a_cut_log_says_what_is_missing(path, tools, tmp_path, cap
     tools(tmp_path / "cut.mcap", tmp_path / "cut.blf")
     (said,) = [record for record in caplog.records if record.name.startswith("adacd_hil.")]
     assert (said.levelname, "cut" in said.getMessage()) == ("WARNING", True)
-
-
-def test_logconvert_from_mcap_to_mcap_keeps_nanoseconds(messages, path, tools, tmp_path):
-    read = list(McapReader(tools(path, tmp_path / "copy.mcap")))
-    assert [message.t_ns for message in read] == [message.t_ns for message in messages]
 
 
 def test_others_decode_the_frames(messages, path):
@@ -203,17 +199,6 @@ def test_frames_of_a_log_that_is_cut_are_read_up_to_the_cut(messages, path, tmp_
         counts.append(len(read))
     assert counts == sorted(counts)
     assert len(set(counts)) > 2
-
-
-def test_a_flipped_bit_in_a_chunk_costs_the_chunk_and_is_said(messages, path, tmp_path):
-    with path.open("rb") as file:
-        chunk = make_reader(file).get_summary().chunk_indexes[0]
-    whole = bytearray(path.read_bytes())
-    whole[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
-    (tmp_path / "x.mcap").write_bytes(whole)
-    log = read_frames(tmp_path / "x.mcap")
-    assert 0 < len(log.frames) < len(messages)
-    assert "x.mcap is damaged at byte" in log.problem
 
 
 def test_a_flipped_bit_outside_the_chunks_is_said(path, tmp_path):
@@ -265,12 +250,6 @@ def test_a_gzipped_log_is_read(messages, path, tmp_path):
     zipped.write_bytes(gzip.compress(path.read_bytes()))
     with gzip.open(zipped) as file:
         assert len(list(McapReader(file))) == len(messages)
-
-
-def test_what_is_no_mcap_is_refused(tmp_path):
-    (tmp_path / "x.mcap").write_bytes(b"hello world")
-    with pytest.raises(LogError, match="not an MCAP file"):
-        McapReader(tmp_path / "x.mcap")
 
 
 def test_nothing_is_appended(tmp_path):

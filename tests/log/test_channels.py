@@ -12,6 +12,7 @@ from adacd_hil.log.types.message_types import (
     ENCAPSULATION,
     Member,
     number_type,
+    pack_fd_frame,
     payload_dtype,
     ros_field_name,
     ros_message_name,
@@ -26,6 +27,7 @@ from adacd_hil.log.types.topics import (
     pack_truth,
     run_channels,
     truth_channels,
+    unpack_contact,
 )
 from adacd_hil.records import (
     CONTROL_LAYOUT,
@@ -59,38 +61,19 @@ def test_a_parser_of_others_reads_every_type(channel):
     assert channel.type.name in generate_dynamic(channel.type.name, channel.type.text)
 
 
-def test_every_dbc_message_has_a_topic_with_its_signals():
+def test_every_dbc_message_has_a_topic_of_its_own_number_with_its_signals():
+    run_ids = [channel.id for channel in run_channels(7, tuple(CODEC.messages.values()))]
+    assert len(set(run_ids)) == len(run_ids)
     topics = {channel.topic: channel.type.fields for channel in CHANNELS}
     for name, message in CODEC.messages.items():
         assert topics[f"/decoded/{name}"] == tuple(signal.name for signal in message.signals)
 
 
-def test_numbers_of_topics_are_unique():
-    run_ids = [channel.id for channel in run_channels(7, tuple(CODEC.messages.values()))]
-    assert len(set(run_ids)) == len(run_ids)
-
-
-@pytest.mark.parametrize(
-    ("name", "spelled"),
-    [
-        ("tau_J", "tau_j"),
-        ("F_v1", "f_v1"),
-        ("q", "q"),
-        ("StatusWord", "status_word"),
-        ("TorqueNm", "torque_nm"),
-        ("_private__name_", "private_name"),
-        ("2nd", "n2nd"),
-    ],
-)
-def test_a_field_is_spelled_as_ros_demands(name, spelled):
-    assert ros_field_name(name) == spelled
-
-
-@pytest.mark.parametrize(
-    ("name", "spelled"), [("Drive1Feedback", "Drive1Feedback"), ("DRIVE1_feedback", "DRIVE1Feedback"), ("sync", "Sync")]
-)
-def test_a_message_is_spelled_as_ros_demands(name, spelled):
-    assert ros_message_name(name) == spelled
+def test_fields_and_messages_are_spelled_as_ros_demands():
+    fields = {"tau_J": "tau_j", "F_v1": "f_v1", "q": "q", "TorqueNm": "torque_nm", "_a__b_": "a_b", "2nd": "n2nd"}
+    assert {name: ros_field_name(name) for name in fields} == fields
+    messages = {"Drive1Feedback": "Drive1Feedback", "DRIVE1_feedback": "DRIVE1Feedback", "sync": "Sync"}
+    assert {name: ros_message_name(name) for name in messages} == messages
 
 
 def test_two_fields_with_one_ros_name_are_refused():
@@ -147,58 +130,45 @@ def test_scheme_is_laid_out_as_its_type_says():
         assert np.atleast_1d(getattr(message, name.lower())).tolist() == block[place].tolist()
 
 
-def test_control_is_laid_out_as_its_type_says():
-    block = np.arange(CONTROL_LAYOUT.size) - 3.25
-    message = decode(ChannelId.CONTROL, pack_control(5, block, 0xA1, False, True))
+def test_numbers_are_laid_out_as_their_types_say():
+    control, truth = np.arange(CONTROL_LAYOUT.size) - 3.25, np.arange(TRUTH_LAYOUT.size) * 1.5
+    message = decode(ChannelId.CONTROL, pack_control(5, control, 0xA1, False, True))
     assert (message.cycle, message.gate_flags, message.enable, message.quick_stop) == (5, 0xA1, False, True)
     for name, place in CONTROL_LAYOUT.slices.items():
-        assert getattr(message, name.lower()) == block[place].tolist()
-
-
-def test_truth_is_laid_out_as_its_type_says():
-    block = np.arange(TRUTH_LAYOUT.size) * 1.5
-    message = decode(ChannelId.TRUTH, pack_truth(77, block))
+        assert getattr(message, name.lower()) == control[place].tolist()
+    message = decode(ChannelId.TRUTH, pack_truth(77, truth))
     assert message.cycle == 77
     for name, place in TRUTH_LAYOUT.slices.items():
-        assert np.atleast_1d(getattr(message, name.lower())).tolist() == block[place].tolist()
+        assert np.atleast_1d(getattr(message, name.lower())).tolist() == truth[place].tolist()
+    record = CycleRecord(1, -2, 3, 4, 5, -6, 7, 8, 9, 10, 11, 12, 13, 14)
+    message = decode(ChannelId.CYCLE, pack_cycle(record))
+    assert {name: getattr(message, name) for name in CycleRecord._fields} == record._asdict()
 
 
-def test_contact_is_laid_out_as_its_type_says():
+def test_contact_is_laid_out_as_its_type_says_and_read_back():
     head = (9, 2, (-1, 1), (1.5, -2.5), (0.25, 0.75), True)
     rest = (ContactLevel.CONTACT, ContactKind.HIT, Reaction.FLOAT, Location.SINGULAR, True, (0.1, 0.2), (0.3, 0.4))
     report = ContactReport(*head, *rest, 10.0, 0.5, 0.2, 0.01, 0.05)
+    assert unpack_contact(pack_contact(report)) == report
     message = decode(ChannelId.CONTACT, pack_contact(report))
     for name, value in report._asdict().items():
         logged = getattr(message, ros_field_name(name))
         assert logged == (list(value) if isinstance(value, tuple) else value)
 
 
-def test_cycle_is_laid_out_as_its_type_says():
-    record = CycleRecord(1, -2, 3, 4, 5, -6, 7, 8, 9, 10, 11, 12, 13, 14)
-    message = decode(ChannelId.CYCLE, pack_cycle(record))
-    assert {name: getattr(message, name) for name in CycleRecord._fields} == record._asdict()
-
-
-def arm_state(t_ns=9_000_000, sampled_ns=6_500_000):
-    q, dq, tau_J = np.array([0.1, 0.2]), np.array([0.3, 0.4]), np.array([0.5, 0.6])
-    return ArmState(
-        2**40, t_ns, 3, q, dq, tau_J, (4, 5), (6, 2**33), True, False, FaultReason.DATA_AGE, True, 7, sampled_ns
-    )
-
-
-def test_arm_is_laid_out_as_its_type_says():
-    message = decode(ChannelId.ARM, pack_arm(arm_state(), 17))
+@pytest.mark.parametrize(
+    ("sampled_ns", "age_ns"),
+    [(6_500_000, 2_500_000), (9_000_001, -1), (None, 0)],
+    ids=["own", "clock set back", "none"],
+)
+def test_arm_is_laid_out_as_its_type_says_with_the_age_of_its_sample(sampled_ns, age_ns):
+    joints = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
+    ages = (4, 5), (6, 2**33)
+    arm = ArmState(2**40, 9_000_000, 3, *joints, *ages, True, False, FaultReason.DATA_AGE, True, 7, sampled_ns)
+    message = decode(ChannelId.ARM, pack_arm(arm, 17))
     assert (message.cycle, message.first_cycle, message.periods, message.steps) == (2**40, 17, 3, 7)
-    assert (message.age_q, message.age_tau_j, message.sample_age_ns) == ([4, 5], [6, 2**33], 2_500_000)
+    assert (message.age_q, message.age_tau_j, message.sample_age_ns) == ([4, 5], [6, 2**33], age_ns)
     assert (message.is_enabled, message.is_complete, message.fault, message.is_late) == (True, False, 1, True)
-
-
-def test_a_sample_may_be_stamped_after_the_sync_of_a_clock_that_was_set_back():
-    assert decode(ChannelId.ARM, pack_arm(arm_state(sampled_ns=9_000_001), 0)).sample_age_ns == -1
-
-
-def test_a_state_that_names_no_sync_of_its_sample_was_sampled_on_its_own():
-    assert decode(ChannelId.ARM, pack_arm(arm_state(sampled_ns=None), 0)).sample_age_ns == 0
 
 
 def test_states_are_named_before_the_field_that_holds_them():
@@ -206,3 +176,15 @@ def test_states_are_named_before_the_field_that_holds_them():
     lines = text.splitlines()
     state = next(index for index, line in enumerate(lines) if line.startswith("uint8 state "))
     assert lines[state - len(SchemeState) : state] == [f"uint8 STATE_{s.name}={s.value}" for s in SchemeState]
+
+
+def test_an_fd_frame_is_laid_out_as_written_by_hand():
+    stamp = bytes.fromhex("0100000002000000")
+    expected = (
+        "00010000"  # little-endian CDR
+        "01000000 02000000"  # stamp
+        "01000000 00 000000"  # frame_id "", aligned
+        "81010000 00 01 0c 00"  # id, is_extended, is_error, len, aligned
+        "0c000000 000102030405060708090a0b"  # data
+    )
+    assert pack_fd_frame(stamp, 0x181, bytes(range(12)), True) == bytes.fromhex(expected)

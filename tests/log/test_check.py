@@ -1,7 +1,5 @@
 """Every rule of the check is broken by one file, and told where; sound files break none."""
 
-import struct
-
 import pytest
 from made_log import (
     ATTACHMENTS,
@@ -17,9 +15,10 @@ from made_log import (
     put_together,
     rechunk,
     take_apart,
+    write_parts,
 )
 from mcap.opcode import Opcode
-from mcap.records import Channel, Header, Schema, Statistics
+from mcap.records import Channel, Header, Schema
 from mcap.writer import CompressionType, Writer
 
 from adacd_hil.lab.logs.check.content_checks import text_problem
@@ -303,16 +302,6 @@ def test_a_finding_says_where(tmp_path):
     assert data[finding.offset] == Opcode.CHUNK
 
 
-def write_parts(folder, endings, runs=None):
-    for number, ending in enumerate(endings):
-        if ending is None:
-            continue
-        name = f"run_{number:03d}.mcap" if number else "run.mcap"
-        run = {**(runs[number] if runs else RUN), "part": str(number)}
-        (folder / name).write_bytes(make_log(run=run, summary={**SUMMARY, "ending": ending}))
-    return folder / "run.mcap"
-
-
 @pytest.mark.parametrize(
     ("endings", "text"),
     [
@@ -361,12 +350,6 @@ def test_a_file_of_something_else_is_told_and_raises_nothing(tmp_path):
     for data in (b"", b"x", b"hello, this is text\n" * 1000, bytes(5000)):
         rules = {finding.rule for finding in check(tmp_path / "notes.txt", data).findings}
         assert {"magic", "header", "data-end", "footer"} <= rules
-
-
-def test_statistics_are_read_as_mcap_writes_them():
-    statistics = first(take_apart(WHOLE), Opcode.STATISTICS).read(Statistics)
-    assert (statistics.message_count, statistics.channel_message_counts) == (20, {1: 10, 2: 10})
-    assert struct.unpack_from("<Q", first(take_apart(WHOLE), Opcode.STATISTICS).body)[0] == 20
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 from recorded_run import payloads
 
 from adacd_hil.log import log_walk
-from adacd_hil.log.mcap import chunks as chunks_module
+from adacd_hil.log.mcap.chunks import PADDING, read_chunks
 from adacd_hil.log.reader import read_log
 
 CHUNKS = ((0, 5), (5, 10), (10, 15))
@@ -56,14 +56,6 @@ def path(tmp_path, monkeypatch):
     monkeypatch.setattr(log_walk, "read_blocks", read_blocks)
     return tmp_path / "run.mcap"
 
-    return take_apart(make_log(topics=("/joint_states", "/cycle"), chunks=CHUNKS, run=None))
-
-
-def read_chunks(chunks, indexes):
-    """Read chunks that follow each other in memory."""
-    ends = list(itertools.accumulate(map(len, chunks)))
-    return chunks_module.read_chunks(b"".join(chunks) + bytes(chunks_module.PADDING), ends, indexes)
-
 
 @pytest.mark.parametrize("spoil", INDEXES.values(), ids=INDEXES)
 def test_a_wrong_index_changes_nothing(spoil, path):
@@ -84,26 +76,12 @@ def test_a_message_that_no_index_has_is_read(path):
     assert payloads["/decoded/A"].count(payload(77)) == 1
 
 
-def test_chunks_whose_indexes_are_right_are_not_walked_through(monkeypatch):
-    records = [message(1, number, payload(number)) for number in range(6)]
-    chunks = [b"".join(records[:2]), b"".join(records[2:])]
-    size = len(records[0])
-    indexes = [b"".join(struct.pack("<QQ", 0, size * place) for place in range(count)) for count in (2, 4)]
-    walked = read_chunks(chunks, [b"", b""])
-    monkeypatch.setattr(chunks_module, "_walk_through", None)
-    indexed = read_chunks(chunks, indexes)
-    assert indexed.starts.tolist() == walked.starts.tolist() == [size * place for place in range(6)]
-    assert indexed.ends.tolist() == walked.ends.tolist()
-    assert indexed.log_times.tolist() == walked.log_times.tolist() == list(range(6))
-    assert [indexed.payload(place) for place in range(6)] == [payload(number) for number in range(6)]
-
-
 def test_a_record_that_goes_on_in_the_next_chunk_is_none():
     """The indexes fill both chunks together, but not each of them."""
     records = [message(1, number, payload(number)) for number in range(3)]
     data, size = b"".join(records), len(records[0])
     chunks = [data[: size + 40], data[size + 40 :]]
     indexes = [struct.pack("<QQQQ", 0, 0, 1, size), struct.pack("<QQ", 2, size - 40)]
-    contents = read_chunks(chunks, indexes)
+    contents = read_chunks(data + bytes(PADDING), list(itertools.accumulate(map(len, chunks))), indexes)
     assert contents.breaks[0] == size
     assert size not in contents.starts

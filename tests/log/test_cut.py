@@ -1,7 +1,18 @@
 """Stretches of logs: the same messages, whole cycles, nothing out of order."""
 
 import pytest
-from made_log import ATTACHMENTS, MILLISECOND, RUN, SUMMARY, kinds, make_log, put_together, take_apart
+from made_log import (
+    ATTACHMENTS,
+    MILLISECOND,
+    RUN,
+    SUMMARY,
+    kinds,
+    make_log,
+    put_together,
+    read_by_mcap,
+    take_apart,
+    write_parts,
+)
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
@@ -14,17 +25,6 @@ from adacd_hil.records import ContactReport
 INFINITE = float("inf")
 CYCLES = 300
 LATE_NS = 5_000_000_000
-
-
-def read(path):
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        found = reader.iter_messages(log_time_order=False)
-        messages = [
-            (channel.topic, message.log_time, message.publish_time, message.data) for _, channel, message in found
-        ]
-        attachments = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
-        return messages, attachments, {record.name: record.metadata for record in reader.iter_metadata()}
 
 
 def write(path, **options):
@@ -64,8 +64,10 @@ def test_a_result_is_not_named_like_a_part_of_the_log_beside_it(log_path, tmp_pa
 def test_a_stretch_has_its_cycles_whole_and_all_that_explains_them(log_path, tmp_path):
     out = tmp_path / "out.mcap"
     done = cut(log_path, out, TimeWindow(0.040, 0.1205))
-    messages, attachments, metadata = read(out)
-    assert messages == [message for message in read(log_path)[0] if 40 <= (message[2] - LATE_NS) / MILLISECOND <= 120]
+    messages, attachments, metadata = read_by_mcap(out)
+    assert messages == [
+        message for message in read_by_mcap(log_path)[0] if 40 <= (message[2] - LATE_NS) / MILLISECOND <= 120
+    ]
     assert done == len(messages) == 2 * 81
     assert (attachments, metadata["run"]) == (ATTACHMENTS, RUN)
     assert metadata["summary"] == {
@@ -89,7 +91,7 @@ def test_an_open_end_takes_the_rest(log_path, tmp_path):
 def test_only_the_asked_topics_are_taken(log_path, tmp_path):
     out = tmp_path / "out.mcap"
     cut(log_path, out, TimeWindow(0.0, 0.1), topics=("/b",))
-    assert {topic for topic, *_ in read(out)[0]} == {"/b"}
+    assert {topic for topic, *_ in read_by_mcap(out)[0]} == {"/b"}
     with out.open("rb") as file:
         assert [channel.topic for channel in make_reader(file).get_summary().channels.values()] == ["/b"]
 
@@ -180,28 +182,19 @@ def test_an_unknown_contact_is_an_error(log_path):
         find_contact(log_path, 1, 1.0)
 
 
-def write_parts(folder):
-    for number, ending in enumerate(("continued", "closed")):
-        name = f"run_{number:03d}.mcap" if number else "run.mcap"
-        chunks = ((10 * number, 10 * number + 10),)
-        run = {**RUN, "part": str(number)}
-        write(folder / name, chunks=chunks, run=run, times=frame_times, summary={**SUMMARY, "ending": ending})
-    return folder / "run.mcap"
-
-
 def test_parts_are_one_log(tmp_path):
-    path = write_parts(tmp_path)
-    whole = read(path)[0] + read(tmp_path / "run_001.mcap")[0]
+    path = write_parts(tmp_path, times=frame_times)
+    whole = read_by_mcap(path)[0] + read_by_mcap(tmp_path / "run_001.mcap")[0]
     out = tmp_path / "cut.mcap"
     cut(path, out, TimeWindow(-INFINITE, INFINITE))
-    messages, attachments, metadata = read(out)
+    messages, attachments, metadata = read_by_mcap(out)
     assert (messages, attachments, metadata["run"]) == (whole, ATTACHMENTS, RUN)
     assert check_log(out).findings == []
     assert read_log(out).problem == ""
 
 
 def test_parts_that_are_missing_or_of_another_run_are_an_error(tmp_path):
-    path = write_parts(tmp_path)
+    path = write_parts(tmp_path, times=frame_times)
     (tmp_path / "run_001.mcap").rename(tmp_path / "run_002.mcap")
     with pytest.raises(LogError, match=r"run\.mcap lacks run_001\.mcap: recover the log first$"):
         cut(path, tmp_path / "out.mcap", TimeWindow(-INFINITE, INFINITE))

@@ -1,10 +1,10 @@
 """A slow disk and a full one: the ring is emptied all the same, memory is bounded, and what is lost is counted."""
 
-import errno
 import json
 import os
 import pickle
 import re
+import resource
 import socket
 import threading
 
@@ -13,7 +13,6 @@ from recorded_run import CODEC, make_run
 
 from adacd_hil.log.log_files import find_parts
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.recording import log_file as sink_module
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.log_file import Sink
 from adacd_hil.log.recording.packet import pack_cycle, pack_event
@@ -21,6 +20,7 @@ from adacd_hil.log.recording.processes import WriterSetup
 from adacd_hil.log.recording.ring import Ring, RingReader
 from adacd_hil.log.recording.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS, WriterProcess
 from adacd_hil.log.types.topics import run_channels
+from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec_columns import plain_tables
 
 pytestmark = pytest.mark.slow
@@ -146,42 +146,46 @@ def test_a_slow_disk_costs_packets_and_bounded_memory(tmp_path):
 
 
 class Disk:
-    """The disk of the sink; takes `room` more bytes."""
+    """What this process may write to files: while the disk is full, nothing."""
 
-    def __init__(self, monkeypatch):
-        self.room = 2**40
-        self._write_all = sink_module._write_all
-        monkeypatch.setattr(sink_module, "_write_all", self.write_all)
+    def __init__(self):
+        self._limits = resource.getrlimit(resource.RLIMIT_FSIZE)
 
-    def write_all(self, descriptor, data):
-        self._write_all(descriptor, data[: max(self.room, 0)])
-        self.room -= len(data)
-        if self.room < 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    def fill(self):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, self._limits[1]))
+
+    def free(self):
+        resource.setrlimit(resource.RLIMIT_FSIZE, self._limits)
+
+
+@pytest.fixture
+def disk():
+    disk = Disk()
+    yield disk
+    disk.free()
 
 
 def create(path):
     return os.open(path, os.O_WRONLY | os.O_CREAT)
 
 
-def test_a_full_disk_is_tried_again_with_another_part(tmp_path, monkeypatch):
+def test_a_full_disk_is_tried_again_with_another_part(tmp_path, disk):
     run = make_run(1200)
-    disk = Disk(monkeypatch)
     path = tmp_path / "run.mcap"
     writer = Writer(path, create(path))
     writer.feed(run.cycles[:300])
     writer.wait_until_taken()
-    disk.room = 1000
+    disk.fill()
     writer.feed(run.cycles[300:900])
     writer.wait_until_taken()
-    full = f"log {path} can't be written: No space left on device; packets are dropped until there is room"
+    full = f"log {path} can't be written: File too large; packets are dropped until there is room"
     assert writer.told == [full]
-    disk.room = 2**40
+    disk.free()
     failed = writer.clock.now
     writer.wait(lambda: writer.clock.now > failed + 2 * RETRY_PERIOD_NS)
     writer.feed(run.cycles[900:])
     word = writer.end()
-    assert re.fullmatch(r"No space left on device after \d+ bytes", word["error"])
+    assert re.fullmatch(r"File too large after \d+ bytes", word["error"])
     assert (word["lost"], word["parts"]) == (str(packets_of(run.cycles[300:900])), "2")
     again = f"log {tmp_path / 'run_001.mcap'} is written again; packets are missing before it"
     assert writer.told == [full, again]
@@ -195,15 +199,14 @@ def test_a_full_disk_is_tried_again_with_another_part(tmp_path, monkeypatch):
     assert_accounts_for(log, run.cycles, int(word["lost"]))
 
 
-def test_a_part_without_data_is_begun_again_when_there_is_room(tmp_path, monkeypatch):
+def test_a_part_without_data_is_begun_again_when_there_is_room(tmp_path, disk):
     run = make_run(400)
-    disk = Disk(monkeypatch)
     path = tmp_path / "run.mcap"
     writer = Writer(path, create(path))
-    disk.room = 1000
+    disk.fill()
     writer.feed(run.cycles[:200])
     writer.wait_until_taken()
-    disk.room = 2**40
+    disk.free()
     failed = writer.clock.now
     writer.wait(lambda: writer.clock.now > failed + 2 * RETRY_PERIOD_NS)
     writer.feed(run.cycles[200:])
@@ -215,15 +218,14 @@ def test_a_part_without_data_is_begun_again_when_there_is_room(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("has_chunk", [False, True])
-def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path, monkeypatch):
+def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path, disk):
     run = make_run(400)
-    disk = Disk(monkeypatch)
     path = tmp_path / "run.mcap"
     writer = Writer(path, create(path))
     if has_chunk:
         writer.feed(run.cycles[:200])
         writer.wait_until_taken()
-    disk.room = 0
+    disk.fill()
     writer.feed(run.cycles[200:])
     writer.wait_until_taken()
     failed = writer.clock.now
@@ -232,7 +234,7 @@ def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path,
     assert word["lost"] == str(packets_of(run.cycles[200:]))
     assert [file.name for file in tmp_path.iterdir()] == ["run.mcap"]
     assert len(read_log(path).scheme) == 200 * has_chunk
-    assert word["error"].startswith("No space left on device")
+    assert word["error"].startswith("File too large")
     assert len(writer.told) == 1
 
 
@@ -251,6 +253,23 @@ def test_what_was_dropped_is_counted_in_one_part_only(tmp_path):
     assert log.problem == ""
     assert missing_in(log) == [5]
     assert log.summary["dropped"] == "5"
+
+
+def test_a_packet_that_makes_no_sense_is_dropped_alone(tmp_path):
+    run = make_run(10)
+    path = tmp_path / "run.mcap"
+    writer = Writer(path, create(path))
+    writer.feed(run.cycles[:5])
+    for packet in (
+        pack_cycle(1, 0, [], [(True, Frame(1, bytes(65), 0))]),
+        pack_cycle(1, 0, [(9999, b"")], []),
+        b"\x01",
+    ):
+        writer.put(packet)
+    writer.feed(run.cycles[5:])
+    word = writer.end()
+    assert (word["lost"], word["error"]) == ("3", "")
+    assert read_log(path).scheme.block.tobytes() == run.blocks.tobytes()
 
 
 def test_the_setup_arrives_as_it_was_sent(tmp_path):

@@ -12,9 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zstandard
-from mcap.records import Chunk
-from mcap.stream_reader import StreamReader
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
 from adacd_hil.log.log_files import LogError
@@ -23,7 +20,6 @@ from adacd_hil.log.recording import recorder as recorder_module
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
-from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec_columns import MessageTable
 
 CONTROL_PROCESS = """
@@ -42,7 +38,7 @@ sys.stdin.read()
 
 @pytest.fixture(scope="module")
 def run():
-    return make_run(300)
+    return make_run(300, has_fd=True)
 
 
 @pytest.fixture(scope="module")
@@ -114,10 +110,6 @@ def test_what_is_logged_reaches_the_disk_though_nothing_follows(tmp_path):
     assert read_log(tmp_path / "run.mcap").scheme.block.tobytes() == run.blocks.tobytes()
 
 
-def missing_by(notice):
-    return int(re.fullmatch(r"(\d+) packets are missing before this", notice)[1])
-
-
 @pytest.mark.slow
 def test_a_writer_that_is_behind_costs_packets_not_time(tmp_path):
     run = make_run(50)
@@ -145,7 +137,8 @@ def test_a_writer_that_is_behind_costs_packets_not_time(tmp_path):
     notices = [event.message for _, event in log.events if event.name == "log"]
     # More than one: an event still fits where a cycle doesn't.
     assert 1 <= len(notices) <= 4
-    assert sum(missing_by(notice) for notice in notices) == dropped
+    missing = [re.fullmatch(r"(\d+) packets are missing before this", notice) for notice in notices]
+    assert sum(int(found[1]) for found in missing) == dropped
     assert len(log.scheme) + len(log.events) - len(notices) + dropped == sent
 
 
@@ -163,10 +156,11 @@ def test_in_lockstep_a_writer_that_is_behind_is_waited_for(tmp_path):
     os.kill(recorder.pid, signal.SIGSTOP)
     sender = threading.Thread(target=send)
     sender.start()
-    while recorder._ring.capacity - recorder._ring.waiting > 4100:
+    while len(sent) < 2**20 // 4200:
         os.sched_yield()
     for _ in range(1000):  # lets the sender run against it
         os.sched_yield()
+    assert len(sent) < 2**20 // 4000
     os.kill(recorder.pid, signal.SIGCONT)
     has_continued.set()
     sender.join()
@@ -199,7 +193,7 @@ def test_a_disk_that_fails_at_the_very_end_is_reported(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("limit", "least"), [(30_000, 0), (200_000, 50), (400_000, 150)])
+@pytest.mark.parametrize(("limit", "least"), [(30_000, 0), (400_000, 150)])
 def test_a_full_disk_is_said_when_it_happens_and_stops_nobody(limit, least, tmp_path, capfd):
     run = make_run(2000)
     recorder = start(tmp_path / "run.mcap", run)
@@ -257,20 +251,6 @@ def test_messages_that_have_no_topic_are_an_error_before_the_run_and_leave_no_fi
     assert not path.exists()
 
 
-@pytest.mark.slow
-def test_a_packet_that_makes_no_sense_is_dropped_alone(tmp_path):
-    run = make_run(10)
-    recorder = start(tmp_path / "run.mcap", run)
-    feed(recorder, run.cycles[:5])
-    recorder.cycle(1, [], [(True, Frame(1, bytes(65), 0))])
-    recorder.cycle(1, [(9999, b"no such channel")])
-    recorder._put(b"\x01")
-    feed(recorder, run.cycles[5:])
-    summary = recorder.close()
-    assert (summary.dropped, summary.is_complete) == (3, False)
-    assert read_log(tmp_path / "run.mcap").scheme.block.tobytes() == run.blocks.tobytes()
-
-
 def cuts(size):
     generator = np.random.default_rng(7)
     return sorted({*range(60), *range(size - 60, size), *generator.integers(0, size, 250).tolist()})
@@ -280,7 +260,7 @@ def cuts(size):
 @pytest.mark.slow
 def test_a_log_cut_anywhere_gives_what_came_before(run, whole, tmp_path):
     path = tmp_path / "cut.mcap"
-    times = [frame.t_ns for _, frame in run.frames]
+    times = [frame.t_ns for *_, frame in run.frames]
     counts = []
     for size in cuts(len(whole)):
         path.write_bytes(whole[:size])
@@ -317,29 +297,6 @@ def test_a_flipped_bit_is_noticed_or_harmless(run, whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_damaged_chunk_costs_only_itself(whole, run, tmp_path):
-    """Also when it is the first, which holds the definitions of all topics."""
-    path = tmp_path / "damaged.mcap"
-    path.write_bytes(whole)
-    with path.open("rb") as file:
-        chunks = [r for r in StreamReader(file, emit_chunks=True).records if isinstance(r, Chunk)]
-    assert len(chunks) >= 2
-    for chunk in chunks:
-        damaged = bytearray(whole)
-        place = whole.index(chunk.data)
-        damaged[place + len(chunk.data) // 2] ^= 0x10
-        path.write_bytes(damaged)
-        log = read_log(path)
-        times = log.scheme.t_ns.tolist()
-        outside = {c.t_ns for c in run.cycles if not chunk.message_start_time <= c.t_ns <= chunk.message_end_time}
-        assert log.problem.startswith("damaged at byte ")
-        assert not log.is_complete
-        assert outside
-        assert outside <= set(times)
-        assert len(times) < 300
-
-
-@pytest.mark.slow
 def test_a_damaged_attachment_is_not_handed_out(whole, run, tmp_path):
     damaged = bytearray(whole)
     damaged[whole.index(run.attachments["run.toml"])] ^= 1
@@ -351,30 +308,13 @@ def test_a_damaged_attachment_is_not_handed_out(whole, run, tmp_path):
     assert log.problem.startswith("damaged at byte ")
 
 
-@pytest.mark.slow
-def test_a_chunk_that_claims_to_be_huge_is_damage_not_memory(whole, tmp_path):
-    path = tmp_path / "huge.mcap"
-    path.write_bytes(whole)
-    with path.open("rb") as file:
-        chunk = next(r for r in StreamReader(file, emit_chunks=True).records if isinstance(r, Chunk))
-    head = chunk.message_start_time.to_bytes(8, "little") + chunk.message_end_time.to_bytes(8, "little")
-    place = whole.index(head) + len(head)
-    path.write_bytes(whole[:place] + (1 << 60).to_bytes(8, "little") + whole[place + 8 :])
-    log = read_log(path)
-    assert log.problem.startswith("damaged at byte ")
-    assert zstandard.get_frame_parameters(chunk.data).content_size == chunk.uncompressed_size
-
-
-def test_a_file_that_is_not_mcap_is_an_error_of_one_line(tmp_path):
+def test_no_file_and_a_file_of_something_else_are_an_error_of_one_line(tmp_path):
     path = tmp_path / "notes.txt"
+    with pytest.raises(LogError, match=f"^log {path} can't be read: No such file or directory$"):
+        read_log(path)
     path.write_text("hello, this is text\n" * 10)
     with pytest.raises(LogError, match=f"^{path} is not an MCAP file$"):
         read_log(path)
-
-
-def test_a_file_that_does_not_exist_is_an_error_of_one_line(tmp_path):
-    with pytest.raises(LogError, match=f"^log {tmp_path / 'none.mcap'} can't be read: No such file or directory$"):
-        read_log(tmp_path / "none.mcap")
 
 
 def test_an_empty_file_is_a_log_cut_at_once(tmp_path):

@@ -1,11 +1,11 @@
 """Recordings of every format, read to the same frames; times to the nanosecond where the format has them."""
 
 import struct
-import zlib
 
 import can
 import numpy as np
 import pytest
+from made_log import BLF_ERROR, BLF_MARKER, blf_frame, blf_object, write_blf
 from recorded_run import make_run, record
 
 from adacd_hil.log.frames.frame_log import read_frames
@@ -50,13 +50,8 @@ def candump_log(tmp_path_factory):
     return read_frames(path)
 
 
-@pytest.mark.parametrize("number", range(len(CANDUMP)))
-def test_a_line_of_candump_is_read_as_it_stands(candump_log, number):
-    assert fields(candump_log, number) == CANDUMP[number][1:]
-
-
-def test_all_lines_of_candump_are_read(candump_log):
-    assert len(candump_log.frames) == len(CANDUMP)
+def test_lines_of_candump_are_read_as_they_stand(candump_log):
+    assert [fields(candump_log, number) for number in range(len(candump_log.frames))] == [row[1:] for row in CANDUMP]
     assert candump_log.channels == ("vcan0", "can1", "can0")
     assert candump_log.problem == ""
 
@@ -68,12 +63,12 @@ def test_our_bus_end_has_neither_remote_frames_nor_29_bits_that_read_as_11(candu
     ]  # fmt: skip
 
 
-def test_a_candump_log_that_is_cut_says_where(tmp_path):
+@pytest.mark.parametrize("line", ["(1.000001) can0 12", "(1.000001) can0 123#112"])
+def test_a_candump_log_that_is_cut_says_where(line, tmp_path):
     path = tmp_path / "cut.log"
-    path.write_text("(1.000000) can0 123#11\n(1.000001) can0 12")
+    path.write_text(f"(1.000000) can0 123#11\n{line}")
     log = read_frames(path)
-    assert len(log.frames) == 1
-    assert log.problem == "cut.log: line 2 is no frame: (1.000001) can0 12"
+    assert (len(log.frames), log.problem) == (1, f"cut.log: line 2 is no frame: {line}")
 
 
 @pytest.mark.parametrize(
@@ -150,55 +145,30 @@ def test_a_log_of_ours_gives_the_frames_that_its_reader_gives(tmp_path):
     assert log.epoch_ns == NOON_NS
 
 
-FRAME = struct.Struct("<HBBL8s")
-BLF_FRAME, BLF_ERROR, BLF_MARKER = 86, 73, 96
-
-
-def blf_object(kind, body, version=1, flags=2, t_ns=0):
-    head = struct.pack("<LHHQ", flags, 0, 0, t_ns)
-    record = struct.pack("<4sHHLL", b"LOBJ", 32, version, 32 + len(body), kind) + head + body
-    return record + bytes(len(record) % 4)
-
-
-def write_blf(path, objects, cut=0):
-    """Write a BLF of one container by hand, `cut` bytes short."""
-    with can.BLFWriter(path):
-        pass
-    inner = b"".join(objects)
-    packed = struct.pack("<H6xI4x", 2, len(inner)) + zlib.compress(inner)
-    container = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(packed), 10) + packed
-    path.write_bytes((path.read_bytes()[:144] + container + bytes(len(container) % 4))[: -cut or None])
-    return path
-
-
-def data_frames(count):
-    return [blf_object(BLF_FRAME, FRAME.pack(1, 0, 8, 0x181, bytes([n % 256] * 8)), t_ns=n) for n in range(count)]
-
-
 def error_frame(dlc):
     return blf_object(BLF_ERROR, struct.pack("<HHLBBBxLLH2x8s", 1, 0, 0, 0, 0, dlc, 0, 0x4, 0, b"12345678"))
 
 
 def test_an_error_frame_whose_length_code_no_frame_has_ends_nothing(tmp_path):
-    frames = data_frames(5)
-    log = read_frames(write_blf(tmp_path / "x.blf", [*frames[:2], error_frame(15), *frames[2:]]))
+    frames = [blf_frame(number) for number in range(5)]
+    log = read_frames(write_blf(tmp_path / "x.blf", b"".join([*frames[:2], error_frame(15), *frames[2:]])))
     assert log.frames["data"][~log.frames["is_error"], 0].tolist() == [0, 1, 2, 3, 4]
     assert log.frames["length"].tolist() == [8] * 6
     assert log.problem == ""
 
 
 def test_an_object_of_a_version_to_come_is_counted_only_where_it_is_a_frame(tmp_path):
-    frames, marker = data_frames(4), blf_object(BLF_MARKER, bytes(40), version=3)
-    log = read_frames(write_blf(tmp_path / "x.blf", [*frames[:2], marker, *frames[2:]]))
+    frames, marker = [blf_frame(number) for number in range(4)], blf_object(BLF_MARKER, bytes(40), version=3)
+    log = read_frames(write_blf(tmp_path / "x.blf", b"".join([*frames[:2], marker, *frames[2:]])))
     assert (len(log.frames), log.problem) == (4, "")
     frames[1] = frames[1].replace(b"\x20\0\x01\0", b"\x20\0\x03\0", 1)
-    log = read_frames(write_blf(tmp_path / "x.blf", [*frames[:2], marker, *frames[2:]]))
+    log = read_frames(write_blf(tmp_path / "x.blf", b"".join([*frames[:2], marker, *frames[2:]])))
     assert log.frames["data"][:, 0].tolist() == [0, 2, 3]
     assert log.problem == "x.blf: a frame of header version 3 is not read"
 
 
 def test_a_blf_that_is_cut_says_so(tmp_path):
-    log = read_frames(write_blf(tmp_path / "x.blf", data_frames(500), cut=100))
+    log = read_frames(write_blf(tmp_path / "x.blf", b"".join(map(blf_frame, range(500))), cut=100))
     assert 0 < len(log.frames) < 500
     assert log.problem == f"x.blf: cut within an object, behind {len(log.frames)} frames"
 
@@ -264,13 +234,6 @@ def test_a_cut_line_of_a_trc_is_counted(tmp_path, capfd):
     assert len(log.frames) == 1
     assert "2.0 Rx 01" in log.problem
     assert capfd.readouterr() == ("", "")
-
-
-def test_half_a_byte_at_the_end_of_a_candump_log_is_no_frame(tmp_path):
-    path = tmp_path / "x.log"
-    path.write_text("(1.000000) can0 123#1122\n(1.000001) can0 123#112")
-    log = read_frames(path)
-    assert (len(log.frames), log.problem) == (1, "x.log: line 2 is no frame: (1.000001) can0 123#112")
 
 
 SAVVYCAN = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"

@@ -1,12 +1,9 @@
 """Recordings of strangers whose numbers lie: each is read to an end, and what is wrong is one line."""
 
-import struct
-import zlib
-
 import can
 import numpy as np
 import pytest
-from made_log import make_log
+from made_log import BLF_FRAME, blf_frame, blf_object, make_log, write_blf
 
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.signal_tables import Tables, export_tables
@@ -19,23 +16,9 @@ from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.message_types import TIME_TEXT, payload_dtype
 from adacd_hil.wire.dbc_decoder import load_decoder
 
-HEAD = struct.Struct("<4sHHII")
-CONTAINER = 10
-FILE_HEAD = 144
 
-
-def blf(path, inner, method=2, size=None):
-    """Write a BLF with one container that holds `inner`."""
-    with can.BLFWriter(path) as writer:
-        writer(can.Message(timestamp=1.7e9, arbitration_id=0x181, data=b"12345678", is_extended_id=False, channel=0))
-    packed = struct.pack("<H6xI4x", method, len(inner)) + (zlib.compress(inner) if method == 2 else inner)
-    record = HEAD.pack(b"LOBJ", 16, 1, len(packed) + 16 if size is None else size, CONTAINER) + packed
-    path.write_bytes(path.read_bytes()[:FILE_HEAD] + record + bytes(len(record) % 4))
-    return path
-
-
-def item(version, size, body=bytes(32)):
-    return HEAD.pack(b"LOBJ", 32, version, size, 86) + body
+def item(version, size):
+    return blf_object(BLF_FRAME, bytes(16), version, size=size)
 
 
 LIES = {
@@ -52,12 +35,12 @@ LIES = {
 @pytest.mark.parametrize(("inner", "options", "line"), LIES.values(), ids=LIES)
 def test_a_blf_whose_sizes_lie_is_refused_at_once(inner, options, line, tmp_path):
     with pytest.raises(LogError, match=line) as error:
-        read_frames(blf(tmp_path / "x.blf", inner, **options))
+        read_frames(write_blf(tmp_path / "x.blf", inner, **options))
     assert "\n" not in str(error.value)
 
 
 def test_a_blf_whose_sizes_are_right_is_read(tmp_path):
-    assert len(read_frames(blf(tmp_path / "x.blf", item(1, 48))).frames) == 1
+    assert len(read_frames(write_blf(tmp_path / "x.blf", blf_frame())).frames) == 1
 
 
 def candump_line(time="1700000000.000000", channel="can0"):
@@ -105,7 +88,7 @@ def test_a_time_beyond_64_bits_is_left_out_and_named(tmp_path):
 
 
 def test_a_channel_that_is_a_number_of_5000_digits_is_a_name(tmp_path):
-    frames = np.zeros(1, read_frames(blf(tmp_path / "x.blf", b"")).frames.dtype)
+    frames = np.zeros(1, read_frames(write_blf(tmp_path / "x.blf", b"")).frames.dtype)
     (message,) = to_messages(frames, ["9" * 5000])
     assert message.channel == "9" * 5000
 

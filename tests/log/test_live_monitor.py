@@ -68,16 +68,21 @@ def two_cycles():
     return run
 
 
-@pytest.fixture(scope="module")
-def described():
+def shown_of(run):
+    """What a monitor says of a run."""
     fed = Feed()
     with live_client(fed.live.url, TOPICS) as client:
-        fed.cycles(two_cycles(), 1)
+        fed.cycles(run, 1)
         monitor = LiveMonitor(client)
         for message in receive_until_last(client):
             monitor.accept_message(message)
     fed.close()
     return monitor.describe()
+
+
+@pytest.fixture(scope="module")
+def described():
+    return shown_of(two_cycles())
 
 
 def test_the_latest_state_is_described(described):
@@ -189,16 +194,11 @@ def test_the_monitor_listens_for_as_long_as_it_is_asked_to():
 
 
 @pytest.mark.parametrize(
-    ("module", "words", "asked_for"),
-    [
-        ("websockets", ("demo", "--live"), "--live"),
-        ("websockets", ("run", "-i", "virtual", "-c", "x", "--live"), "--live"),
-        ("websockets", ("monitor", "--url", "ws://127.0.0.1:1"), "--url"),
-    ],
+    ("words", "asked_for"), [(("demo", "--live"), "--live"), (("monitor", "--url", "ws://127.0.0.1:1"), "--url")]
 )
-def test_without_the_extra_there_is_one_line_and_status_2(monkeypatch, tmp_path, module, words, asked_for):
+def test_without_the_extra_there_is_one_line_and_status_2(monkeypatch, tmp_path, words, asked_for):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setitem(sys.modules, "websockets", None)
     result = CliRunner().invoke(cli, words)
     assert result.exit_code == 2
     assert result.stderr == f"adacd-hil: {asked_for} needs the extra `live`: {install_command('live')}\n"
@@ -210,24 +210,10 @@ def test_a_monitor_needs_a_bus_or_a_url():
     assert (result.exit_code, result.stderr) == (2, "adacd-hil: give --interface and --channel, or --url\n")
 
 
-def test_where_nothing_is_served_there_is_one_line_and_status_1():
-    result = CliRunner().invoke(cli, ["monitor", "--url", "ws://127.0.0.1:1", "--once"])
-    assert result.exit_code == 1
-    assert result.stderr.startswith("adacd-hil: live view ws://127.0.0.1:1: ")
-    assert result.stderr.count("\n") == 1
-
-
 def test_no_escape_sequence_of_an_event_reaches_the_terminal():
-    fed = Feed()
-    with live_client(fed.live.url, TOPICS) as client:
-        run = two_cycles()
-        run.cycles[1].event = Event("warning", "\x1b[2Jname", "\x1b]0;owned\x07text\r\n")
-        fed.cycles(run, 1)
-        monitor = LiveMonitor(client)
-        for message in receive_until_last(client):
-            monitor.accept_message(message)
-    fed.close()
-    text = as_text(monitor.describe())
+    run = two_cycles()
+    run.cycles[1].event = Event("warning", "\x1b[2Jname", "\x1b]0;owned\x07text\r\n")
+    text = as_text(shown_of(run))
     assert "\\u001b[2Jname" in text
     assert {letter for letter in text if not letter.isprintable()} <= {"\n"}
 

@@ -109,16 +109,13 @@ OWN = socket.gethostname().lower()
     ("origin", "host", "status"),
     [
         (None, "127.0.0.1:8765", None),
-        (None, "10.1.2.3:8765", None),
         (None, "[::1]:8765", None),
-        (None, "localhost", None),
         (None, "LOCALHOST.:8765", None),
         (None, OWN, None),
         (None, f"{OWN.partition('.')[0]}.local:8765", None),
         (None, "arm.lab.example:8765", None),  # --live-name
         (None, "stranger.example:8765", 403),
         (None, "127.0.0.1.stranger.example", 403),
-        (None, "localhost.stranger.example", 403),
         (None, "", 403),
         (None, "127.0.0.1:x", 403),
         (None, "user@127.0.0.1", 403),
@@ -126,7 +123,6 @@ OWN = socket.gethostname().lower()
         ("https://studio.foxglove.dev", "127.0.0.1:8765", None),
         ("file://", "127.0.0.1:8765", None),
         ("http://localhost:8080", "127.0.0.1:8765", None),
-        ("http://127.0.0.1:3000", "127.0.0.1:8765", None),
         ("https://[::1]:3000", "127.0.0.1:8765", None),
         ("https://view.lab.example", "127.0.0.1:8765", None),  # --live-origin
         ("viewer-app://", "127.0.0.1:8765", None),
@@ -137,10 +133,8 @@ OWN = socket.gethostname().lower()
         ("https://stranger.example", "127.0.0.1:8765", 403),
         ("null", "127.0.0.1:8765", 403),  # a sandboxed frame of anybody's
         ("", "127.0.0.1:8765", 403),
-        ("https://app.foxglove.dev.stranger.example", "127.0.0.1:8765", 403),
         ("https://app.foxglove.dev@stranger.example", "127.0.0.1:8765", 403),
         ("http://app.foxglove.dev", "127.0.0.1:8765", 403),
-        ("http://localhost.stranger.example", "127.0.0.1:8765", 403),
         ("http://localhost:8080/x", "127.0.0.1:8765", 403),
         ("http://127.0.0.1.stranger.example", "127.0.0.1:8765", 403),
         ("http://stranger.example:8765", "stranger.example:8765", 403),  # a name that was bound to this machine
@@ -187,16 +181,6 @@ def test_who_is_refused_gets_the_reason_and_nothing_else(served, request_options
     assert "scheme" not in response.body.decode()
 
 
-def test_a_name_that_is_not_ours_is_refused_on_the_wire(served):
-    port = int(served.rsplit(":", 1)[1])
-    request = raw_request("stranger.example:8765")
-    with socket.create_connection(("127.0.0.1", port)) as client:
-        client.sendall(request)
-        answer = client.makefile("rb").read()
-    assert answer.startswith(b"HTTP/1.1 403")
-    assert b"--live-name" in answer
-
-
 def page(url, *headers):
     """What a browser gets that is pointed at the port: status line, headers, body."""
     port = int(url.rsplit(":", 1)[1])
@@ -219,11 +203,17 @@ def test_a_browser_gets_a_page_that_says_what_connects(served):
 
 
 @pytest.mark.parametrize(
-    "headers", [["Host: stranger.example"], ["Host: 127.0.0.1", "Origin: https://stranger.example"], []]
+    ("headers", "remedy"),
+    [
+        (["Host: stranger.example"], "--live-name"),
+        (["Host: 127.0.0.1", "Origin: https://stranger.example"], "--live-origin"),
+        ([], ""),
+    ],
 )
-def test_a_page_is_admitted_as_a_viewer_is(served, headers):
+def test_a_page_is_admitted_as_a_viewer_is(served, headers, remedy):
     head, body = page(served, *headers)
     assert head.startswith("HTTP/1.1 403")
+    assert remedy in body
     assert "<html" not in body
 
 

@@ -67,21 +67,8 @@ def message_of(columns: Columns, number: int) -> tuple[int, bytes]:
 
 
 @pytest.mark.slow
-@given(CYCLES)
-def test_a_cycle_comes_out_as_it_went_in(cycle):
-    assert contents(unpacked(pack_cycle(*cycle))) == [cycle]
-
-
-@pytest.mark.long
-@given(TIMES, COUNTS, EVENTS)
-def test_an_event_comes_out_as_it_went_in(t_ns, dropped, event):
-    assert contents(unpacked(pack_event(t_ns, dropped, event))) == [(t_ns, dropped, event)]
-
-
-@pytest.mark.long
-@pytest.mark.slow
 @given(st.lists(st.one_of(CYCLES, st.tuples(TIMES, COUNTS, EVENTS)), max_size=8))
-def test_many_packets_come_out_in_order(packets):
+def test_packets_come_out_as_they_went_in(packets):
     packed = [pack_event(*packet) if isinstance(packet[2], Event) else pack_cycle(*packet) for packet in packets]
     assert contents(unpacked(*packed)) == packets
 

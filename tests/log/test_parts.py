@@ -177,19 +177,6 @@ def test_a_part_that_is_missing_costs_only_itself(number, log_path, whole):
     assert log.attachments == whole.attachments
 
 
-def test_a_part_that_is_damaged_costs_only_what_is_damaged(log_path, whole):
-    part = part_path(log_path, 1)
-    lost = times_of(part)
-    data = part.read_bytes()
-    part.write_bytes(data[: len(data) // 2])
-    log = read_log(log_path)
-    assert log.problem == f"run_001.mcap: cut after {len(data) // 2} bytes"
-    assert not log.is_complete
-    missing = set(whole.scheme.t_ns.tolist()) - set(log.scheme.t_ns.tolist())
-    assert missing < lost
-    assert missing
-
-
 def test_a_last_part_that_is_cut_is_not_taken_for_one_that_another_follows(log_path):
     part = part_path(log_path, 2)
     part.write_bytes(part.read_bytes()[:100_000])

@@ -13,10 +13,11 @@ from made_log import (
     new,
     payload,
     put_together,
+    read_by_mcap,
     take_apart,
+    write_parts,
 )
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
 from mcap.records import Metadata
 
 from adacd_hil.lab.logs.check.log_check import check_log
@@ -26,16 +27,8 @@ from adacd_hil.log.reader import read_log
 
 CHUNKS = tuple((start, start + 3) for start in range(0, 12, 3))
 COUNT = 24
+THREE = ("continued", "continued", "closed")
 WHOLE = make_log(chunks=CHUNKS, summary={**SUMMARY, "messages": str(COUNT)})
-
-
-def read(path):
-    """Read with mcap's reader: messages, attachments, metadata."""
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        messages = [(channel.topic, found.log_time, found.data) for _, channel, found in reader.iter_messages()]
-        attachments = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
-        return messages, attachments, {record.name: record.metadata for record in reader.iter_metadata()}
 
 
 def recovered(tmp_path, data):
@@ -45,14 +38,14 @@ def recovered(tmp_path, data):
     assert path.read_bytes() == data
     assert check_log(recovery.out).errors == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == ["log.mcap", "log.recovered.mcap"]
-    return recovery, *read(recovery.out)
+    return recovery, *read_by_mcap(recovery.out)
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "log.mcap"
     path.write_bytes(WHOLE)
-    return read(path)
+    return read_by_mcap(path)
 
 
 def flipped(data, place, bit=0):
@@ -210,24 +203,10 @@ def test_the_log_itself_is_not_overwritten(tmp_path):
     assert path.read_bytes() == WHOLE
 
 
-def parts_of_a_log(folder, count, run=RUN):
-    for number in range(count):
-        ending = "closed" if number == count - 1 else "continued"
-        name = f"run_{number:03d}.mcap" if number else "run.mcap"
-        start = 5 * number
-        data = make_log(
-            chunks=((start, start + 5),),
-            run={**run, "part": str(number)},
-            summary={**SUMMARY, "messages": "10", "dropped": "1", "ending": ending},
-        )
-        (folder / name).write_bytes(data)
-    return folder / "run.mcap"
-
-
 def test_parts_become_one_log(tmp_path):
-    recovery = recover(parts_of_a_log(tmp_path, 3))
-    messages, attachments, metadata = read(recovery.out)
-    assert (len(messages), attachments, recovery.losses.is_any) == (30, ATTACHMENTS, False)
+    recovery = recover(write_parts(tmp_path, THREE, summary={**SUMMARY, "dropped": "1"}))
+    messages, attachments, metadata = read_by_mcap(recovery.out)
+    assert (len(messages), attachments, recovery.losses.is_any) == (60, ATTACHMENTS, False)
     assert metadata["run"] == RUN
     assert metadata["summary"]["dropped"] == "3"
     log = read_log(recovery.out)
@@ -235,25 +214,25 @@ def test_parts_become_one_log(tmp_path):
 
 
 def test_parts_that_are_missing_or_of_another_run_cost_themselves(tmp_path):
-    path = parts_of_a_log(tmp_path, 4)
+    path = write_parts(tmp_path, ("continued", *THREE))
     (tmp_path / "run_001.mcap").unlink()
     (tmp_path / "run_003.mcap").unlink()
     (tmp_path / "run_002.mcap").write_bytes(make_log(run={**RUN, "part": "2", "name": "other"}))
     recovery = recover(path)
     assert recovery.losses.missing_parts == ["run_001.mcap", "run_002.mcap (of another run)"]
     assert recovery.losses.describe() == "run_001.mcap, run_002.mcap (of another run)"
-    assert len(read(recovery.out)[0]) == 10
-    parts_of_a_log(tmp_path, 3)
+    assert len(read_by_mcap(recovery.out)[0]) == 20
+    write_parts(tmp_path, THREE)
     (tmp_path / "run_002.mcap").unlink()
     assert recover(path).losses.missing_parts == ["run_002.mcap"]
 
 
 def test_a_part_whose_metadata_have_one_damaged_entry_is_still_of_the_run(tmp_path):
-    path = parts_of_a_log(tmp_path, 2)
+    path = write_parts(tmp_path)
     second = tmp_path / "run_001.mcap"
     second.write_bytes(flipped(second.read_bytes(), second.read_bytes().index("Prüfung".encode())))
     recovery = recover(path)
-    assert recovery.messages == 20
+    assert recovery.messages == 40
     assert recovery.losses.describe() == "metadata may be wrong"
 
 

@@ -114,7 +114,7 @@ def mujoco_torque(model, q, dq, ddq):
 
 
 @pytest.mark.parametrize("mounting_deg", MOUNTINGS_DEG)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_urdf_moves_in_mujoco_as_the_cad_model_says(seed, mounting_deg):
     generator = np.random.default_rng(seed)
     theta, settings = random_theta(generator, mounting_deg), settings_of(mounting_deg)
@@ -168,20 +168,6 @@ def test_a_link_whose_centre_is_on_its_joint_has_a_body_too():
     assert mujoco_torque(model, [0.3, 0.7], [0.0, 0.0], [1.0, 0.0]) == pytest.approx([0.2, 0.02])
 
 
-def test_the_layout_holds_the_urdf_and_shows_every_panel_once():
-    urdf = robot_description(settings_of(FLAT)).encode()
-    layout = json.loads(viewer_layout(urdf))
-    arm = layout["configById"]["3D!arm"]["layers"]["arm"]
-    assert base64.b64decode(arm["url"].removeprefix("data:text/xml;base64,")) == urdf
-    assert sorted(shown(layout["layout"])) == sorted(layout["configById"])
-
-
-def test_a_layout_without_an_arm_has_no_3d_panel():
-    layout = json.loads(viewer_layout())
-    assert sorted(shown(layout["layout"])) == sorted(layout["configById"])
-    assert "3D!arm" not in layout["configById"]
-
-
 VIEWERS_KEYS = {
     "Plot": "paths showXAxisLabels showYAxisLabels showLegend legendDisplay showPlotValuesInLegend sidebarDimension "
     "isSynced xAxisVal",
@@ -193,8 +179,14 @@ VIEWERS_KEYS = {
 """What each panel's configuration must have, after the types of Lichtblick's panels (August 2026)."""
 
 
-def test_every_panel_has_a_title_and_the_keys_that_its_viewer_reads():
-    layout = json.loads(viewer_layout(robot_description(settings_of(FLAT)).encode()))
+def test_every_panel_is_shown_once_with_a_title_and_the_keys_that_its_viewer_reads():
+    urdf = robot_description(settings_of(FLAT)).encode()
+    layout = json.loads(viewer_layout(urdf))
+    arm = layout["configById"]["3D!arm"]["layers"]["arm"]
+    assert base64.b64decode(arm["url"].removeprefix("data:text/xml;base64,")) == urdf
+    for shown_layout in (layout, json.loads(viewer_layout())):
+        assert sorted(shown(shown_layout["layout"])) == sorted(shown_layout["configById"])
+    assert "3D!arm" not in shown_layout["configById"]
     for name, panel in layout["configById"].items():
         titles = {panel.pop("lichtblickPanelTitle"), panel.pop("foxglovePanelTitle")}
         assert len(titles) == 1

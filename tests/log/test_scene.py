@@ -26,7 +26,6 @@ from adacd_hil.lab.live.scene import (
     share_of_threshold,
     transforms_of,
 )
-from adacd_hil.log.types.topics import pack_contact, unpack_contact
 from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Location, Reaction, SchemeState
 
 SHAPE = Shape((0.35, 0.30))
@@ -64,10 +63,6 @@ def drawn(*entities):
 
 def rgba(primitive):
     return (primitive.color.r, primitive.color.g, primitive.color.b, primitive.color.a)
-
-
-def test_a_contact_report_comes_back_as_it_was_packed():
-    assert unpack_contact(pack_contact(PUSH)) == PUSH
 
 
 def test_each_joint_shows_how_near_its_residual_is():

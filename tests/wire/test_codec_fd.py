@@ -1,4 +1,4 @@
-"""The CAN FD contracts: frames written by hand, their protection, and what a contract may not say."""
+"""The CAN FD contracts: their protection, and what a contract may not say."""
 
 from pathlib import Path
 
@@ -12,61 +12,6 @@ FD = load_codec(contract_folder() / "arm_fd.dbc")
 HALF_MS = load_codec(contract_folder() / "arm_fd_500us.dbc")
 CLASSIC = load_codec()
 PROTECTED = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque", "Drive1Command", "Drive2Command")
-
-# contract, message, bytes on the wire, values after the end-to-end header; every field a different value
-FRAMES = [
-    (
-        FD,
-        "Drive1Feedback",
-        "ca1c07a5" + "40420f00" + "18fcffff" + "3712" + "0a" + "21" + "9cff" + "1f86" + "7d00" + "39a0",
-        (1_000_000 * 5.9921124526782858e-06, -0.5, 4663.0, 10.0, 33.0, -100.0, 34335.0, 125.0, 41017.0),
-    ),
-    (FD, "Drive2Command", "ca1c07a5" + "0f00" + "85ff" + "0c00" + "e803", (15.0, -123.0, 12.0, 1000.0)),
-    (
-        FD,
-        "Sensor1Torque",
-        "ca1c07a5" + "60e31600" + "c0bdf0ff" + "05" + "81" + "9308",
-        (1.5, -1.0, 5.0, 129.0, 21.95),
-    ),
-    (
-        HALF_MS,
-        "Drive2Feedback",
-        "ca1c07a5" + "40420f00" + "18fcffff" + "3712" + "1f86",
-        (1_000_000 * 5.9921124526782858e-06, -0.5, 4663.0, 34335.0),
-    ),
-    (HALF_MS, "Drive1Command", "ca1c07a5" + "0f00" + "85ff" + "0c00" + "e803", (15.0, -123.0, 12.0, 1000.0)),
-    (HALF_MS, "Sensor2Torque", "ca1c07a5" + "60e31600" + "05" + "81" + "9308", (1.5, 5.0, 129.0, 21.95)),
-]
-
-
-@pytest.mark.parametrize(("codec", "name", "wire", "values"), FRAMES)
-def test_an_fd_frame_written_by_hand_decodes_to_its_values(
-    codec: Codec, name: str, wire: str, values: tuple[float, ...]
-) -> None:
-    assert codec.message(name).decode_values(bytes.fromhex(wire)) == pytest.approx(values, rel=1e-12)
-
-
-@pytest.mark.parametrize(("codec", "name", "wire", "values"), FRAMES)
-def test_values_encode_to_the_fd_frame_written_by_hand(
-    codec: Codec, name: str, wire: str, values: tuple[float, ...]
-) -> None:
-    assert bytes(codec.message(name).encode(*values))[4:] == bytes.fromhex(wire)[4:]
-
-
-def test_an_fd_header_written_by_hand_decodes_to_its_signals() -> None:
-    assert FD.message("Drive1Command").decode(bytes.fromhex("ca1c07a5" + "00" * 8))[:3] == (0x1CCA, 7.0, 165.0)
-
-
-def test_there_is_one_frame_per_device_and_direction() -> None:
-    lengths = {name: (FD.message(name).length, HALF_MS.message(name).length) for name in PROTECTED}
-    assert lengths == {
-        "Drive1Feedback": (24, 16),
-        "Drive2Feedback": (24, 16),
-        "Sensor1Torque": (16, 12),
-        "Sensor2Torque": (16, 12),
-        "Drive1Command": (12, 12),
-        "Drive2Command": (12, 12),
-    }
 
 
 @pytest.mark.parametrize("codec", [FD, HALF_MS], ids=["arm_fd", "arm_fd_500us"])
@@ -105,18 +50,14 @@ def test_a_message_says_how_it_is_protected(
 
 
 @pytest.mark.parametrize("codec", [FD, HALF_MS], ids=["arm_fd", "arm_fd_500us"])
-def test_cantools_finds_the_profile_5_crc_of_a_sent_frame_right(codec: Codec) -> None:
+def test_cantools_finds_the_crc_of_a_sent_frame_right(codec: Codec) -> None:
+    frame = CLASSIC.message("Drive1Command").sender().protect(CLASSIC.message("Drive1Command").encode_raw(15, -123))
+    assert frame[0] == compute_profile2_crc(frame, CLASSIC.message("Drive1Command").data_ids[0])
     for name in PROTECTED:
         message = codec.message(name)
         frame = message.sender().protect(message.encode_raw(*range(1, 1 + len(message.values))))
         crc = compute_profile5_crc(frame, int.from_bytes(message.data_ids, "little"))
         assert frame[0] | frame[1] << 8 == crc
-
-
-def test_cantools_finds_the_profile_2_crc_of_a_sent_frame_right() -> None:
-    message = CLASSIC.message("Drive1Command")
-    frame = message.sender().protect(message.encode_raw(15, -123))
-    assert frame[0] == compute_profile2_crc(frame, message.data_ids[0])
 
 
 @pytest.mark.parametrize("codec", [CLASSIC, FD, HALF_MS], ids=["arm", "arm_fd", "arm_fd_500us"])
@@ -133,18 +74,6 @@ def test_the_data_ids_of_all_fd_contracts_differ() -> None:
     assert len(set(ids)) == len(ids)
 
 
-@pytest.mark.parametrize("codec", [CLASSIC, FD, HALF_MS], ids=["arm", "arm_fd", "arm_fd_500us"])
-def test_every_flipped_bit_of_every_protected_frame_is_found(codec: Codec) -> None:
-    for message in codec.messages.values():
-        if not message.is_protected:
-            continue
-        frame = message.sender().protect(bytearray(range(message.length)))
-        for bit in range(8 * message.length):
-            flipped = bytearray(frame)
-            flipped[bit // 8] ^= 1 << bit % 8
-            assert not message.receiver().check(bytes(flipped)).is_valid, f"{message.name} bit {bit}"
-
-
 def edited(tmp_path: Path, *changes: tuple[str, str]) -> Path:
     text = (contract_folder() / "arm_fd.dbc").read_text()
     for old, new in changes:
@@ -159,7 +88,7 @@ def test_the_layout_digest_of_the_classic_contract_is_that_of_wire_version_1() -
     assert (CLASSIC.wire_version, CLASSIC.layout_digest) == (1, 0xF80FDAE0)
 
 
-@pytest.mark.parametrize("length", [0, 1, 8, 9, 11, 12, 13, 20, 24, 33, 48, 63, 64])
+@pytest.mark.parametrize("length", [0, 8, 9, 12, 13, 63, 64])
 def test_only_lengths_with_a_data_length_code_are_taken(tmp_path: Path, length: int) -> None:
     signals = "".join(f' SG_ b{index} : {8 * index}|8@1+ (1,0) [0|255] "" HOST\n' for index in range(length))
     fd = 'BA_DEF_ BO_ "VFrameFormat" ENUM ' + ",".join(f'"f{index}"' for index in range(14)) + ',"StandardCAN_FD";\n'

@@ -33,10 +33,6 @@ def run_cantools(*commands: tuple[str, ...]) -> list[str]:
     return done.stdout.split("-- done\n")[: len(commands)]
 
 
-def test_the_contracts_are_there() -> None:
-    assert {"arm", "arm_fd", "arm_fd_500us"} <= {path.stem for path in FILES}
-
-
 @pytest.mark.slow
 @EVERY_FILE
 def test_cantools_lists_dumps_and_converts_the_file(path: Path, tmp_path: Path) -> None:
@@ -57,22 +53,9 @@ def test_cantools_lists_dumps_and_converts_the_file(path: Path, tmp_path: Path) 
     assert (again.layout_digest, again.wire_version) == (ours.layout_digest, ours.wire_version)
 
 
-@EVERY_FILE
-def test_only_frames_of_more_than_8_bytes_are_declared_can_fd(path: Path) -> None:
-    for message in cantools.database.load_file(path).messages:
-        assert message.is_fd is (message.length > 8)
-
-
 FD_FILES = pytest.mark.parametrize(
     ("name", "data_rate", "period_us"), [("arm_fd", 5_000_000, 1000), ("arm_fd_500us", 8_000_000, 500)]
 )
-
-
-@FD_FILES
-def test_a_tool_finds_bit_rates_and_period_in_the_fd_contracts(name: str, data_rate: int, period_us: int) -> None:
-    attributes = cantools.database.load_file(contract_folder() / f"{name}.dbc").dbc.attributes
-    found = [attributes[key].value for key in ("Baudrate", "BaudrateCANFD", "BusPeriod_us")]
-    assert found == [1_000_000, data_rate, period_us]
 
 
 @FD_FILES
@@ -80,6 +63,9 @@ def test_bit_rates_of_a_contract_are_those_it_states_else_its_defaults(
     name: str, data_rate: int, period_us: int
 ) -> None:
     codec = load_codec(contract_folder() / f"{name}.dbc")
+    attributes = cantools.database.load_file(codec.path).dbc.attributes
+    found = [attributes[key].value for key in ("Baudrate", "BaudrateCANFD", "BusPeriod_us")]
+    assert found == [1_000_000, data_rate, period_us]
     assert read_bitrates(codec) == (1_000_000, data_rate)
     text = codec.text.decode()
     unsaid = text.replace(f'BA_ "BaudrateCANFD" {data_rate};', "").replace('BA_ "Baudrate" 1000000;', "")

@@ -81,10 +81,6 @@ def test_the_place_of_a_protocol_error_is_named(place: int, text: str) -> None:
     assert f"protocol error ({text})" in said
 
 
-def test_every_kind_is_reported_by_some_frame() -> None:
-    assert {kind for _, _, kind, _, _ in REPORTS} == {kind.name for kind in TroubleKind}
-
-
 def test_no_frame_of_any_class_is_without_a_line() -> None:
     for error_class in range(0x400):
         text = decode_error(Frame(error_class, b"\xff" * 8, 0, is_error=True))[1]

@@ -66,6 +66,8 @@ def test_the_pages_example_is_part_of_the_text() -> None:
     ("before", "after", "is_other"),
     [
         ('"Nm" HOST', '"mNm" HOST', False),
+        ('BA_ "BusPeriod_us" 1000;', 'BA_ "BusPeriod_us" 4000;', False),
+        ('"Trigger" BO_ 641 2', '"Trigger" BO_ 641 0', False),
         ("16|32@1- (1e-06,0)", "16|32@1- (1e-05,0)", True),
         ("16|32@1- (1e-06,0)", "16|32@1- (1e-06,1)", True),
         ("16|32@1- (1e-06,0)", "16|32@1+ (1e-06,0)", True),

@@ -58,11 +58,6 @@ def test_protection_moves_with_the_frame() -> None:
     assert bytes(frame) == bytes(again)
 
 
-def test_nmt_sync_and_the_host_stay() -> None:
-    moved = move_contract(contract("arm"), 4)
-    assert [moved.message(name).can_id for name in ("Nmt", "Sync", "HostHeartbeat")] == [0x000, 0x080, 0x77F]
-
-
 def test_a_moved_contract_has_another_digest() -> None:
     digests = {move_contract(contract("arm"), n, host).layout_digest for n, host in ((0, 127), (4, 127), (4, 126))}
     assert len(digests) == 3
