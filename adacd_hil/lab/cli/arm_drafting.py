@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil import __version__
-from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode, tell
 from adacd_hil.clock import MonotonicClock, format_date, wall_ns
 from adacd_hil.control.configuration_check import ConfigurationFindings, examine_configuration
 from adacd_hil.device.profile import ProfileSettings, ScaleSettings, load_profile, profile_names
@@ -245,7 +245,7 @@ class Drafting:
         clock = MonotonicClock()
         bus = open_bus(interface, channel, clock, None, self.options.bitrate, False)
         try:
-            found = survey(bus, clock, progress=self.interview.say)
+            found = survey(bus, clock, progress=tell)
             kinds = dict.fromkeys(self.options.drive_node or (), DRIVE)
             kinds |= dict.fromkeys(self.options.sensor_node or (), SENSOR)
             devices = recognise(bus, clock, found.nodes, kinds)
@@ -256,10 +256,10 @@ class Drafting:
         self.bitrate = (None if link is None else link.bitrate) or self.bitrate
         for device in devices:
             what = " or ".join(device.profiles) or "no built-in profile"
-            self.interview.say(f"node {device.node.node_id}: {device.kind}, {device.title}: {what}")
+            tell(f"node {device.node.node_id}: {device.kind}, {device.title}: {what}")
         for node in found.nodes:
             if all(device.node is not node for device in devices):
-                self.interview.say(
+                tell(
                     f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; give --drive-node "
                     "or --sensor-node for such a node"
                 )
@@ -284,7 +284,7 @@ class Drafting:
         else:
             line = f"CAN interfaces: {', '.join(present) or 'none is there'}"
         if self.interview.is_asking:
-            self.interview.say(line)
+            tell(line)
         proposal = Fact(present[0] if self.interview.is_asking and present else _NO_BUS)
         question = f"CAN interface of the arm, `{_NO_BUS}` for an arm without hardware"
 
@@ -536,7 +536,7 @@ class Drafting:
                 self.warnings.append(f"{urdf} has no frame at the tip: the length of link 2 is a guess")
             source = f"URDF {urdf.name}"
             arm, mounted = self._mount(urdf, arm)
-            interview.say(draw_arm(arm.mounting_deg))
+            tell(draw_arm(arm.mounting_deg))
             return arm, source if arm.is_tip_known else "", source, f"{source}, {mounted}"
         if options.locked:
             raise CommandError("--lock names a joint of --urdf", ExitCode.USAGE)
@@ -583,7 +583,7 @@ class Drafting:
             Fact(usual or "level", f"as usual of an arm on {mounting}" if usual else ""),
             "q1 = 0 is where the drive reads 0, or `arm.zero_deg`; 90: level, and +q1 lowers it",
         )
-        interview.say(draw_arm((tilt_deg, hangs_deg)))
+        tell(draw_arm((tilt_deg, hangs_deg)))
         return (tilt_deg, hangs_deg), source if at_zero_source else ""
 
     def _mount(self, urdf: Path, arm: PlanarArm) -> tuple[PlanarArm, str]:

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import click
 
-from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode, tell
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line
 
@@ -24,10 +24,6 @@ class Interview:
     def __init__(self, takes_proposals: bool) -> None:
         self.takes_proposals = takes_proposals
         self.is_asking = not takes_proposals and is_terminal()
-
-    def say(self, line: str) -> None:
-        """Print a line that is neither question nor result."""
-        print(in_line(line), file=sys.stderr, flush=True)
 
     def ask(
         self,
@@ -68,14 +64,14 @@ class Interview:
         while True:
             text = click.prompt(in_line(question), default=default, err=True, show_default=default != "")
             if text.strip() == "?":
-                self.say(help_text)
+                tell(help_text)
                 continue
             try:
                 if text == default:
                     return read(value), source
                 return read(text), "given"
             except ConfigError as error:
-                self.say(str(error))
+                tell(str(error))
 
     def confirm(self, answer: bool | None, question: str) -> bool:
         """Return the option's answer if given, else ask; return False without a terminal."""
