@@ -53,6 +53,11 @@ EPILOG = (
 )
 
 
+def tell(line: str) -> None:
+    """Print a line that is neither question nor result."""
+    print(in_line(line), file=sys.stderr, flush=True)
+
+
 class CommandError(Exception):
     """Ends a command with one line and an exit code."""
 

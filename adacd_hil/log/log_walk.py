@@ -9,7 +9,7 @@ import operator
 from collections.abc import Callable, Collection, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -73,14 +73,6 @@ class Extras:
             self.metadata[metadata.name] = metadata.metadata
 
 
-class _Part(NamedTuple):
-    """A file that is part of the log."""
-
-    path: Path
-    number: int
-    is_alone: bool
-
-
 def read_head(path: Path) -> Extras:
     """Read attachments and metadata up to those of the run. Raises LogError for an unreadable file, or no MCAP."""
     extras = Extras()
@@ -116,8 +108,9 @@ class LogWalk:
         """The requested topics that are defined in the parts walked so far."""
         self.path = path
         self._wanted = topics
-        self._plan: list[_Part | str] = []  # parts, and problems where they would be
+        self._plan: list[tuple[Path, int] | str] = []  # files and numbers of parts, and problems where they would be
         self._problems: list[str] = []
+        self._is_alone = False
         self._find_parts()
 
     @property
@@ -131,6 +124,7 @@ class LogWalk:
 
     def _find_parts(self) -> None:
         parts = parts_of(self.path)
+        self._is_alone = list(parts) == [0]
         first_error: LogError | None = None
         for before, number in pairwise((-1, *parts)):
             self._plan += self._missing(before + 1, number)
@@ -140,22 +134,22 @@ class LogWalk:
                 first_error = first_error or error
                 self._plan.append(str(error))
                 continue
-            self._plan_part(head, _Part(parts[number], number, is_alone=list(parts) == [0]))
-        if first_error is not None and not any(isinstance(step, _Part) for step in self._plan):
+            self._plan_part(head, parts[number], number)
+        if first_error is not None and all(isinstance(step, str) for step in self._plan):
             raise first_error
         self._last = max(parts)
 
-    def _plan_part(self, head: Extras, part: _Part) -> None:
+    def _plan_part(self, head: Extras, path: Path, number: int) -> None:
         metadata = head.metadata.get(RUN_METADATA, {})
-        number = metadata.pop(PART_KEY, str(part.number))
+        said = metadata.pop(PART_KEY, str(number))
         is_foreign = bool(self.metadata and metadata) and metadata != self.metadata
-        if is_foreign or (number != str(part.number) and not part.is_alone):
-            self._plan.append(f"{part.path.name} is a part of another log")
+        if is_foreign or (said != str(number) and not self._is_alone):
+            self._plan.append(f"{path.name} is a part of another log")
             return
-        if number != str(part.number):
-            self._plan.append(f"{part.path.name} is part {number} of a log")
-            part = part._replace(number=int(number) if number.isdecimal() else part.number)
-        self._plan.append(part)
+        if said != str(number):
+            self._plan.append(f"{path.name} is part {said} of a log")
+            number = int(said) if said.isdecimal() else number
+        self._plan.append((path, number))
         self.metadata = self.metadata or metadata
         self.attachments = {**head.attachments, **self.attachments}
 
@@ -176,18 +170,16 @@ class LogWalk:
             if isinstance(step, str):
                 self._problems.append(step)
                 continue
-            walk = _PartWalk(step.path, builder, self.layout, self._wanted)
+            path, joined = step
+            walk = _PartWalk(path, builder, self.layout, self._wanted)
             for piece in walk.pieces(is_ahead):
                 self.topics = {topic.name: topic for topic in builder.topics}
                 yield piece
             self.topics = {topic.name: topic for topic in builder.topics}
             if walk.problem:
-                self._problems.append(walk.problem if step.is_alone else f"{step.path.name}: {walk.problem}")
-            self._problems += [
-                f"{step.path.name}: {name} has another type than before" for name in sorted(walk.other_types)
-            ]
+                self._problems.append(walk.problem if self._is_alone else f"{path.name}: {walk.problem}")
+            self._problems += [f"{path.name}: {name} has another type than before" for name in sorted(walk.other_types)]
             self.parts += 1
-            joined = step.number
             self.attachments = {**walk.extras.attachments, **self.attachments}
             self._sum_up(walk.extras.metadata.get(SUMMARY_METADATA, {}))
         if joined == self._last and self.summary.get(ENDING_KEY) == CONTINUED:

@@ -366,12 +366,12 @@ class Run:
             return np.zeros(len(cycle))
         return np.asarray(np.interp(cycle, self.cycle, self.time_s()), dtype=np.float64)
 
-    def truth_time_s(self, rows: slice = slice(None)) -> Vector:
-        """Return the time of the cycles of the truth, or of some rows of it, since motion start, s (k,)."""
+    def truth_time_s(self) -> Vector:
+        """Return the time of the cycles of the truth since motion start, s (k,)."""
         if self.truth is None:
             return np.zeros(0)
         time_s = self.truth.time_s
-        return self.time_of_s(self.truth.cycle[rows]) if time_s is None else time_s[rows]
+        return self.time_of_s(self.truth.cycle) if time_s is None else time_s
 
 
 @dataclass(frozen=True)

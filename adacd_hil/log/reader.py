@@ -7,10 +7,10 @@ On two processors one reads, checks and decompresses ahead while the other gathe
 request cost only their decompression.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -104,6 +104,11 @@ class Series:
         """Return some of the messages."""
         return Series(self.records[rows], self._epoch_ns)
 
+    def between(self, first_ns: int, end_ns: int) -> "Series":
+        """Return the messages from a time to one before another."""
+        t_ns = self.t_ns
+        return self.part((t_ns >= first_ns) & (t_ns < end_ns))
+
     @property
     def block(self) -> Vector:
         """All float64 values of each message (n, k), in order: for our own topics the block as it was logged."""
@@ -134,7 +139,7 @@ class RunLog:
     @property
     def is_complete(self) -> bool:
         """Whether the file is whole, no packet was dropped on the way to it, and nothing was lost before a recovery."""
-        return not self.problem and self.summary.get("dropped", "0") == "0" and LOST_KEY not in self.summary
+        return _is_complete(self.problem, self.summary)
 
     @property
     def epoch_ns(self) -> int:
@@ -160,6 +165,10 @@ class RunLog:
     def truth(self) -> Series:
         """The emulator's truth, records.TRUTH_LAYOUT."""
         return self.topics["/truth"]
+
+
+def _is_complete(problem: str, summary: Mapping[str, str]) -> bool:
+    return not problem and summary.get(DROPPED_KEY, "0") == "0" and LOST_KEY not in summary
 
 
 def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
@@ -274,6 +283,21 @@ def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
     return contacts
 
 
+Time = TypeVar("Time", int, float)
+
+
+def each_once(reports: Iterable[tuple[Time, ContactReport]]) -> list[tuple[Time, ContactReport]]:
+    """Return each contact once: the time of its first report, and its last one.
+
+    All reports of a contact name the cycle in which it began.
+    """
+    found: dict[int, tuple[Time, ContactReport]] = {}
+    for time, report in reports:
+        first, _ = found.get(report.cycle, (time, report))
+        found[report.cycle] = first, report
+    return list(found.values())
+
+
 class Piece(NamedTuple):
     """A stretch of a log that ends with whole cycles: consecutive pieces have all of it, in order.
 
@@ -329,7 +353,7 @@ class LogStream(LogWalk):
     @property
     def is_complete(self) -> bool:
         """Whether all that was read is whole, no packet was dropped, and nothing was lost before a recovery."""
-        return not self.problem and self.summary.get(DROPPED_KEY, "0") == "0" and LOST_KEY not in self.summary
+        return _is_complete(self.problem, self.summary)
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
         """Unpack the events of a piece."""

@@ -43,20 +43,16 @@ class LinkBody(NamedTuple):
     inertia_kg_m2: float
 
 
-class ModelError(ValueError):
-    """No two rigid links have these parameters; the message is one line."""
-
-
 def find_bodies(
     theta: Sequence[float], length1_m: float, gravity_m_s2: float = GRAVITY_M_S2
 ) -> tuple[LinkBody, LinkBody]:
-    """Find two links with these parameters (p,), 7 or 9 of them. Raises ModelError if there are none.
+    """Find two links with these parameters (p,), 7 or 9 of them. Raises ValueError if there are none.
 
     gravity_m_s2: in the plane of motion.
     """
     alpha, beta, gamma = theta[_A1] - theta[_A3], theta[_A2], theta[_A3]
     if not (gamma > 0.0 and alpha * gamma > beta * beta):
-        raise ModelError(f"a1 = {theta[_A1]:g}, a2 = {beta:g}, a3 = {gamma:g} kg m² belong to no rigid links")
+        raise ValueError(f"a1 = {theta[_A1]:g}, a2 = {beta:g}, a3 = {gamma:g} kg m² belong to no rigid links")
     if beta > 0.0:
         center2_m = length1_m * math.sqrt(gamma / alpha)
         mass2_kg = beta / (length1_m * center2_m)
@@ -69,7 +65,7 @@ def find_bodies(
         return LinkBody(mass1_kg, _ROD_C * length1_m, _ROD_I * mass1_kg * length1_m**2), second
     expected_Nm = gravity_m_s2 * mass2_kg * center2_m
     if abs(theta[_A5] - expected_Nm) > _AGREEMENT * max(expected_Nm, theta[_A5]):
-        raise ModelError(f"a5 = {theta[_A5]:g} Nm, but a2 = {beta:g} kg m² makes it {expected_Nm:g} Nm")
+        raise ValueError(f"a5 = {theta[_A5]:g} Nm, but a2 = {beta:g} kg m² makes it {expected_Nm:g} Nm")
     moment = theta[_A4] / gravity_m_s2 - mass2_kg * length1_m
     if moment == 0.0:
         return LinkBody(3.0 * left / length1_m**2, 0.0, left), second
@@ -94,7 +90,7 @@ def robot_description(settings: Settings) -> str:
         gravity_m_s2 = GRAVITY_M_S2 * math.sin(tilt_rad)
         bodies = find_bodies(arm.cad_theta, arm.link_length_m[0], gravity_m_s2) if arm.cad_theta else ()
         reason = "arm.cad_theta is not given"
-    except ModelError as error:
+    except ValueError as error:
         reason = f"arm.cad_theta: {error}"
     if not bodies:
         robot.append(Comment(f" no inertia: {reason} "))

@@ -239,7 +239,7 @@ def test_a_broken_rule_is_found_with_its_severity(name, tmp_path):
     assert name.split(",")[0].removesuffix(" at the start") in rules, found.findings
     if expected is not None:
         assert rules == expected, found.findings
-    severities = {RULES[rule].severity for rule in rules}
+    severities = {RULES[rule] for rule in rules}
     assert (found.errors > 0, found.warnings > 0) == ("error" in severities, "warning" in severities)
 
 

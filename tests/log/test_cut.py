@@ -17,9 +17,9 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from adacd_hil.lab.logs.check.log_check import check_log
-from adacd_hil.lab.logs.cut import TimeWindow, contacts_begun, cut, find_contact
+from adacd_hil.lab.logs.cut import TimeWindow, cut, find_contact
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.reader import read_log
+from adacd_hil.log.reader import each_once, read_log
 from adacd_hil.records import ContactReport
 
 INFINITE = float("inf")
@@ -174,7 +174,7 @@ def test_contacts_are_counted_by_the_cycle_that_they_began_in():
         report(20, False),
         report(20, True),
     ]
-    assert contacts_begun(reports) == [3 * MILLISECOND, 9 * MILLISECOND, 20 * MILLISECOND]
+    assert [begun_ns for begun_ns, _ in each_once(reports)] == [3 * MILLISECOND, 9 * MILLISECOND, 20 * MILLISECOND]
 
 
 def test_an_unknown_contact_is_an_error(log_path):

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil import __version__
-from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode, tell
 from adacd_hil.clock import MonotonicClock, format_date, wall_ns
 from adacd_hil.control.configuration_check import ConfigurationFindings, examine_configuration
 from adacd_hil.device.profile import ProfileSettings, ScaleSettings, load_profile, profile_names
 from adacd_hil.file_access import read_input, replace_file
-from adacd_hil.lab.cli.interview import Interview, Proposal
+from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.lab.commission.arm_draft import (
     LEVEL_DEG,
     ArmFacts,
@@ -245,7 +245,7 @@ class Drafting:
         clock = MonotonicClock()
         bus = open_bus(interface, channel, clock, None, self.options.bitrate, False)
         try:
-            found = survey(bus, clock, progress=self.interview.say)
+            found = survey(bus, clock, progress=tell)
             kinds = dict.fromkeys(self.options.drive_node or (), DRIVE)
             kinds |= dict.fromkeys(self.options.sensor_node or (), SENSOR)
             devices = recognise(bus, clock, found.nodes, kinds)
@@ -256,10 +256,10 @@ class Drafting:
         self.bitrate = (None if link is None else link.bitrate) or self.bitrate
         for device in devices:
             what = " or ".join(device.profiles) or "no built-in profile"
-            self.interview.say(f"node {device.node.node_id}: {device.kind}, {device.title}: {what}")
+            tell(f"node {device.node.node_id}: {device.kind}, {device.title}: {what}")
         for node in found.nodes:
             if all(device.node is not node for device in devices):
-                self.interview.say(
+                tell(
                     f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; give --drive-node "
                     "or --sensor-node for such a node"
                 )
@@ -284,8 +284,8 @@ class Drafting:
         else:
             line = f"CAN interfaces: {', '.join(present) or 'none is there'}"
         if self.interview.is_asking:
-            self.interview.say(line)
-        proposal = Proposal(present[0] if self.interview.is_asking and present else _NO_BUS)
+            tell(line)
+        proposal = Fact(present[0] if self.interview.is_asking and present else _NO_BUS)
         question = f"CAN interface of the arm, `{_NO_BUS}` for an arm without hardware"
 
         def read(text: str) -> str:
@@ -319,7 +319,7 @@ class Drafting:
             return [known[number] for number in chosen]
 
         # Of more than two, as of two arms, only the user can choose.
-        proposal = Proposal(tuple(known) if len(known) == 2 else None, "in the order of the node ids")
+        proposal = Fact(tuple(known) if len(known) == 2 else None, "in the order of the node ids")
         answer, source = self.interview.ask(option, given, f"Node ids of the {kind}s of joint 1 and 2", read, proposal)
         if source != "given":
             self.warnings.append(f"{kind}s of joint 1 and 2 are nodes {nodes}, {source}: `doctor --move` checks it")
@@ -463,7 +463,7 @@ class Drafting:
             if question.given(self.options) is None and question.key not in guessed:
                 continue
             if question.option not in self._answers:
-                proposal = Proposal(question.propose(guessed.get(question.key, 1.0)))
+                proposal = Fact(question.propose(guessed.get(question.key, 1.0)))
                 self._answers[question.option] = self.interview.ask(
                     question.option,
                     question.given(self.options),
@@ -529,14 +529,14 @@ class Drafting:
             def read(text: str) -> tuple[Path, PlanarArm] | None:
                 return None if text == "-" else (Path(text), _read_urdf(Path(text), options.locked))
 
-            found, _ = interview.ask("--urdf", None, "URDF of the arm, - for none", read, Proposal("-"))
+            found, _ = interview.ask("--urdf", None, "URDF of the arm, - for none", read, Fact("-"))
             urdf, arm = found or (None, None)
         if urdf is not None and arm is not None:
             if not arm.is_tip_known:
                 self.warnings.append(f"{urdf} has no frame at the tip: the length of link 2 is a guess")
             source = f"URDF {urdf.name}"
             arm, mounted = self._mount(urdf, arm)
-            interview.say(draw_arm(arm.mounting_deg))
+            tell(draw_arm(arm.mounting_deg))
             return arm, source if arm.is_tip_known else "", source, f"{source}, {mounted}"
         if options.locked:
             raise CommandError("--lock names a joint of --urdf", ExitCode.USAGE)
@@ -545,13 +545,13 @@ class Drafting:
             options.length_m,
             "Lengths in m, joint to joint and joint to tip",
             lambda value: _checked("link_length_m", _numbers(value, float, "--length-m")),
-            Proposal((0.35, 0.30)),
+            Fact((0.35, 0.30)),
         )
         mounting_deg, gravity_source = self._ask_mounting()
         mass_kg = options.mass_kg
         if mass_kg is None and interview.is_asking:
             question = "Masses of the links in kg, - for unknown"
-            mass_kg, _ = interview.ask("--mass-kg", None, question, _masses, Proposal("-"))
+            mass_kg, _ = interview.ask("--mass-kg", None, question, _masses, Fact("-"))
         if mass_kg is None:
             return PlanarArm(length_m, (), mounting_deg), length_source, "", gravity_source
         arm = uniform_rods(length_m, _masses(mass_kg) or (0.0, 0.0), mounting_deg)
@@ -569,7 +569,7 @@ class Drafting:
             given,
             "Mounting of the base: flat (joint axes vertical), floor, wall, ceiling, or the tilt of the plane in deg",
             lambda text: (text.casefold(), _tilt(text)),
-            Proposal("flat"),
+            Fact("flat"),
             "on floor, wall and ceiling the joint axes are level and all of gravity acts; a tilt of 0 is flat",
         )
         if tilt_deg <= SLIGHT_TILT_DEG:
@@ -580,10 +580,10 @@ class Drafting:
             options.at_zero,
             "Link 1 at q1 = 0 points down, up, level (+q1 lifts it), or down only at q1 = (deg)",
             _hanging,
-            Proposal(usual or "level", f"as usual of an arm on {mounting}" if usual else ""),
+            Fact(usual or "level", f"as usual of an arm on {mounting}" if usual else ""),
             "q1 = 0 is where the drive reads 0, or `arm.zero_deg`; 90: level, and +q1 lowers it",
         )
-        interview.say(draw_arm((tilt_deg, hangs_deg)))
+        tell(draw_arm((tilt_deg, hangs_deg)))
         return (tilt_deg, hangs_deg), source if at_zero_source else ""
 
     def _mount(self, urdf: Path, arm: PlanarArm) -> tuple[PlanarArm, str]:
@@ -593,7 +593,7 @@ class Drafting:
             return arm, "its root's z axis up"
         question = "Mounting of the URDF's root: floor (z up), wall (x down), ceiling (z down), or its pitch in deg"
         try:
-            pitch_deg, _ = interview.ask("--mounting", given, question, _pitch, Proposal("floor"))
+            pitch_deg, _ = interview.ask("--mounting", given, question, _pitch, Fact("floor"))
         except ConfigError as error:
             raise CommandError(str(error), ExitCode.USAGE) from None
         mounted = "its root's z axis up" if pitch_deg == 0.0 else f"its root pitched by {pitch_deg:g} deg"
@@ -617,15 +617,15 @@ class Drafting:
                 if len(pair) == 2 and None not in pair:
                     behind = " behind their gears" if any(scale.gear_ratio != 1.0 for scale in scales) else ""
                     return Fact(_checked("rated_torque_Nm", (pair[0], pair[1])), source + behind)
-        proposal = Proposal((12.0, 6.0))
+        proposal = Fact((12.0, 6.0))
         if geometry.effort_Nm is not None and min(geometry.effort_Nm) > 0.0:
-            proposal = Proposal(geometry.effort_Nm)  # a URDF's effort is a limit, no rating
+            proposal = Fact(geometry.effort_Nm)  # a URDF's effort is a limit, no rating
         for pair in (by_eds, by_drives):
             if len(pair) == 2 and None not in pair and _is_rating(pair):
-                proposal = Proposal((pair[0], pair[1]))
+                proposal = Fact((pair[0], pair[1]))
         return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
 
-    def _limit(self, key: str, option: str, proposal: Proposal) -> Fact:
+    def _limit(self, key: str, option: str, proposal: Fact) -> Fact:
         """Ask for a pair of `arm.KEY`, within its bounds."""
         given = getattr(self.options, option[2:].replace("-", "_"))
         meaning = known_keys()[f"arm.{key}"].meaning
@@ -710,22 +710,22 @@ def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> Pla
         raise ConfigError(f"URDF {path}: {error}") from None
 
 
-def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Proposal:
+def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Fact:
     """Propose the smallest of the drives' limit, the URDF's effort and the rated torque."""
     shares = [min(rating.torque_share or 1.0, 1.0) for rating in ratings] or [1.0, 1.0]
     efforts = geometry.effort_Nm or rated.value
     limit = tuple(min(rated.value[joint] * shares[joint], efforts[joint]) for joint in range(2))
     source = "the rated torque" if limit == tuple(rated.value) else "the least of 0x6072 and the URDF's effort"
-    return Proposal(limit, source if rated.source else "")
+    return Fact(limit, source if rated.source else "")
 
 
-def _limit_proposal(by_urdf: Pair | None, by_drives: list[float | None], source: str, default: Pair) -> Proposal:
+def _limit_proposal(by_urdf: Pair | None, by_drives: list[float | None], source: str, default: Pair) -> Fact:
     """Propose the URDF's limits, else those read from both drives, from this source, else a guess."""
     if by_urdf is not None:
-        return Proposal(by_urdf, "the URDF's")
+        return Fact(by_urdf, "the URDF's")
     if by_drives and None not in by_drives:
-        return Proposal(tuple(by_drives), source)
-    return Proposal(default)
+        return Fact(tuple(by_drives), source)
+    return Fact(default)
 
 
 _ESSENTIAL = {"scale.increments_per_joint_rev", "scale.torque_Nm", "scale.rated_torque_count_Nm"}

@@ -1,15 +1,15 @@
 """The bit budget of a contract, as text and as JSON."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
-from adacd_hil.cli.output import ExitCode
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.printable import in_line
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import fold, terminal_columns
 from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, check_budget, us
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.codec import Codec, load_codec
 from adacd_hil.wire.contract_frames import read_attribute
 
 _COLUMNS = ("id", "message", "bytes", "trigger", "every ms", "bits", "µs", "response µs", "disturbed µs", "deadline µs")
@@ -21,16 +21,6 @@ _LEGEND = (
 )
 
 
-class Judgement(NamedTuple):
-    """A contract's budget, remarks, exit status, and the wire version and layout digest of its devices."""
-
-    budget: Budget
-    notes: list[str]
-    code: ExitCode
-    wire_version: int
-    layout_digest: int
-
-
 def judge(
     dbc: str | None,
     config: str,
@@ -38,8 +28,8 @@ def judge(
     bitrate: int | None,
     data_bitrate: int | None,
     arms: int | None = None,
-) -> Judgement:
-    """Compute the budget of a contract, with remarks. Raises CodecError, ConfigError.
+) -> tuple[Codec, Budget, list[str]]:
+    """Compute the budget of a contract; return its codec, the budget, and remarks. Raises CodecError, ConfigError.
 
     Without `dbc` it is that of the configuration's devices, loaded or composed. The configuration's period counts if
     neither option nor DBC gives one; so does its number of arms on the bus.
@@ -55,13 +45,11 @@ def judge(
         notes.append(
             f"configuration {settings.name} has bus.period_us = {settings.bus.period_us}, the DBC {budget.period_us}"
         )
-    code = ExitCode.OK if budget.is_fit else ExitCode.FAILURE
-    return Judgement(budget, notes, code, codec.wire_version, codec.layout_digest)
+    return codec, budget, notes
 
 
-def as_text(judgement: Judgement) -> str:
+def as_text(codec: Codec, budget: Budget, notes: Sequence[str]) -> str:
     """Format a budget for people, as wide as their terminal, else 120 letters."""
-    budget = judgement.budget
     rates = f"{budget.bitrate} bit/s" + (f", data {budget.data_bitrate} bit/s" if budget.data_bitrate else "")
     findings = [
         (
@@ -74,8 +62,8 @@ def as_text(judgement: Judgement) -> str:
             f"feedback in after {us(budget.feedback_ns)} µs, commands need {us(budget.command_ns)} µs, "
             f"left for the host {us(budget.host_ns)} µs",
         ),
-        ("0x2000", f"wire version {judgement.wire_version}, layout digest 0x{judgement.layout_digest:08X}"),
-        *(("note", note) for note in judgement.notes),
+        ("0x2000", f"wire version {codec.wire_version}, layout digest 0x{codec.layout_digest:08X}"),
+        *(("note", note) for note in notes),
         ("verdict", budget.line),
     ]
     width = terminal_columns() or _WIDTH
@@ -104,20 +92,19 @@ def _response(response: ResponseTime) -> str:
     return ("" if response.is_bounded else "> ") + us(response.time_ns)
 
 
-def as_json(judgement: Judgement) -> dict[str, Any]:
+def as_json(codec: Codec, budget: Budget, notes: Sequence[str]) -> dict[str, Any]:
     """Return a budget as a dictionary for JSON."""
-    budget = judgement.budget
     return {
         "contract": budget.name,
-        "wire_version": judgement.wire_version,
-        "layout_digest": f"0x{judgement.layout_digest:08X}",
+        "wire_version": codec.wire_version,
+        "layout_digest": f"0x{codec.layout_digest:08X}",
         "arms": budget.arms,
         "period_us": budget.period_us,
         "bitrate": budget.bitrate,
         "data_bitrate": budget.data_bitrate,
         "is_fit": budget.is_fit,
         "verdict": budget.line,
-        "notes": judgement.notes,
+        "notes": notes,
         "unstuffed_bits": budget.unstuffed_bits,
         "worst_bits": budget.worst_bits,
         "cyclic_us": budget.cyclic_ns / 1000,

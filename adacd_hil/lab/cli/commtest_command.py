@@ -1,11 +1,10 @@
 """Communication test: cycles at zero torque for a while, and a verdict on the connection."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
 from adacd_hil.cli.connection import Connection, on_interrupt
-from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode, tell
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.control.pacing import prepare_spin
 from adacd_hil.device.arm import Arm
@@ -29,7 +28,6 @@ from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.log.types.topics import ChannelId, pack_cycle
 from adacd_hil.log.viewer_layout import viewer_layout
 from adacd_hil.plain_values import plain_values
-from adacd_hil.printable import in_line
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.score.distribution import bar_chart, doubling_bins
@@ -61,7 +59,7 @@ def run_commtest(
     with connection.bus(clock, codec.is_fd) as bus:
         tap = Tap(bus, clock)
         arm, master = Arm(settings, codec, tap), Master(settings, codec, tap)
-        _progress(f"looking for the arm on {bus.channel}")
+        tell(f"looking for the arm on {bus.channel}")
         try:
             refuse_company(tap, clock, settings, codec)
             master.reset()
@@ -72,7 +70,7 @@ def run_commtest(
         boot_frames = tap.take_passed()
         grant = request_realtime(settings.realtime_request)
         for line in grant.missing:
-            _progress(f"not granted: {line}")
+            tell(f"not granted: {line}")
         loop = ZeroTorqueLoop(settings, tap, clock, arm, master, is_enabling)
         achieved = {**grant.describe(), **prepare_spin(loop.pacer, settings, clock, grant)}
         with grant.unpinned():
@@ -82,7 +80,7 @@ def run_commtest(
             if recorder is not None:
                 recorder.cycle(clock.now_ns(), [], boot_frames)
             test = CommunicationTest(settings, arm, *read_bitrates(codec))
-            _progress(f"testing for {seconds:g} s, drives {'enabled, torque zero' if is_enabling else 'not enabled'}")
+            tell(f"testing for {seconds:g} s, drives {'enabled, torque zero' if is_enabling else 'not enabled'}")
             fault = _run(loop, master, test, recorder, seconds)
         finally:
             if recorder is not None:
@@ -287,7 +285,3 @@ def _findings(described: dict[str, Any]) -> list[str]:
     verdict, share = described["verdict"], 100.0 * described["share"]
     lines.append(f"{verdict}: {share:.2f} % of the periods brought complete fresh data (good from 95 %)")
     return lines
-
-
-def _progress(line: str) -> None:
-    print(in_line(line), file=sys.stderr, flush=True)

@@ -2,12 +2,11 @@
 
 import json
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from adacd_hil.cli.output import CommandError, ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.lab.tune.excitation_search import ExcitationLimits, Figures, NoExcitationError, Search
-from adacd_hil.plain_values import json_text
+from adacd_hil.lab.tune.excitation_search import NoExcitationError, Search
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings
@@ -24,18 +23,11 @@ _LABELS = (
 )
 
 
-class ExcitationOutcome(NamedTuple):
-    """Result of a search; `present` is None if the configuration has no excitation."""
+def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> dict[str, Any]:
+    """Search an excitation; `out`: the file for the result. Raises ConfigError, CommandError.
 
-    config: str
-    present: Figures | None
-    found: Figures
-    limits: ExcitationLimits
-    excitation: ExcitationSettings
-
-
-def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> ExcitationOutcome:
-    """Search an excitation; `out`: the file for the result. Raises ConfigError, CommandError."""
+    Returns it by the keys of JSON: figures of the present one, None without one, and of the one found; their limits.
+    """
     if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
         raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
     task = Search(load_settings(config, profile))
@@ -47,35 +39,27 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
     except NoExcitationError as error:
         raise CommandError(str(error)) from None
     present = task.figures(task.present) if task.present.period_s else None
-    return ExcitationOutcome(config, present, task.figures(found), task.limits, found)
+    return {
+        "present": present,
+        "found": task.figures(found),
+        "limits": task.limits.by_figure(),
+        "excitation": found,
+    }
 
 
-def as_toml(outcome: ExcitationOutcome) -> str:
-    """Return the excitation as a configuration that extends the one it was found for."""
-    base = outcome.config if outcome.config in builtin_names() else str(Path(outcome.config).resolve())
-    return f"extends = {json.dumps(base)}\n\n[excitation]\n{to_toml(outcome.excitation)}"
+def as_toml(config: str, excitation: ExcitationSettings) -> str:
+    """Return an excitation as a configuration that extends the one it was found for."""
+    base = config if config in builtin_names() else str(Path(config).resolve())
+    return f"extends = {json.dumps(base)}\n\n[excitation]\n{to_toml(excitation)}"
 
 
-def as_json(outcome: ExcitationOutcome) -> str:
-    """Return the search's result as JSON."""
-    return json_text(
-        {
-            "present": outcome.present,
-            "found": outcome.found,
-            "limits": outcome.limits.by_figure(),
-            "excitation": outcome.excitation,
-        }
-    )
-
-
-def as_text(outcome: ExcitationOutcome) -> str:
+def as_text(outcome: dict[str, Any]) -> str:
     """Format the figures as a table, joint 1 / joint 2."""
-    limits = outcome.limits.by_figure()
     rows = [
         (
             label,
-            *(_cell(getattr(one, name, None), form) for one in (outcome.present, outcome.found)),
-            _cell(limits.get(name), form),
+            *(_cell(getattr(one, name, None), form) for one in (outcome["present"], outcome["found"])),
+            _cell(outcome["limits"].get(name), form),
         )
         for name, label, form in _LABELS
     ]

@@ -2,11 +2,11 @@
 
 import sys
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import click
 
-from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode, tell
 from adacd_hil.printable import in_line
 from adacd_hil.settings.schema import ConfigError
 
@@ -18,13 +18,6 @@ def is_terminal() -> bool:
     return sys.stdin is not None and sys.stdin.isatty()
 
 
-class Proposal(NamedTuple):
-    """A proposed answer. source: its origin; "" for a guess. value None: no proposal."""
-
-    value: Any
-    source: str = ""
-
-
 class Interview:
     """Asks questions that no option has answered; without a terminal it takes proposals if allowed, else fails."""
 
@@ -32,55 +25,53 @@ class Interview:
         self.takes_proposals = takes_proposals
         self.is_asking = not takes_proposals and is_terminal()
 
-    def say(self, line: str) -> None:
-        """Print a line that is neither question nor result."""
-        print(in_line(line), file=sys.stderr, flush=True)
-
     def ask(
         self,
         option: str,
         given: Any,
         question: str,
         read: Callable[[Any], Answer],
-        proposal: Proposal = Proposal(None),  # noqa: B008 (immutable)
+        proposal: tuple[Any, str] = (None, ""),
         explanation: str = "",
     ) -> tuple[Answer, str]:
         """Return an answer and its source: "given", the proposal's, or "" for an unchanged guess.
 
         read: makes an answer from an option's value, typed text, or a proposal; raises ConfigError for an invalid one,
-        and the question is repeated. explanation: printed on `?`. Raises CommandError without an answer.
+        and the question is repeated. explanation: printed on `?`. proposal: value and
+        source, "" for a guess; value None: none. Raises CommandError without an answer.
         """
         if given is not None:
             return read(given), "given"
+        value, source = proposal
         if self.is_asking:
-            help_text = "; ".join(
-                part for part in (explanation, f"{option} answers it, too", _origin(proposal), "Ctrl-C ends") if part
-            )
-            return self._prompt(question, read, proposal, help_text)
-        if proposal.value is None:
+            origin = "" if value is None else f"Enter takes {as_typed(value)}: {source or 'a guess'}"
+            parts = (explanation, f"{option} answers it, too", origin, "Ctrl-C ends")
+            return self._prompt(question, read, proposal, "; ".join(filter(None, parts)))
+        if value is None:
             raise CommandError(f"stdin is not a terminal: give {option} ({question})", ExitCode.USAGE)
         if not self.takes_proposals:
             raise CommandError(
-                f"stdin is not a terminal: give {option} ({question}), or --yes for {as_typed(proposal)}",
+                f"stdin is not a terminal: give {option} ({question}), or --yes for {as_typed(value)}",
                 ExitCode.USAGE,
             )
-        return read(proposal.value), proposal.source
+        return read(value), source
 
     def _prompt(
-        self, question: str, read: Callable[[Any], Answer], proposal: Proposal, help_text: str
+        self, question: str, read: Callable[[Any], Answer], proposal: tuple[Any, str], help_text: str
     ) -> tuple[Answer, str]:
+        value, source = proposal
+        default = None if value is None else as_typed(value)
         while True:
-            default = None if proposal.value is None else as_typed(proposal)
             text = click.prompt(in_line(question), default=default, err=True, show_default=default != "")
             if text.strip() == "?":
-                self.say(help_text)
+                tell(help_text)
                 continue
             try:
-                if text == default and proposal.value is not None:
-                    return read(proposal.value), proposal.source
+                if text == default:
+                    return read(value), source
                 return read(text), "given"
             except ConfigError as error:
-                self.say(str(error))
+                tell(str(error))
 
     def confirm(self, answer: bool | None, question: str) -> bool:
         """Return the option's answer if given, else ask; return False without a terminal."""
@@ -89,15 +80,8 @@ class Interview:
         return self.is_asking and click.confirm(in_line(question), default=False, err=True)
 
 
-def _origin(proposal: Proposal) -> str:
-    if proposal.value is None:
-        return ""
-    return f"Enter takes {as_typed(proposal)}: {proposal.source or 'a guess'}"
-
-
-def as_typed(proposal: Proposal) -> str:
-    """Format a proposed value in the form in which the user types it."""
-    value = proposal.value
+def as_typed(value: Any) -> str:
+    """Format a value in the form in which the user types it."""
     if isinstance(value, tuple | list):
         return " ".join(f"{one:g}" if isinstance(one, float) else str(one) for one in value)
     return str(value)

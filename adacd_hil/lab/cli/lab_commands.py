@@ -108,10 +108,10 @@ def tare(
     With more than one pose, the arm is moved by hand in between. Exit status 1: refused, for the reason given; the
     file is as it was. `adacd-hil run --tare FILE` uses the offsets.
     """
-    from adacd_hil.lab.cli.tare_command import tare_on_bus
+    from adacd_hil.lab.cli.tare_command import as_text, tare_on_bus
 
-    result = tare_on_bus(connection, clock, out, poses, seconds, auto_zero)
-    answer(as_json, {"file": result.path, "backup": result.backup, **vars(result.tare)}, result.as_text())
+    found, backup = tare_on_bus(connection, clock, out, poses, seconds, auto_zero)
+    answer(as_json, {"file": out, "backup": backup, **vars(found)}, as_text(found, out, backup))
     return ExitCode.OK
 
 
@@ -204,12 +204,12 @@ def excitation(
     Prints the figures of the configuration's excitation beside those of the one found.
     """
     from adacd_hil.lab.cli import excitation_command as command
+    from adacd_hil.plain_values import json_text
 
     with checked_place(out):
-        outcome = command.search(config, profile, seconds, seed, out)
-        print_and_write(
-            command.as_json(outcome) if as_json else command.as_text(outcome), out, command.as_toml(outcome), as_json
-        )
+        found = command.search(config, profile, seconds, seed, out)
+        text = json_text(found) if as_json else command.as_text(found)
+        print_and_write(text, out, command.as_toml(config, found["excitation"]), as_json)
     return ExitCode.OK
 
 
@@ -245,8 +245,8 @@ def budget(
     from adacd_hil.lab.cli import budget_command as budgets
 
     found = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
-    answer(as_json, budgets.as_json(found), budgets.as_text(found))
-    return found.code
+    answer(as_json, budgets.as_json(*found), budgets.as_text(*found))
+    return ExitCode.OK if found[1].is_fit else ExitCode.FAILURE
 
 
 @click.command(epilog=EPILOG)

@@ -1,7 +1,5 @@
 """`adacd-hil log`: logs at a glance, checked, recovered, cut and exported, with the text printed of them."""
 
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,13 +7,11 @@ import click
 
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table
+from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table, tell
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from adacd_hil.lab.logs.check.log_check import LogCheck
     from adacd_hil.lab.logs.recover import LogRecovery
     from adacd_hil.log.log_files import TimeWindow
@@ -24,10 +20,6 @@ if TYPE_CHECKING:
 _TOLD_FAULTS = 5
 _log_argument = click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
 _out_option = click.option("--out", type=WrittenPath(dir_okay=False), metavar="FILE")
-
-
-def _tell(line: str) -> None:
-    print(in_line(line), file=sys.stderr)
 
 
 @click.group("log", cls=CommandGroup)
@@ -64,7 +56,7 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     """
     from adacd_hil.lab.logs.check.log_check import check_log, find_logs
 
-    checked = [check_log(path, _tell) for path in find_logs(logs)]
+    checked = [check_log(path, tell) for path in find_logs(logs)]
     answer(as_json, checked, "\n".join(map(check_as_text, checked)))
     if any(entry.errors for entry in checked):
         return ExitCode.FAILURE
@@ -86,7 +78,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     """
     from adacd_hil.lab.logs.recover import recover as recover_log
 
-    recovery = recover_log(log, out, _tell)
+    recovery = recover_log(log, out, tell)
     answer(as_json, _recovery(recovery), recovery_as_text(recovery))
     return ExitCode.PARTIAL if recovery.losses.is_any else ExitCode.OK
 
@@ -125,7 +117,7 @@ def cut(
             raise CommandError("--contact excludes --from and --until", ExitCode.USAGE)
         stretch = find_contact(log, contact, around_s)
     out = out or default_out(log)
-    messages = cut_log(log, out, stretch, topics, _tell)
+    messages = cut_log(log, out, stretch, topics, tell)
     answer(as_json, {"out": out, **stretch.named_bounds, "messages": messages}, in_line(f"{out}: {messages} messages"))
     return ExitCode.OK
 
@@ -280,31 +272,20 @@ def export(
     candump logs of the frames: can_logconvert.
     """
     from adacd_hil.lab.logs.signal_tables import export_tables
+    from adacd_hil.log.logged_run import Milestones
     from adacd_hil.wire.dbc_decoder import DbcDecoder
 
     decoder = DbcDecoder(*find_dbc(log, dbc))
-    summary = export_tables(log, out or log.with_name(f"{log.stem}-tables"), kind, topics, decoder, _tell_rows())
+    told = Milestones(lambda rows: tell(f"{rows} rows"), _TOLD_EACH)
+    summary = export_tables(log, out or log.with_name(f"{log.stem}-tables"), kind, topics, decoder, told.reach)
     for note in summary.notes:
-        _tell(f"{kind}: {note}")
+        tell(f"{kind}: {note}")
     if summary.problem:
-        _tell(f"warning: {summary.problem}")
+        tell(f"warning: {summary.problem}")
     lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
     text = "\n".join(lines) or in_line(f"nothing to export: {decoder.path.name} knows no frame of {log.name}")
     answer(as_json, {"files": summary.rows, "text": text, "problem": summary.problem}, text)
     return ExitCode.PARTIAL if summary.problem else ExitCode.OK
-
-
-def _tell_rows() -> Callable[[int], None]:
-    """Print how many rows are written, a line for every so many."""
-    told = 0
-
-    def tell(count: int) -> None:
-        nonlocal told
-        if count - told >= _TOLD_EACH:
-            told = count
-            _tell(f"{count} rows")
-
-    return tell
 
 
 def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:

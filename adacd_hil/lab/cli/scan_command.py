@@ -1,10 +1,9 @@
 """Scan: the nodes on a bus, their frames, and whether they are the arm of the configuration."""
 
-import sys
 from typing import Any
 
 from adacd_hil.cli.connection import Connection
-from adacd_hil.cli.output import ExitCode, format_table
+from adacd_hil.cli.output import ExitCode, format_table, tell
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.device.network import Master
 from adacd_hil.lab.commission.survey import Node, Survey, compare, expected_nodes, message_name, survey
@@ -23,7 +22,7 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
     with connection.bus(clock, codec.is_fd) as bus:
         expected = expected_nodes(Master(settings, codec, bus).slaves, codec)
         reporting = {node.node_id for node in expected if node.layout_digest is not None}
-        found = survey(bus, clock, listen_s, lambda line: print(in_line(line), file=sys.stderr, flush=True), reporting)
+        found = survey(bus, clock, listen_s, tell, reporting)
     described = describe(found, compare(found, expected), codec)
     is_right = not any(row["verdict"] not in ("", "unexpected") for row in described["nodes"])
     return described, ExitCode.OK if is_right else ExitCode.BUS_MISSING

@@ -3,7 +3,6 @@
 import dataclasses
 import signal
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
@@ -20,37 +19,28 @@ from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration import Settings
 
 
-@dataclass(frozen=True)
-class StoredTare:
-    """A tare and the path of its file. `backup`: path of the file that it replaced, None without one."""
-
-    tare: Tare
-    path: Path
-    backup: Path | None
-
-    def as_text(self) -> str:
-        """Format the tare for people."""
-        tare = self.tare
-        lines = [
-            f"joint{joint}: offset {offset:+.4f} ± {error:.4f} Nm (was {old:+.4f}), spread of poses {spread:.4f} Nm, "
-            f"sensor {sensor.serial}"
-            for joint, (offset, error, old, spread, sensor) in enumerate(
-                zip(
-                    tare.offset_Nm,
-                    tare.standard_error_Nm,
-                    tare.old_offset_Nm,
-                    tare.spread_Nm,
-                    tare.sensors,
-                    strict=True,
-                ),
-                start=1,
-            )
-        ]
-        if tare.gravity_model != "none":
-            lines.append("gravity ({}): a4 = {:.4f} Nm, a5 = {:.4f} Nm".format(tare.gravity_model, *tare.gravity_Nm))
-        kept = "" if self.backup is None else f"; the one before is {self.backup}"
-        lines.append(f"{self.path}{kept}")
-        return "\n".join(in_line(line) for line in lines)
+def as_text(tare: Tare, path: Path, backup: Path | None) -> str:
+    """Format a tare in a file for people. backup: the file that it replaced, None without one."""
+    lines = [
+        f"joint{joint}: offset {offset:+.4f} ± {error:.4f} Nm (was {old:+.4f}), spread of poses {spread:.4f} Nm, "
+        f"sensor {sensor.serial}"
+        for joint, (offset, error, old, spread, sensor) in enumerate(
+            zip(
+                tare.offset_Nm,
+                tare.standard_error_Nm,
+                tare.old_offset_Nm,
+                tare.spread_Nm,
+                tare.sensors,
+                strict=True,
+            ),
+            start=1,
+        )
+    ]
+    if tare.gravity_model != "none":
+        lines.append("gravity ({}): a4 = {:.4f} Nm, a5 = {:.4f} Nm".format(tare.gravity_model, *tare.gravity_Nm))
+    kept = "" if backup is None else f"; the one before is {backup}"
+    lines.append(f"{path}{kept}")
+    return "\n".join(in_line(line) for line in lines)
 
 
 def tare_on_bus(
@@ -60,8 +50,11 @@ def tare_on_bus(
     poses: int | None,
     seconds: float | None,
     is_auto_zeroing: bool,
-) -> StoredTare:
-    """Tare the sensors of an arm on a bus. Raises ConfigError, CodecError, BusError, CommandError, OSError."""
+) -> tuple[Tare, Path | None]:
+    """Tare the sensors of an arm on a bus; return the tare, and the file that its file `out` replaced, if any.
+
+    Raises ConfigError, CodecError, BusError, CommandError, OSError.
+    """
     interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)
     settings = _with_options(connection.settings(), poses, seconds)
@@ -82,7 +75,7 @@ def tare_on_bus(
         raise CommandError(f"tare refused: {reason}", ExitCode.FAILURE) from None
     except DeviceError as reason:
         raise CommandError(reason.line, ExitCode.BUS_MISSING) from None
-    return StoredTare(tare, out, write_tare(tare, out))
+    return tare, write_tare(tare, out)
 
 
 def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:

@@ -27,7 +27,7 @@ from adacd_hil.lab.commission.communication_test import (
     ZeroTorqueCycle,
     ZeroTorqueLoop,
 )
-from adacd_hil.lab.commission.host_checks import Check, CheckOutcome, failed, ok, skipped, warning
+from adacd_hil.lab.commission.host_checks import Check, Finding, failed, ok, skipped, warning
 from adacd_hil.lab.commission.survey import NMT_STATES, compare, expected_nodes, survey
 from adacd_hil.lab.commission.traffic import Traffic, listen
 from adacd_hil.records import JOINTS, Vector
@@ -111,13 +111,13 @@ class ArmExamination:
         return np.array(values, dtype=np.float64).reshape(len(values), JOINTS)
 
 
-def check_bus(patient: ArmExamination) -> CheckOutcome:
+def check_bus(patient: ArmExamination) -> Finding:
     """Check that the bus opens."""
     patient.connect()
     return ok(f"{patient.tap.channel} is open")
 
 
-def check_other_masters(patient: ArmExamination) -> CheckOutcome:
+def check_other_masters(patient: ArmExamination) -> Finding:
     """Check that no other master is on the bus."""
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
@@ -131,7 +131,7 @@ def check_other_masters(patient: ArmExamination) -> CheckOutcome:
     return ok(f"none in {LISTEN_S:g} s; {len(traffic.talks)} identifiers heard, {traffic.error_frames} error frames")
 
 
-def check_nodes(patient: ArmExamination) -> CheckOutcome:
+def check_nodes(patient: ArmExamination) -> Finding:
     """Check that the expected nodes are there, with the expected identity."""
     expected = expected_nodes(patient.master.slaves)
     found = survey(patient.tap, patient.clock, 0.0)
@@ -145,13 +145,13 @@ def check_nodes(patient: ArmExamination) -> CheckOutcome:
     return ok(", ".join(f"{node.name} (node {node.node_id})" for node in expected))
 
 
-def check_boot(patient: ArmExamination) -> CheckOutcome:
+def check_boot(patient: ArmExamination) -> Finding:
     """Check that each node boots after a reset of communication."""
     patient.reset()
     return ok("all nodes booted after a reset of communication")
 
 
-def check_contract(patient: ArmExamination) -> CheckOutcome:
+def check_contract(patient: ArmExamination) -> Finding:
     """Check that host and devices use the same contract."""
     codec = patient.codec
     lacking = []
@@ -172,14 +172,14 @@ def check_contract(patient: ArmExamination) -> CheckOutcome:
     return ok(f"wire version {codec.wire_version}, layout digest 0x{codec.layout_digest:08X}")
 
 
-def check_set_up(patient: ArmExamination) -> CheckOutcome:
+def check_set_up(patient: ArmExamination) -> Finding:
     """Run a run's identity check and set-up of the nodes."""
     patient.master.identify()
     patient.master.configure()
     return ok(f"SYNC period {patient.settings.bus.period_us} µs, heartbeat {patient.settings.bus.heartbeat_ms} ms")
 
 
-def check_pdo_map(patient: ArmExamination) -> CheckOutcome:
+def check_pdo_map(patient: ArmExamination) -> Finding:
     """Check that the devices' PDO parameters and mappings are those of the contract."""
     lines = []
     for slave in patient.master.slaves:
@@ -204,7 +204,7 @@ def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
     return f"{slave.name}: 0x6076 = {' x '.join(parts)}, {rated_Nm:.4g} Nm at the joint, 0.1 % of it a count"
 
 
-def check_torque_scale(patient: ArmExamination) -> CheckOutcome:
+def check_torque_scale(patient: ArmExamination) -> Finding:
     """Report the drives' rated torques at the joints; the set-up has compared them already."""
     slaves = patient.master.slaves[:JOINTS]
     pairs = zip(slaves, patient.settings.arm.rated_torque_Nm, strict=True)
@@ -214,7 +214,7 @@ def check_torque_scale(patient: ArmExamination) -> CheckOutcome:
     return ok(text)
 
 
-def check_protection(patient: ArmExamination) -> CheckOutcome:
+def check_protection(patient: ArmExamination) -> Finding:
     """List the cyclic frames that carry no end-to-end header."""
     names = [
         message.name
@@ -229,7 +229,7 @@ def check_protection(patient: ArmExamination) -> CheckOutcome:
     return ok("every cyclic frame has an end-to-end header")
 
 
-def check_cycle(patient: ArmExamination) -> CheckOutcome:
+def check_cycle(patient: ArmExamination) -> Finding:
     """Run cycles at the period with disabled drives."""
     patient.tap.take_passed()
     patient.master.start()
@@ -241,7 +241,7 @@ def check_cycle(patient: ArmExamination) -> CheckOutcome:
     return ok(f"{len(patient.cycles)} cycles, torque zero, drives not enabled")
 
 
-def check_rate(patient: ArmExamination) -> CheckOutcome:
+def check_rate(patient: ArmExamination) -> Finding:
     """Check that SYNC and feedback keep the period."""
     report = patient.communication()
     elapsed_s = report.periods * patient.settings.bus.period_s
@@ -260,7 +260,7 @@ def check_rate(patient: ArmExamination) -> CheckOutcome:
     return warning(text, remedy) if report.verdict is Verdict.WARNING else ok(text)
 
 
-def check_load(patient: ArmExamination) -> CheckOutcome:
+def check_load(patient: ArmExamination) -> Finding:
     """Check that the bus has room for frames that are not cyclic."""
     load = patient.communication().load_percent
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
@@ -269,7 +269,7 @@ def check_load(patient: ArmExamination) -> CheckOutcome:
     return ok(text)
 
 
-def check_heartbeats(patient: ArmExamination) -> CheckOutcome:
+def check_heartbeats(patient: ArmExamination) -> Finding:
     """Check that each node sends heartbeats in state Operational, often enough."""
     expected_Hz = 1e3 / patient.settings.bus.heartbeat_ms
     silent, odd, slow = [], [], []
@@ -292,7 +292,7 @@ def check_heartbeats(patient: ArmExamination) -> CheckOutcome:
     return ok(f"all operational, every {patient.settings.bus.heartbeat_ms} ms")
 
 
-def check_devices(patient: ArmExamination) -> CheckOutcome:
+def check_devices(patient: ArmExamination) -> Finding:
     """Check that no drive is in fault and no device reports an error."""
     lines = [line for line in describe_faults(patient.arm) if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
@@ -301,7 +301,7 @@ def check_devices(patient: ArmExamination) -> CheckOutcome:
     return ok("no fault, no EMCY")
 
 
-def check_saturation(patient: ArmExamination) -> CheckOutcome:
+def check_saturation(patient: ArmExamination) -> Finding:
     """Check that no sensor is saturated or invalid."""
     reported = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
     text = ", ".join(f"{name} {status!r}" for name, status in reported.items())
@@ -316,7 +316,7 @@ def _by_joint(form: str, values: Vector) -> str:
     return ", ".join(f"joint {number} {form.format(value)}" for number, value in enumerate(values.tolist(), start=1))
 
 
-def check_rest(patient: ArmExamination) -> CheckOutcome:
+def check_rest(patient: ArmExamination) -> Finding:
     """Check that the arm stands still with its drives off."""
     dq = patient.joint_values("dq")
     if not len(dq):
@@ -329,7 +329,7 @@ def check_rest(patient: ArmExamination) -> CheckOutcome:
     return ok(text)
 
 
-def check_torque_zero(patient: ArmExamination) -> CheckOutcome:
+def check_torque_zero(patient: ArmExamination) -> Finding:
     """Check that the torque at rest is near zero."""
     tau_J = patient.joint_values("tau_J")
     if not len(tau_J):
@@ -345,7 +345,7 @@ def check_torque_zero(patient: ArmExamination) -> CheckOutcome:
     return ok(text)
 
 
-def check_noise(patient: ArmExamination) -> CheckOutcome:
+def check_noise(patient: ArmExamination) -> Finding:
     """Check that the torque signal changes, and that its noise is small."""
     tau_J = patient.joint_values("tau_J")
     if len(tau_J) < 2:
@@ -361,7 +361,7 @@ def check_noise(patient: ArmExamination) -> CheckOutcome:
     return ok(text)
 
 
-def check_bus_errors(patient: ArmExamination) -> CheckOutcome:
+def check_bus_errors(patient: ArmExamination) -> Finding:
     """Check that no error frame came while the cycle ran."""
     link = patient.read_link()
     errors = patient.traffic.error_frames
@@ -373,8 +373,8 @@ def check_bus_errors(patient: ArmExamination) -> CheckOutcome:
     return ok(f"no error frame{counters}")
 
 
-def _check_joint(joint: int) -> Callable[[ArmExamination], CheckOutcome]:
-    def check(patient: ArmExamination) -> CheckOutcome:
+def _check_joint(joint: int) -> Callable[[ArmExamination], Finding]:
+    def check(patient: ArmExamination) -> Finding:
         if patient.ask is None:
             return skipped(patient.no_move_reason)
         tau_J = patient.joint_values("tau_J")
@@ -432,7 +432,7 @@ class HandMotion:
         self._last = state.q
         self._way = state.q - self._start
 
-    def judge(self) -> CheckOutcome:
+    def judge(self) -> Finding:
         """Return the outcome for the motion so far."""
         joint, number = self._joint, self._joint + 1
         ways_deg = np.degrees(self._way)
@@ -451,7 +451,7 @@ class HandMotion:
             return failed(f"position decreases toward +q ({text})", f"reverse arm.sign of joint {number}")
         return self._judge_torque(text)
 
-    def _judge_torque(self, text: str) -> CheckOutcome:
+    def _judge_torque(self, text: str) -> Finding:
         work_J = self._work_J[self._joint]
         if work_J > WORK_FLOOR_J:
             return failed(

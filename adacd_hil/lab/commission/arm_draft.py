@@ -313,7 +313,7 @@ _LEAST_TORQUE_SHARE = 0.3
 
 
 class Fact(NamedTuple):
-    """A pair of values. source: its origin; "" for a guess."""
+    """A value, mostly a pair, known or proposed. source: its origin; "" for a guess."""
 
     value: Any
     source: str = ""

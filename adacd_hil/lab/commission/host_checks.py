@@ -30,21 +30,16 @@ class Status(Enum):
     SKIPPED = "skipped"
 
 
-class CheckOutcome(NamedTuple):
-    """Outcome of a check with its reason. `remedy`: the user's next step; "" if none is needed."""
-
-    status: Status
-    reason: str
-    remedy: str = ""
-
-
 class Finding(NamedTuple):
-    """The outcome of a named check."""
+    """Outcome of a check with its reason. name: of the check, "" before it is reported.
+
+    `remedy`: the user's next step; "" if none is needed.
+    """
 
     name: str
     status: Status
     reason: str
-    remedy: str
+    remedy: str = ""
 
 
 Examination = TypeVar("Examination")
@@ -54,28 +49,28 @@ class Check(NamedTuple, Generic[Examination]):
     """One line of the table. `needs`: names of earlier checks that must not have failed."""
 
     name: str
-    run: Callable[[Examination], CheckOutcome]
+    run: Callable[[Examination], Finding]
     needs: tuple[str, ...] = ()
 
 
-def ok(reason: str) -> CheckOutcome:
+def ok(reason: str) -> Finding:
     """Return the outcome of a passed check."""
-    return CheckOutcome(Status.OK, reason)
+    return Finding("", Status.OK, reason)
 
 
-def warning(reason: str, remedy: str) -> CheckOutcome:
+def warning(reason: str, remedy: str) -> Finding:
     """Return the outcome for an arm that can run with reduced margin."""
-    return CheckOutcome(Status.WARNING, reason, remedy)
+    return Finding("", Status.WARNING, reason, remedy)
 
 
-def failed(reason: str, remedy: str) -> CheckOutcome:
+def failed(reason: str, remedy: str) -> Finding:
     """Return the outcome for an arm that must not or can't run."""
-    return CheckOutcome(Status.FAILED, reason, remedy)
+    return Finding("", Status.FAILED, reason, remedy)
 
 
-def skipped(reason: str) -> CheckOutcome:
+def skipped(reason: str) -> Finding:
     """Return the outcome of a check that isn't possible here."""
-    return CheckOutcome(Status.SKIPPED, reason)
+    return Finding("", Status.SKIPPED, reason)
 
 
 def diagnose(
@@ -100,13 +95,12 @@ def diagnose(
             outcome = _run(check, examination)
             if outcome.status is Status.FAILED:
                 blocked[check.name] = check.name
-        finding = Finding(check.name, *outcome)
-        report(finding)
-        findings.append(finding)
+        findings.append(outcome._replace(name=check.name))
+        report(findings[-1])
     return findings
 
 
-def _run(check: Check[Examination], examination: Examination) -> CheckOutcome:
+def _run(check: Check[Examination], examination: Examination) -> Finding:
     try:
         return check.run(examination)
     except DeviceError as error:
@@ -132,7 +126,7 @@ def configuration_checks(settings: Settings) -> list[Check[Settings]]:
     ]
 
 
-def check_settings(settings: Settings) -> CheckOutcome:
+def check_settings(settings: Settings) -> Finding:
     """Check the configuration for likely mistakes."""
     odd = oddities(settings)
     if odd:
@@ -140,8 +134,8 @@ def check_settings(settings: Settings) -> CheckOutcome:
     return ok(f"configuration {settings.name}")
 
 
-def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
-    def ask(settings: Settings) -> CheckOutcome:
+def _asking_for(known: KnownKey) -> Callable[[Settings], Finding]:
+    def ask(settings: Settings) -> Finding:
         value = value_of(settings, known.key)
         text = "nothing is given" if value is None else f"{in_words(value)} is a guess"
         remedy = f"measure it or look it up, write it, and take `{known.key}` off `assumed`"
@@ -150,8 +144,8 @@ def _asking_for(known: KnownKey) -> Callable[[Settings], CheckOutcome]:
     return ask
 
 
-def _asking_for_profile(value: float) -> Callable[[Settings], CheckOutcome]:
-    def ask(_: Settings) -> CheckOutcome:
+def _asking_for_profile(value: float) -> Callable[[Settings], Finding]:
+    def ask(_: Settings) -> Finding:
         remedy = "look it up or measure it, write it into that profile, and take the key off its `assumed`"
         return warning(f"{value:.10g} is a guess", remedy)
 
@@ -191,14 +185,14 @@ class Host:
         return self.interface == "socketcan"
 
 
-def check_kernel(host: Host) -> CheckOutcome:
+def check_kernel(host: Host) -> Finding:
     """Check that the kernel has SocketCAN and gives us raw sockets."""
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} does not use the kernel's CAN")
     return look_for_socketcan()
 
 
-def look_for_socketcan() -> CheckOutcome:
+def look_for_socketcan() -> Finding:
     """Check that this kernel gives out raw CAN sockets."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
@@ -211,7 +205,7 @@ def look_for_socketcan() -> CheckOutcome:
     return ok("SocketCAN, raw sockets allowed")
 
 
-def check_interface(host: Host) -> CheckOutcome:
+def check_interface(host: Host) -> Finding:
     """Check that the interface exists and is up."""
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} is python-can's own")
@@ -226,10 +220,10 @@ def check_interface(host: Host) -> CheckOutcome:
     return ok(f"{name} is up, hardware" + (f" ({link.kind})" if link.kind else ""))
 
 
-def _with_hardware(check: Callable[[Host, InterfaceState], CheckOutcome]) -> Callable[[Host], CheckOutcome]:
+def _with_hardware(check: Callable[[Host, InterfaceState], Finding]) -> Callable[[Host], Finding]:
     """Skip a check that is meaningless on a virtual bus."""
 
-    def run(host: Host) -> CheckOutcome:
+    def run(host: Host) -> Finding:
         if host.link is None:
             return skipped("no SocketCAN interface")
         if host.link.is_virtual:
@@ -239,7 +233,7 @@ def _with_hardware(check: Callable[[Host, InterfaceState], CheckOutcome]) -> Cal
     return run
 
 
-def check_bitrate(host: Host, link: InterfaceState) -> CheckOutcome:
+def check_bitrate(host: Host, link: InterfaceState) -> Finding:
     """Check that the bit rates are the contract's."""
     if link.bitrate is None:
         return skipped("the kernel does not report it here; install iproute2")
@@ -253,7 +247,7 @@ def check_bitrate(host: Host, link: InterfaceState) -> CheckOutcome:
     return ok(f"{link.bitrate} bit/s" + (f", data phase {link.data_bitrate}" if host.data_bitrate else ""))
 
 
-def check_sample_point(_host: Host, link: InterfaceState) -> CheckOutcome:
+def check_sample_point(_host: Host, link: InterfaceState) -> Finding:
     """Check that the sample point is compatible with the devices'."""
     if link.sample_point is None:
         return skipped("the kernel does not report it here; install iproute2")
@@ -264,7 +258,7 @@ def check_sample_point(_host: Host, link: InterfaceState) -> CheckOutcome:
     return ok(text)
 
 
-def check_restart(_host: Host, link: InterfaceState) -> CheckOutcome:
+def check_restart(_host: Host, link: InterfaceState) -> Finding:
     """Check the automatic restart after bus-off."""
     if link.restart_ms is None:
         return skipped("the kernel does not report it here; install iproute2")
@@ -276,7 +270,7 @@ def check_restart(_host: Host, link: InterfaceState) -> CheckOutcome:
     return ok(f"{link.restart_ms} ms after bus-off")
 
 
-def check_controller(_host: Host, link: InterfaceState) -> CheckOutcome:
+def check_controller(_host: Host, link: InterfaceState) -> Finding:
     """Check that the controller takes part in the bus."""
     if link.state is None:
         return skipped("the kernel does not report it here; install iproute2")
@@ -288,7 +282,7 @@ def check_controller(_host: Host, link: InterfaceState) -> CheckOutcome:
     return ok(counters)
 
 
-def check_queue(host: Host) -> CheckOutcome:
+def check_queue(host: Host) -> Finding:
     """Check that the transmit queue is short enough not to hold outdated commands."""
     if host.link is None:
         return skipped("no SocketCAN interface")
@@ -303,7 +297,7 @@ def check_queue(host: Host) -> CheckOutcome:
     return ok(f"txqueuelen {length}")
 
 
-def check_mtu(host: Host) -> CheckOutcome:
+def check_mtu(host: Host) -> Finding:
     """Check that CAN FD frames fit, if the contract has some."""
     if host.link is None:
         return skipped("no SocketCAN interface")
@@ -314,7 +308,7 @@ def check_mtu(host: Host) -> CheckOutcome:
     return ok(f"{host.link.mtu}, CAN FD frames fit")
 
 
-def check_permissions(host: Host) -> CheckOutcome:
+def check_permissions(host: Host) -> Finding:
     """Check that this process may empty the interface's queue after a fault."""
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} has no queue in the kernel")
@@ -331,7 +325,7 @@ def check_permissions(host: Host) -> CheckOutcome:
     return ok("CAP_NET_ADMIN: the interface's queue can be emptied")
 
 
-def check_scheduler(host: Host) -> CheckOutcome:
+def check_scheduler(host: Host) -> Finding:
     """Check that scheduler, processor, locked memory and shallow idle states are granted."""
     grant = host.request_realtime()
     if grant.missing:
@@ -340,7 +334,7 @@ def check_scheduler(host: Host) -> CheckOutcome:
     return ok(", ".join(f"{name.replace('_', ' ')} {value}" for name, value in grant.describe().items()))
 
 
-def check_throttling(host: Host) -> CheckOutcome:
+def check_throttling(host: Host) -> Finding:
     """Check that the kernel doesn't throttle a real-time process."""
     folder = host.root / "proc/sys/kernel"
     try:
@@ -357,7 +351,7 @@ def check_throttling(host: Host) -> CheckOutcome:
     return ok(text)
 
 
-def check_preemption(host: Host) -> CheckOutcome:
+def check_preemption(host: Host) -> Finding:
     """Check that the kernel wakes a real-time process in time."""
     version = _read(host.root / "proc/version")
     if _read(host.root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
@@ -366,7 +360,7 @@ def check_preemption(host: Host) -> CheckOutcome:
     return warning(f"{kind}: single cycles can be late by milliseconds", "install a PREEMPT_RT kernel (linux-image-rt)")
 
 
-def check_processor(host: Host) -> CheckOutcome:
+def check_processor(host: Host) -> Finding:
     """Check that the processors' clock is steady."""
     folder = host.root / "sys/devices/system/cpu"
     governors = sorted({_read(path) for path in folder.glob("cpu[0-9]*/cpufreq/scaling_governor")})
@@ -378,7 +372,7 @@ def check_processor(host: Host) -> CheckOutcome:
     return ok(text)
 
 
-def check_isolation(host: Host) -> CheckOutcome:
+def check_isolation(host: Host) -> Finding:
     """Check that the processor of the cycle is isolated."""
     isolated = isolated_cpus(host.root / "sys/devices/system/cpu")
     names = ", ".join(map(str, isolated)) or "none"

@@ -1,6 +1,6 @@
 """A run's log as named numpy arrays, one row per cycle, with its events, contacts and certificates."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import LogError, log_in
 from adacd_hil.log.logged_run import settings_of
-from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.log.reader import RunLog, each_once, read_log
 from adacd_hil.records import ContactReport, SchemeState, Vector
 from adacd_hil.remedies import install_command, nearest_name
 from adacd_hil.score.metrics import certificates_in
@@ -169,7 +169,7 @@ def load(run: str | Path) -> LoadedRun:
         path=path,
         arrays=arrays,
         events=tuple(RunEvent((t_ns - zero_ns) * 1e-9, *event) for t_ns, event in events),
-        contacts=tuple(_contacts(log.contacts, zero_ns)),
+        contacts=tuple(RunContact((t_ns - zero_ns) * 1e-9, report) for t_ns, report in each_once(log.contacts)),
         metadata=log.metadata,
         attachments=log.attachments,
         problem=log.problem,
@@ -191,13 +191,3 @@ def _arrays(log: RunLog) -> dict[str, NDArray[Any]]:
         arrays |= {"t_ns": topic.t_ns[rows]} if not arrays else {}
         arrays |= {name: topic[name][rows] for name in topic.fields if name not in arrays}
     return arrays
-
-
-def _contacts(reports: Iterable[tuple[int, ContactReport]], zero_ns: int) -> Iterator[RunContact]:
-    """Yield each contact once: the time of its first report, and its last report."""
-    found: dict[int, RunContact] = {}
-    for t_ns, report in reports:
-        first = found.get(report.cycle)
-        t_s = (t_ns - zero_ns) * 1e-9 if first is None else first.t_s
-        found[report.cycle] = RunContact(t_s, report)
-    yield from found.values()

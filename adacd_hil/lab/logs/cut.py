@@ -3,7 +3,7 @@
 Times count from the first of them in the log. A log of which anything is lost is recovered first.
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,7 @@ from adacd_hil.lab.logs.log_copy import LogCopy
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import CUT, RUN_METADATA, LogError, TimeWindow
 from adacd_hil.log.mcap.chunks import Contents
-from adacd_hil.log.reader import begin_of_log, read_log
-from adacd_hil.records import ContactReport
+from adacd_hil.log.reader import begin_of_log, each_once, read_log
 
 
 def default_out(path: Path) -> Path:
@@ -26,19 +25,11 @@ def default_out(path: Path) -> Path:
 def find_contact(path: Path, contact: int, around_s: float) -> TimeWindow:
     """Return the stretch around the contact of this number, from 1, of a log. Raises LogError."""
     log = read_log(path, ("/contact",))
-    begun = contacts_begun(log.contacts)
+    begun = each_once(log.contacts)
     if not 1 <= contact <= len(begun):
         raise LogError(f"log {path} has {len(begun)} contacts: there is no contact {contact}")
-    at_s = (begun[contact - 1] - begin_of_log(path)) * 1e-9
+    at_s = (begun[contact - 1][0] - begin_of_log(path)) * 1e-9
     return TimeWindow(at_s - around_s, at_s + around_s)
-
-
-def contacts_begun(reports: Iterable[tuple[int, ContactReport]]) -> list[int]:
-    """Give the time of each contact's first report, ns: all reports of one name the cycle in which it began."""
-    begun: dict[int, int] = {}
-    for t_ns, report in reports:
-        begun.setdefault(report.cycle, t_ns)
-    return list(begun.values())
 
 
 def cut(

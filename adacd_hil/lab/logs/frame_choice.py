@@ -7,7 +7,6 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.frames.frame_log import FrameSource
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.dbc_decoder import DbcDecoder
 
@@ -30,7 +29,7 @@ class FrameChoice:
     start_ns: int | None = None
     end_ns: int | None = None
 
-    def pieces(self, source: FrameSource) -> Iterator[NDArray[Any]]:
+    def pieces(self, source: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
         """Yield the chosen frames of each piece of a recording; skips pieces without any."""
         first_ns = None
         for frames in source:

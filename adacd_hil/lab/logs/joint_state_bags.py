@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LOG_NAME, LogError
@@ -16,11 +16,8 @@ _BAG_MAGIC: Final = b"#ROSBAG V"
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 
 
-class Bag(NamedTuple):
-    """The contents of a bag: the type of each topic, and a function that reads the messages of one."""
-
-    topics: Mapping[str, str]
-    messages: Callable[[str], Iterator[tuple[int, JointStateMessage]]]  # with when they were recorded, ns
+Bag = tuple[Mapping[str, str], Callable[[str], Iterator[tuple[int, JointStateMessage]]]]
+"""The type of each topic, and a function that reads the messages of one, with when they were recorded, ns."""
 
 
 def is_bag(path: Path) -> bool:
@@ -79,7 +76,7 @@ def _opened_mcap(path: Path) -> Iterator[Bag]:
             for _, _, message in make_reader(file).iter_messages(topics=[topic], log_time_order=False):
                 yield message.log_time, decode_joint_state(message.data)
 
-        yield Bag(topics, messages)
+        yield topics, messages
 
 
 @contextmanager
@@ -96,7 +93,7 @@ def _opened_rosbag(path: Path, is_ros1: bool) -> Iterator[Bag]:
             for _, received_ns, data in reader.messages(connections=connections):
                 yield received_ns, decode_joint_state(data, is_ros1)
 
-        yield Bag({each.topic: each.msgtype for each in reader.connections}, messages)
+        yield {each.topic: each.msgtype for each in reader.connections}, messages
 
 
 def joint_state_topics(topics: Mapping[str, str]) -> list[str]:

@@ -22,13 +22,13 @@ def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
     Raises LogError if the bag can't be read or has no efforts, ConfigError if it lacks a topic or a joint.
     """
     wanted = described.columns.q or described.urdf.joint_names
-    with opened_bag(path) as bag:
-        topic = _topic(path, bag.topics, described.bag.topic)
+    with opened_bag(path) as (topics, read_messages):
+        topic = _topic(path, topics, described.bag.topic)
         states = _States(path, topic, wanted)
         read = RecordedRows(path, 1 + 3 * len(wanted), 1.0, span)
         is_stamped = described.bag.time == "header"
         first_ns: int | None = None
-        for number, (received_ns, message) in enumerate(bag.messages(topic), start=1):
+        for number, (received_ns, message) in enumerate(read_messages(topic), start=1):
             if row := states.read(number, message, read):
                 time_ns = message.stamp_ns if is_stamped else received_ns
                 first_ns = time_ns if first_ns is None else first_ns

@@ -14,7 +14,7 @@ import numpy as np
 from adacd_hil.file_access import read_input
 from adacd_hil.lab.logs.joint_state_bags import JOINT_STATES, is_bag, joint_state_topics, opened_bag
 from adacd_hil.lab.offline.column_checks import largest_torques
-from adacd_hil.lab.offline.recording_map import ISO, TIME_S, UnitsSection, time_unit_of, units_by_slope
+from adacd_hil.lab.offline.recording_map import ISO, TIME_S, CsvSection, UnitsSection, time_unit_of, units_by_slope
 from adacd_hil.lab.offline.table_guess import TableGuess, guess_table
 from adacd_hil.lab.serial_arm.urdf import SerialArm, UrdfError, read_urdf
 from adacd_hil.log.log_files import LogError
@@ -97,13 +97,11 @@ def _of_table(recording: Path, arm: SerialArm) -> list[DraftedKey]:
         if role not in guess.columns:
             raise ConfigError(
                 f"recording {recording}: no {n} columns look like {what} of {', '.join(arm.joint_names)}; there are "
-                f"{', '.join(form.heads)}"
+                f"{', '.join(guess.heads)}"
             )
     keys = []
-    defaults = {"delimiter": ",", "decimal": ".", "has_header": True, "skip_rows": 0}
-    for key, default in defaults.items():
-        if getattr(form, key) != default:
-            keys.append(DraftedKey("csv", key, getattr(form, key), ""))
+    defaults = vars(CsvSection())
+    keys += [DraftedKey("csv", key, value, "") for key, value in vars(form).items() if value != defaults[key]]
     for role in ("time", "q", "dq", "tau_J", "contact"):
         if role in guess.columns:
             names = guess.columns[role]
@@ -176,8 +174,8 @@ def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
     """Draft the keys of a bag; it needs no key if it has the URDF's names on one topic."""
     keys = []
-    with opened_bag(recording) as bag:
-        found = joint_state_topics(bag.topics)
+    with opened_bag(recording) as (topics, read_messages):
+        found = joint_state_topics(topics)
         if not found:
             raise LogError(f"recording {recording} has no topic of sensor_msgs/msg/JointState")
         topic = JOINT_STATES if JOINT_STATES in found else found[0]
@@ -186,7 +184,7 @@ def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
         names: dict[str, None] = {}
         positions, efforts = [], []
         is_stamped = False
-        for _, (_, message) in zip(range(_SEEN_MESSAGES), bag.messages(topic), strict=False):
+        for _, (_, message) in zip(range(_SEEN_MESSAGES), read_messages(topic), strict=False):
             names |= dict.fromkeys(message.names)
             is_stamped |= message.stamp_ns != 0
             if len(message.names) == len(message.position) == len(message.effort):

@@ -23,7 +23,7 @@ from adacd_hil.lab.offline.csv_recording import (
     read_number,
     split_rows,
 )
-from adacd_hil.lab.offline.recording_map import unit_of
+from adacd_hil.lab.offline.recording_map import CsvSection, unit_of
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 
@@ -54,22 +54,16 @@ _UNIT_ROLES: Final = {
 _ALIKE: Final = 0.9
 
 
-class TableForm(NamedTuple):
-    """Form of a file, as in `[csv]` of a map; units: of a row below the head, "" without one."""
-
-    delimiter: str
-    decimal: str
-    has_header: bool
-    skip_rows: int
-    heads: tuple[str, ...]  # "1", "2" without a head
-    units: tuple[str, ...]
-
-
 @dataclass
 class TableGuess:
-    """The guess. columns, units: by role, from the heads. reasons: of guesses."""
+    """The guess. columns, units: by role, from the heads. reasons: of guesses.
 
-    form: TableForm
+    heads: "1", "2" without a head; units_below: of a row below the head, "" without one.
+    """
+
+    form: CsvSection
+    heads: tuple[str, ...]
+    units_below: tuple[str, ...]
     values: Vector  # (k, columns) of the rows that were read; nan for cells without a number
     is_iso: bool = False
     columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -78,7 +72,7 @@ class TableGuess:
 
     def of(self, role: str) -> Vector:
         """Return the values of a role (k, c)."""
-        return self.values[:, [self.form.heads.index(name) for name in self.columns[role]]]
+        return self.values[:, [self.heads.index(name) for name in self.columns[role]]]
 
 
 class _Head(NamedTuple):
@@ -94,9 +88,9 @@ def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     """Guess form and columns of a CSV file for an arm with these joints. Raises LogError."""
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
-    form, first = _form(path, lines)
-    values, is_iso = _values(_split(path, lines[first:], form.delimiter), form)
-    guess = TableGuess(form, values, is_iso)
+    form, heads, units, first = _form(path, lines)
+    values, is_iso = _values(_split(path, lines[first:], form.delimiter), len(heads), form.decimal)
+    guess = TableGuess(form, heads, units, values, is_iso)
     if form.has_header:
         _by_heads(guess, joint_names)
     else:
@@ -115,18 +109,22 @@ def _is_full(cells: list[str], decimal: str) -> bool:
     )
 
 
-def _form(path: Path, lines: list[str]) -> tuple[TableForm, int]:
-    """Find the form with the most columns, and the line where the data begin. Raises LogError."""
-    best: tuple[int, TableForm, int] | None = None
+_Form = tuple[CsvSection, tuple[str, ...], tuple[str, ...], int]
+"""Form, heads, units below them, and the line where the data begin."""
+
+
+def _form(path: Path, lines: list[str]) -> _Form:
+    """Find the form with the most columns. Raises LogError."""
+    best: _Form | None = None
     for delimiter in DELIMITERS:
         for decimal in (".", ",") if delimiter != "," else (".",):
             rows = [_trimmed(cells) for cells in _split(path, lines[:_HEAD_ROWS], delimiter)]
             first = next((k for k in range(len(rows)) if _begins(rows[k : k + _FULL_ROWS], decimal)), None)
-            if first is not None and (best is None or len(rows[first]) > best[0]):
-                best = (len(rows[first]), _form_at(rows, first, delimiter, decimal), first)
+            if first is not None and (best is None or len(rows[first]) > len(best[1])):
+                best = _form_at(rows, first, delimiter, decimal)
     if best is None:
         raise LogError(f"recording {path}: no rows of numbers in its first {_HEAD_ROWS} lines")
-    return best[1], best[2]
+    return best
 
 
 def _trimmed(cells: list[str]) -> list[str]:
@@ -141,7 +139,7 @@ def _begins(rows: list[list[str]], decimal: str) -> bool:
     return len(rows) == _FULL_ROWS and count >= 3 and all(len(row) == count and _is_full(row, decimal) for row in rows)
 
 
-def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) -> TableForm:
+def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) -> _Form:
     """Return the form of a file whose data begin at a row: the head is above, perhaps with a row of units between."""
     count = len(rows[first])
     above = [k for k in range(first) if len(rows[k]) == count and rows[k][0].removeprefix("#").strip()]
@@ -149,21 +147,20 @@ def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) ->
     if len(above) > 1 and any(map(unit_of, rows[above[-1]])):
         units = tuple(map(unit_of, rows[above.pop()]))
     if not above:
-        return TableForm(delimiter, decimal, False, first, tuple(str(k + 1) for k in range(count)), units)
+        return CsvSection(delimiter, decimal, False, first), tuple(str(k + 1) for k in range(count)), units, first
     heads = [cell.strip() for cell in rows[above[-1]]]
     heads[0] = heads[0].removeprefix("#").strip()
-    return TableForm(delimiter, decimal, True, above[-1], tuple(heads), units)
+    return CsvSection(delimiter, decimal, True, above[-1]), tuple(heads), units, first
 
 
-def _values(rows: list[list[str]], form: TableForm) -> tuple[Vector, bool]:
-    """Read the data; tell whether the first column has dates, which are read as nan."""
-    count = len(form.heads)
+def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bool]:
+    """Read the data; tell whether the first column has dates, which are read as nan. count: of columns."""
     table: list[list[float]] = []
     is_iso = False
     for cells in rows[:_SEEN_ROWS]:
         if len(cells) >= count:
-            is_iso |= not table and not is_number(cells[0], form.decimal)
-            table.append([_number(cell, form.decimal) for cell in cells[:count]])
+            is_iso |= not table and not is_number(cells[0], decimal)
+            table.append([_number(cell, decimal) for cell in cells[:count]])
     return np.array(table).reshape(-1, count), is_iso
 
 
@@ -175,8 +172,8 @@ def _number(cell: str, decimal: str) -> float:
 
 
 def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
-    heads = [_taken_apart(place, text, joint_names) for place, text in enumerate(guess.form.heads)]
-    heads = [head._replace(unit=guess.form.units[head.place] or head.unit) for head in heads]
+    heads = [_taken_apart(place, text, joint_names) for place, text in enumerate(guess.heads)]
+    heads = [head._replace(unit=guess.units_below[head.place] or head.unit) for head in heads]
     groups: dict[tuple[tuple[str, ...], str], list[_Head]] = {}
     for head in heads:
         groups.setdefault((head.words, head.unit), []).append(head)
@@ -193,7 +190,7 @@ def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
                 continue
         rank = (sum(word in _NOT_MEASURED for word in words), len(words), members[0].place)
         if role:
-            others.setdefault(role, []).append(guess.form.heads[members[0].place])
+            others.setdefault(role, []).append(guess.heads[members[0].place])
         if role and (role not in chosen or rank < chosen[role][0]):
             chosen[role] = (rank, members)
     if "tau_J" not in chosen and "current" in chosen:
@@ -202,7 +199,7 @@ def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
         guess.units["tau_J"] = chosen["current"][1][0].unit or "A"
     for role, (_, members) in chosen.items():
         if role != "current":
-            guess.columns[role] = tuple(guess.form.heads[head.place] for head in members)
+            guess.columns[role] = tuple(guess.heads[head.place] for head in members)
             if len(others.get(role, ())) > 1:
                 guess.reasons.setdefault(role, f"one of {', '.join(others[role])}")
             if members[0].unit:
@@ -242,7 +239,7 @@ def _role(words: tuple[str, ...], unit: str) -> str:
 
 def _by_values(guess: TableGuess, n: int) -> None:
     """Take the first column that grows for the time; positions are n columns whose slope the next n are."""
-    values, heads = guess.values, guess.form.heads
+    values, heads = guess.values, guess.heads
     grows = [place for place in range(values.shape[1]) if np.all(np.diff(values[:, place]) > 0.0)]
     first = 0
     if grows and grows[0] == 0:
@@ -265,7 +262,7 @@ def _by_values(guess: TableGuess, n: int) -> None:
 
 
 def _take(guess: TableGuess, role: str, block: tuple[int, ...], reason: str) -> None:
-    guess.columns[role] = tuple(guess.form.heads[place] for place in block)
+    guess.columns[role] = tuple(guess.heads[place] for place in block)
     guess.reasons[role] = reason
 
 

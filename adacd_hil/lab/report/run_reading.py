@@ -185,15 +185,10 @@ def _read(
         if bounds_ns is not None:
             if len(scheme) and scheme.t_ns[0] >= bounds_ns[1]:
                 return
-            series = {name: _within(each, bounds_ns) for name, each in series.items()}
+            series = {name: each.between(*bounds_ns) for name, each in series.items()}
         reading.add_piece(series, stream.events(piece))
         if until_ns is not None and len(scheme) and reading.is_settled(until_ns, int(scheme.t_ns[-1])):
             return
-
-
-def _within(series: Series, bounds_ns: Bounds) -> Series:
-    t_ns = series.t_ns
-    return series.part((t_ns >= bounds_ns[0]) & (t_ns < bounds_ns[1]))
 
 
 def _with_ending(

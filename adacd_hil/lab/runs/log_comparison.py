@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
-from adacd_hil.log.reader import LogStream, Series, begin_of_log
+from adacd_hil.log.reader import LogStream, Series, begin_of_log, each_once
 from adacd_hil.records import ContactReport, SchemeState
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.settings.setting_keys import changed_keys
@@ -46,7 +46,7 @@ class RunReader:
         self.cycles = 0
         self.states: list[tuple[float, str]] = []
         self.parameters: dict[str, list[float]] = {}
-        self._contacts: dict[int, Contact] = {}
+        self._contacts: list[Contact] = []
         self._times = {name: Distribution() for name in _TIMES}
         self._bounds: tuple[int, int] | None = None
 
@@ -92,8 +92,8 @@ class RunReader:
             if len(records):
                 last = records[-1].copy()
             contacts = self._wanted(piece.series["/contact"])
-            for time_ns, record in zip(contacts.t_ns.tolist(), contacts.records, strict=True):
-                self._take_contact((time_ns - zero_ns) * 1e-9, record)
+            times_s = ((contacts.t_ns - zero_ns) * 1e-9).tolist()
+            self._contacts = each_once((*self._contacts, *zip(times_s, _reports(contacts), strict=True)))
             cycles = self._wanted(piece.series["/cycle"])
             for name in _TIMES:
                 if name in cycles.fields:
@@ -106,14 +106,6 @@ class RunReader:
         for name, value in zip(self.settings.estimator.parameter_names, record["theta_hat"].tolist(), strict=False):
             self.parameters.setdefault(name, []).append(value)
 
-    def _take_contact(self, time_s: float, record: Any) -> None:
-        """Keep the last report of each contact, with the time of its first one."""
-        key = int(record["cycle"])
-        before = self._contacts.get(key)
-        there = [name for name in ContactReport._fields if name in (record.dtype.names or ())]
-        report = ContactReport(**{name: record[name].tolist() for name in there})
-        self._contacts[key] = (time_s if before is None else before[0], report)
-
     @property
     def problem(self) -> str:
         """The parts of the log that are missing, one line."""
@@ -122,7 +114,7 @@ class RunReader:
     @property
     def contacts(self) -> list[Contact]:
         """The contacts, by time."""
-        return sorted(self._contacts.values(), key=lambda contact: contact[0])
+        return sorted(self._contacts, key=lambda contact: contact[0])
 
     @property
     def timing_us(self) -> dict[str, dict[str, float]]:
@@ -131,6 +123,13 @@ class RunReader:
             name.removesuffix("_ns"): times.low_percentiles() if name == "slack_ns" else times.percentiles()
             for name, times in self._times.items()
         }
+
+
+def _reports(contacts: Series) -> Iterator[ContactReport]:
+    """Read the reports of /contact, of any version's enums."""
+    there = [name for name in ContactReport._fields if name in contacts.fields]
+    for record in contacts.records:
+        yield ContactReport(**{name: record[name].tolist() for name in there})
 
 
 def _name_of(state: int) -> str:

@@ -30,7 +30,7 @@ from adacd_hil.log.logged_run import (
     split_sections,
 )
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
-from adacd_hil.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
+from adacd_hil.score.distribution import Distribution, LogHistogram, log_histogram
 from adacd_hil.score.judge import (
     Detection,
     Score,
@@ -326,12 +326,11 @@ _PER_CYCLE: Final = ("frames_missing", "commands_late")
 
 
 class TimingGatherer:
-    """Sums up /cycle piece by piece, in bounded memory; `exact` as in `Distribution`."""
+    """Sums up /cycle piece by piece, in bounded memory."""
 
-    def __init__(self, period_us: float, is_modelled: bool, exact: int = EXACT) -> None:
+    def __init__(self, period_us: float, is_modelled: bool) -> None:
         self._period_us = period_us
         self._is_modelled = is_modelled
-        self._exact = exact
         self._cycles = 0
         self._times: dict[str, Distribution] = {}
         self._histograms: dict[str, LogHistogram] = {}
@@ -348,7 +347,7 @@ class TimingGatherer:
             self._add_times(quantity, columns)
         for name, column in QUEUES.items():
             if column in columns and not self._is_modelled:  # lockstep has no queues
-                self._depths.setdefault(name, Distribution(self._exact)).add_values(columns[column])
+                self._depths.setdefault(name, Distribution()).add_values(columns[column])
         if "data_age" in columns:
             ages = np.bincount(np.minimum(columns["data_age"], OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
             self._ages = ages if self._ages is None else self._ages + ages
@@ -358,14 +357,14 @@ class TimingGatherer:
             if len(columns):
                 self._last[name] = int(columns[name][-1])
         if reactions is not None and (compute_us := columns.times_us(COMPUTE)) is not None:
-            self._reactions = self._reactions or Distribution(self._exact)
+            self._reactions = self._reactions or Distribution()
             self._reactions.add_values(compute_us[reactions])
 
     def _add_times(self, quantity: Quantity, columns: CycleColumns) -> None:
         values_us = columns.times_us(quantity)
         if values_us is None or (self._is_modelled and quantity is LATENESS):  # lockstep has no grid to be late on
             return
-        self._times.setdefault(quantity.name, Distribution(self._exact)).add_values(values_us)
+        self._times.setdefault(quantity.name, Distribution()).add_values(values_us)
         found = log_histogram(values_us)
         before = self._histograms.get(quantity.name)
         self._histograms[quantity.name] = found if before is None else before.joined(found)

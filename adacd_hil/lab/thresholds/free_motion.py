@@ -91,10 +91,9 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
     for piece in stream:
         scheme = piece.series["/scheme"]
         if bounds_ns is not None and len(scheme):
-            t_ns = scheme.t_ns
-            if t_ns[0] >= bounds_ns[1]:
+            if scheme.t_ns[0] >= bounds_ns[1]:
                 return
-            scheme = scheme.part((t_ns >= bounds_ns[0]) & (t_ns < bounds_ns[1]))
+            scheme = scheme.between(*bounds_ns)
         if len(scheme):
             yield scheme
 

@@ -11,34 +11,24 @@ lib.h.
 """
 
 import importlib.util
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adacd_hil.log.frames.mcap_frames import McapFrames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE, FrameLog
 from adacd_hil.remedies import install_command, nearest_name
 
+if TYPE_CHECKING:
+    from adacd_hil.log.frames.can_io import PythonCanFrames
+
 SUFFIXES = (".mcap", ".log", ".blf", ".asc", ".mf4", ".trc", ".csv")
 
 
-class FrameSource(Protocol):
-    """The frames of a recording in pieces: iterate once; all else is complete afterwards."""
-
-    channels: list[str]
-    epoch_ns: int
-    problem: str
-
-    def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Return the frames, (n,) of RECORDED_FRAME_DTYPE, in the order of the recording."""
-
-
-def open_frames(path: Path) -> FrameSource:
-    """Open a recording; its suffix gives its format.
+def open_frames(path: Path) -> "McapFrames | PythonCanFrames":
+    """Open a recording; its suffix gives its format. Iterate once; all else is complete afterwards.
 
     Raises LogError when it can't be read, also from the iteration.
     """

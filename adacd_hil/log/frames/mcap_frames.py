@@ -58,12 +58,11 @@ from adacd_hil.log.types.message_types import (
     pack_can_frame,
     pack_fd_frame,
 )
-from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE, fill_times, record_dtype
+from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE, SENT, fill_times, record_dtype
 
 CHANNEL_KEY = "can_channel"
 RATE_SWITCH_KEY = "bit_rate_switch"
 ERROR_STATE_KEY = "error_state_indicator"
-SENT = "to_can_bus"
 _HEAD_BYTES = MESSAGE_HEAD + len(ENCAPSULATION) + 12
 """Bytes of a record up to its frame_id."""
 _FRAME_ID_BYTES = 8

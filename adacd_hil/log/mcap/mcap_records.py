@@ -233,7 +233,53 @@ def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
 
     It ends with a Footer that the magic follows.
     """
-    return _Scan(file).items()
+    size = os.fstat(file.fileno()).st_size
+    position = len(MAGIC) if _read(file, 0, len(MAGIC)) == MAGIC else 0
+    while position < size:
+        head = _head(file, position, size)
+        if head is None:
+            found = _find_next(file, position + 1, size)
+            yield FileGap(position, found - position)
+            position = found
+            continue
+        record = RawRecord(position, head[0], _read(file, position + HEAD.size, head[1]))
+        yield record
+        position = record.end
+        if record.opcode == Opcode.FOOTER and _read(file, position, len(MAGIC)) == MAGIC:
+            return
+
+
+def _head(file: IO[bytes], position: int, size: int) -> tuple[int, int] | None:
+    """Return opcode and length of the record at `position` of a file of `size` bytes, if one is there."""
+    head = _read(file, position, HEAD.size)
+    if len(head) < HEAD.size:
+        return None
+    opcode, length = HEAD.unpack(head)
+    start = position + HEAD.size
+    if not opcode or length > min(size - start, MOST_RECORD_BYTES):
+        return None
+    if opcode in set(Opcode):
+        is_there = fits(opcode, length, lambda place, count: _read(file, start + place, count))
+    else:  # a kind that is not known, if a known one follows
+        is_there = _is_shaped(file, start + length, size)
+    return (opcode, length) if is_there else None
+
+
+def _is_shaped(file: IO[bytes], position: int, size: int) -> bool:
+    """Return whether a record that repeats its length is at `position`."""
+    opcode = _read(file, position, 1)
+    return bool(opcode) and has_shape(opcode[0]) and _head(file, position, size) is not None
+
+
+def _find_next(file: IO[bytes], position: int, size: int) -> int:
+    """Find the next record that repeats its length; the end of the file if there is none."""
+    while position < size:
+        window = _read(file, position, _WINDOW + HEAD.size)
+        for match in _BEGINNING.finditer(window):
+            if _is_shaped(file, position + match.start(), size):
+                return position + match.start()
+        position += _WINDOW
+    return size
 
 
 def read_header(path: Path) -> Header | None:
@@ -247,69 +293,6 @@ def read_header(path: Path) -> Header | None:
     except (OSError, LogError):
         return None
     return header
-
-
-class _Scan:
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-        self._size = os.fstat(file.fileno()).st_size
-
-    def items(self) -> Iterator[RawRecord | FileGap]:
-        position = len(MAGIC)
-        if self._read(0, position) != MAGIC:
-            position = 0
-        while position < self._size:
-            head = self._head(position)
-            if head is None:
-                found = self._find(position + 1)
-                yield FileGap(position, found - position)
-                position = found
-                continue
-            record = RawRecord(position, head[0], self._read(position + HEAD.size, head[1]))
-            yield record
-            position = record.end
-            if record.opcode == Opcode.FOOTER and self._read(position, len(MAGIC)) == MAGIC:
-                return
-
-    def _read(self, position: int, count: int) -> bytes:
-        self._file.seek(position)
-        return self._file.read(count)
-
-    def _head(self, position: int) -> tuple[int, int] | None:
-        """Return opcode and length of the record at `position`, if one is there."""
-        head = self._read(position, HEAD.size)
-        if len(head) < HEAD.size:
-            return None
-        opcode, length = HEAD.unpack(head)
-        start = position + HEAD.size
-        if not opcode or length > min(self._size - start, MOST_RECORD_BYTES):
-            return None
-        if opcode in set(Opcode):
-            is_there = fits(opcode, length, lambda place, count: self._read(start + place, count))
-        else:  # a kind that is not known, if a known one follows
-            is_there = self._is_shaped(start + length)
-        return (opcode, length) if is_there else None
-
-    def _is_shaped(self, position: int) -> bool:
-        """Return whether a record that repeats its length is at `position`."""
-        head = self._read(position, HEAD.size)
-        if len(head) < HEAD.size or not has_shape(head[0]):
-            return False
-        opcode, length = HEAD.unpack(head)
-        start = position + HEAD.size
-        return length <= min(self._size - start, MOST_RECORD_BYTES) and fits(
-            opcode, length, lambda place, count: self._read(start + place, count)
-        )
-
-    def _find(self, position: int) -> int:
-        """Find the next record that repeats its length; the end of the file if there is none."""
-        while position < self._size:
-            window = self._read(position, _WINDOW + HEAD.size)
-            for match in _BEGINNING.finditer(window):
-                if self._is_shaped(position + match.start()):
-                    return position + match.start()
-            position += _WINDOW
-        return self._size
 
 
 def chunk_crc(record: RawRecord) -> int:

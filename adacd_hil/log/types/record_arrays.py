@@ -74,21 +74,15 @@ LONG_FRAME_DTYPE = _frame_dtype(MAX_DATA)
 """A frame of a log with FD frames, classic ones too: `data` (64,). All else is as in the other."""
 
 
-class FrameTopic(NamedTuple):
-    """A topic of frames."""
-
-    type_name: str
-    is_tx: bool
-    is_long: bool
-
-
+SENT = "to_can_bus"
+"""In the names of topics of sent frames."""
 FRAME_TOPICS = {
-    "/to_can_bus": FrameTopic(CAN_FRAME.name, is_tx=True, is_long=False),
-    "/from_can_bus": FrameTopic(CAN_FRAME.name, is_tx=False, is_long=False),
-    "/to_can_bus_fd": FrameTopic(FD_FRAME.name, is_tx=True, is_long=True),
-    "/from_can_bus_fd": FrameTopic(FD_FRAME.name, is_tx=False, is_long=True),
+    "/to_can_bus": CAN_FRAME.name,
+    "/from_can_bus": CAN_FRAME.name,
+    "/to_can_bus_fd": FD_FRAME.name,
+    "/from_can_bus_fd": FD_FRAME.name,
 }
-"""The topics of frames."""
+"""The topics of frames and their types."""
 
 
 def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
@@ -98,15 +92,14 @@ def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
 
 def is_of_frames(topic: Topic) -> bool:
     """Return whether a topic is one of ours with bus frames."""
-    return topic.name in FRAME_TOPICS and FRAME_TOPICS[topic.name].type_name == topic.type_name
+    return FRAME_TOPICS.get(topic.name) == topic.type_name
 
 
 def frames_of(records: NDArray[Any], topic: Topic, epoch_ns: int) -> NDArray[Any]:
     """Make frames of the records of a topic of frames; epoch_ns: subtracted from the file's times."""
-    kind = FRAME_TOPICS[topic.name]
-    frames = np.empty(len(records), LONG_FRAME_DTYPE if kind.is_long else FRAME_DTYPE)
+    frames = np.empty(len(records), LONG_FRAME_DTYPE if topic.has_tail else FRAME_DTYPE)
     fill_times(frames, records, epoch_ns)
-    frames["is_tx"] = kind.is_tx
+    frames["is_tx"] = SENT in topic.name
     for name in ("can_id", "length", "is_error", "data"):
         frames[name] = records[name]
     return frames

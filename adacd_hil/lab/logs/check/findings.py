@@ -46,72 +46,66 @@ class Findings:
         """Add a finding of a rule of `RULES`."""
         self.counts[rule] += 1
         if self.counts[rule] <= _TOLD:
-            self.found.append(LogFinding(self.file, RULES[rule].severity, rule, text, offset))
+            self.found.append(LogFinding(self.file, RULES[rule], rule, text, offset))
 
     def count(self, severity: Severity) -> int:
         """Count all findings of a severity."""
-        return sum(count for rule, count in self.counts.items() if RULES[rule].severity is severity)
-
-
-class Rule(NamedTuple):
-    """A rule: what a log must be like, and how bad it is when it is not."""
-
-    severity: Severity
-    demand: str
+        return sum(count for rule, count in self.counts.items() if RULES[rule] is severity)
 
 
 _ERROR, _WARNING, _NOTE = Severity
-RULES: dict[str, Rule] = {
+RULES: dict[str, Severity] = {
     # the file
-    "magic": Rule(_ERROR, "the file begins and ends with MCAP's magic, and nothing follows"),
-    "record": Rule(_ERROR, "every byte belongs to a record that can be read"),
-    "header": Rule(_ERROR, "one Header, before all else"),
-    "data-end": Rule(_ERROR, "one DataEnd"),
-    "footer": Rule(_ERROR, "one Footer"),
-    "place": Rule(_ERROR, "each kind of record is in its section"),
-    "library": Rule(_WARNING, "the Header says what wrote the file"),
-    "profile": Rule(_WARNING, "the Header's profile is empty, ros1 or ros2"),
-    "unknown-record": Rule(_WARNING, "every kind of record is known"),
+    "magic": _ERROR,  # the file begins and ends with MCAP's magic, and nothing follows
+    "record": _ERROR,  # every byte belongs to a record that can be read
+    "header": _ERROR,  # one Header, before all else
+    "data-end": _ERROR,  # one DataEnd
+    "footer": _ERROR,  # one Footer
+    "place": _ERROR,  # each kind of record is in its section
+    "library": _WARNING,  # the Header says what wrote the file
+    "profile": _WARNING,  # the Header's profile is empty, ros1 or ros2
+    "unknown-record": _WARNING,  # every kind of record is known
     # CRCs
-    "chunk-crc": Rule(_ERROR, "every chunk can be opened and fits its CRC"),
-    "data-crc": Rule(_ERROR, "the data section fits its CRC"),
-    "summary-crc": Rule(_ERROR, "the summary fits its CRC"),
-    "attachment-crc": Rule(_ERROR, "every attachment fits its CRC"),
-    "no-crc": Rule(_NOTE, "CRCs vouch for all messages, attachments and the summary"),
-    "some-crc": Rule(_WARNING, "without a CRC of the data section, all chunks have a CRC or none"),
+    "chunk-crc": _ERROR,  # every chunk can be opened and fits its CRC
+    "data-crc": _ERROR,  # the data section fits its CRC
+    "summary-crc": _ERROR,  # the summary fits its CRC
+    "attachment-crc": _ERROR,  # every attachment fits its CRC
+    "no-crc": _NOTE,  # CRCs vouch for all messages, attachments and the summary
+    "some-crc": _WARNING,  # without a CRC of the data section, all chunks have a CRC or none
     # definitions
-    "schema-id": Rule(_ERROR, "no schema has the number 0"),
-    "schema-encoding": Rule(_ERROR, "a schema with data names its encoding"),
-    "empty-schema": Rule(_WARNING, "a schema isn't empty"),
-    "redefinition": Rule(_ERROR, "definitions of one number are equal"),
-    "duplicate": Rule(_WARNING, "the data section defines each number once"),
-    "undefined-schema": Rule(_ERROR, "the schema of a channel is defined before it"),
-    "undefined-channel": Rule(_ERROR, "the channel of a message is defined before it"),
-    "summary-only": Rule(_ERROR, "what the summary defines and messages use, the data section defines too"),
-    "unused-summary-only": Rule(_NOTE, "the data section defines what no message uses, too"),
+    "schema-id": _ERROR,  # no schema has the number 0
+    "schema-encoding": _ERROR,  # a schema with data names its encoding
+    "empty-schema": _WARNING,  # a schema isn't empty
+    "redefinition": _ERROR,  # definitions of one number are equal
+    "duplicate": _WARNING,  # the data section defines each number once
+    "undefined-schema": _ERROR,  # the schema of a channel is defined before it
+    "undefined-channel": _ERROR,  # the channel of a message is defined before it
+    "summary-only": _ERROR,  # what the summary defines and messages use, the data section defines too
+    "unused-summary-only": _NOTE,  # the data section defines what no message uses, too
     # chunks and indexes
-    "chunk-record": Rule(_ERROR, "a chunk holds schemas, channels and messages, whole ones"),
-    "chunk-times": Rule(_ERROR, "a chunk's times are those of its earliest and latest message"),
-    "chunk-size": Rule(_ERROR, "a chunk is as large as it says"),
-    "message-index": Rule(_ERROR, "the message indexes behind a chunk have exactly its messages"),
-    "no-message-index": Rule(_WARNING, "a chunk has message indexes"),
-    "unindexed-messages": Rule(_WARNING, "a file with indexes has no messages outside chunks"),
-    "chunk-index": Rule(_ERROR, "one chunk index for each chunk, and all it says is so"),
-    "no-chunk-index": Rule(_WARNING, "the summary has chunk indexes"),
-    "summary-channels": Rule(_ERROR, "the summary defines the channels and schemas that it needs"),
-    "attachment-index": Rule(_ERROR, "one index for each attachment, and all it says is so"),
-    "metadata-index": Rule(_ERROR, "one index for each metadata record, and all it says is so"),
-    "summary-offset": Rule(_ERROR, "summary offsets and Footer say where the groups are"),
-    "statistics": Rule(_ERROR, "at most one Statistics, and all its counts and times are so"),
+    "chunk-record": _ERROR,  # a chunk holds schemas, channels and messages, whole ones
+    "chunk-times": _ERROR,  # a chunk's times are those of its earliest and latest message
+    "chunk-size": _ERROR,  # a chunk is as large as it says
+    "message-index": _ERROR,  # the message indexes behind a chunk have exactly its messages
+    "no-message-index": _WARNING,  # a chunk has message indexes
+    "unindexed-messages": _WARNING,  # a file with indexes has no messages outside chunks
+    "chunk-index": _ERROR,  # one chunk index for each chunk, and all it says is so
+    "no-chunk-index": _WARNING,  # the summary has chunk indexes
+    "summary-channels": _ERROR,  # the summary defines the channels and schemas that it needs
+    "attachment-index": _ERROR,  # one index for each attachment, and all it says is so
+    "metadata-index": _ERROR,  # one index for each metadata record, and all it says is so
+    "summary-offset": _ERROR,  # summary offsets and Footer say where the groups are
+    "statistics": _ERROR,  # at most one Statistics, and all its counts and times are so
     # messages
-    "order": Rule(_WARNING, "log_time doesn't run backwards within a channel"),
-    "schema-text": Rule(_ERROR, "the text of a ros2msg schema can be read"),
-    "cdr": Rule(_ERROR, "a cdr message begins with its encapsulation and is as long as its schema says"),
+    "order": _WARNING,  # log_time doesn't run backwards within a channel
+    "schema-text": _ERROR,  # the text of a ros2msg schema can be read
+    "cdr": _ERROR,  # a cdr message begins with its encapsulation and is as long as its schema says
     # our logs
-    "missing-part": Rule(_ERROR, "a log has all its parts"),
-    "foreign-part": Rule(_ERROR, "the parts of a log are of one run"),
-    "counts": Rule(_ERROR, "the summary's counts of messages and frames are so"),
-    "ending": Rule(_WARNING, "the summary says why the log ended, and that it was meant to"),
-    "dropped": Rule(_WARNING, "no packet was dropped on the way to the log"),
-    "lost": Rule(_WARNING, "nothing was lost before the log was recovered"),
+    "missing-part": _ERROR,  # a log has all its parts
+    "foreign-part": _ERROR,  # the parts of a log are of one run
+    "counts": _ERROR,  # the summary's counts of messages and frames are so
+    "ending": _WARNING,  # the summary says why the log ended, and that it was meant to
+    "dropped": _WARNING,  # no packet was dropped on the way to the log
+    "lost": _WARNING,  # nothing was lost before the log was recovered
 }
+"""How bad it is where a log is not as a rule demands."""

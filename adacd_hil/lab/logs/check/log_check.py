@@ -60,40 +60,29 @@ _FOOTER_CRC = 4
 _DATA_SECTION = "data section"
 
 
-class FileFacts(NamedTuple):
-    """The facts that a checked file states about itself."""
-
-    findings: Findings
-    metadata: dict[str, dict[str, str]]
-    messages: int
-    frames: int
-    is_ended: bool
-
-
-def check_file(path: Path) -> FileFacts:
-    """Check a file by itself. Raises LogError when it can't be read."""
-    with failing_as(f"log {path} can't be read"), open_input(path) as file:
-        return _FileCheck(path.name, file).run()
-
-
 class _FileCheck:
+    """The check of one file by itself; then what the file states about itself."""
+
     def __init__(self, name: str, file: IO[bytes]) -> None:
+        """Check a file."""
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.messages = self.frames = 0
         self._file = file
-        self._findings = Findings(name)
-        self._definitions = DefinitionCheck(self._findings)
-        self._chunks = ChunkCheck(self._findings, self._definitions)
-        self._summary = SummaryCheck(self._findings, self._definitions, self._chunks)
-        self._metadata: dict[str, dict[str, str]] = {}
+        self.findings = Findings(name)
+        self._definitions = DefinitionCheck(self.findings)
+        self._chunks = ChunkCheck(self.findings, self._definitions)
+        self._summary = SummaryCheck(self.findings, self._definitions, self._chunks)
         self._is_summary = False  # DataEnd is behind
         self._crc = 0  # of the section so far
         self._counts = {Opcode.HEADER: 0, Opcode.DATA_END: 0, Opcode.FOOTER: 0}
         self._has_trailer = False
+        self._run()
 
-    def run(self) -> FileFacts:
+    def _run(self) -> None:
         magic = self._file.read(len(MAGIC))
         is_right = magic == MAGIC
         if not is_right:
-            self._findings.add_finding("magic", "the file doesn't begin with MCAP's magic", 0)
+            self.findings.add_finding("magic", "the file doesn't begin with MCAP's magic", 0)
         self._crc = crc32(magic) if is_right else 0
         end = len(magic) if is_right else 0
         for item in scan(self._file):
@@ -111,13 +100,16 @@ class _FileCheck:
         self._finish(end)
         topics = {number: channel.topic for number, channel in self._definitions.channels.items()}
         counts = {number: int(self._chunks.counts[number]) for number in topics}
-        total = int(self._chunks.counts.sum())
-        is_ended = self._counts[Opcode.DATA_END] > 0
-        return FileFacts(self._findings, self._metadata, total, count_frames(topics, counts), is_ended)
+        self.messages, self.frames = int(self._chunks.counts.sum()), count_frames(topics, counts)
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether it has a DataEnd."""
+        return self._counts[Opcode.DATA_END] > 0
 
     def _gap(self, gap: FileGap) -> None:
         """Report bytes that don't form a record; the CRC includes them."""
-        self._findings.add_finding("record", f"{gap.size} bytes are no record", gap.offset)
+        self.findings.add_finding("record", f"{gap.size} bytes are no record", gap.offset)
         position = self._file.tell()
         self._crc = crc_of(self._file, gap.offset, gap.offset + gap.size, self._crc)
         self._file.seek(position)
@@ -138,7 +130,7 @@ class _FileCheck:
         try:
             self._judge(record)
         except LogError as error:
-            self._findings.add_finding("record", str(error), record.offset)
+            self.findings.add_finding("record", str(error), record.offset)
 
     def _count(self, record: RawRecord) -> None:
         """Count records that a file may have only once."""
@@ -146,28 +138,26 @@ class _FileCheck:
         self._counts[opcode] += 1
         if self._counts[opcode] > 1:
             rule = {Opcode.HEADER: "header", Opcode.DATA_END: "data-end", Opcode.FOOTER: "footer"}[opcode]
-            self._findings.add_finding(rule, f"there is more than one {name_of(opcode)}", record.offset)
+            self.findings.add_finding(rule, f"there is more than one {name_of(opcode)}", record.offset)
 
     def _data_end(self, record: RawRecord) -> None:
         self._count(record)
         stored = int.from_bytes(record.body, "little")
         if not stored:
-            self._findings.without_crc[_DATA_SECTION] += 1
+            self.findings.without_crc[_DATA_SECTION] += 1
         elif stored != self._crc:
-            self._findings.add_finding("data-crc", "the data section fails its CRC", record.offset)
+            self.findings.add_finding("data-crc", "the data section fails its CRC", record.offset)
         self._is_summary = True
         self._crc = 0
 
     def _judge(self, record: RawRecord) -> None:
         opcode = record.opcode
         if opcode not in set(Opcode):
-            self._findings.add_finding(
-                "unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset
-            )
+            self.findings.add_finding("unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset)
             return
         if opcode in (_DATA if self._is_summary else _SUMMARY):
             where = "summary" if self._is_summary else "data section"
-            self._findings.add_finding("place", f"{name_of(opcode)} in the {where}", record.offset)
+            self.findings.add_finding("place", f"{name_of(opcode)} in the {where}", record.offset)
             return
         if self._is_summary:
             self._summary.record(record)
@@ -190,26 +180,26 @@ class _FileCheck:
                 self._attachment(record)
             case Opcode.METADATA:
                 metadata: Metadata = parse(opcode, record.body)
-                self._metadata[metadata.name] = metadata.metadata
+                self.metadata[metadata.name] = metadata.metadata
                 self._summary.metadata(record, metadata.name)
 
     def _header(self, record: RawRecord) -> None:
         self._count(record)
         if record.offset != len(MAGIC):
-            self._findings.add_finding("header", "the Header doesn't come first", record.offset)
+            self.findings.add_finding("header", "the Header doesn't come first", record.offset)
         header: Header = parse(record.opcode, record.body)
         if not header.library:
-            self._findings.add_finding("library", "the Header doesn't say what wrote the file", record.offset)
+            self.findings.add_finding("library", "the Header doesn't say what wrote the file", record.offset)
         if header.profile not in _PROFILES:
-            self._findings.add_finding("profile", f"the profile {header.profile!r} is not a known one", record.offset)
+            self.findings.add_finding("profile", f"the profile {header.profile!r} is not a known one", record.offset)
 
     def _attachment(self, record: RawRecord) -> None:
         attachment = parse(record.opcode, record.body)
         self._summary.attachment(record, attachment)
         if record.body[-4:] == bytes(4):
-            self._findings.without_crc["attachment"] += 1
+            self.findings.without_crc["attachment"] += 1
         elif not attachment_crc_fits(record):
-            self._findings.add_finding(
+            self.findings.add_finding(
                 "attachment-crc", f"the attachment {attachment.name} fails its CRC", record.offset
             )
 
@@ -217,30 +207,30 @@ class _FileCheck:
         """Judge the file as a whole; it was read up to `end`."""
         for opcode, rule in ((Opcode.HEADER, "header"), (Opcode.DATA_END, "data-end"), (Opcode.FOOTER, "footer")):
             if not self._counts[opcode]:
-                self._findings.add_finding(rule, f"there is no {name_of(opcode)}")
+                self.findings.add_finding(rule, f"there is no {name_of(opcode)}")
         self._file.seek(0, 2)
         size = self._file.tell()
         if not self._has_trailer:
-            self._findings.add_finding("magic", "the file doesn't end with a Footer and MCAP's magic", size)
+            self.findings.add_finding("magic", "the file doesn't end with a Footer and MCAP's magic", size)
         elif end < size:
-            self._findings.add_finding("magic", f"{size - end} bytes follow the end", end)
+            self.findings.add_finding("magic", f"{size - end} bytes follow the end", end)
         self._definitions.finish(self._chunks.counts)
         self._summary.finish()
         self._judge_missing_crcs()
 
     def _judge_missing_crcs(self) -> None:
         """Report the parts that no CRC covers. The CRC of the data section covers all that is in it."""
-        missing, chunks = self._findings.without_crc, len(self._chunks.facts)
+        missing, chunks = self.findings.without_crc, len(self._chunks.facts)
         if not missing[_DATA_SECTION]:
             missing = Counter(summary=missing["summary"])
         elif 0 < missing["chunk"] < chunks:
             text = f"{missing['chunk']} of {chunks} chunks have no CRC, nor has the data section"
-            self._findings.add_finding("some-crc", text)
+            self.findings.add_finding("some-crc", text)
         elif chunks and not missing["chunk"] and not self._chunks.has_outside:
             missing = missing - Counter([_DATA_SECTION])  # each chunk has its own
         parts = [f"{count} {part}s" if count > 1 else f"the {part}" for part, count in missing.items() if count]
         if parts:
-            self._findings.add_finding(
+            self.findings.add_finding(
                 "no-crc", f"nothing vouches for these bytes, which have no CRC: {', '.join(parts)}"
             )
 
@@ -278,10 +268,11 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
 def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> LogCheck:
     """Check the log whose first part is `path`, with all its parts. Raises LogError when a file can't be read."""
     parts = parts_of(path)
-    checked = {}
+    checked: dict[int, _FileCheck] = {}
     for number, part in parts.items():
         progress(f"checking {part.name}")
-        checked[number] = check_file(part)
+        with failing_as(f"log {part} can't be read"), open_input(part) as file:
+            checked[number] = _FileCheck(part.name, file)
     whole = Findings(path.name)
     _check_parts(path, checked, whole)
     for facts in checked.values():
@@ -298,7 +289,7 @@ def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> L
     )
 
 
-def _check_parts(path: Path, checked: dict[int, FileFacts], findings: Findings) -> None:
+def _check_parts(path: Path, checked: dict[int, _FileCheck], findings: Findings) -> None:
     """Judge the parts of a log together."""
     last = max(checked)
     for missing in missing_parts(path, checked):
@@ -324,11 +315,11 @@ def _identity(run: dict[str, str]) -> Iterator[tuple[str, str]]:
     return (pair for pair in run.items() if pair[0] != PART_KEY)
 
 
-def _summary(facts: FileFacts) -> dict[str, str]:
+def _summary(facts: _FileCheck) -> dict[str, str]:
     return facts.metadata.get(SUMMARY_METADATA, {})
 
 
-def _check_words(facts: FileFacts) -> None:
+def _check_words(facts: _FileCheck) -> None:
     """Compare the metadata of one of our own logs with its contents, and judge how the log ended."""
     findings, summary = facts.findings, _summary(facts)
     if RUN_METADATA not in facts.metadata:
