@@ -1,8 +1,10 @@
 """A folder and an emulated arm for the commands that run on a bus: each opens the embedded one."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 from click.testing import CliRunner, Result
 from rig import Rig
@@ -54,3 +56,15 @@ class Lab:
 
 def complaints(result: Result) -> list[str]:
     return [line for line in result.stderr.splitlines() if line.startswith("adacd-hil:")]
+
+
+def answered(monkeypatch: pytest.MonkeyPatch, ask: Callable[[], object], answer: str) -> Result:
+    """Type an answer to a question on a terminal; what goes on prints `started`."""
+
+    @click.command()
+    def command() -> None:
+        monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+        ask()
+        print("started")
+
+    return CliRunner().invoke(command, input=answer)

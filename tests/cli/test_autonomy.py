@@ -19,9 +19,9 @@ from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.lab.cli.play_command import may_move_an_arm
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
 from adacd_hil.settings.configuration import Settings, load_settings
-from adacd_hil.settings.run_settings import OperatorSettings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.toml_files import builtin_names
-from adacd_hil.wire.can_interface import is_virtual
+from adacd_hil.wire.can_interface import InterfaceState, is_virtual
 
 
 def changed(**sections: dict[str, object]) -> Settings:
@@ -89,34 +89,24 @@ def test_on_what_may_be_hardware_nothing_is_driven_blind_or_acknowledged_by_itse
     check_autonomy(settings, "virtual", "x")
 
 
-def test_a_second_setting_lets_a_script_acknowledge_on_hardware() -> None:
-    check_autonomy(
-        changed(operator={"acknowledge_after_s": 0.5, "acknowledge_on_hardware": True}), "pcan", "PCAN_USBBUS1"
-    )
-    check_autonomy(load_settings("certified"), "pcan", "PCAN_USBBUS1")
-
-
-def test_a_script_that_only_ends_the_run_is_no_acknowledgement(tmp_path: Path) -> None:
-    mine = tmp_path / "short.toml"
-    mine.write_text('[operator]\nscript = [{ at_s = 1.0, request = "finish" }]\n')
-    check_autonomy(load_settings(str(mine)), "pcan", "PCAN_USBBUS1")
+def test_a_second_setting_lets_a_script_acknowledge_on_hardware_and_one_that_only_ends_the_run_needs_none() -> None:
+    ending = {"script": (RequestSettings(at_s=1.0, request="finish"),)}
+    for operator in ({"acknowledge_after_s": 0.5, "acknowledge_on_hardware": True}, {}, ending):
+        check_autonomy(changed(operator=operator), "pcan", "PCAN_USBBUS1")
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "expected"),
-    [("vcan", "bus", True), ("vxcan", "bus", True), ("slcan", "bus", False), ("can", "bus", False), ("", "bus", False)],
+    ("kind", "expected"), [("vcan", True), ("vxcan", True), ("slcan", False), ("can", False), ("", False)]
 )
 def test_what_kind_an_interface_is_says_whether_a_wire_is_behind_it(
-    monkeypatch: pytest.MonkeyPatch, kind: str, name: str, expected: bool
+    monkeypatch: pytest.MonkeyPatch, kind: str, expected: bool
 ) -> None:
-    from adacd_hil.wire.can_interface import InterfaceState
-
-    monkeypatch.setattr("adacd_hil.wire.can_interface.read_link", lambda _: InterfaceState(name, True, kind, 16, 10))
-    monkeypatch.setattr("adacd_hil.cli.connection.can_interfaces", lambda: [name])
-    assert is_virtual("socketcan", name) == expected
-    assert may_move_an_arm("socketcan", name) != expected
-    assert is_refused("lockstep", "socketcan", name) != expected
-    assert not is_refused("realtime", "socketcan", name)
+    monkeypatch.setattr("adacd_hil.wire.can_interface.read_link", lambda _: InterfaceState("bus", True, kind, 16, 10))
+    monkeypatch.setattr("adacd_hil.cli.connection.can_interfaces", lambda: ["bus"])
+    assert is_virtual("socketcan", "bus") == expected
+    assert may_move_an_arm("socketcan", "bus") != expected
+    assert is_refused("lockstep", "socketcan", "bus") != expected
+    assert not is_refused("realtime", "socketcan", "bus")
 
 
 def is_refused(clock: str, interface: str, channel: str) -> bool:
@@ -128,23 +118,12 @@ def is_refused(clock: str, interface: str, channel: str) -> bool:
     return False
 
 
-def test_an_interface_that_is_not_there_is_not_virtual() -> None:
+def test_lockstep_is_refused_on_an_adapter_and_a_name_that_is_not_there_is_left_to_who_opens_it() -> None:
     assert not is_virtual("socketcan", "no_such_can0")
     assert not is_virtual("pcan", "PCAN_USBBUS1")
-
-
-def test_lockstep_is_refused_on_an_adapter_and_a_name_that_is_not_there_is_left_to_who_opens_it() -> None:
     assert is_refused("lockstep", "pcan", "PCAN_USBBUS1")
     assert not is_refused("lockstep", "socketcan", "no_such_can0")
     assert not is_refused("lockstep", "virtual", "any")
-
-
-def test_ctrl_z_asks_for_the_end_where_an_arm_would_be_left_alone() -> None:
-    asked: list[int] = []
-    with on_interrupt(lambda: asked.append(1), signal.SIGTSTP):
-        signal.raise_signal(signal.SIGTSTP)
-    assert asked == [1]
-    assert signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL
 
 
 IN_BACKGROUND = """
@@ -178,12 +157,15 @@ def test_a_terminal_does_not_stop_who_runs_in_its_background() -> None:
     assert shown
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP])
 def test_a_signal_asks_for_the_end(number: signal.Signals) -> None:
     asked: list[int] = []
-    with on_interrupt(lambda: asked.append(1)):
+    before = signal.getsignal(number)
+    further = [number] if number == signal.SIGTSTP else []  # Ctrl-Z, where an arm would be left alone
+    with on_interrupt(lambda: asked.append(1), *further):
         signal.raise_signal(number)
     assert asked == [1]
+    assert signal.getsignal(number) is before
 
 
 def test_a_command_that_was_started_to_outlive_its_terminal_goes_on_after_a_hang_up() -> None:

@@ -104,15 +104,12 @@ def test_without_a_terminal_lines_are_plain() -> None:
     assert written == ["a\nb\n\n"]
 
 
-def test_a_silent_bus_is_said_to_be() -> None:
-    result = CliRunner().invoke(cli, ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1"))
+def test_a_silent_bus_is_said_to_be_and_json_is_one_snapshot() -> None:
+    words = ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1")
+    result = CliRunner().invoke(cli, words)
     assert (result.exit_code, result.stderr) == (0, "listening on silent\n")
     assert result.stdout == "load 0.0 %, 0 frames, 0 error frames\n\nnothing heard\n"
-
-
-def test_json_is_one_snapshot() -> None:
-    result = CliRunner().invoke(cli, ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1", "--json"))
-    described = json.loads(result.stdout)
+    described = json.loads(CliRunner().invoke(cli, (*words, "--json")).stdout)
     assert (described["frames"], described["messages"], described["not_processed"]) == (0, [], None)
 
 
