@@ -5,15 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_arms import urdf_text
 
 from adacd_hil.lab.offline.recording_import import ForeignRecording, read_recording
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.log.log_files import LogError
 from adacd_hil.settings.schema import ConfigError
 
-ARM = """<robot name="one"><link name="base"/><link name="arm"/>
-<joint name="hinge" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
-<limit lower="-3" upper="3" velocity="5" effort="5"/></joint></robot>"""
+ARM = urdf_text(1, ("0 0 1",), has_masses=False)
 MAP = """[arm]
 urdf = "arm.urdf"
 [columns]
@@ -220,7 +219,7 @@ def test_a_file_that_can_not_be_read_names_the_key_or_the_remedy(
 def test_velocities_that_nobody_filled_in_are_derived(read: Callable[..., ForeignRecording]) -> None:
     head, keys = "t,angle,torque,speed\n", ('time = "t" -> time = "t"\ndq = ["speed"]',)
     idle = read(table(lambda *row: plain(*row) + ",0.0", head), *keys)
-    assert idle.notes == ("the velocity of hinge is always 0 rad/s: velocities are derived from the positions",)
+    assert idle.notes == ("the velocity of joint1 is always 0 rad/s: velocities are derived from the positions",)
     assert np.abs(idle.stretches[0].record.dq).max() == pytest.approx(10.0, rel=0.02)
     filled = read(table(lambda k, q, tau: f"{plain(k, q, tau)},{10.0 * np.cos(0.05 * k)}", head), *keys)
     assert filled.notes == ()
@@ -240,7 +239,7 @@ def test_a_position_that_jumps_by_a_turn_goes_on(read: Callable[..., ForeignReco
     expected = np.array([angle(k) for k in range(COUNT)]) * 2.0 * np.pi / turn
     q = recording.stretches[0].record.q[:, 0]
     np.testing.assert_allclose(q - q[0], expected[: len(q)] - expected[0], atol=1e-6)
-    assert recording.notes == ("the position of hinge jumps by a turn 3 times: it goes on instead",)
+    assert recording.notes == ("the position of joint1 jumps by a turn 3 times: it goes on instead",)
 
 
 def test_positions_that_jump_otherwise_stay_as_they_are(read: Callable[..., ForeignRecording]) -> None:

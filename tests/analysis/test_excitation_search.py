@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from scipy.signal import lsim
 
-from adacd_hil.cli.main import cli
 from adacd_hil.control.motions import Excitation
 from adacd_hil.lab.tune.excitation_search import TOLERANCE, NoExcitationError, Search
 from adacd_hil.scheme.kernel.certified_memory import constants_of
@@ -139,7 +138,7 @@ def test_the_command_writes_a_configuration_with_what_it_found(tmp_path: Path) -
     small = "period_s = 2.4\ncosine = [[-0.04, 0.01], [-0.04, 0.01]]\nsine = [[0.0, 0.0], [0.0, 0.0]]\n"
     config.write_text(f"extends = 'certified'\n[certified]\nlearn_every = 20\n[excitation]\n{small}")
     words = ["excitation", "--config", str(config), "--seconds", "0", "--out", str(out), "--json"]
-    done = CliRunner().invoke(cli, words)
+    done = called(*words)
     assert done.exit_code == 0
     printed = json.loads(done.stdout)
     assert printed["found"]["excitation_Nm2s"] > printed["present"]["excitation_Nm2s"]

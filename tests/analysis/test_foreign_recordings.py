@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from numpy.testing import assert_allclose
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.offline import recorded_columns
 from adacd_hil.lab.offline.recording_identification import identify
 from adacd_hil.lab.offline.recording_import import read_recording
@@ -251,18 +250,17 @@ def test_the_command_says_by_its_status_whether_the_test_is_explained(
     tmp_path: Path, free: Path, touched: Path
 ) -> None:
     mapped = ("--map", str(EXAMPLE / "map.toml"), "--json")
-    explained = CliRunner().invoke(cli, ["identify", str(free), *mapped, "--out", str(tmp_path / "out")])
+    explained = called("identify", free, *mapped, "--out", tmp_path / "out")
     result = json.loads(explained.stdout)
     assert (explained.exit_code, result["test"]["margin"] > 1.0) == (0, True), explained.stderr
     assert json.loads((tmp_path / "out" / "identify.json").read_text()) == result
     assert (tmp_path / "out" / "test.png").stat().st_size > 10_000
     payload = write(tmp_path / "payload.csv", table(3.0) * np.array([1.0, 1.0, 1.0, 1.5, 1.5, 1.0]))
-    other = CliRunner().invoke(cli, ["identify", str(free), "--test", str(payload), *mapped])
+    other = called("identify", free, "--test", payload, *mapped)
     assert other.exit_code == 3
 
 
 def test_a_span_that_ends_before_it_begins_is_usage(free: Path) -> None:
-    arguments = ["identify", str(free), "--map", str(EXAMPLE / "map.toml"), "--from", "5", "--until", "4"]
-    played = CliRunner().invoke(cli, arguments)
+    played = called("identify", free, "--map", EXAMPLE / "map.toml", "--from", "5", "--until", "4")
     assert (played.exit_code, played.stdout) == (2, "")
     assert "--from 5 s is not before --until 4 s" in played.stderr

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foreign_arms import urdf_text
 
 from adacd_hil import api
 from adacd_hil.lab.library.array_detection import ArrayError, OfflineArm, detect, fit
@@ -24,14 +25,11 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "docs" / "examples"
 PERIOD_S = 2e-3
 PUSH_S, PUSH_NM = (9.0, 9.3), 0.5
-ONE_JOINT = """<robot name="one"><link name="base"/><link name="arm"/>
-<joint name="shoulder" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
-<limit lower="-3" upper="3" velocity="5" effort="5"/></joint></robot>"""
 
 
 @pytest.fixture(scope="module")
 def arm() -> OfflineArm:
-    return OfflineArm.from_urdf(ONE_JOINT)
+    return OfflineArm.from_urdf(urdf_text(1, ("0 0 1",), has_masses=False))
 
 
 @pytest.fixture

@@ -6,10 +6,9 @@ from functools import partialmethod
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from hand_made_run import make_certified_run, make_run, react, record, record_truth, touch, with_columns
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.report import run_reading
 from adacd_hil.lab.report.page import left_out_text, shown_contacts
 from adacd_hil.lab.report.report_files import write_run_report
@@ -261,9 +260,7 @@ def test_an_attempt_that_begins_in_two_pieces_begins_once():
 
 @pytest.mark.long
 def test_the_report_of_a_stretch_says_which_it_is(certified, tmp_path):
-    ran = CliRunner().invoke(
-        cli, ["report", str(certified), "--from", "2.9", "--until", "3.93", "--out", str(tmp_path), "--json"]
-    )
+    ran = called("report", certified, "--from", "2.9", "--until", "3.93", "--out", tmp_path, "--json")
     (table,) = json.loads(ran.stdout)
     assert table["stretch"] == {
         "from_s": pytest.approx(2.9),

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from called import called
+from click.testing import Result
 from foreign_arms import AXES, Motion, record, urdf_text
 from joint_state_bags import State, write_mcap
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.offline.map_draft import MapDraft, draft_map
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.log.log_files import LogError
@@ -125,7 +125,7 @@ def test_dates_are_found(tmp_path: Path, motion: Motion) -> None:
 def test_a_period_that_nobody_says_is_left_to_be_written(tmp_path: Path, motion: Motion) -> None:
     _, keys = draft(tmp_path, table("q1,q2,tau1,tau2", motion.q, motion.tau))
     assert keys["sampling"] == {"period_s": 0.0}
-    played = CliRunner().invoke(cli, ["identify", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml")])
+    played = called("identify", tmp_path / "r.csv", "--map", tmp_path / "map.toml")
     assert played.exit_code == 2
     assert "`sampling.period_s`" in played.stderr
 
@@ -188,7 +188,7 @@ def test_the_command_writes_a_map_that_identifies_the_arm_and_replaces_none(tmp_
     recording.write_text(table(heads, 1e3 * motion.t, np.degrees(motion.q), motion.tau))
 
     def identify(*words: object) -> Result:
-        return CliRunner().invoke(cli, ["identify", *map(str, words)])
+        return called("identify", *words)
 
     drafted = identify("--init", recording, urdf)
     assert drafted.exit_code == 0, drafted.stderr
@@ -209,6 +209,6 @@ def test_init_takes_a_recording_and_a_urdf_and_identify_a_map(tmp_path: Path) ->
         (["--init", str(tmp_path / "r.csv")], "--init takes one recording and one URDF"),
         ([str(tmp_path / "r.csv")], "--map is missing"),
     ):
-        played = CliRunner().invoke(cli, ["identify", *arguments])
+        played = called("identify", *arguments)
         assert played.exit_code == 2
         assert said in played.stderr

@@ -5,10 +5,9 @@ import re
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from hand_made_run import A, M, make_run, record
 
-from adacd_hil.cli.main import cli
 from adacd_hil.settings.toml_files import to_toml
 
 pytestmark = pytest.mark.slow
@@ -30,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def report(*given: object):
-    return CliRunner().invoke(cli, ["report", *map(str, given)])
+    return called("report", *given)
 
 
 @pytest.mark.long

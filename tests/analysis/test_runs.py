@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
+from called import called
 from hand_made_run import A, M, make_certified_run, make_run, record
 
-from adacd_hil.cli.main import cli
 from adacd_hil.file_access import create_file
 from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_reading import read_run
@@ -202,10 +201,6 @@ def test_an_emulated_arm_is_another_than_that_on_a_bus() -> None:
     ]
 
 
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
-
-
 @pytest.fixture
 def many(one: Path) -> Path:
     """A folder with a good run, one that is not judged, broken ones, and a link."""
@@ -222,12 +217,12 @@ def many(one: Path) -> Path:
 
 
 def test_a_folder_that_is_not_there_is_one_line(tmp_path: Path) -> None:
-    (line,) = call("runs", tmp_path / "none").stderr.splitlines()
+    (line,) = called("runs", tmp_path / "none").stderr.splitlines()
     assert f"{tmp_path / 'none'} does not exist; `adacd-hil demo` and `run` make runs" in line
 
 
 def test_every_run_is_listed_and_a_broken_one_with_the_reason(many: Path) -> None:
-    found = call("runs", many)
+    found = called("runs", many)
     assert found.exit_code == PARTIAL
     assert "4 runs, 2 not good, 1 not judged" in found.stdout
     assert "2026-11-26T08-00-00: broken: " in found.stdout
@@ -237,7 +232,7 @@ def test_every_run_is_listed_and_a_broken_one_with_the_reason(many: Path) -> Non
 
 def test_runs_are_chosen_by_verdict_date_and_arm(many: Path) -> None:
     def names(*options: str) -> list[str]:
-        return [run["run"] for run in json.loads(call("runs", many, "--json", *options).stdout)["runs"]]
+        return [run["run"] for run in json.loads(called("runs", many, "--json", *options).stdout)["runs"]]
 
     assert names("--verdict", "good") == [DATED]
     assert names("--verdict", "good", "--until", "2026-11-24") == []
@@ -256,14 +251,14 @@ def test_runs_are_chosen_by_verdict_date_and_arm(many: Path) -> None:
     ],
 )
 def test_a_choice_that_makes_no_sense_is_one_line(many: Path, options: tuple[str, ...], line: str) -> None:
-    found = call("runs", many, *options)
+    found = called("runs", many, *options)
     assert found.exit_code == USAGE
     assert line in found.stderr
 
 
 def test_tables_have_a_row_for_each_run_and_fixed_types(many: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
-    call("runs", many, "--csv", tmp_path / "runs.csv", "--parquet", tmp_path / "runs.parquet")
+    called("runs", many, "--csv", tmp_path / "runs.csv", "--parquet", tmp_path / "runs.parquet")
     with (tmp_path / "runs.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["threshold_1_Nm"] for row in rows if row["status"] == GOOD] == ["0.15"]
@@ -275,7 +270,7 @@ def test_tables_have_a_row_for_each_run_and_fixed_types(many: Path, tmp_path: Pa
 
 def test_the_page_leads_to_the_reports_that_there_are(many: Path) -> None:
     (many / DATED / "report.html").write_text("")
-    call("runs", many, "--html", many / "index.html")
+    called("runs", many, "--html", many / "index.html")
     page = (many / "index.html").read_text(encoding="utf-8")
     assert page.count("<a href=") == 1
     assert f'<a href="{DATED}/report.html">{DATED}</a>' in page
@@ -285,10 +280,10 @@ def test_the_page_leads_to_the_reports_that_there_are(many: Path) -> None:
 
 def test_a_trend_is_drawn_and_told(one: Path, tmp_path: Path) -> None:
     shutil.copytree(one, one.parent / "2026-11-26T08-00-00")
-    found = call("trend", one.parent, "--out", tmp_path / "trend.html")
+    found = called("trend", one.parent, "--out", tmp_path / "trend.html")
     assert found.exit_code == 0, found.stderr
     assert (tmp_path / "trend.html").read_text().startswith("<!DOCTYPE")
     assert "Thresholds have not changed since run 2026-11-25T14-22-33 of 2026-11-25 14:22: 2 runs." in found.stdout
-    (arm,) = json.loads(call("trend", one.parent, "--json").stdout)["arms"]
+    (arm,) = json.loads(called("trend", one.parent, "--json").stdout)["arms"]
     assert arm["threshold_Nm"] == {"values": [[0.15, 0.15]] * 2, "std": [[None, None]] * 2, "changes": []}
-    assert call("trend", one.parent, "--out", tmp_path / "trend.svg").exit_code == USAGE
+    assert called("trend", one.parent, "--out", tmp_path / "trend.svg").exit_code == USAGE

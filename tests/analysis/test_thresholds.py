@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from numpy.lib.stride_tricks import sliding_window_view
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.thresholds import free_motion as module
 from adacd_hil.lab.thresholds.detector_comparison import (
     STEPS_NM,
@@ -294,7 +293,7 @@ def test_never_is_a_dash_and_null_and_the_worst_rank():
 
 def thresholds(logs, *arguments):
     with logs_of(logs):
-        return CliRunner().invoke(cli, ["thresholds", *logs, *arguments])
+        return called("thresholds", *logs, *arguments)
 
 
 @pytest.mark.slow

@@ -11,10 +11,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 
 from adacd_hil.cli.embedded_run import Cast, run_embedded
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.lab.tune import tune_roc
 from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, suggested_toml, write_tuning
@@ -471,7 +470,7 @@ def test_the_candidate_without_changes_shows_the_logged_residual(log):
 
 
 def tune(*words):
-    return CliRunner().invoke(cli, ["tune", *map(str, words)])
+    return called("tune", *words)
 
 
 def test_tune_says_that_so_little_motion_shows_nothing(log, tmp_path):

@@ -4,16 +4,15 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
-
-from adacd_hil.cli.main import cli
+from called import called
+from click.testing import Result
 
 CONTRACTS = Path(__file__).parent.parent / "wire" / "contracts"
 FITS, DOES_NOT_FIT, USAGE = 0, 1, 2
 
 
 def budget(*arguments: str) -> Result:
-    return CliRunner().invoke(cli, ["budget", *arguments])
+    return called("budget", *arguments)
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from called import called
+from click.testing import Result
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.commission.host_checks import Status, configuration_checks
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.toml_files import builtin_names
@@ -15,7 +15,7 @@ USAGE = 2
 
 
 def config(*arguments: str) -> Result:
-    return CliRunner().invoke(cli, ["config", *arguments])
+    return called("config", *arguments)
 
 
 def shown(*arguments: str) -> dict[str, tuple[str, str]]:

@@ -1,21 +1,20 @@
 """Doctor's findings about an emulated arm in virtual time; what it sends is judged on the wire."""
 
-import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from own_arm import describe_arm, describe_geared_arm
 from rig import CODEC, Rig
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.cli.doctor_command import as_json, as_text
 from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
 from adacd_hil.lab.commission.host_checks import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.wire.codec import Codec, load_codec
 from firmware_sim.cli.own_devices import rehearse
 from firmware_sim.nodes.device import NmtState
@@ -95,8 +94,7 @@ def test_each_kind_of_host_frame_shows_another_master(can_id: int, doing: str) -
     ],
 )
 def test_on_a_shared_bus_the_neighbours_frames_are_no_other_master(sync: str, can_id: int, status: Status) -> None:
-    base = load_settings("paper")
-    rig = Rig(dataclasses.replace(base, bus=dataclasses.replace(base.bus, arms=2, sync=sync)), is_wall=True)
+    rig = Rig(apply_settings(load_settings("paper"), {"bus.arms": "2", "bus.sync": sync}), is_wall=True)
     patient = examination(rig)
     patient.connect()
     rig.bus.deliver(can_id, b"\x01")
@@ -145,7 +143,7 @@ def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, v
 @pytest.mark.parametrize("describe", [describe_arm, describe_geared_arm])
 def test_devices_of_one_s_own_pass(tmp_path: Path, describe: Callable[[Path], list[str]]) -> None:
     """Sensors of 16 bits have their torque in 0x7130, and the drives theirs in objects of the maker, or in µNm."""
-    written = CliRunner().invoke(cli, ["init", *describe(tmp_path)])
+    written = called("init", *describe(tmp_path))
     assert written.exit_code == 0, written.stderr
     config = str(tmp_path / "my-arm.toml")
     played = rehearse(config, "idle")

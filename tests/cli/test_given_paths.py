@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 import pytest
-from click.testing import CliRunner
+from called import called
 
 from adacd_hil.cli.main import cli as emulator_cli
 from adacd_hil.cli.main import cli as host_cli
@@ -19,7 +19,7 @@ ON_BUS = ("-i", "virtual", "-c", "x")
 
 def refused(*words: str) -> str:
     """Return the line of error of a command that must end for wrong usage."""
-    done = CliRunner().invoke(host_cli, words)
+    done = called(*words)
     assert (done.exit_code, done.stdout) == (USAGE, "")
     return done.stderr.splitlines()[-1]
 

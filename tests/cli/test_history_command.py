@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bus_lab import BUS_MISSING, SHORT_RUN, USAGE, Lab, answered, complaints
-from click.testing import CliRunner
+from bus_lab import BUS_MISSING, SHORT_RUN, USAGE, Lab, answered
+from called import called, complaints
 
 from adacd_hil.cli.commands.run_command import ask_first_run
-from adacd_hil.cli.main import cli
 from adacd_hil.clock import date_ns, wall_ns
 from adacd_hil.control.history_file import (
     HISTORY_FORMAT,
@@ -78,7 +77,7 @@ def test_a_run_adds_its_certificate_and_the_next_one_is_compared_with_it(
     assert log.metadata["history_certificates"] == "1 certificate"
     assert log.attachments["history.toml"] == first_history.encode()
     assert parse_toml(log.attachments["config.toml"])["history"]["friction_Nm"] == list(first.friction_Nm)
-    replayed = CliRunner().invoke(cli, ["replay", str(lab.folder / "run.mcap")])
+    replayed = called("replay", lab.folder / "run.mcap")
     assert "identical, bit for bit" in replayed.stdout + replayed.stderr
 
 
@@ -108,7 +107,7 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_one_line(
     lab: Lab, file: Path, old: str, new: str, says: str
 ) -> None:
     file.write_text(file.read_text().replace(old, new, 1))
-    for result in (lab.run("--history", str(file)), CliRunner().invoke(cli, ["history", str(file)])):
+    for result in (lab.run("--history", str(file)), called("history", file)):
         assert result.exit_code == USAGE
         (line,) = complaints(result)
         assert says in line
@@ -137,9 +136,9 @@ def test_the_picture_replaces_an_earlier_one_and_nothing_else(file: Path, first_
     other.write_text(first_history)
     picture.touch()  # an empty file is nobody's
     for _ in range(2):
-        assert CliRunner().invoke(cli, ["history", str(file), "--plot", str(picture)]).exit_code == 0
+        assert called("history", file, "--plot", picture).exit_code == 0
     for taken in (other, file):
-        result = CliRunner().invoke(cli, ["history", str(file), "--plot", str(taken)])
+        result = called("history", file, "--plot", taken)
         assert result.exit_code == USAGE
         assert taken.read_text() == first_history
 
@@ -202,14 +201,14 @@ def test_a_certificate_of_the_future_is_refused(file: Path) -> None:
 
 def test_it_is_listed_printed_and_drawn(lab: Lab, file: Path) -> None:
     picture = lab.folder / "history.png"
-    listed = CliRunner().invoke(cli, ["history", str(file), "--plot", str(picture)])
+    listed = called("history", file, "--plot", picture)
     assert listed.exit_code == 0
     last = read_history(file).last
     assert last.date_utc in listed.stdout
     assert f"{last.friction_Nm[1]:.3f}" in listed.stdout
     assert "Sensor1" in listed.stdout
     assert picture.read_bytes().startswith(b"\x89PNG")
-    printed = json.loads(CliRunner().invoke(cli, ["history", str(file), "--json"]).stdout)
+    printed = json.loads(called("history", file, "--json").stdout)
     assert printed == json.loads(json.dumps(asdict(read_history(file))))
 
 
@@ -219,7 +218,7 @@ def test_a_run_without_a_certificate_adds_nothing(lab: Lab) -> None:
     result = lab.run("--history", str(path))
     assert "history" not in json.loads(result.stdout)
     assert not path.exists()
-    assert CliRunner().invoke(cli, ["history", str(path)]).exit_code == USAGE
+    assert called("history", path).exit_code == USAGE
 
 
 def test_a_history_that_cannot_be_written_is_partial_and_says_so(lab: Lab) -> None:

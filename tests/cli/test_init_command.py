@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.bus_lab import complaints
-from click.testing import CliRunner, Result
+from called import called, complaints
+from click.testing import Result
 from eds_variants import EdsVariant
 from own_arm import write_sensor_eds
 from rig import Rig, SessionRig
 
-from adacd_hil.cli.main import cli
 from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
@@ -51,7 +50,7 @@ def out(tmp_path: Path) -> Path:
 
 
 def init(out: Path, *arguments: str, typed: str = "") -> Result:
-    return CliRunner().invoke(cli, ["init", str(out), *arguments], input=typed)
+    return called("init", out, *arguments, typed=typed)
 
 
 def written(out: Path) -> Settings:

@@ -3,18 +3,17 @@
 import json
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from log.made_log import SUMMARY, make_log
 from log.recorded_run import make_run, record
 
-from adacd_hil.cli.main import cli
 from firmware_sim.bench.bench_time import TruthLog
 
 WHOLE = make_log()
 
 
 def call(*arguments):
-    result = CliRunner().invoke(cli, ["log", *map(str, arguments)])
+    result = called("log", *arguments)
     return result.exit_code, result.stdout, result.stderr
 
 

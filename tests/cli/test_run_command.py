@@ -4,12 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from bus_lab import BUS_MISSING, SHORT_RUN, Lab, answered, complaints
-from click.testing import CliRunner
+from bus_lab import BUS_MISSING, SHORT_RUN, Lab, answered
+from called import called, complaints
 
 from adacd_hil.cli.commands.run_command import as_text, ask_without_anchor, next_of_run, summarise
 from adacd_hil.cli.embedded_run import resolve, run_embedded
-from adacd_hil.cli.main import cli
 from adacd_hil.scheme.identify.anchor import unanchored_joints
 from adacd_hil.settings.configuration import load_settings
 
@@ -75,7 +74,7 @@ def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
 
 @pytest.mark.parametrize("interface", ["socketcan", "sockercan", "udp_multicast"])
 def test_an_interface_that_cannot_be_used_is_named_before_any_question(interface: str) -> None:
-    result = CliRunner().invoke(cli, ["run", "-i", interface, "-c", "can77", "--config", "certified"])
+    result = called("run", "-i", interface, "-c", "can77", "--config", "certified")
     assert result.exit_code == BUS_MISSING
     assert "torque offset" not in result.stderr
 

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bus_lab import BUS_MISSING, OFFSET, SHORT_RUN, USAGE, Lab, complaints
+from bus_lab import BUS_MISSING, OFFSET, SHORT_RUN, USAGE, Lab
+from called import complaints
 
 from adacd_hil.control.tare_file import read_tare
 

@@ -129,7 +129,6 @@ def test_an_empty_bus_has_nobody() -> None:
         (0x100, "TIME"),
         (0x181, "TPDO1"),
         (0x200, ""),
-        (0x201, "RPDO1"),
         (0x4FF, "TPDO4"),
         (0x581, "SDO response"),
         (0x67F, "SDO request"),
