@@ -11,8 +11,10 @@ from adacd_hil.lab.serial_arm.urdf import SerialArm, read_urdf
 AXES = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0", "0 0 1")
 
 
-def urdf_text(joints: int, axes=AXES, has_masses: bool = True, effort: float = 60.0, density: float = 1.0) -> str:
-    """Write an arm of links of 0.3 m and less and less mass."""
+def urdf_text(
+    joints: int, axes=AXES, has_masses: bool = True, effort: float = 60.0, density: float = 1.0, names=()
+) -> str:
+    """Write an arm of links of 0.3 m and less and less mass; its joints are joint1, joint2 … unless they have names."""
     text = '<robot name="made"><link name="base"/>'
     for i in range(joints):
         mass = 3.0 * density / (1 + i)
@@ -22,7 +24,8 @@ def urdf_text(joints: int, axes=AXES, has_masses: bool = True, effort: float = 6
         )
         text += (
             f'<link name="link{i + 1}">{inertial if has_masses else ""}</link>'
-            f'<joint name="joint{i + 1}" type="revolute"><parent link="{f"link{i}" if i else "base"}"/>'
+            f'<joint name="{names[i] if names else f"joint{i + 1}"}" type="revolute">'
+            f'<parent link="{f"link{i}" if i else "base"}"/>'
             f'<child link="link{i + 1}"/><origin xyz="{0.3 if i else 0.0} 0 0"/><axis xyz="{axes[i]}"/>'
             f'<limit lower="-2" upper="2" velocity="5" effort="{effort}"/></joint>'
         )

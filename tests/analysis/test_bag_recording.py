@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_arms import urdf_text
 from joint_state_bags import State, write_mcap, write_rosbag1, write_rosbag2
 from rosbags.rosbag2 import StoragePlugin
 
@@ -15,16 +16,7 @@ from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.settings.schema import ConfigError
 
 NAMES = ("pan", "lift", "elbow")
-ARM = (
-    '<robot name="three"><link name="link0"/>'
-    + "".join(
-        f'<link name="link{i + 1}"/><joint name="{name}" type="revolute"><parent link="link{i}"/>'
-        f'<child link="link{i + 1}"/><origin xyz="0.3 0 0"/><axis xyz="0 0 1"/>'
-        '<limit lower="-3" upper="3" velocity="5" effort="50"/></joint>'
-        for i, name in enumerate(NAMES)
-    )
-    + "</robot>"
-)
+ARM = urdf_text(3, ("0 0 1",) * 3, has_masses=False, names=NAMES)
 COUNT = 100
 
 

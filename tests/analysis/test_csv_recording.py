@@ -5,15 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_arms import urdf_text
 
 from adacd_hil.lab.offline.recording_import import ForeignRecording, read_recording
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.log.log_files import LogError
 from adacd_hil.settings.schema import ConfigError
 
-ARM = """<robot name="one"><link name="base"/><link name="arm"/>
-<joint name="hinge" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
-<limit lower="-3" upper="3" velocity="5" effort="5"/></joint></robot>"""
+ARM = urdf_text(1, ("0 0 1",), has_masses=False)
 MAP = """[arm]
 urdf = "arm.urdf"
 [columns]
@@ -28,12 +27,20 @@ def wave(k: int) -> tuple[float, float]:
     return round(np.sin(0.05 * k), 4), round(2.0 * np.cos(0.05 * k), 4)
 
 
-def lines(row: Callable[[int, float, float], str], head: str = "t,angle,torque\n") -> list[str]:
-    return [head, *(row(k, *wave(k)) + "\n" for k in range(COUNT))]
+def table(row: Callable[[int, float, float], str], head: str = "t,angle,torque\n") -> str:
+    return head + "".join(row(k, *wave(k)) + "\n" for k in range(COUNT))
 
 
 def plain(k: int, angle: float, torque: float) -> str:
     return f"{0.005 * k:.3f},{angle},{torque}"
+
+
+def with_commas(*row) -> str:
+    return plain(*row).replace(",", ";").replace(".", ",")
+
+
+def dated(k: int, angle: float, torque: float) -> str:
+    return f"2024-05-01T10:00:{0.005 * k:09.6f}Z,{angle},{torque}"
 
 
 @pytest.fixture
@@ -65,58 +72,55 @@ def check(recording: ForeignRecording, tolerance: float = 1e-9) -> None:
 
 FORMS = {
     "semicolons and decimal commas": (
-        lines(lambda k, q, tau: plain(k, q, tau).replace(",", ";").replace(".", ","), "t;angle;torque\n"),
+        table(with_commas, "t;angle;torque\n"),
         ['[csv]\ndelimiter = ";"\ndecimal = ","'],
     ),
-    "milliseconds": (lines(lambda k, q, tau: f"{5 * k},{q},{tau}"), ['[units]\ntime = "ms"']),
-    "dates": (
-        lines(lambda k, q, tau: f"2024-05-01T10:00:{0.005 * k:09.6f}Z,{q},{tau}"),
-        ['[units]\ntime = "iso"'],
-    ),
+    "milliseconds": (table(lambda k, q, tau: f"{5 * k},{q},{tau}"), ['[units]\ntime = "ms"']),
+    "dates": (table(dated), ['[units]\ntime = "iso"']),
     "dates with a blank, and no zone": (
-        lines(lambda k, q, tau: f"2024-05-01 10:00:{0.005 * k:06.3f},{q},{tau}"),
+        table(lambda k, q, tau: f"2024-05-01 10:00:{0.005 * k:06.3f},{q},{tau}"),
         ['[units]\ntime = "iso"'],
     ),
     "ns since 1970": (
-        lines(lambda k, q, tau: f"{1_712_000_000_123_456_789 + 5_000_000 * k},{q},{tau}"),
+        table(lambda k, q, tau: f"{1_712_000_000_123_456_789 + 5_000_000 * k},{q},{tau}"),
         ['[units]\ntime = "ns"'],
     ),
     "blanks": (
-        lines(lambda k, q, tau: f"  {0.005 * k:.3f}   {q} {tau}", "t angle torque\n"),
+        table(lambda k, q, tau: f"  {0.005 * k:.3f}   {q} {tau}", "t angle torque\n"),
         ['[csv]\ndelimiter = " "'],
     ),
-    "a comment before the heads": (lines(plain, "# t,angle,torque\n"), []),
-    "a delimiter at the end of each row": (lines(lambda *row: plain(*row) + ",", "t,angle,torque,\n"), []),
-    "empty lines": (["t,angle,torque\n\n", *lines(plain, "")[1:], "\n\n"], []),
+    "a comment before the heads": (table(plain, "# t,angle,torque\n"), []),
+    "a delimiter at the end of each row": (table(lambda *row: plain(*row) + ",", "t,angle,torque,\n"), []),
+    "empty lines": (table(plain, "t,angle,torque\n\n") + "\n\n", []),
     "a mark of the byte order, and of another system's line ends": (
-        ["\ufeff", *(line.replace("\n", "\r\n") for line in lines(plain))],
+        "\ufeff" + table(plain).replace("\n", "\r\n"),
         [],
     ),
-    "quotes": (lines(lambda k, q, tau: f'"{0.005 * k:.3f}","{q}","{tau}"', '"t","angle","torque"\n'), []),
+    "quotes": (table(lambda k, q, tau: f'"{0.005 * k:.3f}","{q}","{tau}"', '"t","angle","torque"\n'), []),
 }
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_forms_of_a_table_are_read(read: Callable[..., ForeignRecording], form: str) -> None:
     text, keys = FORMS[form]
-    recording = read("".join(text), *keys)
+    recording = read(text, *keys)
     check(recording)
     assert recording.notes == ()
 
 
 def test_a_period_stands_for_the_times(read: Callable[..., ForeignRecording]) -> None:
-    text = "".join(lines(lambda _, q, tau: f"{q},{tau}", "angle,torque\n"))
+    text = table(lambda _, q, tau: f"{q},{tau}", "angle,torque\n")
     period = "[sampling]\nperiod_s = 0.005"
     for keys in ((period, 'time = "t"\n -> '), (period,)):
         recording = read(text, *keys)
         check(recording)
         assert recording.notes == ("no column of times: a row every 0.005 s (sampling.period_s)",)
-    cut = read(text.replace("\n", "\n", 1).replace(f"{wave(100)[0]},{wave(100)[1]}\n", f"{wave(100)[0]}\n"), period)
+    cut = read(text.replace(f"{wave(100)[0]},{wave(100)[1]}\n", f"{wave(100)[0]}\n"), period)
     check(cut, tolerance=2e-3)  # the row that is left out leaves its time
 
 
 def test_times_that_are_missing_without_a_period_name_the_key(read: Callable[..., ForeignRecording]) -> None:
-    text = "".join(lines(lambda _, q, tau: f"{q},{tau}", "angle,torque\n"))
+    text = table(lambda _, q, tau: f"{q},{tau}", "angle,torque\n")
     with pytest.raises(ConfigError, match=r"no column 't'.*`sampling\.period_s`"):
         read(text)
     with pytest.raises(ConfigError, match=r"`columns\.time`.*`sampling\.period_s`"):
@@ -126,13 +130,12 @@ def test_times_that_are_missing_without_a_period_name_the_key(read: Callable[...
 
 
 def test_a_row_of_units_is_compared_with_the_map(read: Callable[..., ForeignRecording]) -> None:
-    body = lines(plain, "")[1:]
-    recording = read("".join(["t,angle,torque\n", "[s],(rad),N m\n", *body]))
+    recording = read(table(plain, "t,angle,torque\n[s],(rad),N m\n"))
     check(recording)
     assert recording.notes == ("row 2 names units ([s], (rad), N m)",)
     for units, said in (("s,deg,Nm", "'deg' for column 'angle'"), ("ms,rad,Nm", "'ms' for column 't'")):
         with pytest.raises(ConfigError, match=f"row of units says {said}, the map"):
-            read("".join(["t,angle,torque\n", units + "\n", *body]))
+            read(table(plain, f"t,angle,torque\n{units}\n"))
 
 
 SPOILT = {
@@ -149,7 +152,7 @@ SPOILT = {
 @pytest.mark.parametrize("kind", SPOILT)
 def test_a_spoilt_row_is_left_out_and_counted(read: Callable[..., ForeignRecording], kind: str) -> None:
     spoil, count, first = SPOILT[kind]
-    recording = read("".join(spoil(lines(plain))))
+    recording = read("".join(spoil(table(plain).splitlines(keepends=True))))
     check(recording, tolerance=2e-3)
     (note,) = recording.notes
     assert note.startswith(count)
@@ -157,7 +160,7 @@ def test_a_spoilt_row_is_left_out_and_counted(read: Callable[..., ForeignRecordi
 
 
 def test_many_doubled_rows_are_no_harm_and_many_spoilt_ones_end_it(read: Callable[..., ForeignRecording]) -> None:
-    rows = lines(plain)
+    rows = table(plain).splitlines(keepends=True)
     doubled = read("".join([rows[0], *(row for row in rows[1:] for _ in range(2))]))
     check(doubled)
     assert doubled.notes[0].startswith("200 rows with the time of the row before")
@@ -171,37 +174,33 @@ def test_many_doubled_rows_are_no_harm_and_many_spoilt_ones_end_it(read: Callabl
 
 REFUSED = {
     "decimal commas": (
-        "".join(lines(lambda *row: plain(*row).replace(",", ";").replace(".", ","), "t;angle;torque\n")),
+        table(with_commas, "t;angle;torque\n"),
         ['[csv]\ndelimiter = ";"'],
         "row 2: column 't' is '0,000', no number: `csv.decimal` = \",\" reads it",
     ),
-    "dates": (
-        "".join(lines(lambda k, q, tau: f"2024-05-01T10:00:{0.005 * k:09.6f}Z,{q},{tau}")),
-        [],
-        '`units.time` = "iso" reads it',
-    ),
+    "dates": (table(dated), [], '`units.time` = "iso" reads it'),
     "milliseconds": (
-        "".join(lines(lambda k, q, tau: f"{5 * k},{q},{tau}")),
+        table(lambda k, q, tau: f"{5 * k},{q},{tau}"),
         [],
         'rows are 5 s apart, 1e-05 to 0.1 s are expected; with `units.time` = "ms" they are 5 ms',
     ),
     "microseconds taken for milliseconds": (
-        "".join(lines(lambda k, q, tau: f"{5000 * k},{q},{tau}")),
+        table(lambda k, q, tau: f"{5000 * k},{q},{tau}"),
         ['[units]\ntime = "ms"'],
         '`units.time` = "us" they are 5000 us',
     ),
     "another delimiter": (
-        "".join(lines(lambda *row: plain(*row).replace(",", "\t"), "t\tangle\ttorque\n")),
+        table(plain).replace(",", "\t"),
         [],
         "has one column; with `csv.delimiter` = '\\t' it has more",
     ),
-    "no positions in the map": ("".join(lines(plain)), ['q = ["angle"]\n -> '], "missing key `columns.q`"),
+    "no positions in the map": (table(plain), ['q = ["angle"]\n -> '], "missing key `columns.q`"),
     "a spreadsheet": (b"PK\x03\x04" + bytes(100), [], "is a spreadsheet or an archive: save it as CSV"),
     "the URDF": (f"{ARM}\n", [], "is a URDF: the map names it, `arm.urdf`"),
     "frames": (b"LOGG" + bytes(100), [], "log export --format csv --dbc"),
     "compressed": (b"\x1f\x8b\x08\x00" + bytes(100), [], "is compressed: gunzip it"),
     "no text": (b"t,angle,torque\n" + b"\xb0\xff\n" * 60, [], "is no text in UTF-8"),
-    "UTF-16": ("".join(lines(plain)).encode("utf-16"), [], "is UTF-16: save it as UTF-8"),
+    "UTF-16": (table(plain).encode("utf-16"), [], "is UTF-16: save it as UTF-8"),
     "nothing": ("", [], "has no column 't'"),
 }
 
@@ -219,10 +218,10 @@ def test_a_file_that_can_not_be_read_names_the_key_or_the_remedy(
 
 def test_velocities_that_nobody_filled_in_are_derived(read: Callable[..., ForeignRecording]) -> None:
     head, keys = "t,angle,torque,speed\n", ('time = "t" -> time = "t"\ndq = ["speed"]',)
-    idle = read("".join(lines(lambda *row: plain(*row) + ",0.0", head)), *keys)
-    assert idle.notes == ("the velocity of hinge is always 0 rad/s: velocities are derived from the positions",)
+    idle = read(table(lambda *row: plain(*row) + ",0.0", head), *keys)
+    assert idle.notes == ("the velocity of joint1 is always 0 rad/s: velocities are derived from the positions",)
     assert np.abs(idle.stretches[0].record.dq).max() == pytest.approx(10.0, rel=0.02)
-    filled = read("".join(lines(lambda k, q, tau: f"{plain(k, q, tau)},{10.0 * np.cos(0.05 * k)}", head)), *keys)
+    filled = read(table(lambda k, q, tau: f"{plain(k, q, tau)},{10.0 * np.cos(0.05 * k)}", head), *keys)
     assert filled.notes == ()
     assert filled.has_velocities
     assert not idle.has_velocities
@@ -236,27 +235,26 @@ def test_a_position_that_jumps_by_a_turn_goes_on(read: Callable[..., ForeignReco
     def wrapped(k: int, _: float, torque: float) -> str:
         return f"{0.005 * k:.3f},{(angle(k) + turn / 2.4) % turn - turn / 2.4:.9f},{torque}"
 
-    recording = read("".join(lines(wrapped)), f'[units]\nq = "{unit}"')
+    recording = read(table(wrapped), f'[units]\nq = "{unit}"')
     expected = np.array([angle(k) for k in range(COUNT)]) * 2.0 * np.pi / turn
     q = recording.stretches[0].record.q[:, 0]
     np.testing.assert_allclose(q - q[0], expected[: len(q)] - expected[0], atol=1e-6)
-    assert recording.notes == ("the position of hinge jumps by a turn 3 times: it goes on instead",)
+    assert recording.notes == ("the position of joint1 jumps by a turn 3 times: it goes on instead",)
 
 
 def test_positions_that_jump_otherwise_stay_as_they_are(read: Callable[..., ForeignRecording]) -> None:
-    jumping = read("".join(lines(lambda k, q, tau: f"{0.005 * k:.3f},{4.0 * (k % 20 == 0)},{tau}")))
+    jumping = read(table(lambda k, q, tau: f"{0.005 * k:.3f},{4.0 * (k % 20 == 0)},{tau}"))
     assert jumping.stretches[0].record.q.max() == pytest.approx(4.0)
     assert jumping.notes == ()
 
 
 def test_times_that_jitter_are_a_note_with_the_period_that_replaces_them(read: Callable[..., ForeignRecording]) -> None:
-    late = lines(lambda k, q, tau: f"{0.005 * k + 0.002 * (k % 2):.3f},{q},{tau}")
-    (note,) = read("".join(late)).notes
+    (note,) = read(table(lambda k, q, tau: f"{0.005 * k + 0.002 * (k % 2):.3f},{q},{tau}")).notes
     assert note.startswith("rows are 3 to 7 ms apart")
     assert "`sampling.period_s` = 0.005" in note
-    assert read("".join(lines(plain))).notes == ()
+    assert read(table(plain)).notes == ()
 
 
 def test_noise_is_at_least_that_of_rounding(read: Callable[..., ForeignRecording]) -> None:
-    recording = read("".join(lines(lambda k, q, tau: f"{0.005 * k:.3f},{q},{round(tau / 0.5) * 0.5}")))
+    recording = read(table(lambda k, q, tau: f"{0.005 * k:.3f},{q},{round(tau / 0.5) * 0.5}"))
     assert recording.noise_Nm[0] == pytest.approx(0.5 / np.sqrt(12.0))

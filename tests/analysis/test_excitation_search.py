@@ -6,17 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from scipy.signal import lsim
 
-from adacd_hil.cli.main import cli
 from adacd_hil.control.motions import Excitation
 from adacd_hil.lab.tune.excitation_search import TOLERANCE, NoExcitationError, Search
 from adacd_hil.scheme.kernel.certified_memory import constants_of
 from adacd_hil.scheme.model.regressor import regressor
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings, TrajectorySettings
-from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.schema import ConfigError, parse
 
 TWO = ((-0.04, 0.01), (-0.04, 0.01))
 NO_SINE = ((0.0, 0.0), (0.0, 0.0))
@@ -32,10 +31,6 @@ def small_settings(**changes) -> Settings:
     )
 
 
-def once(_: int) -> bool:
-    return False
-
-
 @pytest.fixture(scope="module")
 def search() -> Search:
     return Search(small_settings())
@@ -43,7 +38,7 @@ def search() -> Search:
 
 @pytest.fixture(scope="module")
 def found(search: Search) -> ExcitationSettings:
-    return search.run(1, once, iterations=20)
+    return search.run(1, lambda _: False, iterations=20)
 
 
 def test_the_motion_is_the_one_that_the_arm_makes() -> None:
@@ -74,16 +69,12 @@ def test_what_a_motion_shows_is_what_the_scheme_counts() -> None:
         W[n, :, :7] = regressor(q, dq, ddq, 7, 0.0)
     W[:, :, 7:9] = np.eye(2)
     W[:, :, 9:] = np.einsum("ni,ij->nij", np.gradient(W[:, :, :7] @ settings.cad_theta, 1e-3, axis=0), np.eye(2))
-    rows = [lsim(([10.0], [1.0, 10.0]), column, elapsed_s)[1] * each for column, each in columns(W, scale)]
-    X = np.array(rows).reshape(2, len(scale), -1).transpose(1, 0, 2).reshape(len(scale), -1)
+    rows = [lsim(([10.0], [1.0, 10.0]), column, elapsed_s)[1] for column in W.reshape(1400, -1).T]
+    X = np.array(rows).reshape(2, len(scale), -1).transpose(1, 0, 2).reshape(len(scale), -1) * scale[:, None]
     eigenvalues = np.linalg.eigvalsh(1e-3 * X @ X.T)
     figures = search.figures(settings.excitation)
     assert figures.excitation_Nm2s == pytest.approx(eigenvalues[0], rel=0.1)
     assert figures.condition == pytest.approx(eigenvalues[-1] / eigenvalues[0], rel=0.1)
-
-
-def columns(W: np.ndarray, scale: np.ndarray):
-    return ((W[:, i, j], scale[j]) for i in range(2) for j in range(len(scale)))
 
 
 def test_what_is_found_begins_at_rest_in_the_corner(found: ExcitationSettings) -> None:
@@ -95,17 +86,12 @@ def test_what_is_found_begins_at_rest_in_the_corner(found: ExcitationSettings) -
     np.testing.assert_allclose(ddq, 0.0, atol=1e-3)
 
 
-def test_what_is_found_keeps_the_limits(search: Search, found: ExcitationSettings) -> None:
-    figures = search.figures(found)
-    for name, limits in search.limits.by_figure().items():
-        for value, limit in zip(getattr(figures, name), limits, strict=True):
-            assert value <= limit * (1.0 + TOLERANCE)
-
-
-def test_what_is_found_shows_more_than_the_start(search: Search, found: ExcitationSettings) -> None:
+def test_what_is_found_shows_more_than_the_start_within_the_limits(search: Search, found: ExcitationSettings) -> None:
     before, after = search.figures(search.present), search.figures(found)
     assert after.excitation_Nm2s > 2.0 * before.excitation_Nm2s
     assert after.cost < before.cost
+    for name, limits in search.limits.by_figure().items():
+        assert (np.array(getattr(after, name)) <= np.array(limits) * (1.0 + TOLERANCE)).all()
 
 
 def test_a_seed_is_a_result(search: Search) -> None:
@@ -135,34 +121,27 @@ def test_without_a_model_of_the_arm_torque_has_no_limit_and_the_lag_no_column(se
         ({"excitation": ExcitationSettings(2.4, (TWO[0], ()), (NO_SINE[0], ()))}, r"\[2, 0\] harmonics"),
     ],
 )
-def test_what_leaves_nothing_to_search_is_said_in_a_line(changes, words: str) -> None:
-    with pytest.raises(ConfigError, match=words) as raised:
+def test_what_leaves_nothing_to_search_is_said(changes, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
         Search(small_settings(**changes))
-    assert "\n" not in str(raised.value)
 
 
 def test_limits_that_no_motion_keeps_are_said_in_a_line() -> None:
     trajectory = TrajectorySettings(amplitude_deg=(1e-7, 1e-7))
     arm = dataclasses.replace(small_settings().arm, torque_limit_Nm=(0.0, 0.0))
     with pytest.raises(NoExcitationError, match="none of 1 motions keeps the limits"):
-        Search(small_settings(trajectory=trajectory, arm=arm)).run(1, once, iterations=1)
+        Search(small_settings(trajectory=trajectory, arm=arm)).run(1, lambda _: False, iterations=1)
 
 
 def test_the_command_writes_a_configuration_with_what_it_found(tmp_path: Path) -> None:
     config, out = tmp_path / "small.toml", tmp_path / "found" / "mine.toml"
     small = "period_s = 2.4\ncosine = [[-0.04, 0.01], [-0.04, 0.01]]\nsine = [[0.0, 0.0], [0.0, 0.0]]\n"
     config.write_text(f"extends = 'certified'\n[certified]\nlearn_every = 20\n[excitation]\n{small}")
-    done = CliRunner().invoke(
-        cli, ["excitation", "--config", str(config), "--seconds", "0", "--out", str(out), "--json"]
-    )
+    words = ["excitation", "--config", str(config), "--seconds", "0", "--out", str(out), "--json"]
+    done = called(*words)
     assert done.exit_code == 0
     printed = json.loads(done.stdout)
     assert printed["found"]["excitation_Nm2s"] > printed["present"]["excitation_Nm2s"]
     written = load_settings(str(out))
-    assert written.excitation == ExcitationSettings(
-        **{
-            key: value if key == "period_s" else tuple(map(tuple, value))
-            for key, value in printed["excitation"].items()
-        }
-    )
+    assert written.excitation == parse(ExcitationSettings, printed["excitation"])
     assert written.certified.learn_every == 20

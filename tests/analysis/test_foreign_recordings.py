@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from numpy.testing import assert_allclose
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.offline import recorded_columns
 from adacd_hil.lab.offline.recording_identification import identify
 from adacd_hil.lab.offline.recording_import import read_recording
@@ -118,11 +117,9 @@ def test_parameters_torque_and_touches_are_found(free: Path, touched: Path, exam
 def test_what_is_touched_is_not_learnt(touched: Path, example) -> None:
     recording = read_recording(touched, example)
     before, after = recording.free.stretches
-    blur_s = recording.blur_s
-    assert before.start_s + len(before.record.q) * PERIOD_S == pytest.approx(
-        TOUCH_S[0] - 4.5 - blur_s, abs=2 * PERIOD_S
-    )
-    assert after.start_s == pytest.approx(TOUCH_S[1] - 4.5 + blur_s, abs=2 * PERIOD_S)
+    begin_s, end_s = (at_s - 4.5 for at_s in TOUCH_S)
+    free_s = before.start_s + len(before.record.q) * PERIOD_S, after.start_s
+    assert free_s == pytest.approx((begin_s - recording.blur_s, end_s + recording.blur_s), abs=2 * PERIOD_S)
 
 
 def test_a_gap_and_a_missing_value_part_a_recording(tmp_path: Path, example) -> None:
@@ -161,7 +158,6 @@ def test_rotors_are_parameters_only_of_motors(tmp_path: Path, example) -> None:
     ("old", "new", "line"),
     [
         ('time = "time_ms"', 'time = "tme_ms"', "has no column 'tme_ms'; did you mean 'time_ms'?"),
-        ('time = "time_ms"', 'time = "9"', "has no column '9'"),
         ('q = "deg"', 'q = "degree"', "did you mean 'deg'?"),
         ('["j1_mNm", "j2_mNm"]', '["j1_mNm"]', "`columns.tau_J` has 1 values; the arm has 2 moving joints"),
         ("planar-arm.urdf", "none.urdf", "none.urdf: No such file"),
@@ -184,15 +180,10 @@ def rows(joints: str, count: int = 60) -> str:
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("", "has no column 'time_ms'"),
         (HEAD + "\n", "has 0 rows"),
         (
             HEAD + "\n" + "1,2,3,4,5,0\n" * 60,
             "has 1 row, 50 are the least; 59 rows with the time of the row before left out (row 3: 0 s once more)",
-        ),
-        (
-            HEAD + "\n" + "1,2,3,x,5,0\n" * 60,
-            "row 2: column 'j1_mNm' is 'x', no number; 60 rows that can't be read are too many",
         ),
         (HEAD + "\n" + rows("1e300,3"), "column 'j1_deg' is 1e+300 at 0 s, more than 1e+06 rad"),
         (HEAD + "\n" + rows("1,3") + "100,1,-2e12,4,5,0\n", "column 'j2_deg' is -2e+12 at 0.099 s"),
@@ -243,19 +234,15 @@ def test_a_period_that_would_make_too_many_samples_is_refused(tmp_path: Path, fr
         read_recording(free, described)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1e300"/>', r"1e300 is more than 1e\+18"),
-        ('<origin xyz="0.35 0 0"/>', '<origin xyz="0.35 -1e308 0"/>', r"-1e308 is more than 1e\+18"),
-    ],
-)
-def test_a_number_of_the_urdf_that_nothing_can_be_reckoned_with_is_one_line(
-    tmp_path: Path, old: str, new: str, said: str
-) -> None:
-    with pytest.raises(ConfigError, match=said):
-        read_map(copy_example(tmp_path, urdf=(old, new)))
-    largest = ('<origin xyz="0.35 0 0"/>', '<origin xyz="1e18 1e18 1e18"/>')
+def test_a_number_of_the_urdf_that_nothing_can_be_reckoned_with_is_one_line(tmp_path: Path) -> None:
+    axis, origin = '<axis xyz="0 0 1"/>', '<origin xyz="0.35 0 0"/>'
+    for old, new, said in (
+        (axis, axis.replace("1", "1e300"), r"1e300 is more than 1e\+18"),
+        (origin, origin.replace("0 0", "-1e308 0"), r"-1e308 is more than 1e\+18"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            read_map(copy_example(tmp_path, urdf=(old, new)))
+    largest = (origin, '<origin xyz="1e18 1e18 1e18"/>')
     model_of(read_map(copy_example(tmp_path, urdf=largest)).urdf.chain)
 
 
@@ -263,18 +250,17 @@ def test_the_command_says_by_its_status_whether_the_test_is_explained(
     tmp_path: Path, free: Path, touched: Path
 ) -> None:
     mapped = ("--map", str(EXAMPLE / "map.toml"), "--json")
-    explained = CliRunner().invoke(cli, ["identify", str(free), *mapped, "--out", str(tmp_path / "out")])
+    explained = called("identify", free, *mapped, "--out", tmp_path / "out")
     result = json.loads(explained.stdout)
     assert (explained.exit_code, result["test"]["margin"] > 1.0) == (0, True), explained.stderr
     assert json.loads((tmp_path / "out" / "identify.json").read_text()) == result
     assert (tmp_path / "out" / "test.png").stat().st_size > 10_000
     payload = write(tmp_path / "payload.csv", table(3.0) * np.array([1.0, 1.0, 1.0, 1.5, 1.5, 1.0]))
-    other = CliRunner().invoke(cli, ["identify", str(free), "--test", str(payload), *mapped])
+    other = called("identify", free, "--test", payload, *mapped)
     assert other.exit_code == 3
 
 
 def test_a_span_that_ends_before_it_begins_is_usage(free: Path) -> None:
-    arguments = ["identify", str(free), "--map", str(EXAMPLE / "map.toml"), "--from", "5", "--until", "4"]
-    played = CliRunner().invoke(cli, arguments)
+    played = called("identify", free, "--map", EXAMPLE / "map.toml", "--from", "5", "--until", "4")
     assert (played.exit_code, played.stdout) == (2, "")
     assert "--from 5 s is not before --until 4 s" in played.stderr

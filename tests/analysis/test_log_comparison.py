@@ -34,10 +34,6 @@ def contact(time_s: float, **changes: Any) -> Contact:
     return time_s, ContactReport(0, 1, (0, 0), (0.0, 0.0), (0.0, 0.0), True)._replace(**changes)
 
 
-def test_a_place_that_a_later_version_may_have_is_no_trouble() -> None:
-    assert contact_in_words(contact(1.0, force_N=5.0, location=77)) == "1.000 s, link 1, 5.0 N"
-
-
 @pytest.mark.parametrize(
     ("change", "line"),
     [
@@ -110,13 +106,17 @@ def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone() -> No
     ]
 
 
-def test_a_lower_bound_reads_as_one_in_a_comparison() -> None:
-    bound, known = contact(1.0, force_N=-14.7, location=2), contact(1.0, force_N=-14.7, location=1)
-    assert [contact_in_words(each) for each in (bound, known, contact(1.0))] == [
-        "1.000 s, link 1, ≥ 14.7 N",
-        "1.000 s, link 1, -14.7 N",
-        "1.000 s, link 1",
-    ]
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"force_N": -14.7, "location": 2}, ", ≥ 14.7 N"),
+        ({"force_N": -14.7, "location": 1}, ", -14.7 N"),
+        ({"force_N": 5.0, "location": 77}, ", 5.0 N"),  # a place that a later version may have
+        ({}, ""),
+    ],
+)
+def test_a_lower_bound_reads_as_one_in_a_comparison(changes, words: str) -> None:
+    assert contact_in_words(contact(1.0, **changes)) == f"1.000 s, link 1{words}"
 
 
 def test_a_contact_has_one_counterpart_at_most() -> None:

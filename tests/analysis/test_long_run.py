@@ -6,10 +6,9 @@ from functools import partialmethod
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from hand_made_run import make_certified_run, make_run, react, record, record_truth, touch, with_columns
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.report import run_reading
 from adacd_hil.lab.report.page import left_out_text, shown_contacts
 from adacd_hil.lab.report.report_files import write_run_report
@@ -27,8 +26,6 @@ from adacd_hil.score import emulator_truth
 from adacd_hil.score.emulator_truth import TruthTable, read_truth
 from adacd_hil.settings.toml_files import to_toml
 
-PIECE = 333
-
 
 def table_of(read):
     return report_json(evaluate(read.run, read.gathered), read.run.metadata, read.source)
@@ -37,16 +34,10 @@ def table_of(read):
 @pytest.fixture
 def few_kept(monkeypatch):
     """Read in short pieces, and keep next to nothing."""
-    for name, value in (
-        ("BUCKETS", 4),
-        ("TIME_BUCKETS", 4),
-        ("TRACED_CONTACTS", 0),
-        ("ADAPTATIONS", 0),
-        ("_NOISE_CYCLES", 4),
-        ("_WAITING", 700),
-    ):
+    few = {"BUCKETS": 4, "TIME_BUCKETS": 4, "TRACED_CONTACTS": 0, "ADAPTATIONS": 0, "_NOISE_CYCLES": 4, "_WAITING": 700}
+    for name, value in few.items():
         monkeypatch.setattr(run_reading, name, value)
-    in_short_pieces = partialmethod(reader.LogStream.__init__, cycles_per_piece=PIECE)
+    in_short_pieces = partialmethod(reader.LogStream.__init__, cycles_per_piece=333)
     monkeypatch.setattr(reader.LogStream, "__init__", in_short_pieces)
 
 
@@ -175,9 +166,6 @@ def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s()
     assert not truth.contact_link.any()
 
 
-# --- stretches -------------------------------------------------------------------------------------------------------
-
-
 def stretched(path, start_s, end_s, **options):
     return read_run(path, truth_of(path), TimeWindow(start_s, end_s), **options)
 
@@ -229,16 +217,8 @@ def test_a_stretch_beside_the_log_is_a_log_error(certified):
 def test_a_stretch_that_begins_in_the_second_attempt_knows_the_emulators_cycles(log):
     whole = evaluate(read_run(log, truth_of(log)).run)
     assert whole.fault == FaultReason.DRIVE.name
-    (expected,) = (contact for contact in whole.contacts)
-    (found,) = evaluate(stretched(log, 4.0, 9.0).run).contacts
+    (expected,), (found,) = whole.contacts, evaluate(stretched(log, 4.0, 9.0).run).contacts
     assert (found.onset_s, found.delay_ms) == (expected.onset_s, expected.delay_ms)
-
-
-def test_a_log_begins_with_its_first_message(log):
-    assert start_of_log(log) <= 0.2e9
-
-
-# --- where pieces meet -----------------------------------------------------------------------------------------------
 
 
 def scheme_of(cycles, state=SchemeState.MONITOR):
@@ -278,24 +258,9 @@ def test_an_attempt_that_begins_in_two_pieces_begins_once():
     assert attempts.begins.tolist() == [0]
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        (("--from", "5", "--until", "3"), "--from 5 s is not before --until 3 s"),
-        (("--from", "nan"), "--from nan is not a time"),
-        (("--until", "inf"), "--until inf is not a time"),
-    ],
-)
-def test_a_stretch_that_is_none_is_refused_in_one_line(certified, options, line):
-    ran = CliRunner().invoke(cli, ["report", str(certified), *options])
-    assert (ran.exit_code, ran.stderr) == (2, f"adacd-hil: {line}\n")
-
-
 @pytest.mark.long
 def test_the_report_of_a_stretch_says_which_it_is(certified, tmp_path):
-    ran = CliRunner().invoke(
-        cli, ["report", str(certified), "--from", "2.9", "--until", "3.93", "--out", str(tmp_path), "--json"]
-    )
+    ran = called("report", certified, "--from", "2.9", "--until", "3.93", "--out", tmp_path, "--json")
     (table,) = json.loads(ran.stdout)
     assert table["stretch"] == {
         "from_s": pytest.approx(2.9),
@@ -306,9 +271,6 @@ def test_the_report_of_a_stretch_says_which_it_is(certified, tmp_path):
     }
     page = (tmp_path / "report.html").read_text()
     assert "the log from 2.90 s until 5.25 s, widened so that no contact and no adaptation is cut" in page
-
-
-# --- what is shown of many -------------------------------------------------------------------------------------------
 
 
 def test_of_many_contacts_the_first_are_listed_and_those_that_went_wrong(certified):
@@ -327,7 +289,7 @@ def test_of_many_contacts_the_first_are_listed_and_those_that_went_wrong(certifi
 def test_many_adaptations_are_summed_up():
     adaptation_s = dict(zip("ABCDEF", (2.0, 1.0, None, 1.5, 3.0, 1.0), strict=True))
     text = identified_text(adaptation_s, dict.fromkeys(adaptation_s, None), frozenset(), "certified")
-    assert text == "the model was certified in 1.00 to 3.00 s, 5 times, and not certified 1 times"
+    assert "in 1.00 to 3.00 s, 5 times, and not certified 1 times" in text
 
 
 def test_of_many_stays_those_that_are_narrower_than_a_mark_are_drawn_together():

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from foreign_arms import AXES, Motion, record, rigid_torque, urdf_text, write_recording
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.offline.other_readings import is_possible
 from adacd_hil.lab.offline.recording_identification import Identified, identify
 from adacd_hil.lab.offline.recording_import import read_recording
@@ -536,20 +535,20 @@ def test_the_command_says_verdict_rows_left_out_and_the_next_thing_to_do(tmp_pat
     rows = recording.read_text().splitlines(keepends=True)
     recording.write_text("".join([*rows[:901], *rows[900:]]))
     arguments = ["identify", str(recording), "--map", str(described)]
-    played = CliRunner().invoke(cli, arguments)
+    played = called(*arguments)
     assert played.exit_code == 3
     assert "s: NOT explained" in played.stdout
     assert "r.csv: 1 row with the time of the row before left out (row 902: 4.495 s once more)" in played.stdout
     assert "because the torque of joint2 has the other sign" in played.stdout
     assert "next: in the map: `scale.tau_J` = [1, -1]; then identify again" in played.stderr
-    verdict = json.loads(CliRunner().invoke(cli, [*arguments, "--json"]).stdout)["test"]["verdict"]
+    verdict = json.loads(called(*arguments, "--json").stdout)["test"]["verdict"]
     assert not verdict["is_explained"]
     assert verdict["next"] == "in the map: `scale.tau_J` = [1, -1]"
 
 
 def test_json_of_a_recording_without_torque_is_json(tmp_path: Path, upright: Motion) -> None:
     recording, described = write_recording(tmp_path, urdf_text(2, UPRIGHT), replace(upright, tau=0.0 * upright.tau))
-    played = CliRunner().invoke(cli, ["identify", str(recording), "--map", str(described), "--json"])
+    played = called("identify", recording, "--map", described, "--json")
     test = json.loads(played.stdout, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))["test"]
     assert (test["margin"], test["explained"]) == (None, {"joint1": None, "joint2": None})
 

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records, without_cycles, writable
+from log.recorded_run import make_run
+from log.recorded_run import record as record_log
 
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.device.profile import enable_timeout_s
@@ -308,10 +310,7 @@ def test_other_settings_decide_otherwise_about_the_same_motion(log: Path) -> Non
 
 
 def test_a_log_without_its_settings_is_refused(tmp_path: Path) -> None:
-    from log.recorded_run import make_run
-    from log.recorded_run import record as write
-
-    write(tmp_path / "run.mcap", make_run(3))
+    record_log(tmp_path / "run.mcap", make_run(3))
     with pytest.raises(LogError, match=r"no attachment config\.toml"):
         replay(tmp_path / "run.mcap")
 

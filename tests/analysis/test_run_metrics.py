@@ -47,12 +47,6 @@ def test_time_counts_from_motion_start(stays, row, time_s):
     assert make_run(*stays).time_s()[row] == pytest.approx(time_s)
 
 
-def test_skipped_cycles_take_their_time():
-    run = make_run()
-    run.t_ns[60:] += 4_000_000
-    assert run.time_s()[60] == pytest.approx(0.014)
-
-
 def test_the_papers_experiment_has_sections_a_to_e_without_a_gap():
     sections = split_sections(make_run())
     assert {section.label: section.kind for section in sections} == {
@@ -91,12 +85,6 @@ def test_sections_are_lettered_beyond_z(index, label):
 )
 def test_an_adaptation_lasts_from_adapt_to_monitor(stays, times_s):
     assert evaluate(make_run(*stays)).adaptation_s == pytest.approx(times_s)
-
-
-def test_a_fault_has_its_name_and_its_time():
-    run = make_run((A, 10), (SchemeState.FAULT, 5))
-    run.fault[10:] = FaultReason.ADAPT_TIMEOUT
-    assert (evaluate(run).fault, evaluate(run).fault_s) == ("ADAPT_TIMEOUT", pytest.approx(0.010))
 
 
 @pytest.mark.parametrize(("tau_ext_Nm", "delay_ms"), [(0.2, 138.6), (-0.5, 35.7)])
@@ -322,41 +310,32 @@ def contact_run():
     return run
 
 
+def covered_run():
+    run = make_run()
+    return replace(run, truth=replace(run.truth, span=Span(FIRST_CYCLE + 1500, FIRST_CYCLE + 4000)))
+
+
+def stopped_run():
+    return make_run((A, 1000), (M, 1000), (R, 100), (S, 3000), (M, 1000))
+
+
 @pytest.mark.parametrize(
-    ("make", "first", "end"),
+    ("make", "label", "counting", "not_counting"),
     [
-        (contact_run, 2000, 2250 + SETTLING_ROWS),
-        (lambda: react(make_run(), 2000), 2000, 2099 + SETTLING_ROWS),
-        (real_arm, 3000 - SETTLING_ROWS, 3099 + SETTLING_ROWS),
+        (contact_run, "B", (1999, 2251 + SETTLING_ROWS), (2001, 2249 + SETTLING_ROWS)),
+        (lambda: react(make_run(), 2000), "B", (1999, 2100 + SETTLING_ROWS), (2001, 2098 + SETTLING_ROWS)),
+        (real_arm, "B", (2999 - SETTLING_ROWS, 3100 + SETTLING_ROWS), (3001 - SETTLING_ROWS, 3098 + SETTLING_ROWS)),
+        (lambda: make_run(finish_cycle=FIRST_CYCLE + 9000), "E", (8999,), (9000,)),
+        (covered_run, "B", (1500, 4000), (1499, 4001)),
+        (stopped_run, "B", (), (4000,)),
     ],
-    ids=["a contact", "a withdrawal", "of a real arm the time around a detection"],
+    ids=["contact and ten time constants", "withdrawal", "about a real arm's detection", "parking", "truth", "stop"],
 )
-def test_the_residual_leaves_out_what_is_touched_and_ten_time_constants(make, first, end):
-    for row, counts in ((first - 1, True), (first + 1, False), (end - 1, False), (end + 1, True)):
+def test_the_residual_leaves_out_what_is_no_free_motion(make, label, counting, not_counting):
+    for row in (*counting, *not_counting):
         run = make()
         run.tau_ext_hat[row] = (1.0, 1.0)
-        assert (residual(run) == (1.0, 1.0)) is counts, row
-
-
-@pytest.mark.parametrize(("row", "counts"), [(8999, True), (9000, False)])
-def test_the_residual_leaves_out_the_parking_at_the_end(row, counts):
-    run = make_run(finish_cycle=FIRST_CYCLE + 9000)
-    run.tau_ext_hat[row] = [0.09, 0.0]
-    assert (residual(run, "E")[0] == 0.09) is counts
-
-
-@pytest.mark.parametrize(("row", "counts"), [(1499, False), (1500, True), (4000, True), (4001, False)])
-def test_the_residual_leaves_out_what_the_truth_does_not_cover(row, counts):
-    run = make_run()
-    run = replace(run, truth=replace(run.truth, span=Span(FIRST_CYCLE + 1500, FIRST_CYCLE + 4000)))
-    run.tau_ext_hat[row] = (1.0, 1.0)
-    assert (residual(run) == (1.0, 1.0)) is counts
-
-
-def test_the_residual_leaves_out_a_stop():
-    run = make_run((A, 1000), (M, 1000), (R, 100), (S, 3000), (M, 1000))
-    run.tau_ext_hat[4000] = (1.0, 1.0)
-    assert residual(run) == (0.0, 0.0)
+        assert (residual(run, label) == (1.0, 1.0)) is (row in counting), row
 
 
 def test_the_residual_says_over_how_many_cycles():

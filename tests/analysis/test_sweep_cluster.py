@@ -6,11 +6,9 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from hang import HANG_S
 from made_certificates import Authority
-
-from adacd_hil.cli.main import cli
 
 distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -114,7 +112,7 @@ def test_certificates_that_cant_be_used_are_one_line_and_status_2(
     words |= changes
     more = [str(word) for pair in words.items() if pair[1] is not None for word in pair]
     monkeypatch.chdir(tmp_path)
-    refused = CliRunner().invoke(cli, ["sweep", str(log), "--out", str(tmp_path / "out"), *more])
+    refused = called("sweep", log, "--out", tmp_path / "out", *more)
     complaints = [line for line in refused.stderr.splitlines() if not line.startswith("1 row: ")]
     assert (refused.exit_code, len(complaints)) == (2, 1), refused.stderr
     assert reason in complaints[0]
@@ -123,7 +121,7 @@ def test_certificates_that_cant_be_used_are_one_line_and_status_2(
 def test_an_open_scheduler_is_called_open(tmp_path: Path, log: Path, monkeypatch) -> None:
     monkeypatch.setattr("adacd_hil.lab.tune.workers.TIMEOUT_S", 0.1)
     words = ["sweep", str(log), "--scheduler", "tcp://127.0.0.1:1", "--out", str(tmp_path / "out")]
-    refused = CliRunner().invoke(cli, words)
+    refused = called(*words)
     assert refused.exit_code == 1
     assert "tcp://127.0.0.1:1 is open" in refused.stderr
     assert refused.stderr.splitlines()[-1].startswith("adacd-hil: no Dask scheduler at tcp://127.0.0.1:1: ")

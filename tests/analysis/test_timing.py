@@ -128,28 +128,19 @@ def short_run(**changes):
     return with_columns(run, lateness_ns=np.arange(120) * 1000, **changes)
 
 
-def test_the_curves_of_a_cycle_are_its_times_and_its_queues():
-    names = ["time-lateness", "time-compute", "time-sync_to_command", "time-slack", "queues"]
-    assert list(panels_of(short_run())) == names
-
-
-def test_a_single_late_cycle_is_in_its_curve():
-    run = make_run((M, 50_000), clock="realtime", has_truth=False)
-    lateness_ns = np.full(50_000, 5000)
-    lateness_ns[31_417] = 7_000_000
-    (trace,) = panels_of(with_columns(run, lateness_ns=lateness_ns))["time-lateness"].traces
-    assert (trace.values[31_417], trace.values.max()) == (7000.0, 7000.0)
-
-
-def test_a_skipped_period_is_drawn_in_its_cycle():
+def test_a_skipped_period_and_a_single_late_cycle_are_in_their_curves():
     overruns = np.zeros(120, dtype=np.int64)
     overruns[70:] = 2
     (trace,) = panels_of(short_run(overruns=overruns))["skipped"].traces
     assert (np.flatnonzero(trace.values).tolist(), trace.values[70]) == ([70], 2.0)
+    (trace,) = panels_of(short_run())["time-lateness"].traces
+    assert trace.values.tolist() == list(range(120))
 
 
 def test_a_log_has_the_curves_that_it_can_have():
     run = short_run()
+    whole = ["time-lateness", "time-compute", "time-sync_to_command", "time-slack", "queues"]
+    assert list(panels_of(run)) == whole
     assert list(panels_of(like_an_old_log(run))) == ["time-lateness", "time-sync_to_command"]
     lockstep = replace(run, metadata={**run.metadata, "clock": "lockstep"})
-    assert list(panels_of(lockstep)) == ["time-compute", "time-sync_to_command", "time-slack"]
+    assert list(panels_of(lockstep)) == whole[1:4]

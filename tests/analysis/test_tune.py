@@ -11,10 +11,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 
 from adacd_hil.cli.embedded_run import Cast, run_embedded
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.lab.tune import tune_roc
 from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, suggested_toml, write_tuning
@@ -55,24 +54,13 @@ from firmware_sim.scenario.scenario import load_scenario
 M, A = SchemeState.MONITOR, SchemeState.ADAPT
 
 
-# what was counted
-
-
 def test_rates_and_shares_have_exact_bounds():
-    for alarms, hours, most, least in (
-        (0, 10.0, 0.299573, 0.0),
-        (3, 1.0, 7.753657, 0.817692),
-        (3, 2.0, 3.876828, 0.408846),
-        (0, 0.0, math.inf, 0.0),
-    ):
+    for alarms, hours, most, least in ((0, 10.0, 0.299573, 0.0), (3, 2.0, 3.876828, 0.408846), (0, 0.0, math.inf, 0.0)):
         assert rate_bound_per_h(alarms, hours) == pytest.approx(most, rel=1e-5)
         assert least_rate_per_h(alarms, hours) == pytest.approx(least, rel=1e-5)
     shares = {(0, 10): (0.0, 0.308497), (10, 10): (0.691503, 1.0), (8, 10): (0.443905, 0.974789), (0, 0): (0.0, 1.0)}
     for found, bounds in shares.items():
         assert share_bounds(*found) == pytest.approx(bounds, rel=1e-5)
-
-
-# thresholds from one half
 
 
 def observed(seconds=600.0, trials=(), seed=1):
@@ -166,16 +154,11 @@ def test_too_little_motion_gives_the_largest_value_seen_and_says_so():
         choose(made, 1.0)
 
 
-# candidates
-
-
 def test_candidates_change_filter_and_gain_within_what_a_configuration_can_have():
     paper = load_settings("paper")
-    tried = candidates(paper)
-    assert len(tried) == 12
-    assert tried[0] == {}
-    fast = next(each for each in tried if each.get("filter.a_rad_s") == "20.0" and len(each) == 2)
-    assert fast["filter.b_rad_s"] == "20.0"
+    first, *_ = tried = candidates(paper)
+    assert (first, len(tried)) == ({}, 12)
+    assert {"filter.a_rad_s": "20.0", "filter.b_rad_s": "20.0"} in tried
     assert {"estimator.P0": "[2.4, 1.2, 1.2, 0.15, 0.15, 0.15, 0.15]"} in tried
     near_the_end = apply_settings(paper, {"filter.a_rad_s": "400"})
     assert not [each for each in candidates(near_the_end) if each.get("filter.a_rad_s") == "1600.0"]
@@ -185,13 +168,14 @@ def test_candidates_change_filter_and_gain_within_what_a_configuration_can_have(
 
 
 def test_thresholds_become_settings_that_are_never_lower():
-    paper, certified = load_settings("paper"), load_settings("certified")
-    assert thresholds_as_changes(paper, np.array([[0.12344, 1e-5]])) == {"detector.threshold_Nm": "[0.1235, 0.001]"}
-    assert thresholds_as_changes(paper, np.array([[400.0, 0.2]]))["detector.threshold_Nm"].startswith("[100.0, ")
-    raised = thresholds_as_changes(certified, np.array([[2.0]]))
-    assert raised == {"certified.noise_sigmas": "13.01", "certified.model_sigmas": "6.503"}
-    assert set(thresholds_as_changes(certified, np.array([[1e-3]])).values()) == {"1.0"}
-    assert set(thresholds_as_changes(certified, np.array([[1e3]])).values()) == {"50.0"}
+    def changed(name, *thresholds):
+        return thresholds_as_changes(load_settings(name), np.array([thresholds]))
+
+    assert changed("paper", 0.12344, 1e-5) == {"detector.threshold_Nm": "[0.1235, 0.001]"}
+    assert changed("paper", 400.0, 0.2)["detector.threshold_Nm"].startswith("[100.0, ")
+    assert changed("certified", 2.0) == {"certified.noise_sigmas": "13.01", "certified.model_sigmas": "6.503"}
+    assert set(changed("certified", 1e-3).values()) == {"1.0"}
+    assert set(changed("certified", 1e3).values()) == {"50.0"}
 
 
 def hand_made_log(count=400):
@@ -217,13 +201,18 @@ def batch_of(settings, states, **fields):
     return SimpleNamespace(block=block, previous_state=np.array(states, np.uint8))
 
 
-def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_monitors_untouched():
-    settings = load_settings("paper")
+def shown_by(settings, states, late_ns=0, **fields) -> ShownLog:
+    """Give what a candidate shows of the log made by hand; late_ns: of its cycles from 100 on."""
     shown = ShownLog(hand_made_log(), settings)
-    states = [A] * 50 + [M] * 350
+    rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000 + late_ns * (np.arange(400) >= 100))
+    shown.take_stretch(rows, batch_of(settings, states, **fields))
+    return shown
+
+
+def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_monitors_untouched():
     value = np.linspace(0.0, 1.0, 400)[:, None] * [1.0, -2.0]
-    rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
-    shown.take_stretch(rows, batch_of(settings, states, tau_ext_hat=value, threshold=100.0 + np.array([0.0, 0.5])))
+    threshold = 100.0 + np.array([0.0, 0.5])
+    shown = shown_by(load_settings("paper"), [A] * 50 + [M] * 350, tau_ext_hat=value, threshold=threshold)
     peaks = shown.peaks()
     np.testing.assert_allclose(peaks[0, 0], [99 / 399, 2 * 99 / 399 - 0.5], atol=1e-12)
     assert np.isnan(peaks[1:3]).all(), "a block of which a part doesn't count"
@@ -243,28 +232,18 @@ def test_a_block_of_joined_logs_is_for_choosing_as_its_first_cycle_is():
 
 
 def test_a_candidate_that_does_not_monitor_misses_the_contact_and_counts_no_motion():
-    settings = load_settings("paper")
-    shown = ShownLog(hand_made_log(), settings)
-    states = [M] * 100 + [A] * 300
-    rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
-    shown.take_stretch(rows, batch_of(settings, states, tau_ext_hat=1.0, threshold=100.0))
+    shown = shown_by(load_settings("paper"), [M] * 100 + [A] * 300, tau_ext_hat=1.0, threshold=100.0)
     assert np.isfinite(shown.peaks()[:, 0, 0]).tolist() == [True, False, False, False]
     assert [len(contact.since_s) for contact in shown.trials()] == [0]
 
 
 def test_the_certified_scheme_s_statistic_is_the_largest_ratio_to_its_thresholds():
     settings = load_settings("certified")
-    shown = ShownLog(hand_made_log(), settings)
     bank = np.zeros(2 * settings.channel_count)
     bank[3] = -0.3
-    rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000 + np.where(np.arange(400) < 100, 0, 7))
-    shown.take_stretch(rows, batch_of(settings, [M] * 400, tau_ext_bank=bank, threshold_bank=0.2))
-    peaks = shown.peaks()
+    peaks = shown_by(settings, [M] * 400, late_ns=7, tau_ext_bank=bank, threshold_bank=0.2).peaks()
     assert peaks[0].item() == pytest.approx(1.5)
     assert np.isnan(peaks[1:]).all(), "cycles that the log knows nothing of"
-
-
-# which one is suggested
 
 
 def outcome(**changes):
@@ -306,31 +285,24 @@ def test_alarms_in_the_half_to_check_on_and_too_short_a_motion_are_no_fit():
     assert problems_of(candidate(seconds=20.0).choice, outcome(), outcome(), 1.0)[0] == "too little motion for a tail"
 
 
+def with_choice(made, choice=None, **chosen):
+    choice = choice or made.choice
+    return dataclasses.replace(made, choice=dataclasses.replace(choice, chosen=made.choice.chosen._replace(**chosen)))
+
+
 def test_of_the_fit_ones_the_fastest_is_suggested():
     slow, fast, unfit = candidate(4.0), candidate(3.0), candidate(1.0, problems=("1 missed",))
     assert best_of([slow, fast, unfit, candidate(None)]) is fast
     assert best_of([unfit]) is None
-    early, late = (
-        dataclasses.replace(
-            each, choice=dataclasses.replace(each.choice, chosen=each.choice.chosen._replace(delays_ms=d))
-        )
-        for each, d in ((fast, (2.0, 3.0, 8.0)), (slow, (2.0, 3.0, 9.0)))
-    )
+    early, late = (with_choice(fast, delays_ms=delays) for delays in ((2.0, 3.0, 8.0), (2.0, 3.0, 9.0)))
     assert best_of([late, early]) is early
 
 
 def test_a_rate_too_far_from_the_motion_leaves_filter_and_gain_as_they_are():
-    def far(delay_ms, rate_per_h):
-        made = candidate(delay_ms)
-        return dataclasses.replace(
-            made, choice=dataclasses.replace(choose(observed(), rate_per_h), chosen=made.choice.chosen)
-        )
-
-    assert [round(far(1.0, rate).choice.extrapolation, 6) for rate in (0.125, 0.12)] == [96.0, 100.0]
-    own, faster = far(4.0, 0.1), far(3.0, 0.1)
-    assert best_of([own, faster]) is own
-    own, faster = far(4.0, 0.125), far(3.0, 0.125)
-    assert best_of([own, faster]) is faster
+    for rate_per_h, extrapolation, is_kept in ((0.12, 100.0, True), (0.125, 96.0, False)):
+        own, faster = (with_choice(candidate(ms), choose(observed(), rate_per_h)) for ms in (4.0, 3.0))
+        assert own.choice.extrapolation == pytest.approx(extrapolation)
+        assert best_of([own, faster]) is (own if is_kept else faster)
 
 
 def tuning_of(best, rate_per_h=1.0, path="run.mcap", **changes):
@@ -342,27 +314,22 @@ def tuning_of(best, rate_per_h=1.0, path="run.mcap", **changes):
 
 
 def test_the_suggestion_is_a_configuration_of_the_changed_keys_with_where_they_come_from(tmp_path):
-    best = candidate(
-        changes={"filter.a_rad_s": "20.0", "filter.b_rad_s": "10.0", "detector.threshold_Nm": "[0.2, 0.3]"}
-    )
+    changes = {"filter.a_rad_s": "20.0", "filter.b_rad_s": "10.0", "detector.threshold_Nm": "[0.2, 0.3]"}
+    best = candidate(changes=changes)
     tuning = tuning_of(best, path="a\nb.mcap", settings={"arm.profile": "M", "termination.beta_Nm": "0.2"})
     text = suggested_toml(tuning, best, "paper", load_settings("paper", "M"))
-    file = tmp_path / "tuned.toml"
-    file.write_text(text)
-    settings = load_settings(str(file))
-    assert settings.filter.a_rad_s == 20.0
-    assert settings.detector.threshold_Nm == (0.2, 0.3)
-    assert settings == dataclasses.replace(apply_settings(load_settings("paper", "M"), best.changes), name="tuned")
+    (tmp_path / "tuned.toml").write_text(text)
+    settings = load_settings(str(tmp_path / "tuned.toml"))
+    assert settings == dataclasses.replace(apply_settings(load_settings("paper", "M"), changes), name="tuned")
     rows = [line for line in text.splitlines() if line and not line.startswith("#")]
     assert rows == [
         'extends = "paper"', "[arm]", 'profile = "M"', "[filter]", "a_rad_s = 20.0", "[detector]",
         "threshold_Nm = [0.2, 0.3]",
     ]  # fmt: skip
     for words in (
-        "version",
-        "SHA-256 " + "ab" * 32, "0.0020 h", "a?b.mcap", "1 false alarms per hour", "tail model, extrapolated 12-fold",
-        "Checked on: 0 false alarms in 0.0833 h, 95 % bound 35.9 per hour; 1 of 1 contacts found (3 to 100 %)",
-        "not shown", "2 adaptations of 5.00 to 6.00 s, 0 missed, 0 false alarms, after 3.0 ms", "termination.beta_Nm",
+        "version", "SHA-256 " + "ab" * 32, "0.0020 h", "a?b.mcap", "1 false alarms per hour", "extrapolated 12-fold",
+        "0 false alarms in 0.0833 h, 95 % bound 35.9 per hour; 1 of 1 contacts found (3 to 100 %)", "not shown",
+        "2 adaptations of 5.00 to 6.00 s, 0 missed, 0 false alarms, after 3.0 ms", "termination.beta_Nm",
     ):  # fmt: skip
         assert words in text
 
@@ -393,9 +360,6 @@ def test_the_report_has_the_figures_and_what_they_show(tmp_path):
         write_tuning(tuning_of(blind), tmp_path / "file")
 
 
-# a log
-
-
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     """Five seconds of the paper's scheme in a hurry: it has adapted in less than one, and is pushed once."""
@@ -413,10 +377,6 @@ def log(tmp_path_factory):
     settings = dataclasses.replace(apply_settings(load_settings("paper"), hasty), operator=operator)
     summary, _ = run_embedded(Cast(settings, load_scenario(str(file), "P", None)), "lockstep", folder)
     return summary.log.path
-
-
-def log_settings(log):
-    return LogSource(log).settings
 
 
 def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
@@ -469,7 +429,7 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
     (after,) = read_logs([log], stretch=TimeWindow(at_s + 0.001))
     assert after.windows == ()
     assert after.t_ns[-1] == whole.t_ns[-1]
-    done = CliRunner().invoke(cli, ["tune", str(log), "--from", str(at_s - 1.0), "--until", str(at_s), "--json"])
+    done = tune(log, "--from", at_s - 1.0, "--until", at_s, "--json")
     found = json.loads(done.stdout)
     assert done.exit_code == 3, done.output
     assert (found["logs"][0]["contacts"], found["own"]["adaptations"]) == (0, 0)
@@ -487,10 +447,9 @@ def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
 def test_every_other_log_is_for_choosing(log, tmp_path):
     for name in ("run.mcap", "truth.mcap"):
         shutil.copy(log.with_name(name), tmp_path / name)
-    first, second = read_logs([log, tmp_path / "run.mcap"])
-    assert first.is_chosen_on.all()
-    assert not second.is_chosen_on.any()
-    assert [window.is_chosen_on for window in first.windows + second.windows] == [True, False]
+    logs = read_logs([log, tmp_path / "run.mcap"])
+    assert [set(each.is_chosen_on) for each in logs] == [{True}, {False}]
+    assert [window.is_chosen_on for each in logs for window in each.windows] == [True, False]
 
 
 def test_the_candidate_without_changes_shows_the_logged_residual(log):
@@ -510,14 +469,17 @@ def test_the_candidate_without_changes_shows_the_logged_residual(log):
         assert 20 < len(rises.since_s) < known.sum()
 
 
+def tune(*words):
+    return called("tune", *words)
+
+
 def test_tune_says_that_so_little_motion_shows_nothing(log, tmp_path):
-    (tmp_path / "hasty.toml").write_text(to_toml(log_settings(log)).replace('name = "paper"', 'name = "hasty"'))
-    arguments = ["tune", str(log.parent), "--out", str(tmp_path / "tuned.toml")]
-    done = CliRunner().invoke(cli, [*arguments, "--json", "--config", str(tmp_path / "hasty.toml")])
+    config, out = tmp_path / "hasty.toml", tmp_path / "tuned.toml"
+    config.write_text(to_toml(LogSource(log).settings).replace('name = "paper"', 'name = "hasty"'))
+    done = tune(log.parent, "--out", out, "--json", "--config", config)
     assert done.exit_code == 3, done.output
     found = json.loads(done.stdout)
-    assert found["suggested"] is None
-    assert not (tmp_path / "tuned.toml").exists()
+    assert (found["suggested"], out.exists()) == (None, False)
     assert (found["own"]["missed"], found["own"]["false_alarms"]) == (0, 0)
     assert len(found["candidates"]) == 12
     assert {"too little motion for a tail"} <= {word for each in found["candidates"] for word in each["problems"]}
@@ -526,28 +488,24 @@ def test_tune_says_that_so_little_motion_shows_nothing(log, tmp_path):
 
 def test_without_truth_only_thresholds_are_looked_for(log, tmp_path):
     shutil.copy(log, tmp_path / "run.mcap")
-    done = CliRunner().invoke(cli, ["tune", str(tmp_path)])
+    done = tune(tmp_path)
     assert done.exit_code == 3, done.output
     assert "contacts and delays are not known" in done.stdout
     assert "filter.a_rad_s" not in done.stdout
 
 
-def test_what_can_not_be_tuned_is_said_in_one_line(log, tmp_path):
-    cases = {
-        ("tune", str(log), str(log)): (2, "a log is given twice"),
-        ("tune", str(tmp_path / "no.mcap")): (1, "no.mcap"),
-        ("tune", str(log), "--config", "papre"): (2, "did you mean 'paper'"),
-        ("tune", str(log), "--config", "paper"): (1, "with the settings to start from"),
-    }
-    for arguments, (code, words) in cases.items():
-        done = CliRunner().invoke(cli, list(arguments))
+def test_what_can_not_be_tuned_is_said_in_one_line(log):
+    for words, code, said in (
+        ((log, log), 2, "a log is given twice"),
+        ((log, "--config", "paper"), 1, "with the settings to start from"),
+    ):
+        done = tune(*words)
         assert done.exit_code == code
-        assert words in done.stderr.splitlines()[-1]
-        assert "Traceback" not in done.output
+        assert said in done.stderr.splitlines()[-1]
 
 
 def test_logs_of_different_settings_are_not_tuned_together(log, monkeypatch):
-    own = log_settings(log)
+    own = LogSource(log).settings
     sources = iter([own, apply_settings(own, {"filter.a_rad_s": "12"})])
     monkeypatch.setattr(tune_roc, "LogSource", lambda _: SimpleNamespace(settings=next(sources)))
     with pytest.raises(LogError, match=r"different settings, such as filter.a_rad_s"):

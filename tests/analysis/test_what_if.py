@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import (
     apply_settings,
@@ -23,26 +23,24 @@ def test_a_number_stands_for_a_list_of_it() -> None:
 
 
 def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken() -> None:
-    changes = {
-        "detector.threshold_Nm": "[0.1, 0.2]",
-        "filter.a_rad_s": "50",
-        "estimator.law": '"gradient"',
-        "scheme": "certified",
-        "certified.cutoffs_rad_s": "[5, 20, 80]",
-        "operator.script": '[{at_s = 1.5, request = "finish"}]',
-    }
-    changed = apply_settings(PAPER, changes)
-    assert changed.detector.threshold_Nm == (0.1, 0.2)
-    assert changed.filter.a_rad_s == 50.0
-    assert changed.estimator.law == "gradient"
-    assert changed.scheme == "certified"
+    changed = apply_settings(
+        PAPER,
+        {
+            "detector.threshold_Nm": "[0.1, 0.2]",
+            "filter.a_rad_s": "50",
+            "estimator.law": '"gradient"',
+            "scheme": "certified",
+            "certified.cutoffs_rad_s": "[5, 20, 80]",
+            "operator.script": '[{at_s = 1.5, request = "finish"}]',
+            "devices.quick_stop_option": "6",  # which was unset
+        },
+    )
+    assert (changed.detector.threshold_Nm, changed.filter.a_rad_s) == ((0.1, 0.2), 50.0)
+    assert (changed.estimator.law, changed.scheme) == ("gradient", "certified")
     assert changed.certified.cutoffs_rad_s == (5.0, 20.0, 80.0)
     assert [(entry.at_s, entry.request) for entry in changed.operator.script] == [(1.5, "finish")]
+    assert changed.devices.quick_stop_option == 6
     assert changed.trajectory == PAPER.trajectory
-
-
-def test_a_setting_that_is_unset_can_be_set() -> None:
-    assert apply_settings(PAPER, {"devices.quick_stop_option": "6"}).devices.quick_stop_option == 6
 
 
 @pytest.mark.parametrize(
@@ -85,29 +83,24 @@ def test_a_change_without_key_or_value_is_refused(given: str) -> None:
 
 def test_another_configuration_keeps_what_made_the_numbers_of_the_log() -> None:
     tared = replace(PAPER.arm, torque_offset_Nm=(0.3, -0.2), torque_offset_std_Nm=(0.01, 0.01), sign=(-1, 1))
-    own = replace(PAPER, arm=tared, bus=replace(PAPER.bus, heartbeat_ms=200))
-    own = apply_settings(own, {"realtime.sample_period": "nominal"})
+    own = apply_settings(replace(PAPER, arm=tared), {"bus.heartbeat_ms": "200", "realtime.sample_period": "nominal"})
     kept = keep_facts(own, load_settings("certified"))
-    assert kept.scheme == "certified"
-    assert kept.arm.torque_offset_Nm == (0.3, -0.2)
-    assert kept.arm.torque_offset_std_Nm == (0.01, 0.01)
-    assert kept.arm.sign == (-1, 1)
-    assert kept.bus == own.bus
-    assert kept.realtime.sample_period == "nominal"
+    assert (kept.scheme, kept.bus, kept.realtime.sample_period) == ("certified", own.bus, "nominal")
+    for name in ("torque_offset_Nm", "torque_offset_std_Nm", "sign"):
+        assert getattr(kept.arm, name) == getattr(tared, name)
 
 
-def test_what_the_motors_hold_is_another_configurations_to_say_only_where_the_log_does_not() -> None:
-    braked = apply_settings(load_settings("certified"), {"arm.holding_torque_Nm": "[8.0, 4.0]"})
-    free = apply_settings(PAPER, {"arm.holding_torque_Nm": "[0.0, 0.0]"})
-    assert keep_facts(free, braked).arm.holding_torque_Nm == (0.0, 0.0)
-    assert keep_facts(PAPER, braked).arm.holding_torque_Nm == (8.0, 4.0)
+@pytest.mark.parametrize(
+    ("key", "own", "other"),
+    [("holding_torque_Nm", (0.0, 0.0), (8.0, 4.0)), ("position_torque_Nm", 0.1, 0.2)],
+)
+def test_what_is_known_of_an_arm_is_another_configurations_to_say_only_where_the_log_does_not(key, own, other) -> None:
+    def saying(settings: Settings, value: object) -> Settings:
+        return replace(settings, arm=replace(settings.arm, **{key: value}))
 
-
-def test_how_much_depends_on_the_place_is_another_configurations_to_say_only_where_the_log_does_not() -> None:
-    cabled = apply_settings(load_settings("certified"), {"arm.position_torque_Nm": "0.2"})
-    own = apply_settings(PAPER, {"arm.position_torque_Nm": "0.1"})
-    assert keep_facts(own, cabled).arm.position_torque_Nm == 0.1
-    assert keep_facts(PAPER, cabled).arm.position_torque_Nm == 0.2
+    theirs = saying(load_settings("certified"), other)
+    assert getattr(keep_facts(saying(PAPER, own), theirs).arm, key) == own
+    assert getattr(keep_facts(PAPER, theirs).arm, key) == other
 
 
 def test_changed_settings_are_listed_by_key_with_both_values() -> None:

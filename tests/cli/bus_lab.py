@@ -1,13 +1,15 @@
 """A folder and an emulated arm for the commands that run on a bus: each opens the embedded one."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
+from called import called
 from click.testing import CliRunner, Result
 from rig import Rig
 
-from adacd_hil.cli.main import cli
 from adacd_hil.clock import Clock
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.settings.schema import parse
@@ -41,16 +43,24 @@ class Lab:
         return rig.bus
 
     def tare(self, *arguments: str) -> Result:
-        return CliRunner().invoke(cli, ["tare", *ON_BUS, "--seconds", "0.3", "--out", str(self.tare_file), *arguments])
+        return called("tare", *ON_BUS, "--seconds", "0.3", "--out", self.tare_file, *arguments)
 
     def run(self, *arguments: str) -> Result:
         config = ("--config", str(self.settings_file), "--out", str(self.folder))
-        return CliRunner().invoke(cli, ["run", *ON_BUS, "--json", *config, *arguments])
+        return called("run", *ON_BUS, "--json", *config, *arguments)
 
     @property
     def log(self) -> RunLog:
         return read_log(self.folder / "run.mcap")
 
 
-def complaints(result: Result) -> list[str]:
-    return [line for line in result.stderr.splitlines() if line.startswith("adacd-hil:")]
+def answered(monkeypatch: pytest.MonkeyPatch, ask: Callable[[], object], answer: str) -> Result:
+    """Type an answer to a question on a terminal; what goes on prints `started`."""
+
+    @click.command()
+    def command() -> None:
+        monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+        ask()
+        print("started")
+
+    return CliRunner().invoke(command, input=answer)

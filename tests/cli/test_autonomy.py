@@ -10,24 +10,20 @@ from pathlib import Path
 
 import can
 import pytest
-from click.testing import CliRunner
+from called import called
 
 from adacd_hil.cli.connection import check_autonomy, check_clock, on_interrupt
 from adacd_hil.cli.embedded_run import USER, resolve
-from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.lab.cli.play_command import may_move_an_arm
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings
+from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.settings.toml_files import builtin_names
-from adacd_hil.wire.can_interface import is_virtual
+from adacd_hil.wire.can_interface import InterfaceState, is_virtual
 
-
-def changed(**sections: dict[str, object]) -> Settings:
-    settings = load_settings("certified")
-    parts = {name: dataclasses.replace(getattr(settings, name), **values) for name, values in sections.items()}
-    return dataclasses.replace(settings, **parts)
+CERTIFIED = load_settings("certified")
 
 
 def test_only_the_demo_s_own_configurations_act_by_script() -> None:
@@ -52,7 +48,7 @@ def test_a_configuration_without_a_script_gets_the_demo_s_user(tmp_path: Path) -
 
 
 def test_on_what_may_be_hardware_no_scenario_s_user_acknowledges() -> None:
-    result = CliRunner().invoke(cli, ["run", "-i", "slcan", "-c", "/dev/null", "--scenario", "paper"])
+    result = called("run", "-i", "slcan", "-c", "/dev/null", "--scenario", "paper")
     assert result.exit_code == ExitCode.USAGE
     assert result.stderr.splitlines() == [
         "adacd-hil: --scenario paper plays the user of an emulated arm; slcan /dev/null may be hardware: leave it out"
@@ -72,51 +68,48 @@ def test_an_emulated_arm_says_what_its_motors_hold_unless_the_configuration_does
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("key", "value", "words"),
     [
-        (changed(bus={"max_age_cycles": 6}), "`bus.max_age_cycles` = 6 lets an arm move without data"),
-        (changed(data={"blind_cycles": 6}), "`data.blind_cycles` = 6 lets an arm move without data"),
-        (changed(operator={"acknowledge_after_s": 0.5}), "`operator.acknowledge_after_s` = 0.5 acknowledges by itself"),
-        (changed(operator={"acknowledge_faults": 1}), "`operator.acknowledge_faults` = 1 acknowledges by itself"),
+        ("bus.max_age_cycles", "6", "lets an arm move without data"),
+        ("data.blind_cycles", "6", "lets an arm move without data"),
+        ("operator.acknowledge_after_s", "0.5", "acknowledges by itself"),
+        ("operator.acknowledge_faults", "1", "acknowledges by itself"),
     ],
 )
 def test_on_what_may_be_hardware_nothing_is_driven_blind_or_acknowledged_by_itself(
-    settings: Settings, words: str
+    key: str, value: str, words: str
 ) -> None:
-    with pytest.raises(CommandError, match=words.replace("`", ".")) as refused:
+    settings = apply_settings(CERTIFIED, {key: value})
+    with pytest.raises(CommandError, match=f"`{key}` = {value} {words}") as refused:
         check_autonomy(settings, "pcan", "PCAN_USBBUS1")
     assert refused.value.code is ExitCode.USAGE
     check_autonomy(settings, "virtual", "x")
 
 
-def test_a_second_setting_lets_a_script_acknowledge_on_hardware() -> None:
-    check_autonomy(
-        changed(operator={"acknowledge_after_s": 0.5, "acknowledge_on_hardware": True}), "pcan", "PCAN_USBBUS1"
-    )
-    check_autonomy(load_settings("certified"), "pcan", "PCAN_USBBUS1")
-
-
-def test_a_script_that_only_ends_the_run_is_no_acknowledgement(tmp_path: Path) -> None:
-    mine = tmp_path / "short.toml"
-    mine.write_text('[operator]\nscript = [{ at_s = 1.0, request = "finish" }]\n')
-    check_autonomy(load_settings(str(mine)), "pcan", "PCAN_USBBUS1")
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"operator.acknowledge_after_s": "0.5", "operator.acknowledge_on_hardware": "true"},
+        {"operator.script": '[{ at_s = 1.0, request = "finish" }]'},
+    ],
+)
+def test_a_script_acknowledges_on_hardware_by_a_second_setting_and_ends_a_run_without(changes: dict[str, str]) -> None:
+    check_autonomy(apply_settings(CERTIFIED, changes), "pcan", "PCAN_USBBUS1")
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "expected"),
-    [("vcan", "bus", True), ("vxcan", "bus", True), ("slcan", "bus", False), ("can", "bus", False), ("", "bus", False)],
+    ("kind", "expected"), [("vcan", True), ("vxcan", True), ("slcan", False), ("can", False), ("", False)]
 )
 def test_what_kind_an_interface_is_says_whether_a_wire_is_behind_it(
-    monkeypatch: pytest.MonkeyPatch, kind: str, name: str, expected: bool
+    monkeypatch: pytest.MonkeyPatch, kind: str, expected: bool
 ) -> None:
-    from adacd_hil.wire.can_interface import InterfaceState
-
-    monkeypatch.setattr("adacd_hil.wire.can_interface.read_link", lambda _: InterfaceState(name, True, kind, 16, 10))
-    monkeypatch.setattr("adacd_hil.cli.connection.can_interfaces", lambda: [name])
-    assert is_virtual("socketcan", name) == expected
-    assert may_move_an_arm("socketcan", name) != expected
-    assert is_refused("lockstep", "socketcan", name) != expected
-    assert not is_refused("realtime", "socketcan", name)
+    monkeypatch.setattr("adacd_hil.wire.can_interface.read_link", lambda _: InterfaceState("bus", True, kind, 16, 10))
+    monkeypatch.setattr("adacd_hil.cli.connection.can_interfaces", lambda: ["bus"])
+    assert is_virtual("socketcan", "bus") == expected
+    assert may_move_an_arm("socketcan", "bus") != expected
+    assert is_refused("lockstep", "socketcan", "bus") != expected
+    assert not is_refused("realtime", "socketcan", "bus")
 
 
 def is_refused(clock: str, interface: str, channel: str) -> bool:
@@ -128,23 +121,12 @@ def is_refused(clock: str, interface: str, channel: str) -> bool:
     return False
 
 
-def test_an_interface_that_is_not_there_is_not_virtual() -> None:
+def test_lockstep_is_refused_on_an_adapter_and_a_name_that_is_not_there_is_left_to_who_opens_it() -> None:
     assert not is_virtual("socketcan", "no_such_can0")
     assert not is_virtual("pcan", "PCAN_USBBUS1")
-
-
-def test_lockstep_is_refused_on_an_adapter_and_a_name_that_is_not_there_is_left_to_who_opens_it() -> None:
     assert is_refused("lockstep", "pcan", "PCAN_USBBUS1")
     assert not is_refused("lockstep", "socketcan", "no_such_can0")
     assert not is_refused("lockstep", "virtual", "any")
-
-
-def test_ctrl_z_asks_for_the_end_where_an_arm_would_be_left_alone() -> None:
-    asked: list[int] = []
-    with on_interrupt(lambda: asked.append(1), signal.SIGTSTP):
-        signal.raise_signal(signal.SIGTSTP)
-    assert asked == [1]
-    assert signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL
 
 
 IN_BACKGROUND = """
@@ -178,12 +160,15 @@ def test_a_terminal_does_not_stop_who_runs_in_its_background() -> None:
     assert shown
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP])
 def test_a_signal_asks_for_the_end(number: signal.Signals) -> None:
     asked: list[int] = []
-    with on_interrupt(lambda: asked.append(1)):
+    before = signal.getsignal(number)
+    further = [number] if number == signal.SIGTSTP else []  # Ctrl-Z, where an arm would be left alone
+    with on_interrupt(lambda: asked.append(1), *further):
         signal.raise_signal(number)
     assert asked == [1]
+    assert signal.getsignal(number) is before
 
 
 def test_a_command_that_was_started_to_outlive_its_terminal_goes_on_after_a_hang_up() -> None:
@@ -205,7 +190,7 @@ def test_an_arm_that_has_a_host_is_left_to_it(command: str, tmp_path: Path, monk
     monkeypatch.setattr("adacd_hil.control.session.request_realtime", lambda _: RealtimeGrant(scheduler_name()))
     with can.Bus(command, interface="virtual") as other:
         heartbeat = other.send_periodic(can.Message(arbitration_id=0x77F, data=[5], is_extended_id=False), 0.05)
-        refused = CliRunner().invoke(cli, [command, "-i", "virtual", "-c", command])
+        refused = called(command, "-i", "virtual", "-c", command)
         heartbeat.stop()
         assert other.recv(0.0) is None
     assert refused.exit_code == ExitCode.BUS_MISSING

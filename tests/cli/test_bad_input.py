@@ -4,10 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from called import called, complaints
 from experiment_runs import PAPER, emulator, other_contract, run_on_vcan, run_while_killing
 
-from adacd_hil.cli.main import cli
 from adacd_hil.log.reader import read_log
 from adacd_hil.wire.codec import contract_folder
 
@@ -16,20 +15,12 @@ pytestmark = pytest.mark.slow
 USAGE, SAFETY_STOP, BUS_MISSING = 2, 4, 5
 
 
-def typed(*arguments: str) -> Result:
-    return CliRunner().invoke(cli, arguments)
-
-
-def complaint_of(result: Result) -> str:
-    (line,) = [line for line in result.stderr.splitlines() if line.startswith("adacd-hil:")]
-    return line
-
-
 def test_a_bus_without_devices_says_who_is_missing_and_leaves_a_readable_log_with_the_reason(tmp_path: Path) -> None:
-    result = typed("run", "-i", "virtual", "-c", "empty", *PAPER, "--out", str(tmp_path))
+    result = called("run", "-i", "virtual", "-c", "empty", *PAPER, "--out", tmp_path)
     missing = "no boot-up from Drive1 (node 1), Drive2 (node 2), Sensor1 (node 3), Sensor2 (node 4)"
     assert result.exit_code == BUS_MISSING
-    assert missing in complaint_of(result)
+    (complaint,) = complaints(result)
+    assert missing in complaint
     log = read_log(tmp_path / "run.mcap")
     assert log.is_complete
     assert any(missing in entry.event.message for entry in log.events)
@@ -39,16 +30,18 @@ def test_a_dbc_that_says_otherwise_than_the_device_profiles_is_refused_before_th
     text = (contract_folder() / "arm.dbc").read_text()
     other = tmp_path / "other.dbc"
     other.write_text(text.replace("SG_ torque : 16|32@1- (1e-06,0)", "SG_ torque : 16|32@1- (1e-05,0)"))
-    result = typed("run", "-i", "virtual", "-c", "x", *PAPER, "--dbc", str(other), "--out", str(tmp_path / "run"))
+    result = called("run", "-i", "virtual", "-c", "x", *PAPER, "--dbc", other, "--out", tmp_path / "run")
     assert result.exit_code == USAGE
-    assert "Sensor1Torque: scales" in complaint_of(result)
+    (complaint,) = complaints(result)
+    assert "Sensor1Torque: scales" in complaint
     assert not (tmp_path / "run").exists()
 
 
 def test_a_scale_that_the_sensors_own_eds_contradicts_is_refused_before_the_arm_moves(tmp_path: Path) -> None:
-    result = typed("demo", "--config", str(other_contract(tmp_path)), "--out", str(tmp_path / "run"))
+    result = called("demo", "--config", other_contract(tmp_path), "--out", tmp_path / "run")
     assert result.exit_code == BUS_MISSING
-    assert "decimal digits 0x6132:1 = 6, 5 expected; correct `scale.torque_Nm`" in complaint_of(result)
+    (complaint,) = complaints(result)
+    assert "decimal digits 0x6132:1 = 6, 5 expected; correct `scale.torque_Nm`" in complaint
 
 
 @pytest.mark.long
@@ -56,7 +49,7 @@ def test_a_scale_that_the_sensors_own_eds_contradicts_is_refused_before_the_arm_
 def test_devices_with_another_contract_are_refused_before_the_arm_moves(tmp_path: Path) -> None:
     config = other_contract(tmp_path)
     with emulator(tmp_path, "--scenario", "idle"):
-        played = run_on_vcan(tmp_path, "--config", str(config), "--clock", "lockstep")
+        played = run_on_vcan(tmp_path, "--config", config, "--clock", "lockstep")
     (complaint,) = played.error_lines
     assert played.status == BUS_MISSING
     assert re.search(r"layout digest 0x[0-9A-F]{8} is not the DBC's 0x[0-9A-F]{8}", complaint)

@@ -4,61 +4,39 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
-
-from adacd_hil.cli.main import cli
+from called import called
+from click.testing import Result
 
 CONTRACTS = Path(__file__).parent.parent / "wire" / "contracts"
 FITS, DOES_NOT_FIT, USAGE = 0, 1, 2
 
 
 def budget(*arguments: str) -> Result:
-    return CliRunner().invoke(cli, ["budget", *arguments])
+    return called("budget", *arguments)
 
 
 @pytest.mark.parametrize(
-    ("dbc", "bits", "status"),
+    ("words", "status"),
     [
-        ("naive_cia402", 1135, DOES_NOT_FIT),
-        ("arm", 795, FITS),
-        ("stock", 715, FITS),
-        ("shared_command", 700, FITS),
-        ("srdo", 1010, DOES_NOT_FIT),
+        (("--dbc", "arm"), FITS),
+        (("--dbc", str(CONTRACTS / "naive_cia402.dbc")), DOES_NOT_FIT),
+        (("--period-us", "900"), DOES_NOT_FIT),
+        (("--dbc", str(CONTRACTS / "fd_500us.dbc")), FITS),
+        (("--dbc", str(CONTRACTS / "fd_1ms.dbc"), "--data-bitrate", "1000000"), DOES_NOT_FIT),
     ],
 )
-def test_the_exit_status_is_the_verdict(dbc: str, bits: int, status: int) -> None:
-    ran = budget("--dbc", dbc if dbc == "arm" else str(CONTRACTS / f"{dbc}.dbc"), "--json")
-    assert ran.exit_code == status
-    found = json.loads(ran.stdout)
-    assert (found["worst_bits"], found["is_fit"]) == (bits, status == FITS)
+def test_the_exit_status_is_the_verdict(words: tuple[str, ...], status: int) -> None:
+    ran = budget(*words, "--json")
+    assert (ran.exit_code, json.loads(ran.stdout)["is_fit"]) == (status, status == FITS)
 
 
-def test_can_fd_contracts_are_judged_at_both_rates() -> None:
-    ran = budget("--dbc", str(CONTRACTS / "fd_1ms.dbc"), "--json")
-    assert json.loads(ran.stdout)["cyclic_us"] == 513.8
-    slower = budget("--dbc", str(CONTRACTS / "fd_1ms.dbc"), "--data-bitrate", "1000000")
-    assert slower.exit_code == DOES_NOT_FIT
-    assert budget("--dbc", str(CONTRACTS / "fd_500us.dbc")).exit_code == FITS
-
-
-@pytest.mark.parametrize(
-    ("dbc", "period_us", "bits", "status"),
-    [
-        ("arm", 1000, 65 + 2 * 730, DOES_NOT_FIT),
-        ("arm", 2000, 65 + 2 * 730, FITS),
-        ("arm_fd", 1000, None, DOES_NOT_FIT),
-        ("arm_fd", 2000, None, FITS),
-        ("arm_fd_500us", 1000, None, FITS),
-    ],
-)
-def test_two_arms_on_one_bus_have_one_sync(dbc: str, period_us: int, bits: int | None, status: int) -> None:
+@pytest.mark.parametrize(("dbc", "period_us", "status"), [("arm", 1000, DOES_NOT_FIT), ("arm_fd", 2000, FITS)])
+def test_two_arms_on_one_bus_have_one_sync(dbc: str, period_us: int, status: int) -> None:
     ran = budget("--dbc", dbc, "--arms", "2", "--period-us", str(period_us), "--json")
-    found = json.loads(ran.stdout)
-    one = json.loads(budget("--dbc", dbc, "--json").stdout)
-    assert ran.exit_code == status
-    assert found["worst_bits"] == (bits or 2 * one["worst_bits"] - 65)
+    found, one = json.loads(ran.stdout), json.loads(budget("--dbc", dbc, "--json").stdout)
+    assert (ran.exit_code, found["arms"]) == (status, 2)
+    assert found["worst_bits"] == 2 * one["worst_bits"] - 65
     assert len(found["messages"]) == 2 * len(one["messages"]) - 2  # NMT and SYNC are there once
-    assert found["arms"] == 2
 
 
 def test_the_configuration_says_how_many_arms_share_the_bus(tmp_path: Path) -> None:
@@ -85,36 +63,19 @@ def test_the_text_has_table_phases_and_verdict_within_120_columns() -> None:
     assert lines[-1] == "verdict       arm.dbc at 1000 µs fits: 795 µs of cyclic frames, 205 µs left for the host"
 
 
-def test_a_contract_that_does_not_fit_says_who_is_late_and_by_how_much() -> None:
-    ran = budget("--period-us", "900")
-    assert ran.exit_code == DOES_NOT_FIT
-    assert "Drive2Command misses its deadline of 900 µs by 20 µs" in " ".join(ran.stdout.split())
-
-
 def test_json_has_every_message_with_its_response_times() -> None:
     found = json.loads(budget("--json").stdout)
     assert (found["wire_version"], found["layout_digest"]) == (1, "0xF80FDAE0")
-    messages = found["messages"]
-    (command,) = [message for message in messages if message["name"] == "Drive1Command"]
-    assert command == {
-        "name": "Drive1Command",
-        "id": 0x201,
-        "is_extended": False,
-        "bytes": 6,
-        "trigger": "command",
-        "interval_us": 1000.0,
-        "unstuffed_bits": 95,
-        "worst_bits": 115,
-        "worst_data_rate_bits": 0,
-        "worst_us": 115.0,
-        "deadline_us": 1000.0,
-        "response_us": {
-            "operation": {"time": 805.0, "is_bounded": True},
-            "requests": {"time": 815.0, "is_bounded": True},
-            "emergencies": {"time": 1920.0, "is_bounded": True},
-        },
-        "late_us": 0.0,
+    (command,) = [message for message in found["messages"] if message["name"] == "Drive1Command"]
+    response_us = {"operation": 805.0, "requests": 815.0, "emergencies": 1920.0}
+    assert command.pop("response_us") == {
+        load: {"time": time, "is_bounded": True} for load, time in response_us.items()
     }
+    assert command == {
+        "name": "Drive1Command", "id": 0x201, "is_extended": False, "bytes": 6, "trigger": "command",
+        "interval_us": 1000.0, "unstuffed_bits": 95, "worst_bits": 115, "worst_data_rate_bits": 0, "worst_us": 115.0,
+        "deadline_us": 1000.0, "late_us": 0.0,
+    }  # fmt: skip
 
 
 def test_the_period_is_the_options_else_the_dbcs_else_the_configurations(tmp_path: Path) -> None:
@@ -135,17 +96,11 @@ def test_the_period_is_the_options_else_the_dbcs_else_the_configurations(tmp_pat
     assert "configuration slow has bus.period_us = 2000, the DBC 1000" in said
 
 
+STOCK = 'drive = ["stock-drive", "stock-drive"]\nsensor = ["int32-sensor", "int32-sensor"]\ncontract = ""'
+
+
 @pytest.mark.parametrize(
-    ("devices", "name", "bits"),
-    [
-        ("", "arm", 795),
-        ('contract = ""', "contract", 795),
-        (
-            'drive = ["stock-drive", "stock-drive"]\nsensor = ["int32-sensor", "int32-sensor"]\ncontract = ""',
-            "contract",
-            0,
-        ),
-    ],
+    ("devices", "name", "bits"), [("", "arm", 795), ('contract = ""', "contract", 795), (STOCK, "contract", 715)]
 )
 def test_without_a_dbc_it_is_the_contract_of_the_configured_devices(
     tmp_path: Path, devices: str, name: str, bits: int
@@ -153,33 +108,16 @@ def test_without_a_dbc_it_is_the_contract_of_the_configured_devices(
     config = tmp_path / "mine.toml"
     config.write_text(f"[devices]\n{devices}\n")
     found = json.loads(budget("--config", str(config), "--json").stdout)
-    stock = json.loads(budget("--config", "stock", "--json").stdout)
-    assert stock["worst_bits"] != 795
     assert found["contract"].startswith(name)
-    assert found["worst_bits"] == (bits or stock["worst_bits"])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("--dbc", "arn"), "contract 'arn' is neither in dbc/ nor a file; did you mean 'arm'?"),
-        (("--dbc", "none.dbc"), "DBC none.dbc: No such file"),
-        (("--config", "papper"), "did you mean 'paper'?"),
-    ],
-)
-def test_bad_input_is_one_line(arguments: tuple[str, ...], line: str) -> None:
-    ran = budget(*arguments)
-    assert (ran.exit_code, ran.stdout) == (USAGE, "")
-    (complaint,) = ran.stderr.splitlines()
-    assert line in complaint
-
-
-def test_the_help_says_what_the_exit_status_means() -> None:
-    said = " ".join(budget("--help").stdout.split())
-    assert "Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC." in said
+    assert found["worst_bits"] == bits
 
 
 ARM = (Path(__file__).parents[2] / "dbc" / "arm.dbc").read_text()
+
+
+MANY = "".join(
+    f'\nBO_ {1 << 31 | number} M{number}: 1 Host\n SG_ a : 0|8@1+ (1,0) [0|0] "" X\n' for number in range(1000)
+)
 
 
 @pytest.mark.slow
@@ -188,18 +126,8 @@ ARM = (Path(__file__).parents[2] / "dbc" / "arm.dbc").read_text()
     [
         (200 * ARM, "message Nmt is defined more than once"),
         (ARM.replace(" Drive2Emcy:", " Drive1Emcy:"), "message Drive1Emcy is defined more than once"),
-        (
-            ARM.replace("BO_ 130 Drive2Emcy", "BO_ 129 Drive2Emcy"),
-            "Drive1Emcy and Drive2Emcy have the same identifier 0x81",
-        ),
-        (
-            ARM
-            + "".join(
-                f'\nBO_ {1 << 31 | number} M{number}: 1 Host\n SG_ a : 0|8@1+ (1,0) [0|0] "" X\n'
-                for number in range(1000)
-            ),
-            "1029 messages are more than 1000",
-        ),
+        (ARM.replace("BO_ 130 Drive2Emcy", "BO_ 129 Drive2Emcy"), "Drive1Emcy and Drive2Emcy have the same identifier"),
+        (ARM + MANY, "1029 messages are more than 1000"),
     ],
     ids=["200 times", "a name", "an identifier", "too many"],
 )

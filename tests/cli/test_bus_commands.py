@@ -4,16 +4,10 @@ from pathlib import Path
 from typing import NoReturn
 
 import pytest
-from click.testing import CliRunner
+from called import called
 
 from adacd_hil.cli.commands import run_command
-from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import CommandError
-
-
-def call(*arguments: str) -> tuple[int, str, list[str]]:
-    result = CliRunner().invoke(cli, arguments)
-    return result.exit_code, result.stdout, result.stderr.splitlines()
 
 
 class NoSession:
@@ -47,7 +41,6 @@ def test_a_run_names_at_once_what_nobody_has_confirmed(
     monkeypatch.setattr(run_command, "Session", NoSession)
     config = tmp_path / "mine.toml"
     config.write_text(f'extends = "certified"\nname = "mine"\nassumed = {assumed}\n')
-    out = str(tmp_path / "run")
-    status, _, stderr = call("run", "-i", "virtual", "-c", "x", "--config", str(config), "--out", out)
+    done = called("run", "-i", "virtual", "-c", "x", "--config", config, "--out", tmp_path / "run")
     warnings = [] if line is None else [f"warning: unconfirmed guesses: {line}"]
-    assert (status, stderr) == (1, [*warnings, "adacd-hil: no arm"])
+    assert (done.exit_code, done.stderr.splitlines()) == (1, [*warnings, "adacd-hil: no arm"])

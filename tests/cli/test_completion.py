@@ -79,7 +79,7 @@ def test_an_answer_takes_no_longer_than_a_person_waits(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_help_imports_neither_numpy_nor_what_reads_a_bus() -> None:
-    heavy = ("numpy", "can", "canopen", "cantools", "numba", "matplotlib")
+    heavy = ("numpy", "can", "canopen", "cantools", "numba", "matplotlib", "jinja2")
     script = f"import sys, adacd_hil.cli.main; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout == "[]\n"

@@ -1,21 +1,21 @@
 """Doctor's findings about an emulated arm in virtual time; what it sends is judged on the wire."""
 
-import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from own_arm import describe_arm, describe_geared_arm
 from rig import CODEC, Rig
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.cli.doctor_command import as_json, as_text
 from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
 from adacd_hil.lab.commission.host_checks import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.settings.configuration import load_settings
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.settings.setting_keys import apply_settings
+from adacd_hil.wire.codec import Codec, load_codec
 from firmware_sim.cli.own_devices import rehearse
 from firmware_sim.nodes.device import NmtState
 
@@ -26,10 +26,12 @@ PASSED = ("kernel", "interface", "controller")
 EARLIER = [Finding(name, Status.OK, "", "") for name in PASSED]
 
 
-def doctor(rig: Rig, ask: Callable[[str], None] | None = None) -> dict[str, Finding]:
-    patient = ArmExamination(
-        rig.settings, rig.codec, rig.clock, lambda: rig.bus, lambda: None, ask=ask, cycle_s=0.4, move_s=1.0
-    )
+def examination(rig: Rig, codec: Codec = CODEC, **more: Any) -> ArmExamination:
+    return ArmExamination(rig.settings, codec, rig.clock, lambda: rig.bus, lambda: None, **more)
+
+
+def doctor(rig: Rig, ask: Callable[[str], None] | None = None, codec: Codec | None = None) -> dict[str, Finding]:
+    patient = examination(rig, codec or rig.codec, ask=ask, cycle_s=0.4, move_s=1.0)
     findings = diagnose(ARM_CHECKS, patient, lambda finding: None, EARLIER)
     assert patient.leave() == ""
     return {finding.name: finding for finding in findings}
@@ -39,18 +41,14 @@ def statuses(findings: dict[str, Finding], status: Status) -> list[str]:
     return [name for name, finding in findings.items() if finding.status is status]
 
 
-def test_a_sound_arm_passes_everything_but_what_it_lacks() -> None:
-    findings = doctor(Rig(is_wall=True))
+def test_a_sound_arm_passes_everything_but_what_it_lacks_and_is_asked_for_no_voltage_only() -> None:
+    rig = Rig(is_wall=True)
+    findings = doctor(rig)
     assert statuses(findings, Status.FAILED) == []
     assert statuses(findings, Status.WARNING) == ["protection"]
     assert statuses(findings, Status.SKIPPED) == ["joint 1", "joint 2"]
     assert findings["rate"].reason.startswith("SYNC 1000/s of 1000, Drive1 1000/s")
     assert findings["protection"].reason.startswith("unprotected: Drive1Feedback, Drive2Feedback")
-
-
-def test_the_drives_are_asked_for_no_voltage_only_and_the_nodes_end_pre_operational() -> None:
-    rig = Rig(is_wall=True)
-    doctor(rig)
     commands = [frame for frame in rig.sent if frame.can_id in (0x201, 0x202)]
     assert len(commands) > 800
     assert {tuple(map(int, COMMAND.decode_values(frame.data))) for frame in commands} == {(0, 0)}
@@ -96,9 +94,8 @@ def test_each_kind_of_host_frame_shows_another_master(can_id: int, doing: str) -
     ],
 )
 def test_on_a_shared_bus_the_neighbours_frames_are_no_other_master(sync: str, can_id: int, status: Status) -> None:
-    base = load_settings("paper")
-    rig = Rig(dataclasses.replace(base, bus=dataclasses.replace(base.bus, arms=2, sync=sync)), is_wall=True)
-    patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
+    rig = Rig(apply_settings(load_settings("paper"), {"bus.arms": "2", "bus.sync": sync}), is_wall=True)
+    patient = examination(rig)
     patient.connect()
     rig.bus.deliver(can_id, b"\x01")
     assert check_other_masters(patient).status is status
@@ -117,23 +114,16 @@ def test_another_contract_is_told_and_stops_the_set_up(tmp_path) -> None:
     rig = Rig(is_wall=True)
     other = tmp_path / "other.dbc"
     other.write_bytes(CODEC.text.replace(b"0|32@1- (5.9921124526782858e-06,0)", b"0|32@1- (5e-06,0)"))
-    patient = ArmExamination(rig.settings, load_codec(other), rig.clock, lambda: rig.bus, lambda: None)
-    findings = {finding.name: finding for finding in diagnose(ARM_CHECKS, patient, lambda finding: None, EARLIER)}
+    findings = doctor(rig, codec=load_codec(other))
     assert findings["contract"].status is Status.FAILED
     assert "the DBC's are 1, 0x" in findings["contract"].reason
     assert findings["set-up"].reason == "needs `contract`, which failed"
-
-
-def break_pdo_map(rig: Rig, index: int, subindex: int, value: int) -> None:
-    """Let a device answer SDO with another mapping than it has."""
-    rig.bench.devices[0].serve(index, subindex, lambda: value)
 
 
 @pytest.mark.parametrize(
     ("index", "subindex", "value", "reason"),
     [
         (0x1A00, 1, 0x60640010, "Drive1Feedback: mapped object 0x1A00:1 = 0x60640010, 0x60640020 expected"),
-        (0x1A00, 1, 0x60630020, "Drive1Feedback: mapped object 0x1A00:1 = 0x60630020, 0x60640020 expected"),
         (0x1A00, 0, 1, "Drive1Feedback: number of mapped objects 0x1A00 = 1, 2 expected"),
         (0x1800, 1, 0x80000181, "Drive1Feedback: identifier 0x1800:1 = 0x80000181, 0x181 expected"),
         (0x1400, 1, 0x00000211, "Drive1Command: identifier 0x1400:1 = 0x211, 0x201 expected"),
@@ -142,8 +132,8 @@ def break_pdo_map(rig: Rig, index: int, subindex: int, value: int) -> None:
 )
 def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, value: int, reason: str) -> None:
     rig = Rig(is_wall=True)
-    break_pdo_map(rig, index, subindex, value)
-    patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
+    rig.bench.devices[0].serve(index, subindex, lambda: value)  # as if it had another mapping
+    patient = examination(rig)
     patient.connect()
     finding = check_pdo_map(patient)
     assert finding.status is Status.FAILED
@@ -153,7 +143,7 @@ def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, v
 @pytest.mark.parametrize("describe", [describe_arm, describe_geared_arm])
 def test_devices_of_one_s_own_pass(tmp_path: Path, describe: Callable[[Path], list[str]]) -> None:
     """Sensors of 16 bits have their torque in 0x7130, and the drives theirs in objects of the maker, or in µNm."""
-    written = CliRunner().invoke(cli, ["init", *describe(tmp_path)])
+    written = called("init", *describe(tmp_path))
     assert written.exit_code == 0, written.stderr
     config = str(tmp_path / "my-arm.toml")
     played = rehearse(config, "idle")
@@ -200,57 +190,42 @@ def test_a_torque_that_is_not_plausible_at_rest_is_told(
     assert text in finding.reason
 
 
-def test_a_saturated_sensor_is_told() -> None:
-    rig = Rig(is_wall=True)
-    sender = CODEC.message("Sensor1Torque").sender()
-
-    def saturate(cycle: int, can_id: int, data: bytes) -> bytes:
-        if can_id == 0x183:  # the header's status nibble
-            return sender.protect(bytearray(data[:1] + b"\x20" + data[2:]))
-        return b"\x02" + data[1:] if can_id == 0x283 else data
-
-    rig.tamper = saturate
-    findings = doctor(rig)
-    assert findings["saturation"].status is Status.FAILED
-    assert "POSITIVE_OVERLOAD" in findings["saturation"].reason
-    assert findings["torque zero"].status is Status.SKIPPED
+def saturated(cycle: int, can_id: int, data: bytes) -> bytes:
+    if can_id == 0x183:  # the header's status nibble
+        return CODEC.message("Sensor1Torque").sender().protect(bytearray(data[:1] + b"\x20" + data[2:]))
+    return b"\x02" + data[1:] if can_id == 0x283 else data
 
 
-def test_a_moving_arm_fails_rest_and_leaves_its_torque_unjudged() -> None:
-    rig = Rig(is_wall=True)
+def moving(cycle: int, can_id: int, data: bytes) -> bytes:
     message = CODEC.message("Drive1Feedback")
+    return bytes(message.encode(message.decode_values(data)[0], 0.2)) if can_id == message.can_id else data
 
-    def move(cycle: int, can_id: int, data: bytes) -> bytes:
-        if can_id != message.can_id:
-            return data
-        position, _ = message.decode_values(data)
-        return bytes(message.encode(position, 0.2))
 
-    rig.tamper = move
+def without_heartbeat(cycle: int, can_id: int, data: bytes) -> bytes | None:
+    return None if can_id == 0x704 and data != b"\x00" else data
+
+
+def losing(cycle: int, can_id: int, data: bytes) -> bytes | None:
+    return None if can_id == 0x181 and cycle % 5 == 0 else data
+
+
+@pytest.mark.parametrize(
+    ("tamper", "name", "text", "skipped"),
+    [
+        (saturated, "saturation", "POSITIVE_OVERLOAD", "torque zero"),
+        (moving, "rest", "", "torque zero"),
+        (without_heartbeat, "heartbeat", "no heartbeat from Sensor2", ""),
+        (losing, "rate", "80.0 % of the periods complete", ""),
+    ],
+)
+def test_what_a_device_sends_wrong_fails_its_check_and_skips_what_needs_it(tamper, name, text, skipped) -> None:
+    rig = Rig(is_wall=True)
+    rig.tamper = tamper
     findings = doctor(rig)
-    assert findings["rest"].status is Status.FAILED
-    assert findings["torque zero"].reason == "needs `rest`, which failed"
-
-
-def test_a_node_without_heartbeat_is_told() -> None:
-    rig = Rig(is_wall=True)
-    rig.tamper = lambda cycle, can_id, data: None if can_id == 0x704 and data != b"\x00" else data
-    finding = doctor(rig)["heartbeat"]
-    assert (finding.status, finding.reason) == (Status.FAILED, "no heartbeat from Sensor2")
-
-
-def test_lost_feedback_fails_the_rate() -> None:
-    rig = Rig(is_wall=True)
-    count = [0]
-
-    def lose(cycle: int, can_id: int, data: bytes) -> bytes | None:
-        count[0] += can_id == 0x181
-        return None if can_id == 0x181 and count[0] % 5 == 0 else data
-
-    rig.tamper = lose
-    finding = doctor(rig)["rate"]
-    assert finding.status is Status.FAILED
-    assert "80.0 % of the periods complete" in finding.reason
+    assert findings[name].status is Status.FAILED
+    assert text in findings[name].reason
+    if skipped:
+        assert findings[skipped].reason == f"needs `{name}`, which failed"
 
 
 def move_by_hand(rig: Rig, speed_rad_s: tuple[float, float], torque_Nm: float) -> Callable[[str], None]:

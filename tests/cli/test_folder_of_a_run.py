@@ -1,6 +1,5 @@
 """Where runs go: a new folder each, to which links lead; nothing of yesterday's is lost."""
 
-import os
 import subprocess
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from adacd_hil.cli import output as run_folder_module
 from adacd_hil.cli.output import run_folder
 from adacd_hil.log.log_files import LogExistsError
 from adacd_hil.log.reader import read_log
-from firmware_sim.bench.bench_time import TruthLog
 
 USAGE, BUS_MISSING = 2, 5
 
@@ -40,21 +38,6 @@ def test_demos_leave_each_other_as_they_are_and_the_links_lead_to_the_last(tmp_p
         "adacd-hil: runs/demo/run.mcap is there already; choose another folder with --out, or move it away\n"
     )
     assert contents(tmp_path) == before
-
-
-@pytest.mark.long
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["run.mcap", "truth.mcap"])
-def test_a_run_into_the_folder_of_one_that_is_going_on_is_told_by_whom(name: str, tmp_path: Path) -> None:
-    with TruthLog(tmp_path / name, blocking=True) as log:
-        refused = adacd_hil(tmp_path, "demo", *PAPER, "--out", ".")
-        log.write_event(0, "info", "run", "going on")
-    assert (refused.status, refused.stdout) == (USAGE, "")
-    assert refused.stderr == (
-        f"adacd-hil: {name} is being written by process {os.getpid()}; choose another folder with --out\n"
-    )
-    assert [file.name for file in tmp_path.iterdir()] == [name]
-    assert len(read_log(tmp_path / name).events) == 1
 
 
 @pytest.mark.long

@@ -3,11 +3,10 @@
 import json
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from rig import CODEC, Rig
 
 from adacd_hil.cli.connection import Connection
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.cli.monitor_command import Monitor, Screen, as_text
 from adacd_hil.wire.bus import Frame
 
@@ -32,19 +31,10 @@ def test_the_table_shows_nodes_messages_and_load() -> None:
     assert feedback[6:9] == ["position", "-0.523597", "rad,"]
     assert ["0x055", "unknown", "1.0"] in [line[:3] for line in lines]
     assert rig.sent == []
-
-
-def test_the_node_filter_shows_one_node() -> None:
-    rig = Rig(is_wall=True)
-    rig.start()
-    rig.add_host()
-    watched = monitor(rig, node_id=3)
-    watched.listen(0.5)
-    assert {message["message"] for message in watched.describe()["messages"]} == {
-        "Sensor1Torque",
-        "Sensor1Status",
-        "Sensor1Heartbeat",
-    }
+    of_one = monitor(rig, node_id=3)
+    of_one.listen(0.5)
+    shown = {message["message"] for message in of_one.describe()["messages"]}
+    assert shown == {"Sensor1Torque", "Sensor1Status", "Sensor1Heartbeat"}
 
 
 def test_frames_that_this_computer_dropped_are_not_counted_against_the_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,15 +94,12 @@ def test_without_a_terminal_lines_are_plain() -> None:
     assert written == ["a\nb\n\n"]
 
 
-def test_a_silent_bus_is_said_to_be() -> None:
-    result = CliRunner().invoke(cli, ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1"))
+def test_a_silent_bus_is_said_to_be_and_json_is_one_snapshot() -> None:
+    words = ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1")
+    result = called(*words)
     assert (result.exit_code, result.stderr) == (0, "listening on silent\n")
     assert result.stdout == "load 0.0 %, 0 frames, 0 error frames\n\nnothing heard\n"
-
-
-def test_json_is_one_snapshot() -> None:
-    result = CliRunner().invoke(cli, ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1", "--json"))
-    described = json.loads(result.stdout)
+    described = json.loads(called(*words, "--json").stdout)
     assert (described["frames"], described["messages"], described["not_processed"]) == (0, [], None)
 
 

@@ -5,9 +5,8 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from called import called
 
-from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import CommandError, checked_place, print_and_write
 from adacd_hil.file_access import is_disk_full
 from adacd_hil.settings.run_settings import ExcitationSettings
@@ -69,7 +68,7 @@ def test_what_was_found_is_told_where_it_can_not_be_written(
 @pytest.mark.parametrize("words", [("excitation",), ("tune", "none.mcap"), ("thresholds", "none.mcap")])
 def test_each_search_tries_its_place(words: tuple[str, ...], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    done = CliRunner().invoke(cli, [*words, "--out", str(tmp_path / "file" / "x.toml")])
+    done = called(*words, "--out", tmp_path / "file" / "x.toml")
     assert (done.exit_code, done.stdout) == (FAILURE, "")
     (complaint,) = done.stderr.splitlines()
     assert f"x.toml can't be written: {tmp_path / 'file'} is no folder" in complaint
@@ -84,7 +83,7 @@ def test_an_excitation_that_has_no_room_is_not_lost(
     monkeypatch.chdir(tmp_path)
     Path("small.toml").write_text(SMALL)
     words = ["excitation", "--config", "small.toml", "--seconds", "0", "--out", "found.toml", *json_words]
-    done = CliRunner().invoke(cli, words)
+    done = called(*words)
     assert done.exit_code == PARTIAL, done.stderr
     assert "found.toml can't be written: No space left on device" in done.stderr.splitlines()[-1]
     if json_words:

@@ -3,14 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
-import click
 import pytest
-from bus_lab import BUS_MISSING, SHORT_RUN, Lab, complaints
-from click.testing import CliRunner
+from bus_lab import BUS_MISSING, SHORT_RUN, Lab, answered
+from called import called, complaints
 
 from adacd_hil.cli.commands.run_command import as_text, ask_without_anchor, next_of_run, summarise
 from adacd_hil.cli.embedded_run import resolve, run_embedded
-from adacd_hil.cli.main import cli
 from adacd_hil.scheme.identify.anchor import unanchored_joints
 from adacd_hil.settings.configuration import load_settings
 
@@ -50,19 +48,12 @@ def test_a_joint_has_an_anchor_by_a_tare_a_last_certificate_or_a_motor_that_hold
     assert unanchored_joints(settings) == joints
 
 
-@pytest.mark.parametrize(("answer", "is_started"), [("y\n", True), ("n\n", False), ("\n", False)])
+@pytest.mark.parametrize(("answer", "is_started"), [("y\n", True), ("\n", False)])
 def test_on_a_terminal_the_user_says_that_an_arm_may_run_without_an_anchor(
     monkeypatch: pytest.MonkeyPatch, answer: str, is_started: bool
 ) -> None:
-    @click.command()
-    def command() -> None:
-        monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-        ask_without_anchor([1], "-i kvaser -c 0")
-        print("started")
-
-    result = CliRunner().invoke(command, input=answer)
-    assert ("started" in result.stdout) is is_started
-    assert result.exit_code == (0 if is_started else 1)
+    result = answered(monkeypatch, lambda: ask_without_anchor([1], "-i kvaser -c 0"), answer)
+    assert (result.exit_code, "started" in result.stdout) == (0 if is_started else 1, is_started)
     assert "the torque offset of joint 2 has no bound" in result.stderr
     assert "`adacd-hil tare -i kvaser -c 0` first, then `run --tare tare.toml`" in result.stderr
 
@@ -83,7 +74,7 @@ def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
 
 @pytest.mark.parametrize("interface", ["socketcan", "sockercan", "udp_multicast"])
 def test_an_interface_that_cannot_be_used_is_named_before_any_question(interface: str) -> None:
-    result = CliRunner().invoke(cli, ["run", "-i", interface, "-c", "can77", "--config", "certified"])
+    result = called("run", "-i", interface, "-c", "can77", "--config", "certified")
     assert result.exit_code == BUS_MISSING
     assert "torque offset" not in result.stderr
 

@@ -26,13 +26,7 @@ CAN0 = InterfaceState(
     rx_errors=0,
     tx_errors=0,
 )
-THROTTLED_AT = {
-    runtime_us: {
-        "proc/sys/kernel/sched_rt_runtime_us": f"{runtime_us}\n",
-        "proc/sys/kernel/sched_rt_period_us": "1000000\n",
-    }
-    for runtime_us in (-1, 500_000, 950_000)
-}
+
 RUN = {check.name: check.run for check in HOST_CHECKS}
 
 
@@ -40,57 +34,46 @@ def host(link: InterfaceState | None = CAN0, **changes: Any) -> Host:
     return dataclasses.replace(Host("socketcan", "can0", link, 1_000_000, 0, lambda: GRANTED), **changes)
 
 
+FD = {"data_bitrate": 5_000_000}
+"""A contract with CAN FD."""
+
+
 @pytest.mark.parametrize(
-    ("check", "changes", "status", "text"),
+    ("check", "changes", "contract", "status", "text"),
     [
-        ("interface", {}, Status.OK, "can0 is up, hardware"),
-        ("interface", {"is_up": False}, Status.FAILED, "can0 is down"),
-        ("interface", {"kind": "vcan"}, Status.OK, "virtual"),
-        ("bit rate", {}, Status.OK, "1000000 bit/s"),
-        ("bit rate", {"bitrate": 500_000}, Status.FAILED, "500000 bit/s, the contract has 1000000"),
-        ("bit rate", {"bitrate": None}, Status.SKIPPED, "install iproute2"),
-        ("bit rate", {"kind": "vcan"}, Status.SKIPPED, "vcan has none"),
-        ("sample point", {}, Status.OK, "87.5 %"),
-        ("sample point", {"sample_point": 0.70}, Status.OK, "70.0 %"),
-        ("sample point", {"sample_point": 0.69}, Status.WARNING, "outside 70% to 90%"),
-        ("sample point", {"sample_point": 0.91}, Status.WARNING, "outside 70% to 90%"),
-        ("restart", {}, Status.OK, "100 ms"),
-        ("restart", {"restart_ms": 0}, Status.WARNING, "stays silent"),
-        ("controller", {}, Status.OK, "ERROR-ACTIVE"),
-        ("controller", {"state": "ERROR-PASSIVE", "tx_errors": 128}, Status.WARNING, "tx 128"),
-        ("controller", {"state": "BUS-OFF"}, Status.FAILED, "BUS-OFF"),
-        ("queue", {}, Status.OK, "txqueuelen 10"),
-        ("queue", {"txqueuelen": 99}, Status.OK, "txqueuelen 99"),
-        ("queue", {"txqueuelen": 100}, Status.WARNING, "up to 100 old commands"),
-        ("queue", {"txqueuelen": 4096, "qdisc": "noqueue"}, Status.OK, "noqueue"),
-        ("mtu", {"mtu": 16}, Status.OK, "16, classic frames fit"),
+        ("interface", {}, {}, Status.OK, "can0 is up, hardware"),
+        ("interface", {"is_up": False}, {}, Status.FAILED, "can0 is down"),
+        ("interface", {"kind": "vcan"}, {}, Status.OK, "virtual"),
+        ("bit rate", {}, {}, Status.OK, "1000000 bit/s"),
+        ("bit rate", {"bitrate": 500_000}, {}, Status.FAILED, "500000 bit/s, the contract has 1000000"),
+        ("bit rate", {"bitrate": None}, {}, Status.SKIPPED, "install iproute2"),
+        ("bit rate", {"kind": "vcan"}, {}, Status.SKIPPED, "vcan has none"),
+        ("bit rate", {}, FD, Status.OK, "data phase 5000000"),
+        ("bit rate", {"data_bitrate": 2_000_000}, FD, Status.FAILED, "2000000 bit/s, the contract has 5000000"),
+        ("bit rate", {"data_bitrate": None}, FD, Status.FAILED, "data phase 0 bit/s, the contract has 5000000"),
+        ("sample point", {"sample_point": 0.70}, {}, Status.OK, "70.0 %"),
+        ("sample point", {"sample_point": 0.69}, {}, Status.WARNING, "outside 70% to 90%"),
+        ("sample point", {"sample_point": 0.91}, {}, Status.WARNING, "outside 70% to 90%"),
+        ("restart", {}, {}, Status.OK, "100 ms"),
+        ("restart", {"restart_ms": 0}, {}, Status.WARNING, "stays silent"),
+        ("controller", {}, {}, Status.OK, "ERROR-ACTIVE"),
+        ("controller", {"state": "ERROR-PASSIVE", "tx_errors": 128}, {}, Status.WARNING, "tx 128"),
+        ("controller", {"state": "BUS-OFF"}, {}, Status.FAILED, "BUS-OFF"),
+        ("queue", {"txqueuelen": 99}, {}, Status.OK, "txqueuelen 99"),
+        ("queue", {"txqueuelen": 100}, {}, Status.WARNING, "up to 100 old commands"),
+        ("queue", {"txqueuelen": 4096, "qdisc": "noqueue"}, {}, Status.OK, "noqueue"),
+        ("mtu", {"mtu": 16}, {}, Status.OK, "16, classic frames fit"),
+        ("mtu", {}, FD, Status.OK, "CAN FD frames fit"),
+        ("mtu", {"mtu": 16}, FD, Status.FAILED, "no CAN FD frames"),
     ],
 )
 def test_an_interface_is_judged_by_what_the_kernel_says(
-    check: str, changes: dict[str, Any], status: Status, text: str
+    check: str, changes: dict[str, Any], contract: dict[str, int], status: Status, text: str
 ) -> None:
-    outcome = RUN[check](host(dataclasses.replace(CAN0, **changes)))
+    outcome = RUN[check](host(dataclasses.replace(CAN0, **changes), **contract))
     assert outcome.status is status
     assert text in outcome.reason
     assert bool(outcome.remedy) is (status in (Status.WARNING, Status.FAILED))
-
-
-@pytest.mark.parametrize(
-    ("check", "changes", "status", "text"),
-    [
-        ("mtu", {}, Status.OK, "CAN FD frames fit"),
-        ("mtu", {"mtu": 16}, Status.FAILED, "no CAN FD frames"),
-        ("bit rate", {}, Status.OK, "data phase 5000000"),
-        ("bit rate", {"data_bitrate": 2_000_000}, Status.FAILED, "data phase 2000000 bit/s, the contract has 5000000"),
-        ("bit rate", {"data_bitrate": None}, Status.FAILED, "data phase 0 bit/s, the contract has 5000000"),
-    ],
-)
-def test_a_contract_with_can_fd_needs_its_data_phase(
-    check: str, changes: dict[str, Any], status: Status, text: str
-) -> None:
-    outcome = RUN[check](host(dataclasses.replace(CAN0, **changes), data_bitrate=5_000_000))
-    assert outcome.status is status
-    assert text in outcome.reason
 
 
 def test_an_interface_that_is_not_there_is_named_with_those_that_are() -> None:
@@ -104,17 +87,13 @@ def test_python_cans_own_interfaces_have_no_kernel_to_look_at(check: str) -> Non
     assert RUN[check](host(None, interface="virtual")).status is Status.SKIPPED
 
 
-def test_what_is_not_granted_is_told_with_its_remedy() -> None:
-    refusals = (Refusal("SCHED_FIFO: no", "allow it"), Refusal("locked memory: no", "allow that"))
-    grant = RealtimeGrant("SCHED_OTHER", refusals)
-    outcome = RUN["scheduler"](host(request_realtime=lambda: grant))
-    assert outcome.reason == "not granted: SCHED_FIFO: no, locked memory: no"
-    assert outcome.remedy == "allow it; allow that"
-
-
-def test_what_is_granted_is_told() -> None:
+def test_what_is_granted_is_told_and_what_is_not_with_its_remedy() -> None:
     reason = RUN["scheduler"](host()).reason
     assert reason == "scheduler SCHED_FIFO 80, cpu 3, memory locked, idle states shallow"
+    grant = RealtimeGrant("SCHED_OTHER", (Refusal("SCHED_FIFO: no", "allow it"), Refusal("memory: no", "allow that")))
+    outcome = RUN["scheduler"](host(request_realtime=lambda: grant))
+    assert outcome.reason == "not granted: SCHED_FIFO: no, memory: no"
+    assert outcome.remedy == "allow it; allow that"
 
 
 @pytest.mark.parametrize(
@@ -138,6 +117,15 @@ def test_a_processor_of_its_own_is_judged(tmp_path: Path, cpu: str, isolated: st
     assert bool(outcome.remedy) is (status is Status.WARNING)
 
 
+def governors(*names: str) -> dict[str, str]:
+    return {f"sys/devices/system/cpu/cpu{k}/cpufreq/scaling_governor": f"{name}\n" for k, name in enumerate(names)}
+
+
+def throttled(runtime_us: int) -> dict[str, str]:
+    kernel = "proc/sys/kernel/sched_rt_"
+    return {f"{kernel}runtime_us": f"{runtime_us}\n", f"{kernel}period_us": "1000000\n"}
+
+
 @pytest.mark.parametrize(
     ("files", "check", "status", "text"),
     [
@@ -148,25 +136,12 @@ def test_a_processor_of_its_own_is_judged(tmp_path: Path, cpu: str, isolated: st
         ({"sys/kernel/realtime": "1\n"}, "preemption", Status.OK, "PREEMPT_RT"),
         ({"proc/version": "Linux #1 SMP PREEMPT_DYNAMIC"}, "preemption", Status.WARNING, "PREEMPT: single"),
         ({"proc/version": "Linux #1 SMP"}, "preemption", Status.WARNING, "no preemption named"),
-        (
-            {"sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance\n"},
-            "processor",
-            Status.OK,
-            "governor performance",
-        ),
-        (
-            {
-                "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance\n",
-                "sys/devices/system/cpu/cpu1/cpufreq/scaling_governor": "powersave\n",
-            },
-            "processor",
-            Status.WARNING,
-            "governor performance, powersave",
-        ),
+        (governors("performance"), "processor", Status.OK, "governor performance"),
+        (governors("performance", "powersave"), "processor", Status.WARNING, "governor performance, powersave"),
         ({}, "processor", Status.SKIPPED, "no frequency scaling"),
-        (THROTTLED_AT[-1], "throttling", Status.OK, "off"),
-        (THROTTLED_AT[950_000], "throttling", Status.OK, "95% of 1000 ms"),
-        (THROTTLED_AT[500_000], "throttling", Status.WARNING, "50% of 1000 ms"),
+        (throttled(-1), "throttling", Status.OK, "off"),
+        (throttled(950_000), "throttling", Status.OK, "95% of 1000 ms"),
+        (throttled(500_000), "throttling", Status.WARNING, "50% of 1000 ms"),
         ({}, "throttling", Status.SKIPPED, "/proc"),
     ],
 )

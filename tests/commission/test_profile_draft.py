@@ -63,11 +63,13 @@ def test_an_answer_is_no_guess(eds: Path) -> None:
 
 
 @pytest.mark.parametrize("access", ["rw", "rww"])
-def test_increments_that_the_factory_sets_are_a_guess(eds: Path, access: str) -> None:
+def test_increments_that_the_factory_sets_are_a_guess_until_the_device_says_them(eds: Path, access: str) -> None:
     variant = EdsVariant().with_value(2000, "608Fsub1").with_value(access, "608Fsub1", key="AccessType")
     drafted = draft(eds, variant)
     assert drafted.settings.scale.increments_per_joint_rev == 2000 * GEAR
     assert "increments_per_joint_rev" in guessed(drafted)
+    numbers = {(0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 16, (0x6091, 2): 1}
+    assert "increments_per_joint_rev" not in guessed(draft_profile(eds, DeviceRatings(numbers=numbers)))
 
 
 @pytest.mark.parametrize("increments", [1, 2000])
@@ -84,13 +86,6 @@ def test_the_coarse_increments_of_a_device_that_was_read_are_kept_as_a_guess(eds
     assert "increments_per_joint_rev" in guessed(drafted)
 
 
-def test_what_the_device_says_is_no_factory_value(eds: Path) -> None:
-    variant = EdsVariant().with_value(2000, "608Fsub1").with_value("rw", "608Fsub1", key="AccessType").write(eds)
-    numbers = {(0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 16, (0x6091, 2): 1}
-    drafted = draft_profile(variant, DeviceRatings(numbers=numbers))
-    assert "increments_per_joint_rev" not in guessed(drafted)
-
-
 def test_a_motor_too_strong_for_an_arm_counts_millionths(eds: Path) -> None:
     drafted = draft(eds, EdsVariant().with_value(512871, "6076"), gear_ratio=26.0, gear_efficiency=1.0)
     assert drafted.settings.scale.rated_torque_count_Nm == 1e-6
@@ -98,14 +93,12 @@ def test_a_motor_too_strong_for_an_arm_counts_millionths(eds: Path) -> None:
     assert "rated_torque_count_Nm" in guessed(drafted)
 
 
-def test_an_object_that_may_not_be_mapped_is_left_out(eds: Path) -> None:
-    drafted = draft(eds, EdsVariant().with_value(0, "603F", "6077", key="PDOMapping"))
-    assert objects(drafted, "Status") == ["0x6041", "0x6061"]
-
-
-def test_a_frame_has_no_more_objects_than_it_has_room_for(eds: Path) -> None:
-    drafted = draft(eds, EdsVariant().without(*(f"1A01sub{sub}" for sub in range(3, 9))))
-    assert objects(drafted, "Status") == ["0x6041", "0x6061"]
+def test_an_object_that_may_not_be_mapped_or_has_no_room_is_left_out(eds: Path) -> None:
+    for variant in (
+        EdsVariant().with_value(0, "603F", "6077", key="PDOMapping"),
+        EdsVariant().without(*(f"1A01sub{sub}" for sub in range(3, 9))),
+    ):
+        assert objects(draft(eds, variant), "Status") == ["0x6041", "0x6061"]
 
 
 def test_a_torque_by_event_comes_no_more_often_than_the_bus_bears(eds: Path) -> None:
@@ -115,13 +108,10 @@ def test_a_torque_by_event_comes_no_more_often_than_the_bus_bears(eds: Path) -> 
     assert frame(without, "Status").inhibit_100us == 0
 
 
-def test_times_that_can_t_be_written_are_the_eds_s(eds: Path) -> None:
+def test_times_and_an_identifier_that_can_t_be_written_are_the_eds_s(eds: Path) -> None:
     variant = EdsVariant().with_value("ro", "1801sub3", "1801sub5", key="AccessType")
     status = frame(draft(eds, variant.with_value(20, "1801sub3").with_value(50, "1801sub5")), "Status")
     assert (status.inhibit_100us, status.event_timer_ms) == (20, 50)
-
-
-def test_an_identifier_that_can_t_be_written_is_the_eds_s(eds: Path) -> None:
     variant = EdsVariant().with_value("const", "1400sub1", key="AccessType")
     assert frame(draft(eds, variant.with_value("$NODEID+0x240", "1400sub1")), "Command").cob_id == 0x240
 
@@ -152,13 +142,10 @@ def test_the_reason_of_a_refusal_is_the_object_that_lacks(eds: Path, variant: Ed
         draft(eds, variant)
 
 
-def test_a_node_without_profile_number_can_be_said_to_be_a_drive(eds: Path) -> None:
+def test_a_node_without_profile_number_can_be_said_to_be_a_drive_and_a_known_maker_s_is_one(eds: Path) -> None:
     path = EdsVariant().with_value("", "1000").write(eds)
     assert kind_of(path) == ""
     assert draft_profile(path, kind="drive").settings.kind == "drive"
-
-
-def test_a_known_maker_s_eds_need_not_name_its_profile(eds: Path) -> None:
     assert kind_of(EdsVariant("maxon_epos4.eds").with_value("", "1000").write(eds)) == "drive"
 
 

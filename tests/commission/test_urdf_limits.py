@@ -3,9 +3,8 @@
 import math
 
 import pytest
-from click.testing import CliRunner
+from called import called
 
-from adacd_hil.cli.main import cli
 from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.lab.commission.arm_draft import planar_from_urdf
 
@@ -43,7 +42,7 @@ LIMITS = {
 def test_an_arm_with_limits_that_say_nothing_is_drafted_with_guesses(limits, tmp_path):
     path, out = tmp_path / "arm.urdf", tmp_path / "arm.toml"
     path.write_text(urdf(limits))
-    done = CliRunner().invoke(cli, ["init", str(out), "--no-bus", "--yes", "--urdf", str(path)])
+    done = called("init", out, "--no-bus", "--yes", "--urdf", path)
     assert done.exit_code == 0, done.output
     found = examine_configuration(str(out))
     assert found.errors == []
@@ -59,8 +58,6 @@ def test_a_limit_that_is_not_taken_is_named_with_its_bound():
 def test_an_arm_without_torque_is_one_line(tmp_path):
     path, out = tmp_path / "arm.urdf", tmp_path / "arm.toml"
     path.write_text(urdf())
-    done = CliRunner().invoke(
-        cli, ["init", str(out), "--no-bus", "--yes", "--urdf", str(path), "--torque-limit-nm", "4", "0"]
-    )
+    done = called("init", out, "--no-bus", "--yes", "--urdf", path, "--torque-limit-nm", "4", "0")
     assert (done.exit_code, out.exists()) == (2, False)
     assert "`arm.torque_limit_Nm[1]` = 0 Nm: joint 2 can't move" in done.output

@@ -102,9 +102,6 @@ def test_a_configuration_that_cannot_be_is_refused(text, reason, tmp_path):
 
 def test_configurations_that_extend_each_other_without_end_are_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "a.toml").write_text('extends = "./a.toml"')
-    with pytest.raises(ConfigError, match="extends itself"):
-        load_settings("a.toml")
     for number in range(12):
         (tmp_path / f"c{number}.toml").write_text(f'extends = "c{number + 1}.toml"')
     (tmp_path / "c12.toml").write_text("")
