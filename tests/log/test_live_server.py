@@ -308,26 +308,6 @@ def test_the_servers_time_is_offered_and_is_that_of_the_log(fed):
     assert all(abs(stamp_ns - time_ns) < 20_000_000 for stamp_ns, time_ns in stamps_ns[1:])
 
 
-def test_of_many_short_messages_the_latest_wait_for_a_slow_viewer():
-    sent = []
-
-    class Slow:
-        async def send(self, data):
-            sent.append(data)
-
-    async def send_waiting():
-        viewer = server_module.Viewer(Slow())
-        for number in range(3000):
-            viewer.put(str(number))
-        sending = asyncio.create_task(viewer.send_all())
-        while not viewer.is_served:
-            await asyncio.sleep(0)
-        sending.cancel()
-
-    asyncio.run(send_waiting())
-    assert sent == [str(number) for number in range(3000 - 1024, 3000)]
-
-
 def test_a_viewer_can_end_a_subscription_and_begin_it_again(fed):
     with opened(fed.live.url) as viewer:
         channels = ask(viewer, "/events", "/robot_description")

@@ -18,7 +18,7 @@ from recorded_run import by_others, make_run, payloads, plain_frames, record
 from adacd_hil.lab.logs.signal_tables import export_tables
 from adacd_hil.log import log_walk
 from adacd_hil.log.log_files import FIELDS_KEY, find_parts, part_path
-from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, LogStream, read_log
+from adacd_hil.log.reader import LogStream, read_log
 from adacd_hil.log.types.message_types import LOG, pack_log, unpack_log
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import Event
@@ -122,11 +122,6 @@ def test_only_what_is_asked_for_is_gathered(path):
     assert (len(piece.frames), piece.payloads) == (0, {})
     (piece,) = LogStream(path, ("/from_can_bus", "/events"))
     assert (piece.series, set(piece.payloads), set(piece.frames["is_tx"])) == ({}, {"/events"}, {False})
-
-
-def test_frames_are_long_in_pieces_with_fd_frames_only(path):
-    assert {piece.frames.dtype for piece in LogStream(path, FRAMES)} == {LONG_FRAME_DTYPE}
-    assert {piece.frames.dtype for piece in LogStream(path, FRAMES[:2])} == {FRAME_DTYPE}
 
 
 def test_what_lies_beyond_the_data_is_zero_whatever_the_memory_held(path, monkeypatch):
