@@ -1,4 +1,4 @@
-"""End-to-end protection: the CRCs against the standard's examples and cantools, and what a frame needs to be taken."""
+"""End-to-end protection: the CRCs against the standard's examples and cantools, and what the receivers accept."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -142,6 +142,41 @@ def test_frames_worked_out_by_long_division_come_out(sender: E2eSender, sent: li
 def test_the_counter_begins_at_0_and_wraps(profile: Profile) -> None:
     sent = frames(profile, profile.modulus + 2)
     assert [frame[profile.counter_byte] for frame in sent] == [*range(profile.modulus), 0, 1]
+
+
+@BOTH
+@pytest.mark.parametrize("lost", [1, 4])
+def test_a_short_burst_of_lost_frames_leaves_the_next_one_usable(profile: Profile, lost: int) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, 10)
+    receiver.check(sent[0])
+    assert [receiver.miss() for _ in range(lost)] == [E2eStatus.NO_NEW_DATA] * lost
+    assert receiver.check(sent[1 + lost]) is E2eStatus.OK_SOME_LOST
+    assert receiver.check(sent[2 + lost]) is E2eStatus.OK
+
+
+@BOTH
+@pytest.mark.parametrize("lost", [5, 16, 17, 40])
+def test_after_a_long_silence_the_third_frame_is_usable_again(profile: Profile, lost: int) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, 50)
+    receiver.check(sent[0])
+    for _ in range(lost):
+        receiver.miss()
+    assert [receiver.check(frame).is_valid for frame in sent[1 + lost : 5 + lost]] == [False, False, True, True]
+
+
+@BOTH
+@pytest.mark.parametrize("missed", range(5))
+def test_a_frame_from_the_past_is_not_used_after_a_burst(profile: Profile, missed: int) -> None:
+    sent = frames(profile, 12)
+    for age in range(1, 9):
+        receiver = profile.receiver()
+        for frame in sent:
+            receiver.check(frame)
+        for _ in range(missed):
+            receiver.miss()
+        assert receiver.check(sent[11 - age]) is E2eStatus.WRONG_SEQUENCE
 
 
 @pytest.mark.parametrize(
