@@ -13,6 +13,7 @@ import can
 import can.logconvert
 import numpy as np
 import pytest
+from made_log import flipped
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -204,9 +205,8 @@ def test_frames_of_a_log_that_is_cut_are_read_up_to_the_cut(messages, path, tmp_
 def test_a_flipped_bit_outside_the_chunks_is_said(path, tmp_path):
     with path.open("rb") as file:
         chunk = make_reader(file).get_summary().chunk_indexes[0]
-    whole = bytearray(path.read_bytes())
-    whole[chunk.chunk_start_offset + chunk.chunk_length + 20] ^= 1  # in its message index
-    (tmp_path / "x.mcap").write_bytes(whole)
+    place = chunk.chunk_start_offset + chunk.chunk_length + 20  # in its message index
+    (tmp_path / "x.mcap").write_bytes(flipped(path.read_bytes(), place))
     assert read_frames(tmp_path / "x.mcap").problem == "x.mcap: the data section fails its CRC"
     assert read_frames(path).problem == ""
 

@@ -43,17 +43,15 @@ def live_setup(**changes) -> LiveView:
 
 @pytest.fixture
 def fed():
-    one = Feed()
-    yield one
-    one.close()
+    with Feed() as one:
+        yield one
 
 
 @pytest.fixture(scope="module")
 def served():
     """One that nothing is written to."""
-    one = Feed()
-    yield one.live.url
-    one.close()
+    with Feed() as one:
+        yield one.live.url
 
 
 def opened(url, *, protocols=(SDK,), origin=None, host=None, **options):
@@ -218,12 +216,11 @@ def test_a_page_is_admitted_as_a_viewer_is(served, headers, remedy):
 
 
 def test_a_page_leaves_the_place_of_a_viewer_free():
-    fed = Feed(live_setup(most_viewers=1))
-    host = f"Host: {fed.live.url.removeprefix('ws://')}"
-    assert all(page(fed.live.url, host)[0].startswith("HTTP/1.1 200") for _ in range(3))
-    with opened(fed.live.url):
-        assert page(fed.live.url, host)[0].startswith("HTTP/1.1 200")
-    fed.close()
+    with Feed(live_setup(most_viewers=1)) as fed:
+        host = f"Host: {fed.live.url.removeprefix('ws://')}"
+        assert all(page(fed.live.url, host)[0].startswith("HTTP/1.1 200") for _ in range(3))
+        with opened(fed.live.url):
+            assert page(fed.live.url, host)[0].startswith("HTTP/1.1 200")
 
 
 def raw_request(host, *more, key="AAAAAAAAAAAAAAAAAAAAAA==", protocol=SDK, path="/"):
@@ -241,8 +238,7 @@ def raw_request(host, *more, key="AAAAAAAAAAAAAAAAAAAAAA==", protocol=SDK, path=
 
 
 def test_one_viewer_too_many_is_refused_until_one_has_left():
-    fed = Feed(live_setup(most_viewers=2))
-    with contextlib.ExitStack() as stack:
+    with Feed(live_setup(most_viewers=2)) as fed, contextlib.ExitStack() as stack:
         first, _ = (stack.enter_context(opened(fed.live.url)) for _ in range(2))
         with pytest.raises(InvalidStatus) as refused:
             opened(fed.live.url)
@@ -250,7 +246,6 @@ def test_one_viewer_too_many_is_refused_until_one_has_left():
         assert "--live-viewers" in refused.value.response.body.decode()
         first.close()
         stack.enter_context(opened(fed.live.url))  # its place is free
-    fed.close()
 
 
 # -- what is said ----------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_log import flipped
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
@@ -172,9 +173,7 @@ def test_a_flipped_chunk_costs_only_itself(spoiled, run):
     times = [cycle.t_ns for cycle in run.cycles]
     for chunk in (found[0], found[2]):
         place = whole.index(chunk.data)
-        damaged = bytearray(whole)
-        damaged[place + len(chunk.data) // 2] ^= 1
-        spoiled.write_bytes(damaged)
+        spoiled.write_bytes(flipped(whole, place + len(chunk.data) // 2))
         stream = LogStream(spoiled, ("/scheme",), 50)
         read = [t_ns for piece in stream for t_ns in piece.series["/scheme"].t_ns.tolist()]
         first, last = chunk.message_start_time - EPOCH_NS, chunk.message_end_time - EPOCH_NS
