@@ -186,6 +186,12 @@ class SessionRig(Rig):
         summary = self.session.run()
         return summary, read_log(summary.log.path)
 
+    def play(self) -> tuple[RunResult, RunLog]:
+        """Run to the end of the cycles; return how they ended, and the log."""
+        summary, log = self.run()
+        assert summary.result is not None
+        return summary.result, log
+
 
 def play_lockstep(
     folder: Path,
@@ -246,3 +252,14 @@ def torques_from(log: RunLog, cycle: int) -> np.ndarray:
 
 def controlwords(log: RunLog) -> np.ndarray:
     return log.decoded["Drive1Command"]["controlword"]
+
+
+def messages(log: RunLog, name: str) -> list[str]:
+    """Return the texts of a log's events of this name."""
+    return [entry.event.message for entry in log.events if entry.event.name == name]
+
+
+def transition(log: RunLog, state: str) -> str:
+    """Return what the supervisor says of the one transition to this state."""
+    (text,) = [text for text in messages(log, "supervisor") if f"-> {state}" in text]
+    return text

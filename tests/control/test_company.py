@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from long_cases import long_but
-from rig import CODEC, TROUBLE_CYCLE, SessionRig, torques_from
+from rig import CODEC, TROUBLE_CYCLE, SessionRig, messages, torques_from, transition
 
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import FaultReason, Request, SchemeState
@@ -23,11 +23,6 @@ def faulted(log: RunLog) -> int:
     return int(log.scheme["cycle"][np.argmax(log.scheme["state"] == SchemeState.FAULT)])
 
 
-def reason(log: RunLog) -> str:
-    (text,) = [entry.event.message for entry in log.events if "-> FAULT" in entry.event.message]
-    return text
-
-
 def rig_with(folder: Path, section: str, **changes: int) -> SessionRig:
     """Make a rig whose session differs in a section of the settings."""
     rig = SessionRig(folder)
@@ -35,16 +30,6 @@ def rig_with(folder: Path, section: str, **changes: int) -> SessionRig:
     changed = dataclasses.replace(getattr(settings, section), **changes)
     rig.session.settings = dataclasses.replace(settings, **{section: changed})
     return rig
-
-
-def play(rig: SessionRig) -> tuple[FaultReason, RunLog]:
-    summary, log = rig.run()
-    assert summary.result is not None
-    return summary.result.fault, log
-
-
-def messages(log: RunLog, name: str) -> list[str]:
-    return [entry.event.message for entry in log.events if entry.event.name == name]
 
 
 def forged_command() -> bytes:
@@ -72,10 +57,10 @@ def test_a_frame_that_only_this_host_sends_is_named_and_faults_at_once(
 ) -> None:
     rig = SessionRig(tmp_path)
     rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(can_id, data)
-    fault, log = play(rig)
-    assert fault is FaultReason.FOREIGN_FRAMES
+    result, log = rig.play()
+    assert result.fault is FaultReason.FOREIGN_FRAMES
     assert faulted(log) <= TROUBLE_CYCLE + 1
-    assert says in reason(log)
+    assert says in transition(log, "FAULT")
     assert messages(log, "bus") == [says]
     assert np.count_nonzero(torques_from(log, TROUBLE_CYCLE + 2)) == 0
 
@@ -83,8 +68,8 @@ def test_a_frame_that_only_this_host_sends_is_named_and_faults_at_once(
 def test_who_only_reads_objects_is_named_and_harmless(tmp_path: Path) -> None:
     rig = SessionRig(tmp_path)
     rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x602, SDO_READ)
-    fault, log = play(rig)
-    assert fault is FaultReason.NONE
+    result, log = rig.play()
+    assert result.fault is FaultReason.NONE
     said = [entry.event for entry in log.events if entry.event.name == "bus"]
     assert [(event.level, event.message) for event in said] == [
         ("warning", "somebody else reads objects of drive 2 (0x602)")
@@ -95,9 +80,9 @@ def test_an_arm_that_somebody_commands_before_it_is_enabled_is_not_enabled(tmp_p
     rig = SessionRig(tmp_path)
     for cycle in range(50, 6000, 500):
         rig.before_sync[cycle] = lambda: rig.bus.deliver(0x201, forged_command())
-    fault, log = play(rig)
-    assert fault is FaultReason.COMMISSION_TIMEOUT
-    assert "fault FOREIGN_FRAMES in" in reason(log)
+    result, log = rig.play()
+    assert result.fault is FaultReason.COMMISSION_TIMEOUT
+    assert "fault FOREIGN_FRAMES in" in transition(log, "FAULT")
     assert not np.any(log.scheme["state"] == SchemeState.ENABLE)
 
 
@@ -116,8 +101,8 @@ def test_a_drive_that_does_not_hear_the_quick_stop_is_taken_out_of_operation_by_
         rig.tamper = lambda cycle, can_id, data: None if can_id == 0x183 else data
 
     rig.before_sync[TROUBLE_CYCLE] = trouble
-    fault, log = play(rig)
-    assert fault is FaultReason.DATA_AGE
+    result, log = rig.play()
+    assert result.fault is FaultReason.DATA_AGE
     at = faulted(log)
     sent = [
         (int(frame["t_ns"]) // 1_000_000, bytes(frame["data"][:2]))
@@ -138,26 +123,26 @@ def test_a_drive_whose_torque_is_not_the_commanded_one_faults(tmp_path: Path) ->
         return data[:3] + (700).to_bytes(2, "little", signed=True) + data[5:]
 
     rig.tamper = overstate
-    fault, log = play(rig)
-    assert fault is FaultReason.TORQUE
+    result, log = rig.play()
+    assert result.fault is FaultReason.TORQUE
     assert TROUBLE_CYCLE < faulted(log) <= TROUBLE_CYCLE + 210
-    assert "Drive1: torque 70.0 % of 12 Nm rated at the joint, " in reason(log)
+    assert "Drive1: torque 70.0 % of 12 Nm rated at the joint, " in transition(log, "FAULT")
     assert np.count_nonzero(log.scheme["request"] == Request.FAULT_TORQUE) > 0
 
 
 def test_a_device_that_has_lost_its_set_up_faults(tmp_path: Path) -> None:
     rig = rig_with(tmp_path, "devices", reread_ms=2)
     rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bench.devices[1].take_over(0x2200, 0, 200)
-    fault, log = play(rig)
-    assert fault is FaultReason.TAMPERED
-    assert "Drive2 (node 2): 0x2200 " in reason(log)
-    assert "is 0xC8, 0xA was set up" in reason(log)
+    result, log = rig.play()
+    assert result.fault is FaultReason.TAMPERED
+    assert "Drive2 (node 2): 0x2200 " in transition(log, "FAULT")
+    assert "is 0xC8, 0xA was set up" in transition(log, "FAULT")
 
 
 def test_the_set_up_is_read_again_while_the_arm_runs_and_differs_in_nothing(tmp_path: Path) -> None:
     rig = rig_with(tmp_path, "devices", reread_ms=2)
-    fault, log = play(rig)
-    assert fault is FaultReason.NONE
+    result, log = rig.play()
+    assert result.fault is FaultReason.NONE
     asked = {
         (int(frame["can_id"]), bytes(frame["data"][1:4]))
         for frame in log.frames

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rig import SessionRig
+from rig import SessionRig, transition
 
 from adacd_hil.device.arm_watch import DeadlineWatch
 from adacd_hil.log.reader import RunLog
@@ -102,8 +102,7 @@ def play(folder: Path, on_misses: str) -> RunLog:
 def test_a_host_that_stalls_faults_with_a_quick_stop_and_says_how_many_it_missed(tmp_path: Path) -> None:
     log = play(tmp_path, "stop")
     assert FaultReason(int(log.scheme["fault"][-1])) is FaultReason.DEADLINE
-    (line,) = [entry.event.message for entry in log.events if "-> FAULT" in entry.event.message]
-    assert line == "MONITOR -> FAULT: DEADLINE; 4 periods missed within 1 s; 3 are too many"
+    assert transition(log, "FAULT") == "MONITOR -> FAULT: DEADLINE; 4 periods missed within 1 s; 3 are too many"
     assert log.control["quick_stop"][-1]
 
 
@@ -119,5 +118,4 @@ def test_a_host_that_stalls_brakes_the_arm_and_holds_it_and_reports_no_contact(t
     assert np.all(speed[-1] == 0.0)
     assert np.all(np.diff(speed, axis=0) <= 0.0)  # it brakes, and goes nowhere first
     assert not log.contacts
-    (line,) = [entry.event.message for entry in log.events if "-> REACT" in entry.event.message]
-    assert line == "MONITOR -> REACT: DEADLINE; 4 periods missed within 1 s; 3 are too many"
+    assert transition(log, "REACT") == "MONITOR -> REACT: DEADLINE; 4 periods missed within 1 s; 3 are too many"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig import SessionRig
+from rig import SessionRig, messages
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control.cycle import FINISH_S
@@ -83,10 +83,9 @@ def test_a_payload_announced_where_that_means_nothing_is_not_announced_again(tmp
 def test_an_arm_that_cannot_be_parked_is_disabled_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("adacd_hil.control.reference.Reference.is_parked", lambda *_: False)
     rig = SessionRig(tmp_path, finish_s=0.5)
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.NONE
+    result, log = rig.play()
+    assert result.fault is FaultReason.NONE
     finish = int(np.flatnonzero(log.scheme["request"] == Request.FINISH)[0])
     assert 0 <= len(log.scheme) - finish - FINISH_S * 1000 < 5
-    (said,) = [entry.event.message for entry in log.events if entry.event.name == "run"]
+    (said,) = messages(log, "run")
     assert said == "not parked within 10 s: the drives are disabled where the arm is"

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from rig import ENABLE_OPERATION, TROUBLE_CYCLE, SessionRig, controlwords, torques_from
+from rig import ENABLE_OPERATION, TROUBLE_CYCLE, SessionRig, controlwords, messages, torques_from
 
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.log.reader import RunLog
@@ -28,10 +28,6 @@ def states(log: RunLog) -> list[int]:
     """Return the states in the order in which they were entered."""
     state = log.scheme["state"]
     return state[np.insert(np.diff(state) != 0, 0, True)].tolist()
-
-
-def messages(log: RunLog, name: str) -> list[str]:
-    return [entry.event.message for entry in log.events if entry.event.name == name]
 
 
 class Recovered(NamedTuple):

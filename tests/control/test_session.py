@@ -15,7 +15,9 @@ from rig import (
     TROUBLE_CYCLE,
     SessionRig,
     controlwords,
+    messages,
     torques_from,
+    transition,
 )
 
 from adacd_hil.control.cycle import RunResult
@@ -42,9 +44,6 @@ class Ended(NamedTuple):
     def result(self) -> RunResult:
         assert self.summary.result is not None
         return self.summary.result
-
-    def messages(self, name: str) -> list[str]:
-        return [entry.event.message for entry in self.log.events if entry.event.name == name]
 
 
 LOST, ALIEN, CORRUPT, PASSIVE = (TROUBLE_CYCLE + 100 * k for k in range(4))
@@ -84,7 +83,7 @@ def test_wrong_frames_change_no_value_and_the_log_says_and_counts_them(disturbed
     (said,) = [entry.event for entry in log.events if entry.event.name == "bus"]
     assert said.level == "warning"
     assert said.message == "error passive (sending); error counters: sending 130, receiving 0"
-    *tallies, dropped = disturbed.messages("frame checks")
+    *tallies, dropped = messages(log, "frame checks")
     assert dropped == "1 frames dropped that are not what their identifier says"
     (tally,) = [line for line in tallies if line.startswith("Sensor1: ")]
     assert ("1 WRONG_CRC" in tally, "1 OK_SOME_LOST" in tally) == (True, True)
@@ -121,21 +120,18 @@ def test_a_fault_after_the_age_budget_is_latched_and_leaves_no_torque_on_the_wir
 def test_a_device_whose_heartbeat_stops_faults_the_run_and_is_named(tmp_path: Path) -> None:
     rig = SessionRig(tmp_path)
     rig.tamper = lambda cycle, i, data: None if i == 0x703 and cycle >= TROUBLE_CYCLE else data
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.HEARTBEAT
+    result, log = rig.play()
+    assert result.fault is FaultReason.HEARTBEAT
     first = int(np.argmax(log.scheme["state"] == SchemeState.FAULT))
     assert TROUBLE_CYCLE + 150 < first <= TROUBLE_CYCLE + 260  # 2.5 periods of 100 ms after the last one
-    (reason,) = [entry.event.message for entry in log.events if "-> FAULT" in entry.event.message]
-    assert "Sensor1 (node 3): no heartbeat for" in reason
+    assert "Sensor1 (node 3): no heartbeat for" in transition(log, "FAULT")
 
 
 def test_an_interrupt_parks_the_arm_before_the_drives_are_disabled(tmp_path: Path) -> None:
     rig = SessionRig(tmp_path, finish_s=30.0)
     rig.before_sync[TROUBLE_CYCLE] = rig.session.interrupt
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.is_interrupted
+    result, log = rig.play()
+    assert result.is_interrupted
     assert set(controlwords(log)[300:-20].tolist()) == {ENABLE_OPERATION}
     np.testing.assert_allclose(np.degrees(log.scheme["q"][-1]), [-30.0, -60.0], atol=1.0)
 
@@ -144,11 +140,10 @@ def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
     rig = SessionRig(tmp_path, finish_s=30.0)
     rig.before_sync[TROUBLE_CYCLE] = rig.session.interrupt
     rig.before_sync[TROUBLE_CYCLE + 50] = rig.session.interrupt
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.cycles < TROUBLE_CYCLE + 50 + 30
+    result, log = rig.play()
+    assert result.cycles < TROUBLE_CYCLE + 50 + 30
     assert set(controlwords(log)[-20:].tolist()) == {QUICK_STOP}
-    (said,) = [entry.event.message for entry in log.events if entry.event.name == "run"]
+    (said,) = messages(log, "run")
     assert said == "interrupted again before it was parked: the drives are disabled where the arm is"
 
 
@@ -163,9 +158,8 @@ def test_an_arm_that_moves_before_it_is_enabled_is_never_enabled(tmp_path: Path)
         return bytes(feedback.encode(position, 0.2))
 
     rig.tamper = push
-    summary, log = rig.run()
-    assert summary.result is not None
-    assert summary.result.fault is FaultReason.COMMISSION_TIMEOUT
+    result, log = rig.play()
+    assert result.fault is FaultReason.COMMISSION_TIMEOUT
     assert ENABLE_OPERATION not in controlwords(log)
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from rig import CycleRig, torque_of
+from rig import CycleRig, messages, torque_of
 
 from adacd_hil.control.fault_recovery import Recovery
 from adacd_hil.control.operator import ScriptedOperator
@@ -46,4 +46,4 @@ def test_recovery_leaves_no_old_command_to_get_out(tmp_path: Path, queue_length:
     assert recovery.empty()
     rig.queue.is_acknowledged = True
     assert rig.sent == []
-    assert any(entry.event.message == "transmit queue emptied" for entry in rig.read().events)
+    assert messages(rig.read(), "recovery") == ["transmit queue emptied"]

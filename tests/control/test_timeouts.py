@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from rig import transition
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.log.reader import read_log
@@ -41,9 +42,4 @@ def test_a_timeout_names_its_cause(scenario: str, line: str, tmp_path: Path) -> 
     file = tmp_path / "not-ready.toml"
     file.write_text(scenario)
     summary, _ = run_embedded(resolve("paper", str(file), None, None), "lockstep", tmp_path)
-    (said,) = [
-        entry.event.message
-        for entry in read_log(summary.log.path).events
-        if entry.event.name == "supervisor" and "-> FAULT" in entry.event.message
-    ]
-    assert said.startswith(line)
+    assert transition(read_log(summary.log.path), "FAULT").startswith(line)

@@ -64,21 +64,6 @@ def test_cantools_reads_a_composed_contract_without_a_warning() -> None:
     assert {triggers[n] for n in ("Nmt", "Sensor1SdoRequest")} == {"request"}
 
 
-def test_node_ids_move_every_identifier_of_a_device() -> None:
-    settings = parse(Settings, {"devices": {"drive_node": [11, 12], "contract": ""}})
-    codec = load_contract(settings)
-    ids = {name: message.can_id for name, message in codec.messages.items() if name.startswith("Drive2")}
-    assert ids == {
-        "Drive2Emcy": 0x08C,
-        "Drive2Feedback": 0x18C,
-        "Drive2Command": 0x20C,
-        "Drive2Status": 0x28C,
-        "Drive2SdoResponse": 0x58C,
-        "Drive2SdoRequest": 0x60C,
-        "Drive2Heartbeat": 0x70C,
-    }
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("config", ["paper", "fd", "fd_500us", "stock"])
 def test_a_contract_moves_to_the_configured_node_ids_and_is_what_the_profiles_say(config: str) -> None:
@@ -92,7 +77,7 @@ def test_a_contract_moves_to_the_configured_node_ids_and_is_what_the_profiles_sa
     assert codec.layout_digest == load_contract(composed).layout_digest
 
 
-def test_a_moved_contract_gets_a_file_for_the_log_and_is_not_mistaken_for_another(tmp_path: Path) -> None:
+def test_a_contract_without_a_file_gets_one_for_the_log_and_is_not_mistaken_for_another(tmp_path: Path) -> None:
     codec = load_contract(parse(Settings, {"devices": {"drive_node": [5, 6], "sensor_node": [7, 8]}}))
     written = write_contract(codec, tmp_path)
     assert written == tmp_path / "arm.dbc"
@@ -102,24 +87,15 @@ def test_a_moved_contract_gets_a_file_for_the_log_and_is_not_mistaken_for_anothe
     with pytest.raises(FileExistsError, match="another one is there already"):
         write_contract(codec, tmp_path)
     assert written.read_bytes() == load_codec().text
+    composed = load_contract(parse(Settings, {"devices": {"contract": ""}}))
+    assert write_contract(composed, tmp_path) == tmp_path / "contract.dbc"
+    assert load_codec(tmp_path / "contract.dbc").layout_digest == load_codec().layout_digest
+    assert write_contract(load_codec(), tmp_path) == load_codec().path  # it has a file
 
 
 def test_the_host_has_a_node_id_of_its_own() -> None:
     with pytest.raises(ConfigError, match=r"`bus.host_node` = 3 is the node id of a device"):
         parse(Settings, {"bus": {"host_node": 3}})
-
-
-def test_a_composed_contract_gets_a_file_for_the_log(tmp_path: Path) -> None:
-    settings = parse(Settings, {"devices": {"contract": ""}})
-    written = write_contract(load_contract(settings), tmp_path)
-    assert written == tmp_path / "contract.dbc"
-    assert load_codec(written).layout_digest == load_codec().layout_digest
-
-
-def test_a_contract_with_a_file_is_not_written_again(tmp_path: Path) -> None:
-    codec = load_codec()
-    assert write_contract(codec, tmp_path) == codec.path
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_misspelt_contract_is_told_the_nearest() -> None:

@@ -87,6 +87,12 @@ class Feed:
             self.live.end_view()
             self.live.process.wait(HANG_S)
 
+    def __enter__(self) -> "Feed":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
 
 def receive_until_last(client: LiveClient) -> list[LiveMessage]:
     """Receive everything up to LAST, which no rate holds back."""

@@ -231,3 +231,9 @@ def write_blf(path, inner, method=2, size=None, cut=0):
     container = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(packed) if size is None else size, 10) + packed
     path.write_bytes((path.read_bytes()[:144] + container + bytes(len(container) % 4))[: -cut or None])
     return path
+
+
+def flipped(data, place, bit=0):
+    damaged = bytearray(data)
+    damaged[place] ^= 1 << bit
+    return bytes(damaged)

@@ -7,7 +7,7 @@ import zlib
 import lz4.frame
 import pytest
 import zstandard
-from made_log import Part, kinds, make_log, put_together, take_apart
+from made_log import kinds, make_log, new, put_together, take_apart
 from mcap.opcode import Opcode
 from mcap.records import Chunk
 from recorded_run import make_run, start
@@ -95,40 +95,32 @@ def test_a_file_may_open_to_so_many_times_its_size():
         opening.allow(0, 1)
 
 
-def body_of(compression, data, size):
-    return struct.pack("<QQQI", 0, 0, size, 0) + _text(compression) + struct.pack("<Q", len(data)) + data
-
-
-def _text(text):
-    return struct.pack("<I", len(text)) + text.encode()
-
-
 def many_small_bombs():
     """Many chunks of empty messages that pack to little: 12 KB in the file are 1 GiB."""
     zeros = bytes(MOST_BYTES - 100)
     record = struct.pack("<BQ", 0x7F, len(zeros)) + zeros
     data = zstandard.compress(record)
-    return [Part(Opcode.CHUNK, body_of("zstd", data, len(record))) for _ in range(32)]
+    return [new(chunk_of("zstd", data, len(record))) for _ in range(32)]
 
 
 def lying_size():
-    return [Part(Opcode.CHUNK, body_of("lz4", lz4.frame.compress(bytes(1000)), 1 << 40))]
+    return [new(chunk_of("lz4", lz4.frame.compress(bytes(1000)), 1 << 40))]
 
 
 def lz4_bomb():
     zeros = bytes(1 << 28)
-    return [Part(Opcode.CHUNK, body_of("lz4", lz4.frame.compress(zeros), 100))]
+    return [new(chunk_of("lz4", lz4.frame.compress(zeros), 100))]
 
 
 def zstd_bomb():
     zeros = pack_unsized(bytes(1 << 28))
-    return [Part(Opcode.CHUNK, body_of("zstd", zeros, 100))]
+    return [new(chunk_of("zstd", zeros, 100))]
 
 
 def zstd_with_a_long_window():
     """A frame that asks for a window of 2 GiB, RFC 8878 3.1.1.1.2, and repeats one byte."""
     frame = b"\x28\xb5\x2f\xfd" + bytes([0x00, 21 << 3]) + (b"\x02\x00\x10" + b"\0") * 10 + b"\x03\x00\x00\0"
-    return [Part(Opcode.CHUNK, body_of("zstd", frame, 100))]
+    return [new(chunk_of("zstd", frame, 100))]
 
 
 BOMBS = {f.__name__: f for f in (many_small_bombs, lying_size, lz4_bomb, zstd_bomb, zstd_with_a_long_window)}
@@ -187,7 +179,7 @@ def test_a_record_that_is_too_large_is_not_read(tmp_path):
     start = parts[1].offset
     path = tmp_path / "run.mcap"
     size = MOST_RECORD_BYTES + (1 << 20)
-    body_start = struct.pack("<QQ", 0, 0) + _text("big") + _text("") + struct.pack("<Q", size - 16 - 7 - 4 - 8 - 4)
+    body_start = struct.pack("<QQI3sIQ", 0, 0, 3, b"big", 0, size - 16 - 7 - 4 - 8 - 4)
     with path.open("wb") as file:
         file.write(whole[:start] + struct.pack("<BQ", Opcode.ATTACHMENT, size) + body_start)
         file.truncate(start + 9 + size)

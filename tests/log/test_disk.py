@@ -2,14 +2,13 @@
 
 import json
 import os
-import pickle
 import re
 import resource
 import socket
 import threading
 
 import pytest
-from recorded_run import CODEC, make_run
+from recorded_run import make_run
 
 from adacd_hil.log.log_files import find_parts
 from adacd_hil.log.reader import read_log
@@ -21,7 +20,6 @@ from adacd_hil.log.recording.ring import Ring, RingReader
 from adacd_hil.log.recording.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS, WriterProcess
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec_columns import plain_tables
 
 pytestmark = pytest.mark.slow
 
@@ -270,10 +268,3 @@ def test_a_packet_that_makes_no_sense_is_dropped_alone(tmp_path):
     word = writer.end()
     assert (word["lost"], word["error"]) == ("3", "")
     assert read_log(path).scheme.block.tobytes() == run.blocks.tobytes()
-
-
-def test_the_setup_arrives_as_it_was_sent(tmp_path):
-    messages = plain_tables(CODEC.messages.values())
-    setup = WriterSetup(tmp_path, True, run_channels(7, messages), messages, 5, 1, 2, {"a": b"\xff"}, {"b": "c"})
-    assert pickle.loads(pickle.dumps(setup)) == setup
-    assert len(messages) == len(CODEC.messages)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_log import flipped
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
 from adacd_hil.log.log_files import LogError
@@ -27,6 +28,7 @@ import sys
 import threading
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
+from made_log import flipped
 from recorded_run import feed, make_run, start
 run = make_run(400)
 recorder = start(Path(sys.argv[1]), run, blocking=sys.argv[3] == "lockstep")
@@ -284,9 +286,7 @@ def test_a_flipped_bit_is_noticed_or_harmless(run, whole, tmp_path):
     generator = np.random.default_rng(11)
     noticed = 0
     for place in (*range(8, 60), *generator.integers(8, len(whole), 200).tolist()):
-        damaged = bytearray(whole)
-        damaged[place] ^= 1 << int(generator.integers(8))
-        path.write_bytes(damaged)
+        path.write_bytes(flipped(whole, place, int(generator.integers(8))))
         log = read_log(path)
         noticed += not log.is_complete
         if log.is_complete:
@@ -298,10 +298,8 @@ def test_a_flipped_bit_is_noticed_or_harmless(run, whole, tmp_path):
 
 @pytest.mark.slow
 def test_a_damaged_attachment_is_not_handed_out(whole, run, tmp_path):
-    damaged = bytearray(whole)
-    damaged[whole.index(run.attachments["run.toml"])] ^= 1
     path = tmp_path / "damaged.mcap"
-    path.write_bytes(damaged)
+    path.write_bytes(flipped(whole, whole.index(run.attachments["run.toml"])))
     log = read_log(path)
     assert "run.toml" not in log.attachments
     assert log.attachments["arm.dbc"] == run.attachments["arm.dbc"]

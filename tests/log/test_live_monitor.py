@@ -70,13 +70,11 @@ def two_cycles():
 
 def shown_of(run):
     """What a monitor says of a run."""
-    fed = Feed()
-    with live_client(fed.live.url, TOPICS) as client:
+    with Feed() as fed, live_client(fed.live.url, TOPICS) as client:
         fed.cycles(run, 1)
         monitor = LiveMonitor(client)
         for message in receive_until_last(client):
             monitor.accept_message(message)
-    fed.close()
     return monitor.describe()
 
 

@@ -43,17 +43,15 @@ def live_setup(**changes) -> LiveView:
 
 @pytest.fixture
 def fed():
-    one = Feed()
-    yield one
-    one.close()
+    with Feed() as one:
+        yield one
 
 
 @pytest.fixture(scope="module")
 def served():
     """One that nothing is written to."""
-    one = Feed()
-    yield one.live.url
-    one.close()
+    with Feed() as one:
+        yield one.live.url
 
 
 def opened(url, *, protocols=(SDK,), origin=None, host=None, **options):
@@ -218,12 +216,11 @@ def test_a_page_is_admitted_as_a_viewer_is(served, headers, remedy):
 
 
 def test_a_page_leaves_the_place_of_a_viewer_free():
-    fed = Feed(live_setup(most_viewers=1))
-    host = f"Host: {fed.live.url.removeprefix('ws://')}"
-    assert all(page(fed.live.url, host)[0].startswith("HTTP/1.1 200") for _ in range(3))
-    with opened(fed.live.url):
-        assert page(fed.live.url, host)[0].startswith("HTTP/1.1 200")
-    fed.close()
+    with Feed(live_setup(most_viewers=1)) as fed:
+        host = f"Host: {fed.live.url.removeprefix('ws://')}"
+        assert all(page(fed.live.url, host)[0].startswith("HTTP/1.1 200") for _ in range(3))
+        with opened(fed.live.url):
+            assert page(fed.live.url, host)[0].startswith("HTTP/1.1 200")
 
 
 def raw_request(host, *more, key="AAAAAAAAAAAAAAAAAAAAAA==", protocol=SDK, path="/"):
@@ -241,8 +238,7 @@ def raw_request(host, *more, key="AAAAAAAAAAAAAAAAAAAAAA==", protocol=SDK, path=
 
 
 def test_one_viewer_too_many_is_refused_until_one_has_left():
-    fed = Feed(live_setup(most_viewers=2))
-    with contextlib.ExitStack() as stack:
+    with Feed(live_setup(most_viewers=2)) as fed, contextlib.ExitStack() as stack:
         first, _ = (stack.enter_context(opened(fed.live.url)) for _ in range(2))
         with pytest.raises(InvalidStatus) as refused:
             opened(fed.live.url)
@@ -250,7 +246,6 @@ def test_one_viewer_too_many_is_refused_until_one_has_left():
         assert "--live-viewers" in refused.value.response.body.decode()
         first.close()
         stack.enter_context(opened(fed.live.url))  # its place is free
-    fed.close()
 
 
 # -- what is said ----------------------------------------------------------------------------------------------------
@@ -306,26 +301,6 @@ def test_the_servers_time_is_offered_and_is_that_of_the_log(fed):
     assert EPOCH_NS + 7_000_000_000 <= times_ns[0] < times_ns[-1] <= EPOCH_NS + 7_200_000_000
     assert len(times_ns) >= 8  # more often than the four times that something came
     assert all(abs(stamp_ns - time_ns) < 20_000_000 for stamp_ns, time_ns in stamps_ns[1:])
-
-
-def test_of_many_short_messages_the_latest_wait_for_a_slow_viewer():
-    sent = []
-
-    class Slow:
-        async def send(self, data):
-            sent.append(data)
-
-    async def send_waiting():
-        viewer = server_module.Viewer(Slow())
-        for number in range(3000):
-            viewer.put(str(number))
-        sending = asyncio.create_task(viewer.send_all())
-        while not viewer.is_served:
-            await asyncio.sleep(0)
-        sending.cancel()
-
-    asyncio.run(send_waiting())
-    assert sent == [str(number) for number in range(3000 - 1024, 3000)]
 
 
 def test_a_viewer_can_end_a_subscription_and_begin_it_again(fed):

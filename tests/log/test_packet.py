@@ -99,14 +99,6 @@ def test_data_that_no_frame_can_hold_shows_by_its_length():
     assert columns.frames["length"].tolist() == [65]
 
 
-def test_classic_frames_are_packed_without_room_for_more():
-    frames = [(False, Frame(1, bytes(8), 0))] * 7
-    longer = [*frames, (False, Frame(1, bytes(24), 0))]
-    empty, classic, mixed = (len(pack_cycle(0, 0, [], each)) for each in ([], frames, longer))
-    assert classic - empty == 7 * 24
-    assert mixed - classic == 24 + 16
-
-
 def test_a_packet_without_a_whole_head_of_a_known_kind_is_told_apart():
     packets = (GOOD, b"", b"\x01", GOOD[:15], pack_event(-3, 0, Event("", "", "")), b"\x09" + GOOD[1:], GOOD)
     sizes = np.array([len(packet) for packet in packets])

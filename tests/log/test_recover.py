@@ -7,6 +7,7 @@ from made_log import (
     RUN,
     SUMMARY,
     Part,
+    flipped,
     kinds,
     make_log,
     message,
@@ -46,12 +47,6 @@ def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "log.mcap"
     path.write_bytes(WHOLE)
     return read_by_mcap(path)
-
-
-def flipped(data, place, bit=0):
-    damaged = bytearray(data)
-    damaged[place] ^= 1 << bit
-    return bytes(damaged)
 
 
 def test_of_an_undamaged_log_nothing_is_lost(whole, tmp_path):

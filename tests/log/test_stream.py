@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_log import flipped
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
@@ -18,7 +19,7 @@ from recorded_run import by_others, make_run, payloads, plain_frames, record
 from adacd_hil.lab.logs.signal_tables import export_tables
 from adacd_hil.log import log_walk
 from adacd_hil.log.log_files import FIELDS_KEY, find_parts, part_path
-from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, LogStream, read_log
+from adacd_hil.log.reader import LogStream, read_log
 from adacd_hil.log.types.message_types import LOG, pack_log, unpack_log
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import Event
@@ -124,11 +125,6 @@ def test_only_what_is_asked_for_is_gathered(path):
     assert (piece.series, set(piece.payloads), set(piece.frames["is_tx"])) == ({}, {"/events"}, {False})
 
 
-def test_frames_are_long_in_pieces_with_fd_frames_only(path):
-    assert {piece.frames.dtype for piece in LogStream(path, FRAMES)} == {LONG_FRAME_DTYPE}
-    assert {piece.frames.dtype for piece in LogStream(path, FRAMES[:2])} == {FRAME_DTYPE}
-
-
 def test_what_lies_beyond_the_data_is_zero_whatever_the_memory_held(path, monkeypatch):
     def used(shape, dtype):
         count = int(np.prod(shape))
@@ -177,9 +173,7 @@ def test_a_flipped_chunk_costs_only_itself(spoiled, run):
     times = [cycle.t_ns for cycle in run.cycles]
     for chunk in (found[0], found[2]):
         place = whole.index(chunk.data)
-        damaged = bytearray(whole)
-        damaged[place + len(chunk.data) // 2] ^= 1
-        spoiled.write_bytes(damaged)
+        spoiled.write_bytes(flipped(whole, place + len(chunk.data) // 2))
         stream = LogStream(spoiled, ("/scheme",), 50)
         read = [t_ns for piece in stream for t_ns in piece.series["/scheme"].t_ns.tolist()]
         first, last = chunk.message_start_time - EPOCH_NS, chunk.message_end_time - EPOCH_NS

@@ -286,19 +286,6 @@ def test_every_event_in_every_state_is_judged_as_the_standard_says(
     assert statuses == set(E2eStatus) - never
 
 
-@pytest.mark.parametrize(
-    ("make", "tolerance"), [(p02, PROFILE_2_TOLERANCE), (p05, PROFILE_5_TOLERANCE)], ids=["P02", "P05"]
-)
-@pytest.mark.parametrize("before", [name for name in BEFORE if name != "nothing yet"])
-def test_the_rows_begin_in_the_state_that_they_name(
-    make: Callable[[Tolerance], Bench], tolerance: Tolerance, before: str
-) -> None:
-    bench = make(tolerance)
-    for event in BEFORE[before]:
-        bench.feed(event)
-    assert bench.found[-1] == (E2eStatus[before], E2eStatus[before])
-
-
 @ALL
 def test_a_long_random_walk_is_judged_as_the_standard_says(
     make: Callable[[Tolerance], Bench], tolerance: Tolerance

@@ -145,30 +145,3 @@ def test_no_can_fd_frame_is_longer_than_the_worst_case(can_id: int, data: bytes,
     assert exact.nominal <= worst.nominal
     assert exact.total <= worst.total
     assert exact.duration_ns(1_000_000, rate * 1_000_000) <= worst.duration_ns(1_000_000, rate * 1_000_000)
-
-
-def most_stuff_bits(length: int) -> int:
-    """Most stuff bits that any identifier, data and CRC could cause, given the fixed bits of the control field."""
-    fixed = [0, *[None] * 11, 0, 0, 0, *to_bits(length, 4), *[None] * (8 * length + 15)]
-    best: dict[tuple[int, int], int] = {(1, 0): 0}  # last bit on the wire, length of its run
-    for fixed_bit in fixed:
-        reached: dict[tuple[int, int], int] = {}
-        for (last, run), count in best.items():
-            for bit in (0, 1) if fixed_bit is None else (fixed_bit,):
-                longer = run + 1 if bit == last else 1
-                key, new = ((1 - bit, 1), count + 1) if longer == 5 else ((bit, longer), count)
-                reached[key] = max(reached.get(key, 0), new)
-        best = reached
-    return max(best.values())
-
-
-def test_a_frame_built_for_it_has_the_most_stuff_bits_that_the_format_allows() -> None:
-    # 0 0000 0111 11|.., then runs of four to the end of the data; identifier and data picked so that the CRC goes on.
-    found = exact_frame(0x01F, bytes.fromhex("8787c1e1e1e1e1")).total - unstuffed_frame(7).total
-    assert found == most_stuff_bits(7)
-    # The formula is one more: it doesn't know that the control field is fixed.
-    assert found == worst_case_frame(7).total - unstuffed_frame(7).total - 1
-
-
-def test_the_longest_known_frame_of_8_bytes_is_two_bits_short_of_the_formula() -> None:
-    assert exact_frame(0x07C, bytes.fromhex("01e1e1e1f0787878")).total == worst_case_frame(8).total - 2
