@@ -1,5 +1,6 @@
 """The state machine: its table against one written by hand, and the conditions that raise its events."""
 
+import itertools
 import re
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ from smooth_motion import settings_with
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
 from adacd_hil.scheme.supervisor import supervisor, transitions
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, SchemeEvent, next_state
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, TRANSITIONS, SchemeEvent, next_state
 from adacd_hil.structured import zeros_of
 
 # What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens, "back"
@@ -49,16 +50,26 @@ def test_every_event_in_every_state_leads_where_the_hand_written_table_says(stat
         assert following == SchemeState[origin if expected == "back" else expected]
 
 
+def test_react_is_entered_from_these_states_only():
+    entered_from = {state.name for state, row in TRANSITIONS.items() if SchemeState.REACT in row.values()}
+    assert entered_from == set(ORIGINS)
+
+
 @pytest.mark.parametrize("state", SchemeState)
 def test_no_event_leaves_every_state_as_it_is(state):
     assert next_state(int(state), 0, int(SchemeState.MONITOR)) == state
 
 
-def test_events_are_numbered_in_order_of_precedence_and_the_hand_written_table_has_every_state():
+def test_the_hand_written_table_covers_all_states_and_events():
+    covered = {(state, event) for state, event, _ in expectations()}
+    named = {event.name for event in SchemeEvent} - {"NONE"}
+    assert covered == set(itertools.product((state.name for state in SchemeState), named))
+
+
+def test_events_are_numbered_in_order_of_precedence():
     assert [(event.name, event.value) for event in SchemeEvent] == [
         (name, number) for number, name in enumerate(["NONE", *EVENTS.split()])
     ]
-    assert {state for state, *_ in expectations()} == set(SchemeState.__members__)
 
 
 SETTINGS = settings_with(
