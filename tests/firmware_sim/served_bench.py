@@ -1,7 +1,7 @@
 """The emulator's service on a scripted bus: what a host sends at which time, until it dies or the script ends."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from bench_host import CODEC, BenchHost, Nmt, quiet_scenario
 
@@ -15,7 +15,7 @@ from firmware_sim.cli.service import Service, StopRequest
 MS = 1_000_000
 START_ALL = (0x000, bytes([Nmt.START, 0]))
 HOST_BEAT = (0x77F, b"\x05")
-Script = list[tuple[int, int, bytes]]
+Script = Sequence[tuple[int, int, bytes]]
 """Time in ms, identifier, data."""
 
 

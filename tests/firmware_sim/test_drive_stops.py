@@ -105,7 +105,8 @@ def test_without_a_ramp_each_stop_ends_at_once(option, words, end):
     """Commands that are missing are a fault with the third SYNC."""
     host = moving_host(option, 0)
     for word in words:
-        host.command(word) if word is not None else None
+        if word is not None:
+            host.command(word)
         host.sync()
     assert host.state_bits() == end
     assert host.bench.drives[0].motor_mode == DriveMode.OFF

@@ -182,18 +182,16 @@ def test_a_drive_that_nobody_can_command_says_why_it_stays_in_switched_on(is_ope
 
 
 @pytest.mark.parametrize("word", [Word.DISABLE_VOLTAGE, Word.SWITCH_ON])
-def test_the_warning_ends_when_operation_is_no_longer_asked_for(word):
+def test_the_warning_ends_when_operation_is_no_longer_asked_for_or_enabled_by_a_command_pdo(word):
     host = without_command_pdo()
     host.write(1, 0x6040, 0, Word.ENABLE)
     host.take()
     host.write(1, 0x6040, 0, word)
     assert struct.unpack_from("<HBB", host.taken(0x081)[0]) == (0, 0, 8)
     assert host.statusword() & WARNING == 0
-
-
-def test_the_warning_ends_when_a_command_pdo_is_there_and_operation_is_enabled_by_it():
-    host = without_command_pdo()
-    host.write(1, 0x6040, 0, Word.ENABLE)
+    for again in ENABLING:
+        host.write(1, 0x6040, 0, again)
+    assert host.statusword() & WARNING == WARNING
     host.write(1, 0x1400, 1, 0x201)
     host.step(Word.ENABLE)
     assert host.state_bits() == State.ENABLED

@@ -219,8 +219,8 @@ RIGHT, EARLY, ODD = SyncKind.RIGHT, SyncKind.EARLY, SyncKind.OUT_OF_SEQUENCE
 
 
 def judged(*syncs: tuple[int, float]) -> list[SyncKind]:
-    """Judge by the clock, after 250 SYNCs on the grid, some by their steps of counter and periods after the last."""
-    order, kinds, counter, at = SyncOrder(is_timed=True), [], 0, 0.0
+    """Judge by the clock, after 250 SYNCs from 0 on, some by their steps of counter and periods since the last."""
+    order, kinds, counter, at = SyncOrder(is_timed=True), [], 0, -1.0
     for steps, periods in (*[(1, 1.0)] * 250, *syncs):
         counter, at = counter + steps, at + periods
         order.judge((counter - 1) % 240 + 1, 240, round(at * PERIOD_NS), PERIOD_NS)

@@ -82,7 +82,7 @@ STEP = np.where(np.arange(400) >= 100, 1.0, 0.0)
     ],
     ids=["below", "crosses later", "crosses after the window", "no window"],
 )
-def test_a_report_is_given_at_once_and_again_when_the_window_ends_with_joint_2s_say_in_the_link(
+def test_a_report_comes_at_once_and_again_when_the_window_ends_in_which_joint_2_may_change_the_link(
     second, window_cycles, links
 ):
     """Detected 16.3 ms after the step, which is between 99 and 100."""

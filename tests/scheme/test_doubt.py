@@ -205,7 +205,7 @@ def test_three_contacts_that_agree_are_named(contacts, is_payload):
         "less friction than none", "more friction than any",
     ],
 )  # fmt: skip
-def test_contacts_that_agree_in_nothing_that_can_be_take_nothing_back(contacts, options):
+def test_contacts_that_no_one_cause_explains_take_nothing_back(contacts, options):
     assert verdict_of(contacts, **options) is None
 
 
