@@ -152,7 +152,7 @@ class TimeWindow(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is unbounded."""
+        """Whether the window has neither begin nor end, so that it is the whole log."""
         return self == TimeWindow()
 
     @property

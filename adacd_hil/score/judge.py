@@ -106,7 +106,7 @@ class TrueContact:
 
     @property
     def onset(self) -> int:
-        """Its first cycle."""
+        """First cycle of the contact."""
         return int(self.cycle[0])
 
     @property
