@@ -150,7 +150,7 @@ EmulatorSpan = tuple[tuple[int, int], tuple[int, int]]
 
 
 class AttemptBegins:
-    """Finds them, piece by piece."""
+    """Finds the cycles in which attempts begin, in columns that come piece by piece."""
 
     def __init__(self) -> None:
         self._begins: list[int] = []

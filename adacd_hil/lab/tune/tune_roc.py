@@ -107,7 +107,7 @@ class Found(NamedTuple):
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
     def by_key(self) -> dict[str, Any]:
-        """Return it by the keys of tune.json."""
+        """Return the effect of the thresholds by the keys of tune.json."""
         plain: dict[str, Any] = {
             "hours": self.hours,
             "false_alarms": self.alarms,
