@@ -127,7 +127,7 @@ def _make(folder: Path) -> os.stat_result:
 
 
 def _is_own(status: os.stat_result) -> bool:
-    """Return whether it is a folder in which only this user can write."""
+    """Return whether a status is that of a folder in which only this user can write."""
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
 
@@ -157,7 +157,10 @@ class _Claims:
             self._descriptor = os.open(_FOLDER / "claims", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
     def claim(self, what: str) -> bool:
-        """Claim a function; return whether another process had it until now. Without file locks nothing is claimed."""
+        """Lock a function, by its full name, for this process; wait, 120 s at most, while another one holds it.
+
+        Return whether another process held the lock, and so may have compiled the function. Without file locks: False.
+        """
         for polls in range(_MOST_POLLS):
             if self._lock(what, fcntl.LOCK_EX | fcntl.LOCK_NB):
                 return polls > 0

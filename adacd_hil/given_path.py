@@ -44,7 +44,7 @@ class CommandGroup(click.Group):
     """A group of commands that lists whole summaries, folded; click cuts them to one line."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list."""
+        """Write the commands that aren't hidden, each with its whole summary, into the help."""
         named = [(name, self.commands[name]) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
             formatter.write_dl(

@@ -445,7 +445,7 @@ class BriefedEvent(Event):
 
     @classmethod
     def of(cls, event: Event, brief: str) -> Self:
-        """Return the event with a shorter text for the operator."""
+        """Return a copy of the event that keeps its text for the log and shows the operator `brief` instead."""
         briefed = cls(*event)
         briefed.brief = brief
         return briefed

@@ -56,7 +56,10 @@ def _sum(widths: Sequence[int]) -> int:
 
 
 def _least_room(column: int, lines: Sequence[Sequence[str]]) -> int:
-    """Return the letters to which a column of words may shrink: words of the first column stay whole, others split."""
+    """Return the smallest width of a column, in letters: the longest piece of a word, at least `_LEAST_ROOM`.
+
+    Words of the first column stay whole; words of the others may split at the joints of a path or a key.
+    """
     words = (word for line in lines for word in line[column].split())
     pieces = (piece for word in words for piece in (_JOINT.split(word) if column else [word]))
     return max(_LEAST_ROOM, *map(len, pieces), 0)

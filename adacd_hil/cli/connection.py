@@ -188,7 +188,7 @@ class Connection:
 
 
 def raise_interrupt() -> NoReturn:
-    """Raise KeyboardInterrupt; as a signal handler it ends a command through its `finally` blocks."""
+    """Raise KeyboardInterrupt, so that a signal ends a command through its `finally` blocks; see `on_interrupt`."""
     raise KeyboardInterrupt
 
 

@@ -82,7 +82,7 @@ class ConsoleOperator:
 
 
 def _unknown(word: str) -> str:
-    """Answer a word that is none of `CONSOLE_WORDS`."""
+    """Return the line for a word that is none of `CONSOLE_WORDS`, with the nearest known word."""
     nearest = nearest_name(word, CONSOLE_WORDS)
     meant = f"; did you mean `{nearest}`?" if nearest else ""
     return f"unknown word {word[:_MOST_LETTERS]!r}{meant} (known: {', '.join(CONSOLE_WORDS)})"

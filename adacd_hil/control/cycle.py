@@ -234,9 +234,9 @@ class Cycle:
         self._controller.torque(arm.q, arm.dq, self._q_d, self._dq_d, self._ddq_d, self._tau_d)
 
     def _limit(self, arm: ArmState, output: SchemeOutput, now_ns: int) -> tuple[ArmCommand, GateFlag]:
-        """Turn the desired torque into a limited command, to be sent now.
+        """Return the command of this cycle, with the desired torque limited, and the gate's changes to the torque.
 
-        A command without torque follows a cycle that took so long, as when the process was stopped, that its torque is
+        The torque is zero if the cycle took too long, for example because the process was stopped: then the torque is
         stale.
         """
         is_stale = now_ns - self._exchange.sync_ns > self._stale_ns

@@ -109,7 +109,7 @@ class Reading(NamedTuple):
         return 0 if (self.position[0], self.torque[0], self.motor[0]) != (1.0, 1.0, 1.0) else 1
 
     def allows(self, found: Sequence[TorqueRatio | None], error: float) -> bool:
-        """Return whether it predicts the ratios of sensed to commanded torque that were found, by node; None: unknown.
+        """Return whether the reading predicts the found ratios of sensed to commanded torque, by node; None: unknown.
 
         error: possible relative error of a torque constant or a scale, 0 to 1.
         """
@@ -131,7 +131,7 @@ class Reading(NamedTuple):
 
     @property
     def row(self) -> tuple[float, ...]:
-        """Its numbers, for compiled functions."""
+        """Pack the reading for `add_block`: two exchanges, factors on position and torque (2 each), turned gravity."""
         return (self.is_drive_exchanged, self.is_sensor_exchanged, *self.position, *self.torque, self.is_turned)
 
 

@@ -122,7 +122,7 @@ class Exchange:
             self._pass_on(frame)
 
     def _pass_on(self, frame: Frame) -> None:
-        """Take a frame that isn't one of the arm's."""
+        """Report an error frame; give any other frame that isn't the arm's to the CANopen master."""
         if frame.is_error:
             say_trouble(self.events, frame)
         else:

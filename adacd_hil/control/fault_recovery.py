@@ -286,7 +286,7 @@ class Recovery:
         return False
 
     def _idle(self, duration_ns: int) -> None:
-        """Wait; log the frames that the bus still carries."""
+        """Wait for `duration_ns`, then take and log the frames that have arrived meanwhile, without acting on them."""
         self._clock.sleep_until_ns(self._clock.now_ns() + duration_ns)
         self._tap.held_ns = None
         try:

@@ -84,7 +84,7 @@ class FirstMotion(EventSource):
     """Judges the arm's first motion. `line`: the contradiction to the configuration, empty without one."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
-        """Start; with `safety.first_motion_error` = 0 it doesn't judge."""
+        """Prepare to judge both joints; with `safety.first_motion_error` = 0, prepare to judge nothing."""
         super().__init__()
         self._arm = arm
         self._settings = settings
@@ -139,7 +139,7 @@ class FirstMotion(EventSource):
         self._read(self._short.add_cycle(arm, acting), state)
 
     def _read(self, block: "_Block | None", state: SchemeState) -> None:
-        """Fit the arm's equation, until the first certificate."""
+        """Fit the arm's equation to a further block; put the causes in `line` if the fit refutes the configuration."""
         readings = self._readings
         if readings is None or self.line:
             return
@@ -337,7 +337,7 @@ class _Blocks:
         self._seen = 0
 
     def break_off(self) -> None:
-        """Begin a new block, since cycles are missing."""
+        """Discard the unfinished block, because cycles are missing; the next cycle begins a new block."""
         self._seen = 0
 
     def add_cycle(self, arm: ArmState, acting: Vector) -> _Block | None:

@@ -171,7 +171,7 @@ class UsedHistory:
         return dataclasses.replace(settings, history=dataclasses.replace(known, offset_std_Nm=std_Nm))
 
     def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
-        """Return events for the log. Raises DeviceError unless the devices are those of the history."""
+        """Compare the devices with the history's; return its summary as events. Raises DeviceError for a difference."""
         if self.history is None:
             return [Event("warning", "history", self.warnings[0])]
         if difference := _difference(self.history.devices, identities, self.path):

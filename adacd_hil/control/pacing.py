@@ -116,7 +116,7 @@ class Pacer(Protocol):
         """Let the host's work after the feedback take its time; return the time at which its commands leave."""
 
     def resume(self) -> None:
-        """Go on after a pause that was meant: its periods are passed over and not counted as overruns."""
+        """End an intended pause: the next cycle skips the pause's periods and doesn't count them as overruns."""
 
 
 class GridPacer:

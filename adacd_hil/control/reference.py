@@ -239,7 +239,7 @@ class Reference(EventSource):
             self._path, self._arrival_cycle, self._is_stopping = None, None, False
 
     def _react(self, output: SchemeOutput, arm: ArmState) -> None:
-        """Begin the reaction."""
+        """Begin the reaction to a contact: brake, withdraw, or yield; a reaction on the path changes no motion."""
         self._reaction = output.reaction
         self._contact_cycle = arm.cycle
         if self._reaction in _ON_PATH:

@@ -68,7 +68,7 @@ class ArmFile(Protocol):
     """A file about an arm that a run uses, such as a tare or a history."""
 
     def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
-        """Return events for the log. Raises DeviceError unless the devices are those of the file."""
+        """Compare the devices with the file's; return remarks as events. Raises DeviceError for a difference."""
 
     def attachments(self) -> dict[str, bytes]:
         """Return what the log keeps of the file, by name."""

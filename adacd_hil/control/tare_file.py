@@ -166,7 +166,7 @@ class UsedTare:
         return max(first, SMALLEST_STD_NM), max(second, SMALLEST_STD_NM)
 
     def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
-        """Return events for the log. Raises DeviceError unless the sensors are those of the tare."""
+        """Compare the sensors with the tare's; return its summary as events. Raises DeviceError for a difference."""
         for sensor, identity in zip(self.tare.sensors, sensor_identities(identities), strict=True):
             if difference := sensor.difference(identity):
                 raise DeviceError(f"{difference} of tare {self.path}; tare again")

@@ -359,7 +359,7 @@ def _make_sensor(codec: Codec, device: PlacedDevice, period_s: float) -> TorqueS
 
 
 def _status_age_limit(device: PlacedDevice, period_s: float) -> float:
-    """Return how many cycles old a drive's status may be: 2.5 of its periods; infinite where it has no period."""
+    """Return the greatest age of a drive's status in cycles: 2.5 periods of the status frame; infinite without one."""
     status = device.pdo("Status")
     if status is None or not status.event_timer_ms:
         return math.inf

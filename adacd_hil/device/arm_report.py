@@ -48,7 +48,7 @@ class DataShares:
 
 
 class DataWatch(EventSource):
-    """Follows one attempt."""
+    """Counts missing and late data over one attempt, and reports shares that exceed their limit."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         super().__init__()
@@ -118,7 +118,7 @@ class DataWatch(EventSource):
         self._missing = [0] * len(self._names)
 
     def shares(self) -> DataShares:
-        """Sum up the attempt."""
+        """Return the shares of missing and late data over all cycles of the attempt."""
         if self._cycles >= SHORTEST_DATA_WINDOW * self._window_cycles:
             self._end_window()
         cycles = max(self._all_cycles, 1)

@@ -114,12 +114,12 @@ class PdoSettings:
 
     @property
     def is_received(self) -> bool:
-        """Whether the device receives it."""
+        """Whether the device receives the PDO."""
         return self.message == "Command"
 
     @property
     def is_synchronous(self) -> bool:
-        """Whether it is exchanged on SYNC."""
+        """Whether the PDO is exchanged on SYNC."""
         return self.transmission <= 240
 
     @property

@@ -74,7 +74,7 @@ def _plain(name: str) -> str:
 
 
 class Strangers(RateLimitedEvents):
-    """Hears them."""
+    """Finds frames of other senders that act on the arm, and reports them as events."""
 
     def __init__(self, settings: Settings, codec: Codec) -> None:
         super().__init__()

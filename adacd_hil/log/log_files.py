@@ -152,7 +152,7 @@ class TimeWindow(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is unbounded."""
+        """Whether the window has neither begin nor end, so that it is the whole log."""
         return self == TimeWindow()
 
     @property
@@ -162,13 +162,13 @@ class TimeWindow(NamedTuple):
         return " ".join(f"{word} {bound_s:g} s" for word, bound_s in words if math.isfinite(bound_s))
 
     def bounds_ns(self, start_ns: int) -> tuple[int, int]:
-        """Return its bounds on a clock on which the log begins at `start_ns`."""
+        """Return begin and end of the window, ns, on a clock on which the log begins at `start_ns`."""
         first_ns, end_ns = (start_ns + round(min(max(bound_s, -_CENTURY_S), _CENTURY_S) * 1e9) for bound_s in self)
         return first_ns, end_ns
 
     @property
     def named_bounds(self) -> dict[str, float]:
-        """Its bounds by the names that results have for them, s; infinite where it is not bounded."""
+        """Begin and end of the window as `from_s` and `until_s`, the names in results; infinite where not bounded."""
         return {"from_s": self.start_s, "until_s": self.end_s}
 
 

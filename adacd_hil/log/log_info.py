@@ -153,7 +153,7 @@ class _InfoView:
             self._info.problems.append(f"{path.name} is cut or damaged: `adacd-hil log check` says how")
 
     def _take_each(self, path: Path) -> Losses:
-        """Read a file whole."""
+        """Read every record of a file and add it to the info; return what was lost to damage."""
         salvage = Salvage(path)
         for item in salvage:
             if isinstance(item, Attachment):

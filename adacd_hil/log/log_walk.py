@@ -259,7 +259,7 @@ class _PartWalk:
         yield from self._builder.add_messages(block.contents, messages, slots)
 
     def _define(self, record: RawRecord | None) -> None:
-        """Take in a definition. Raises LogError for an invalid one and for None."""
+        """Add a schema or a channel to those known. Raises LogError for an invalid record and for None."""
         if record is None:
             raise LogError("no record")
         definition = self._definitions.add_record(record)

@@ -150,7 +150,7 @@ EmulatorSpan = tuple[tuple[int, int], tuple[int, int]]
 
 
 class AttemptBegins:
-    """Finds them, piece by piece."""
+    """Finds the cycles in which attempts begin, in columns that come piece by piece."""
 
     def __init__(self) -> None:
         self._begins: list[int] = []
@@ -326,7 +326,7 @@ class Run:
 
     @property
     def first_contact(self) -> int:
-        """Number of the first contact: they are numbered over the whole log."""
+        """Number of the first contact in this stretch, by its place among all contacts of the log, from 1."""
         return 1 if self.stretch is None else 1 + self.stretch.contacts_before
 
     @property

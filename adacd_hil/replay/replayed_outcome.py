@@ -114,7 +114,7 @@ class OutcomeGatherer:
         self._kept.append(HostCycles(ticks.cycle[rows], ticks.t_ns[rows], batch.previous_state[rows], threshold))
 
     def _watch(self, batch: SchemeBatch, is_quiet: NDArray[np.bool_]) -> None:
-        """Take in the thresholds of the cycles of MONITOR in which no joint is over its own."""
+        """Add residuals and thresholds of the cycles in MONITOR in which no joint is over its threshold."""
         monitors = (batch.state == SchemeState.MONITOR) & (batch.previous_state == SchemeState.MONITOR)
         block = batch.block[monitors & is_quiet]
         if not len(block):

@@ -87,7 +87,10 @@ class SchemeComparison:
             self._note("/scheme", name, is_other, logged, replayed, ticks)
 
     def _compare_reals(self, name: str, logged: Vector, replayed: Vector, ticks: Ticks) -> None:
-        """Compare a field of the block (n, k)."""
+        """Compare a float field, logged and replayed (n, k) each, and note the cycles in which it differs.
+
+        Without a tolerance, every bit counts. Raises LogError if the field has another number of values.
+        """
         if logged.shape != replayed.shape:
             raise LogError(f"/scheme.{name} has {logged.shape[1]} values in the log, {replayed.shape[1]} here")
         is_other = np.asarray(logged.view(np.uint64) != replayed.view(np.uint64))

@@ -106,7 +106,7 @@ class TrueContact:
 
     @property
     def onset(self) -> int:
-        """Its first cycle."""
+        """First cycle of the contact."""
         return int(self.cycle[0])
 
     @property
@@ -125,7 +125,7 @@ class TrueContact:
         return self.is_armed and self.detected_ns is None
 
     def counted_from(self, first_cycle: int) -> "TrueContact":
-        """Return it with the cycles of the host, for which the attempt begins with the given one."""
+        """Return the contact with cycles counted by the host, whose attempt begins with `first_cycle`."""
         return replace(self, cycle=self.cycle + int(whole_rounds(np.array(first_cycle))))
 
     def placed(

@@ -181,7 +181,7 @@ class FrameBudget:
         return is_emcy_id and self.trigger is Trigger.EVENT
 
     def late_ns(self, traffic: LoadCase = LoadCase.OPERATION) -> int:
-        """Time by which its response misses the deadline (at least, if unbounded); 0: in time."""
+        """Time by which the frame's response misses the deadline, ns (at least, if unbounded); 0: in time."""
         response = self.responses[traffic]
         if self.deadline_ns is None:
             return 0
@@ -337,9 +337,10 @@ def check_budget(
     data_bitrate: int | None = None,
     arms: int = 1,
 ) -> Budget:
-    """Compute the budget of a contract, or of several arms of it on one bus.
+    """Compute loads and response times of a contract's frames; arms: number of such arms on the bus.
 
-    Period in µs and rates in bit/s default to the DBC's own. Raises CodecError.
+    Period in µs and rates in bit/s default to the DBC's own. A missed deadline raises no error. Raises CodecError if
+    the DBC lacks these, or its attribute Trigger.
     """
     name, dbc = codec.path.name, codec.database.dbc
     if dbc is None or "Trigger" not in dbc.attribute_definitions:

@@ -240,7 +240,7 @@ class LockstepBus(Bus):
         return True
 
     def _forward(self, can_id: int, data: bytes) -> None:
-        """Give a frame of the host's, which is through, to the devices; after SYNC take their answers."""
+        """Give a frame that the host has transmitted to the devices; after SYNC take their answers."""
         self._bus.send(can_id, data)
         if can_id == self._sync_id:
             self.sync_ns = self._free_ns
@@ -322,7 +322,7 @@ class LockstepBus(Bus):
             self._offer(last, self.sync_ns)
 
     def _offer(self, frame: Frame, t_ns: int) -> None:
-        """Let a device hand over a frame."""
+        """Queue a device's frame to compete for the bus from `t_ns` on; an error frame is received at once."""
         if frame.is_error:
             self._received.append(frame._replace(t_ns=t_ns))
             return
@@ -343,7 +343,7 @@ class LockstepBus(Bus):
         return self._ask(limit_ns) or self._granted_ns < limit_ns
 
     def _ask(self, until_ns: int) -> bool:
-        """Let the devices run until then, or until they send a frame; return whether they sent one."""
+        """Let the devices run until `until_ns` or their first frame; return whether they sent a frame."""
         self._bus.send(HOST_MARK, pack_mark(MarkKind.ADVANCE, until_ns))
         return self._await_grant()
 

@@ -79,7 +79,7 @@ MECHANICS_NUMBERS: Final = float_fields(
 def dry_level(
     mechanics: np.void, joint: int, coulomb_Nm: float, velocity_rad_s: float, transmitted_Nm: float, drift: float
 ) -> float:
-    """Give g(v) in Nm of joint 0 or 1; drift is the factor of `drift_factor` for Coulomb friction."""
+    """Return the level g(v) of dry friction at joint 0 or 1, Nm; drift: factor of `drift_factor`."""
     level = coulomb_Nm
     surplus = mechanics["surplus_Nm"][joint]
     if surplus != 0.0:
@@ -98,13 +98,13 @@ def drift_factor(drop_per_K: float, temperature_C: float) -> float:
 
 @compiled
 def bristle_rate(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, level_Nm: float) -> float:
-    """Give ż in rad/s."""
+    """Return ż = v - σ₀ |v| z / g(v), rad/s: the rate of the bristle deflection z of LuGre friction; level_Nm: g(v)."""
     return velocity_rad_s - sigma0_Nm_rad * abs(velocity_rad_s) * z_rad / level_Nm
 
 
 @compiled
 def advance_bristle(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, level_Nm: float, step_s: float) -> float:
-    """Give z after a step of constant velocity: exact, and stable however fast the bristle follows."""
+    """Return the bristle deflection z after a step of constant velocity, rad: exact, stable at any stiffness."""
     if velocity_rad_s == 0.0:
         return z_rad
     settled_rad = math.copysign(level_Nm / sigma0_Nm_rad, velocity_rad_s)
@@ -125,7 +125,7 @@ def warm(mechanics: np.void, joint: int, temperature_C: float, power_W: float, s
 
 @compiled
 def spring_torque(mechanics: np.void, joint: int, twist_rad: float, twist_rad_s: float) -> float:
-    """Give τ_s in Nm of an elastic joint, twist = motor side minus link side."""
+    """Return the torque τ_s in an elastic joint's spring, Nm; twist: motor side minus link side."""
     stiffness = mechanics["stiffness_Nm_rad"][joint]
     damping = mechanics["damping_Nm_s"][joint]
     half_rad = 0.5 * mechanics["backlash_rad"][joint]

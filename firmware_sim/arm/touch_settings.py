@@ -106,7 +106,7 @@ class ContactSettings:
 
     @property
     def end_tick(self) -> int:
-        """First tick in which it no longer does."""
+        """First 100 µs tick, since the drives were enabled, in which the force no longer acts."""
         return self.onset_tick + ticks(self.duration_s)
 
     @property
@@ -289,13 +289,13 @@ class BodySettings:
 
     @property
     def room_m(self) -> float:
-        """How far it can recede, inf without a wall behind it."""
+        """Distance that the body can recede, m; inf without a wall behind it."""
         if self.clamped:
             return 0.0
         return math.inf if self.gap_m is None else self.gap_m
 
     def overlap_m(self, lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> float:
-        """Return the depth of its link in it in this pose, m; negative: the distance."""
+        """Return how deep the link enters the body in a pose (q1, q2), m; negative: their distance."""
         ends = _ends(lengths_m, pose_rad)
         (base_x, base_y), (end_x, end_y) = ends[self.link - 1], ends[self.link]
         along_x, along_y = end_x - base_x, end_y - base_y
@@ -355,7 +355,7 @@ class WallSettings:
         return ticks(self.at_s)
 
     def overlap_m(self, lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> float:
-        """Return how far the worse of the two link ends is behind it in this pose, m; negative: in front."""
+        """Return how far the deeper of the two link ends is behind the wall in a pose, m; negative: in front of it."""
         normal_x, normal_y = math.cos(math.radians(self.normal_deg)), math.sin(math.radians(self.normal_deg))
         ends = _ends(lengths_m, pose_rad)[1:]
         return max(-(x - self.x_m) * normal_x - (y - self.y_m) * normal_y for x, y in ends)

@@ -309,5 +309,5 @@ class Bench:
                 send()
 
     def _listen(self) -> None:
-        """Take over which PDOs the devices exchange."""
+        """Find anew which frames the nodes send and receive, as `BenchNodes.listen` does."""
         self._nodes.listen()

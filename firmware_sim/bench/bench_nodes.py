@@ -101,7 +101,7 @@ class BenchNodes:
         self.listeners = SyncListeners(self.devices)
 
     def listen(self) -> None:
-        """Take over which PDOs the devices exchange."""
+        """Find anew which frames the nodes send on SYNC and receive, after a change of their PDOs."""
         self.senders = tuple((i, send) for i, device in enumerate(self.devices) for send in device.pdos.on_sync)
         self.has_all_answers = self.answers == frozenset().union(*(device.pdos.answers for device in self.devices))
         commands: dict[int, tuple[tuple[int, Handler], ...]] = {}

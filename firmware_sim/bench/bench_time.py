@@ -239,7 +239,7 @@ class BenchTime:
         outbox.mark(MarkKind.GRANT, self._granted_ns)
 
     def note_sent(self) -> None:
-        """Take the frames that have gone out for an answer: a host in lockstep got them without asking."""
+        """Note that the host in lockstep has all frames sent so far, so that they don't end the next `take_mark`."""
         self._granted = self._outbox.sent
 
     def outlive_host(self) -> None:

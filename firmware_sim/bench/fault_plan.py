@@ -115,7 +115,7 @@ class FaultPlan:
 
     @property
     def is_flooding(self) -> bool:
-        """Whether `babble` has something to say."""
+        """Whether a row of kind `babble` is active."""
         return bool(self._babbling)
 
     def advance(self, scenario_ns: int, since_power_on_ns: int = _BEFORE_NS) -> list[FaultEdge]:
@@ -196,7 +196,7 @@ class FaultPlan:
         return self._power_ns if row.settings.is_from_power_on else self._scenario_ns
 
     def _move(self, row: FaultRow) -> list[FaultEdge]:
-        """Let a row begin or end if it is time."""
+        """Begin or end a row if due, and queue the messages of its storm; return the beginning and end as edges."""
         edges: list[FaultEdge] = []
         now_ns = self._now_ns(row)
         if not row.is_active and not row.is_over and row.begin_ns <= now_ns:
@@ -288,7 +288,7 @@ class FaultPlan:
                 self._actions.append(NodeAction(kind, node, value))
 
     def _storm(self, row: FaultRow) -> None:
-        """Let the EMCY messages happen that are due by now."""
+        """Queue the EMCY messages of a storm that are due by now."""
         now_ns = min(self._now_ns(row), row.end_ns - 1)
         (node,) = row.settings.nodes
         while row.flood_ns <= now_ns:

@@ -56,7 +56,7 @@ class FaultRow:
 
     @property
     def next_ns(self) -> int:
-        """Time of the fault's next beginning or end, ns."""
+        """Time at which the fault next begins or ends, ns on the clock of `begin_ns`; NEVER_NS once it is over."""
         return NEVER_NS if self.is_over else self.end_ns if self.is_active else self.begin_ns
 
     @property
@@ -67,12 +67,12 @@ class FaultRow:
 
     @property
     def due_ns(self) -> int:
-        """Time at which it begins, ends or, in a storm of EMCY, sends the next one."""
+        """Time at which the fault next begins, ends or, in a storm of EMCY, sends an EMCY, ns."""
         is_storming = self.is_active and self.settings.kind == "emcy_storm"
         return min(self.next_ns, self.flood_ns) if is_storming else self.next_ns
 
     def hit(self) -> bool:
-        """Draw whether a frame or value is hit, and count it."""
+        """Return whether the fault hits the next frame or value, at random, and count a hit; False while inactive."""
         if self.hits_left <= 0 or not self.is_active:
             return False
         chance = self.settings.chance
@@ -82,7 +82,7 @@ class FaultRow:
         return True
 
     def late_ns(self) -> int:
-        """Draw how late."""
+        """Draw the delay of a frame, ns: the row's delay plus random jitter."""
         settings = self.settings
         jitter_us = settings.jitter_us * self.draws.random() if settings.jitter_us else 0.0
         return round(((settings.delay_us or 0.0) + jitter_us) * 1e3)

@@ -28,7 +28,7 @@ from firmware_sim.scenario.scenario import Scenario
 
 
 class Held(NamedTuple):
-    """Something that is released later; the smaller one first."""
+    """A function to be called at `due_ns`; of several due at one time, the one held first."""
 
     due_ns: int
     order: int
@@ -36,7 +36,7 @@ class Held(NamedTuple):
 
 
 class Outbox:
-    """Sends and holds back."""
+    """Sends the devices' frames, at once or at a later time."""
 
     def __init__(self, send: Send) -> None:
         self.sent = 0
@@ -55,7 +55,7 @@ class Outbox:
         return self._held[0].due_ns if self._held else NEVER_NS
 
     def put(self, can_id: int, data: bytes) -> None:
-        """Send a frame; while an answer is collected, with it."""
+        """Send a frame at once; between `collect` and `send_released`, hold it for the latter."""
         if self._is_open:
             self.put_later(self._now_ns, can_id, data)
         else:
@@ -71,7 +71,7 @@ class Outbox:
         self.hold(due_ns, lambda: self._put(can_id, data))
 
     def hold(self, due_ns: int, act: Callable[[], None]) -> None:
-        """Do something at `due_ns`."""
+        """Hold a function until `due_ns`; `release` then calls it."""
         self._order += 1
         heapq.heappush(self._held, Held(due_ns, self._order, act))
 

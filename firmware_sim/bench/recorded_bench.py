@@ -143,7 +143,7 @@ class RecordedBody:
         return self._dq_rad_s[0], self._dq_rad_s[1]
 
     def show(self, answers: Sequence[Answer]) -> None:
-        """Take over the values of frames; ignore those of a wrong length."""
+        """Set position, velocity and torque of the recorded arm from answers (identifier, data); skip wrong lengths."""
         for can_id, data in answers:
             for table in (self._feedbacks, self._torques):
                 if can_id in table:
@@ -165,7 +165,7 @@ class RecordedBody:
         drive_mode: Sequence[int],
         tick_count: int | None = None,  # noqa: ARG002 (the body's signature)
     ) -> None:
-        """Take note of the torque; SYNC brings the next cycle."""
+        """Set the motors' torque to the set-points of drives in torque mode, else to 0; don't move the recorded arm."""
         first_Nm, second_Nm = torque_setpoint_Nm
         self.motor_torque_Nm = first_Nm * (drive_mode[0] == _TORQUE), second_Nm * (drive_mode[1] == _TORQUE)
 

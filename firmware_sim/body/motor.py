@@ -107,7 +107,7 @@ def motor_state(settings: DriveSettings) -> np.void:
 
 @compiled
 def winding_temperature(numbers: np.void, state: np.void, joint: int) -> float:
-    """Give T above, °C."""
+    """Return the winding's temperature, °C: T in the module's first lines."""
     return float(numbers["ambient_C"][joint] + state["winding_K"][joint] + state["housing_K"][joint])
 
 

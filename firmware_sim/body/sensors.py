@@ -175,7 +175,7 @@ def _convert(numbers: np.void, joint: int, torque_Nm: float) -> int:
 
 @compiled
 def _bridge(numbers: np.void, joint: int, tau_Nm: float, other_Nm: float, temperature_C: float) -> float:
-    """Give x above, Nm."""
+    """Return the torque that a sensor's bridge senses, Nm: x in the module's first lines."""
     gain = numbers["gain"][joint] + numbers["gain_drift_1_K"][joint] * (temperature_C - REFERENCE_C)
     return float(gain * tau_Nm + numbers["cross_talk"][joint] * other_Nm)
 
@@ -197,7 +197,7 @@ def settle_transducer(
 
 @compiled
 def _sense_joint(numbers: np.void, state: np.void, joint: int, tick: float, bridge_Nm: float) -> None:
-    """Carry one sensor over the tick that began at `tick` and ended with `bridge_Nm`."""
+    """Advance the `state` of one sensor by the tick that began at `tick` and ended with `bridge_Nm`."""
     shaped_Nm = bridge_Nm
     weight = numbers["loop_weight"][joint]
     if weight > 0.0:
@@ -238,7 +238,10 @@ def sense_torque(
     temperature1_C: float,
     temperature2_C: float,
 ) -> None:
-    """Carry both sensors over the tick that began at `tick`; the rest is how it ended. Only if HAS_MEMORY."""
+    """Advance both sensors' `state` by the tick that began at `tick`; call it only if HAS_MEMORY.
+
+    Torques in the springs and joint temperatures: at the end of the tick.
+    """
     _sense_joint(numbers, state, 0, tick, _bridge(numbers, 0, tau1_Nm, tau2_Nm, temperature1_C))
     _sense_joint(numbers, state, 1, tick, _bridge(numbers, 1, tau2_Nm, tau1_Nm, temperature2_C))
 

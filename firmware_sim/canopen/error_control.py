@@ -287,7 +287,7 @@ class SyncOrder:
         self._lateness_ns = 0.0
 
     def forget_last(self) -> None:
-        """Take the next SYNC for the first."""
+        """Forget the last SYNC, so that the next counts as the first."""
         self.counter = 0
 
     def periods_to(self, counter: int, overflow: int) -> int:
@@ -348,7 +348,7 @@ class SyncCounts:
 
     @property
     def is_time_base(self) -> bool:
-        """Whether SYNC can be relied on."""
+        """Whether SYNC can serve as time base: at most TOLERATED odd SYNCs are remembered."""
         return self.odd <= TOLERATED
 
     def count_sync(self, kind: SyncKind, lost: int) -> None:

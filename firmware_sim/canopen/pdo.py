@@ -25,7 +25,7 @@ COUNT = 8
 
 
 class TransmitPdo(PdoRecord):
-    """One TPDO."""
+    """A TPDO of a device: sends the values of its mapped objects on SYNC, event or timer."""
 
     is_received = False
 
@@ -134,7 +134,7 @@ class TransmitPdo(PdoRecord):
 
 
 class ReceivePdo(PdoRecord):
-    """One RPDO."""
+    """An RPDO of a device: writes received values to its mapped objects, at once or at SYNC."""
 
     is_received = True
 
@@ -188,7 +188,7 @@ class ReceivePdo(PdoRecord):
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
     def is_late(self, t_ns: int) -> bool:
-        """Tell whether its deadline is over."""
+        """Tell whether no frame has acted within the PDO's event timer; False without a timer or an earlier frame."""
         return self.timer_ns > 0 and self.acted_ns is not None and t_ns - self.acted_ns >= self.timer_ns
 
 
@@ -273,7 +273,7 @@ class Pdos:
         self.refresh()
 
     def refresh(self) -> None:
-        """Take over a new configuration."""
+        """Find anew which PDOs are exchanged, after a change of the NMT state or of a PDO's objects, and bind them."""
         self._receiving = tuple(pdo for pdo in self.receive if self._is_operational and pdo.is_active)
         sending = tuple(pdo for pdo in self.transmit if self._is_operational and pdo.is_active)
         exchanged: tuple[ReceivePdo | TransmitPdo, ...] = (*self._receiving, *sending)
@@ -296,7 +296,7 @@ class Pdos:
         self.on_refresh()
 
     def _find_commands(self) -> None:
-        """Choose the PDOs that count as command: those with target torque, or, without it, with controlword."""
+        """Mark the RPDOs that count as commands: all with target torque; if there are none, all with controlword."""
         for key in ((0x6071, 0), (0x6040, 0)):
             found = [pdo for pdo in self._receiving if key in pdo.layout.keys]
             if found:

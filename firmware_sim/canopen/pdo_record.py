@@ -81,12 +81,12 @@ class PdoRecord:
 
     @property
     def is_active(self) -> bool:
-        """Whether it is exchanged in Operational."""
+        """Whether the PDO is exchanged in Operational: its COB-ID is valid and it maps an object."""
         return self._is_valid and self._count > 0
 
     @property
     def is_synchronous(self) -> bool:
-        """Whether it goes by SYNC."""
+        """Whether the PDO is sent, or acts, on SYNC."""
         return self.type not in EVENT_DRIVEN
 
     def _check_cob_id(self, value: int) -> None:
@@ -109,7 +109,7 @@ class PdoRecord:
 
     @property
     def _is_held(self) -> bool:
-        """Whether it has to be made invalid before it is changed; no master can where the identifier is read-only."""
+        """Whether a master must make the PDO invalid before changing it; False where the identifier is read-only."""
         return self._is_valid and self._can_be_invalid
 
     def _check_inhibit(self, value: int) -> None:

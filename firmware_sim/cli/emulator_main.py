@@ -339,7 +339,7 @@ def _make_folder(path: Path) -> None:
 def _report(
     bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool
 ) -> EmulatorExit:
-    """Print how it went, having closed the truth log."""
+    """Close the truth log, print counts and drive states of the run, and return the exit status."""
     described: dict[str, Any] = {
         "scenario": scenario.name,
         "profile": scenario.arm.name,

@@ -23,7 +23,7 @@ _SILENCE_NS = 2_000_000_000  # a host that is silent for this long has gone
 
 
 class StopRequest:
-    """Whether the user wants the emulator to end."""
+    """A request to end the emulator: `is_made` is True once `make` was called."""
 
     def __init__(self) -> None:
         self.is_made = False

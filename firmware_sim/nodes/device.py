@@ -132,7 +132,7 @@ class EmulatedDevice(ObjectDictionary):
 
     @property
     def error_register(self) -> int:
-        """0x1001."""
+        """Error register 0x1001, from the tripped watchdogs and the application's faults."""
         register = _GENERIC | _COMMUNICATION if self.tripped else 0
         return register | (_GENERIC | self.fault_bits if self.is_faulty else 0)
 
@@ -271,12 +271,12 @@ class EmulatedDevice(ObjectDictionary):
         return self._application.is_at_work and (index, subindex) not in self.open_at_work
 
     def _check_period(self, period_us: int) -> None:
-        """Keep the SYNC period as long as SYNCs are obeyed."""
+        """Refuse a change of the SYNC period, 0x1006, while the device is Operational."""
         if self.is_operational and period_us != self.value(0x1006):
             refuse(Abort.DEVICE_STATE)
 
     def _check_overflow(self, overflow: int) -> None:
-        """Accept 0 and 2 to 240, and a change at period 0 only: CiA 301, 7.5.2.22."""
+        """Refuse a SYNC overflow of 1 or above 240, and a change while the SYNC period is not 0: CiA 301, 7.5.2.22."""
         if overflow == 1 or overflow > SYNC_OVERFLOW:
             refuse(Abort.VALUE_RANGE)
         if overflow != self.value(0x1019) and self.value(0x1006) != 0:

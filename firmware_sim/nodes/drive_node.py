@@ -170,7 +170,7 @@ class DriveNode(Application):
 
     @property
     def is_left_alone(self) -> bool:
-        """Whether it brakes because time, not SYNC, has shown that the master has gone, and it is still gone."""
+        """Whether the drive brakes because a timeout, not a SYNC, showed the loss of the master, and the loss lasts."""
         is_reacting = self.state is DriveState.FAULT_REACTION_ACTIVE
         return is_reacting and self._is_found_by_time and self._cause in self._tripped
 

@@ -141,7 +141,7 @@ _LONGEST_BRAKING_NS = 1_000_000_000  # an arm that someone keeps pushing never s
 
 
 class Stop(NamedTuple):
-    """One option code. `mode` OFF: the drive function is disabled at once, without braking."""
+    """Meaning of one value of a stop's option code. `mode` OFF: the drive function ends at once, without braking."""
 
     mode: DriveMode
     stays: bool = False  # in Quick stop active
@@ -229,7 +229,7 @@ class TorqueLimits:
         self._combine()
 
     def _combine(self) -> None:
-        """Apply the smallest of several limits."""
+        """Set the lowest and highest torque from the smallest of the limits in each direction."""
         most, positive, negative = self._limits.values()
         self._low, self._high = -min(most, negative), min(most, positive)
 

@@ -112,24 +112,24 @@ class SensorNode(Application):
         return clock.bench_ns(min(due_ns, self._pdos.poll(t_ns)))
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """Report it."""
+        """Trip the heartbeat watchdog, which sends an EMCY."""
         self.device.trip(Watchdog.HEARTBEAT, t_ns)
 
     def find_heartbeat(self, t_ns: int) -> None:
-        """Clear the error."""
+        """Clear the heartbeat watchdog, which sends an EMCY with code 0."""
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def note_error(self) -> None:
-        """Let the status frame report it."""
+        """Make the status frame due, since the error register may have changed."""
         self.has_news = True
 
     @property
     def is_at_work(self) -> bool:
-        """Whether a host relies on its measurement."""
+        """Whether the sensor is Operational, so that a host relies on its measurement."""
         return self.device.is_operational
 
     def restart_node(self, is_node_reset: bool) -> None:
-        """Forget the zero at a node reset."""
+        """At a node reset, forget zero and torque and mark the value invalid; otherwise do nothing."""
         if is_node_reset:
             self._status = STATUS_NOT_VALID
             self._torque = self._counts = 0

@@ -156,7 +156,7 @@ class FaultSettings:
 
     @property
     def is_from_power_on(self) -> bool:
-        """Whether its time counts from power-on, or it is there from then on."""
+        """Whether the fault's times count from power-on, or the fault exists from power-on."""
         return self.since == "power_on" or not KINDS[self.kind].is_timed
 
     @property
@@ -186,12 +186,12 @@ class FaultSettings:
 
     @property
     def is_broadcast(self) -> bool:
-        """Whether it is about frames of the host that come to all devices at once."""
+        """Whether the fault affects frames of the host that all devices receive at once."""
         return (self.frame in BROADCAST and self.node in (None, ALL)) or self.node == HOST
 
     @property
     def is_received(self) -> bool:
-        """Whether it is about frames of the host, on their way to the devices."""
+        """Whether the fault affects frames of the host on their way to the devices."""
         return self.frame in _OF_HOST or self.node == HOST
 
     @property
@@ -209,7 +209,7 @@ class FaultSettings:
 
     @property
     def timed_text(self) -> str:
-        """The same with its onset."""
+        """Kind, frame or signal, node, details and onset of the fault, in one line."""
         if not KINDS[self.kind].is_timed:
             return f"{self.text}, from power on"
         return f"{self.text}, at {self.at_s:g} s since {(self.since or SINCE[0]).replace('_', ' ')}"

@@ -128,7 +128,7 @@ class ScenarioOutcome(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The same few words as those of an expectation."""
+        """The outcome in a few words, in the form of `ExpectSettings.text`."""
         return ExpectSettings(
             adaptations=self.adaptations,
             contacts=self.contacts,

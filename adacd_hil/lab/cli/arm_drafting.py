@@ -762,7 +762,7 @@ class ScaleQuestion:
         return getattr(options, self.option.split()[0].lstrip("-").replace("-", "_"))
 
     def propose(self, value: float) -> Any:
-        """Return the guess in the form in which the user types it."""
+        """Return a guess as an answer to the question: the name of its unit, else the same number for both joints."""
         if self.units:
             return next((name for name, worth in self.units.items() if worth == value), next(iter(self.units)))
         return (value, value)

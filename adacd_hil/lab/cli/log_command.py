@@ -232,7 +232,7 @@ class TableFormat(click.Choice[str]):
     """A format of tables; those of frames, which have left, name their successor."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Check it."""
+        """Return the format if it is one of the choices; fail with the successor of a format that has left."""
         if str(value).lower() in _FRAMES:
             self.fail(_CONVERTED, param, ctx)
         return super().convert(value, param, ctx)

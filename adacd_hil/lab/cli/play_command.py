@@ -39,7 +39,7 @@ class HexId(click.ParamType[int]):
     name = "hex"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Read it."""
+        """Return the identifier as a number; fail if the text is not hexadecimal, or too large."""
         try:
             number = int(str(value), 16)
         except ValueError:

@@ -173,7 +173,7 @@ def check_contract(patient: ArmExamination) -> Finding:
 
 
 def check_set_up(patient: ArmExamination) -> Finding:
-    """Run a run's identity check and set-up of the nodes."""
+    """Identify and set up the nodes as at the start of a run; return SYNC period and heartbeat. Raises DeviceError."""
     patient.master.identify()
     patient.master.configure()
     return ok(f"SYNC period {patient.settings.bus.period_us} µs, heartbeat {patient.settings.bus.heartbeat_ms} ms")

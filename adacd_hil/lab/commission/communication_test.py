@@ -189,7 +189,7 @@ class CommunicationTest:
         return record
 
     def report(self) -> CommunicationReport:
-        """Return the results of the observed cycles."""
+        """Return counts of cycles and overruns, ages of each device's values, and bus load of the observed cycles."""
         cycles = len(self._ages)
         ages = np.array(self._ages, dtype=np.int64).reshape(cycles, 2 * JOINTS)
         periods = cycles + self._overruns

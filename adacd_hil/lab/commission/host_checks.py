@@ -79,9 +79,10 @@ def diagnose(
     report: Callable[[Finding], None],
     earlier: Sequence[Finding] = (),
 ) -> list[Finding]:
-    """Run the checks in order, reporting each one. An error of the bus or a device fails the check.
+    """Run the checks in order; call `report` with each finding, and return all findings.
 
-    `earlier`: findings of another table that these checks may need.
+    An error of the bus or a device fails its check. A check is skipped if a check that it needs has failed, here or
+    in `earlier`, the findings of another table.
     """
     findings: list[Finding] = []
     # failed or skipped check → the failed check that caused it

@@ -72,12 +72,12 @@ class DeviceRatings(NamedTuple):
         return permille * 1e-3 if permille else None
 
     def rated_torque_Nm(self, scale: ScaleSettings) -> float | None:
-        """Return 0x6076 at the joint; None if unknown."""
+        """Return the motor's rated torque, 0x6076, at the joint, Nm; None if unknown."""
         counts = self.numbers.get((0x6076, 0))
         return counts * scale.joint_torque_Nm if counts else None
 
     def position_limit_deg(self, scale: ScaleSettings) -> float | None:
-        """Return 0x607D; None if it isn't a joint's limit, such as a counter's whole range."""
+        """Return the largest |q| within 0x607D on both sides, deg; None if unknown or implausible for a joint."""
         low, high = self.numbers.get((0x607D, 1)), self.numbers.get((0x607D, 2))
         if low is None or high is None or min(-low, high) <= 0 or not scale.increments_per_joint_rev:
             return None
@@ -256,11 +256,11 @@ class _Record(NamedTuple):
     timer_ms: int
 
     def carries(self, *places: _Place) -> bool:
-        """Tell whether its default mapping has these objects."""
+        """Tell whether the PDO's default mapping has all these objects."""
         return set(places) <= set(self.entries)
 
     def can_be(self, transmission: int) -> bool:
-        """Tell whether it can have this transmission type."""
+        """Tell whether the PDO has this transmission type or can be given it."""
         return self.transmission in (None, transmission)
 
 
@@ -547,7 +547,7 @@ class _DriveWriter(_ProfileWriter):
         return _LIKELY_GEAR if not motor_Nm and self.number(0x60A9, 0) in _RPM_UNITS else 1.0
 
     def _increments(self, gear: float) -> tuple[float, list[str]]:
-        """Return the increments per revolution of the joint from the best source, and the lines of the profile."""
+        """Return increments per revolution of the joint, from the best source, and the profile's lines on them."""
         units = read_drive_units(self._numbers_with_gear(), gear)
         found, text = units.increments_per_joint_rev, units.increments_text
         places = [place for place in ((0x608F, 1), (0x6092, 1)) if self.number(*place) is not None]
@@ -594,7 +594,7 @@ class _DriveWriter(_ProfileWriter):
         return [self.guess("velocity_rad_s", rad_s, text), f"velocity_rad_s = {rad_s!r}"]
 
     def _torque(self) -> tuple[float, list[str]]:
-        """Return the rated torque of the motor, Nm (0 if unknown), and the lines of the profile."""
+        """Return the motor's rated torque, Nm (0 if unknown), and the profile's lines on one count of it."""
         counts = self.number(0x6076, 0) or 0
         count_Nm, lines = self.answers.get("rated_torque_count_Nm", 1e-3), list[str]()
         if "rated_torque_count_Nm" not in self.answers:

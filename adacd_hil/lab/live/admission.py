@@ -69,7 +69,7 @@ def normal_origin(origin: str) -> str:
 
 
 class Admission:
-    """The rules of one run."""
+    """The origins and host names from which a run's live view admits viewers."""
 
     def __init__(self, setup: LiveView) -> None:
         """Allow the origins and names of `setup`, besides the viewers' own pages and this machine's own names."""

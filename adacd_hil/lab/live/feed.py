@@ -82,7 +82,7 @@ def pack_batch(batch: Batch) -> bytes:
 
 
 def unpack_batch(data: bytes) -> Batch:
-    """Read it; no bytes are copied."""
+    """Unpack a packed batch; the result is a view of `data`."""
     (count,) = _HEAD.unpack_from(data)
     place = _HEAD.size
     log_ns = np.frombuffer(data, np.int64, count, place)

@@ -316,7 +316,11 @@ def _runs(column: Vector) -> NDArray[np.int64]:
 
 
 def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | None:
-    """Return the longest run of equal torques in which a joint moves, if a coarse sensor can't explain it. q (k, n)."""
+    """Return first row and end row of the longest run of equal torques (k,) if the sensor is stuck, else None.
+
+    The sensor is stuck if some joint of q (k, n) moves in the run and the other runs are far shorter: a coarse sensor
+    has many long runs.
+    """
     runs = _runs(torque)
     lengths = runs[:, 1] - runs[:, 0]
     lengths[np.isin(torque[runs[:, 0]], (torque.min(), torque.max()))] = 1  # a clipped sensor, reported elsewhere

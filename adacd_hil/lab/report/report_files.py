@@ -76,7 +76,7 @@ PRINTED_CONTACTS: Final = 8
 
 
 def _contact_lines(contacts: Sequence[ReportedContact], width: int | None) -> list[str]:
-    """Write a table of contacts for a terminal."""
+    """Return the lines of a table of contacts for a terminal of `width` letters; None: of any width."""
     rows: list[tuple[str, ...]] = [("contact", "at", "touched", "found on", "after")]
     for contact in contacts:
         found = NONE if contact.link_detected is None else f"link {contact.link_detected}"

@@ -81,7 +81,7 @@ def push_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def counted_sentence(metrics: Metrics) -> str:
-    """Count the false alarms and bound their rate; empty without the truth."""
+    """Return a sentence with the number of false alarms and the bound of their rate; "" if the bound is not known."""
     bound = metrics.false_alarm_bound_per_h
     return "" if bound is None else rate_sentence(metrics.armed_false_alarms or 0, bound)
 

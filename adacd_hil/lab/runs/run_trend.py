@@ -245,7 +245,7 @@ def _when(run: RunSummary) -> str:
 
 
 def _rows(values: Vector) -> Vector:
-    """Return rows, a number where a row has one."""
+    """Return values (n, k) unchanged; for k = 1 as (n,)."""
     return values[:, 0] if values.shape[1] == 1 else values
 
 

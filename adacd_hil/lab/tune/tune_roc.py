@@ -107,7 +107,7 @@ class Found(NamedTuple):
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
     def by_key(self) -> dict[str, Any]:
-        """Return it by the keys of tune.json."""
+        """Return the effect of the thresholds by the keys of tune.json."""
         plain: dict[str, Any] = {
             "hours": self.hours,
             "false_alarms": self.alarms,
@@ -191,7 +191,10 @@ def _half(trials: tuple[Trial, ...] | None, is_chosen_on: bool) -> tuple[Trial, 
 
 
 def _predicted(calibration: TailCalibration | None, factor: float) -> float | None:
-    """Give the tail's rate at a factor on the thresholds, None below its level."""
+    """Return the false alarms per hour that the fitted tail predicts if the thresholds are multiplied by `factor`.
+
+    None without a calibration, and where the thresholds are below the level from which the tail holds.
+    """
     if calibration is None:
         return None
     ratio = factor * calibration.bound / calibration.threshold

@@ -156,7 +156,7 @@ class McapFrames:
         return _NO_FRAMES
 
     def _define(self, record: RawRecord) -> None:
-        """Take in a schema or a channel. Raises LogError."""
+        """Add a schema or a channel to those known; ignore other records. Raises LogError for an invalid one."""
         if record.opcode in DEFINITIONS:
             definition = self._definitions.add_record(record)
             if isinstance(definition, Channel):

@@ -170,7 +170,7 @@ class FrameLog(NamedTuple):
 
 
 def is_plain(frames: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mark the frames that a bus end of ours can receive (n,): neither remote nor of 29 bits that read as 11-bit."""
+    """Mark (n,) the frames that a `Bus` receives: all but remote ones and 29-bit ones with identifiers up to 0x7FF."""
     is_as_wide = (frames["can_id"] > MAX_STANDARD_ID) == frames["is_extended"]
     return np.asarray(~frames["is_remote"] & (is_as_wide | frames["is_error"]))
 

@@ -174,7 +174,10 @@ def _is_leant_on(k: Constants, m: Memory, s: int) -> bool:
 
 @compiled
 def _lapses(k: Constants, m: Memory) -> bool:
-    """Return whether enough fits in a row have been refused for the same excess of the same size; record this one."""
+    """Record a refused fit; return whether the kept beliefs lapse: enough refused fits in a row agree against them.
+
+    A fit that disagrees with the refused fits before starts the count at 1.
+    """
     own = m.earlier
     is_little, is_less, is_same, friction_Nm, else_Nm = True, True, True, 0.0, 0.0
     for q in range(VISCOUS):

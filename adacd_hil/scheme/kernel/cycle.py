@@ -111,7 +111,10 @@ def new_course(settings: Settings) -> tuple[Structured, Structured]:
 
 @compiled
 def interval_s(m: RunMemory, sample: Sample) -> float:
-    """Return the time since the last fresh sample, s; 0 for the first sample, a missing one, and if not measured."""
+    """Return the time from the last fresh sample to this one, s, and remember this one's time in `m`.
+
+    0 for the first sample, an incomplete sample, and a run that doesn't measure intervals (`m.is_measured` = 0).
+    """
     if m.is_measured == 0 or sample.is_complete == 0:
         return 0.0
     period_s = (sample.sampled_ns - m.sampled_ns) * 1e-9 if m.is_sampled != 0 else 0.0
