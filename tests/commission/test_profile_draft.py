@@ -34,7 +34,7 @@ def objects(drafted: ProfileDraft, message: str) -> list[str]:
 
 
 def guessed(drafted: ProfileDraft) -> set[str]:
-    return {guess.key.removeprefix("scale.") for guess in drafted.guessed}
+    return {key.removeprefix("scale.") for key in drafted.guessed}
 
 
 @pytest.mark.parametrize(

@@ -228,7 +228,7 @@ class Drafting:
             for joint, name in enumerate(names):
                 draft = self._drafts.get((kind, joint))
                 if draft is not None and name not in profile_names():
-                    keys |= dict.fromkeys(f"{name}: {guess.key}" for guess in draft.guessed)
+                    keys |= dict.fromkeys(f"{name}: {key}" for key in draft.guessed)
                 elif name in profile_names():
                     keys |= dict.fromkeys(f"{name}: {key}" for key in load_profile(name, kind).settings.assumed)
         return list(keys)
@@ -444,7 +444,7 @@ class Drafting:
         for line in (*draft.guesses, *draft.remarks):
             if (warning := f"{name}: {line}") not in self.warnings:
                 self.warnings.append(warning)
-        self.guessed |= {name} if _ESSENTIAL & {guess.key for guess in draft.guessed} else set()
+        self.guessed |= {name} if _ESSENTIAL & draft.guessed.keys() else set()
 
     def _draft(
         self, eds: Path, kind: str, ratings: dict[int, DeviceRatings], among: Collection[str] | None = None
@@ -459,7 +459,7 @@ class Drafting:
         for question in _QUESTIONS:
             if question.kind != kind or (among is not None and question.key not in among):
                 continue
-            guessed = {guess.key: guess.value for draft in drafts.values() for guess in draft.guessed}
+            guessed = {key: value for draft in drafts.values() for key, (value, _) in draft.guessed.items()}
             if question.given(self.options) is None and question.key not in guessed:
                 continue
             if question.option not in self._answers:
@@ -490,13 +490,13 @@ class Drafting:
                 continue
             ratings = devices[joint].ratings if devices else DeviceRatings()
             (draft,) = self._draft(profile.eds, kind, {joint: ratings}, profile.settings.assumed).values()
-            left = [guess.key for guess in draft.guessed if guess.key in profile.settings.assumed]
+            left = [key for key in draft.guessed if key in profile.settings.assumed]
             if len(left) < len(profile.settings.assumed):
                 text = _extension(name, profile.settings.scale, draft.settings.scale, left)
                 file = f"{self.writing.out.stem}-{name}.toml" if not texts else f"{self.writing.out.stem}-{name}-2.toml"
                 completed[joint] = texts.setdefault(text, file)
                 self._drafts[kind, joint] = draft._replace(
-                    guessed=tuple(guess for guess in draft.guessed if guess.key in left), remarks=()
+                    guessed={key: draft.guessed[key] for key in left}, remarks=()
                 )
             else:
                 self.guessed.add(name)

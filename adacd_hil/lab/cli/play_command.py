@@ -33,20 +33,15 @@ _SWITCH_S = 50e-6
 """Thread switch interval of Python: longest delay of the sending thread by the one that reads ahead."""
 
 
-class HexId(click.ParamType[int]):
-    """A CAN identifier in hexadecimal."""
-
-    name = "hex"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Return the identifier as a number; fail if the text is not hexadecimal, or too large."""
-        try:
-            number = int(str(value), 16)
-        except ValueError:
-            self.fail(f"{value} is not a hexadecimal identifier", param, ctx)
-        if not 0 <= number < 1 << 29:
-            self.fail(f"{value} has more than 29 bits", param, ctx)
-        return number
+def hex_id(text: str) -> int:
+    """Return a CAN identifier written in hexadecimal. Raises BadParameter if it isn't, or has more than 29 bits."""
+    try:
+        number = int(text, 16)
+    except ValueError:
+        raise click.BadParameter(f"{text} is not a hexadecimal identifier") from None
+    if not 0 <= number < 1 << 29:
+        raise click.BadParameter(f"{text} has more than 29 bits")
+    return number
 
 
 @click.command("play", epilog=EPILOG)
@@ -86,7 +81,7 @@ class HexId(click.ParamType[int]):
     show_default=True,
     help="Whose frames: by the contract, else by their direction.",
 )
-@click.option("--id", "can_ids", type=HexId(), multiple=True, metavar="HEX", help="Only these identifiers.")
+@click.option("--id", "can_ids", type=hex_id, multiple=True, metavar="HEX", help="Only these identifiers.")
 @dbc_option
 @json_option
 @explained

@@ -30,31 +30,24 @@ _EPILOG = (
 _DATE_FORMS = "2026-11-25, 2026-11-25T14:22 or 2026-11-25T14:22:33"
 
 
-class LocalDate(click.ParamType[datetime]):
-    """A date, or date and time, of this machine's time zone; `is_end`: a date stands for the end of that day."""
+def _local_date(text: str, of_a_day: timedelta = timedelta()) -> datetime:
+    """Read a date, or date and time, of this machine's time zone; of_a_day: added to a date without a time."""
+    try:
+        found = datetime.fromisoformat(text)
+        if len(text) <= len("2026-11-25"):
+            found += of_a_day
+        return found.astimezone()
+    except (ValueError, OverflowError, OSError):
+        raise click.BadParameter(f"{text!r} is no date such as {_DATE_FORMS}") from None
 
-    name = "date"
 
-    def __init__(self, is_end: bool = False) -> None:
-        self._is_end = is_end
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> datetime:
-        """Parse the date."""
-        text = str(value)
-        try:
-            found = datetime.fromisoformat(text)
-            if self._is_end and len(text) <= len("2026-11-25"):
-                found += timedelta(days=1, microseconds=-1)
-            return found.astimezone()
-        except (ValueError, OverflowError, OSError):
-            self.fail(f"{text!r} is no date such as {_DATE_FORMS}", param, ctx)
+def _end_of_date(text: str) -> datetime:
+    return _local_date(text, timedelta(days=1, microseconds=-1))
 
 
 _FILTER_OPTIONS = (  # last first: click lists them the other way round
-    click.option(
-        "--until", type=LocalDate(is_end=True), metavar="DATE", help="Runs begun until then, that day included."
-    ),
-    click.option("--since", type=LocalDate(), metavar="DATE", help="Runs begun since then."),
+    click.option("--until", type=_end_of_date, metavar="DATE", help="Runs begun until then, that day included."),
+    click.option("--since", type=_local_date, metavar="DATE", help="Runs begun since then."),
     click.option("--scenario", "scenarios", multiple=True, metavar="NAME", help="Runs of this scenario; repeatable."),
     click.option(
         "--arm",

@@ -92,14 +92,6 @@ class DeviceRatings(NamedTuple):
         return degrees_s if _LEAST_LIMIT_DEG <= degrees_s <= _MOST_SPEED_DEG_S else None
 
 
-class Guess(NamedTuple):
-    """A guessed value of a draft. key: in the profile. text: the value, and the reason of the guess."""
-
-    key: str
-    value: float
-    text: str
-
-
 class ProfileDraft(NamedTuple):
     """The text of a profile, and what it says. remarks: limits of the device, a line each.
 
@@ -108,7 +100,7 @@ class ProfileDraft(NamedTuple):
 
     text: str
     settings: ProfileSettings
-    guessed: tuple[Guess, ...]
+    guessed: Mapping[str, tuple[float, str]]
     remarks: tuple[str, ...] = ()
     rated_torque_Nm: float | None = None
     is_rated_known: bool = False
@@ -116,7 +108,7 @@ class ProfileDraft(NamedTuple):
     @property
     def guesses(self) -> tuple[str, ...]:
         """The guesses as text, a line each."""
-        return tuple(f"{guess.key.partition('.')[2]} = {guess.text}" for guess in self.guessed)
+        return tuple(f"{key.partition('.')[2]} = {text}" for key, (_, text) in self.guessed.items())
 
 
 def identity_of(eds: Path) -> tuple[int | None, int | None]:
@@ -181,11 +173,8 @@ def draft_profile(
         settings = parse(ProfileSettings, parse_toml(text))
     except ConfigError as error:
         raise ConfigError(f"EDS {eds}: {error}") from None
-    keys = {guess.key for guess in writer.guessed}
-    is_rated_known = not (keys & TORQUE_KEYS or writer.is_factory(0x6076, 0))
-    return ProfileDraft(
-        text, settings, tuple(writer.guessed), tuple(writer.remarks), writer.rated_torque_Nm, is_rated_known
-    )
+    is_rated_known = not (writer.guessed.keys() & TORQUE_KEYS or writer.is_factory(0x6076, 0))
+    return ProfileDraft(text, settings, writer.guessed, tuple(writer.remarks), writer.rated_torque_Nm, is_rated_known)
 
 
 def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
@@ -269,7 +258,7 @@ class _ProfileWriter(ABC):
 
     def __init__(self, eds: Path, objects: Any, ratings: DeviceRatings, answers: Mapping[str, float]) -> None:
         self.eds, self.objects, self.ratings, self.answers = eds, objects, ratings, answers
-        self.guessed: list[Guess] = []
+        self.guessed: dict[str, tuple[float, str]] = {}
         self.remarks: list[str] = []
         self.rated_torque_Nm: float | None = None
         self.facts = maker_facts(eds, self.kind)
@@ -370,7 +359,7 @@ class _ProfileWriter(ABC):
         lines.append(f"features = [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in features)}]")
         lines += self.options("option_codes" in features)
         if self.guessed:
-            keys = ", ".join(f'"{guess.key}"' for guess in self.guessed)
+            keys = ", ".join(f'"{key}"' for key in self.guessed)
             lines += [
                 "# Guesses: look each up or measure it, write it, and take the key off here.",
                 f"assumed = [{keys}]",
@@ -414,7 +403,7 @@ class _ProfileWriter(ABC):
 
     def guess(self, key: str, value: float, text: str) -> str:
         """Record a guess; return the comment above its line."""
-        self.guessed.append(Guess(f"scale.{key}", value, text))
+        self.guessed[f"scale.{key}"] = value, text
         return f"# A guess: {text}"
 
     def pdo(self, message: str, record: _Record, places: Sequence[_Place], transmission: int = 1) -> list[str]:

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
-from adacd_hil.lab.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError
+from adacd_hil.lab.thresholds.false_alarms import TailCalibration, TooLittleMotionError
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, calibrate_all
 from adacd_hil.records import JOINTS, Vector
 
@@ -131,8 +131,8 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
     until = round(ROC_WITHIN_S / period_s)
     largest = _ratios(statistics, found, chosen, phases_s, ROC_STEP_NM, before, after)[:, :, until]
     rows = []
-    for place, (name, calibrated) in enumerate(found.items()):
-        tail = calibrated.calibration.tail
+    for place, (name, (_, calibration)) in enumerate(found.items()):
+        tail = calibration.tail
         factors = np.array([tail.threshold_at(rate) for rate in _ROC_RATES_PER_H])
         for i in range(JOINTS):
             delays = delays_ms[:, place, :, i]
@@ -150,7 +150,7 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
 
 def _ratios(
     statistics: Statistics,
-    found: dict[str, DetectorCalibration],
+    found: dict[str, tuple[Vector, TailCalibration]],
     starts: Vector,
     phases_s: Vector,
     torque_Nm: float,
@@ -165,9 +165,9 @@ def _ratios(
         z[before:] += torque_Nm * step_shape(after, phase_s, period_s)[:, None]
         held_Nm = statistics.held_Nm[start : start + before + after]
         shown = detectors.DetectorBank(statistics.settings, statistics.weights, period_s).take_stream(z, held_Nm)
-        for place, (name, calibrated) in enumerate(found.items()):
+        for place, (name, (thresholds, _)) in enumerate(found.items()):
             rows = list(statistics.settings.detectors[name])
-            over = (shown[before:, rows] / calibrated.thresholds).max(axis=1)
+            over = (shown[before:, rows] / thresholds).max(axis=1)
             largest[place, k] = np.maximum.accumulate(over, axis=0)
     return largest
 

@@ -176,22 +176,15 @@ def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
     )
 
 
-@dataclass(frozen=True)
-class DetectorCalibration:
-    """The thresholds of a detector per channel and joint, and the calibration of all of them together."""
-
-    thresholds: Vector  # (channels, n)
-    calibration: TailCalibration  # of the largest ratio of statistic to threshold; `threshold` is 1
-
-
 def largest_ratio(peaks: Vector, thresholds: Vector) -> Vector:
     """Divide block maxima (B, channels, n) by thresholds (channels, n); return the largest of each block (B,)."""
     return np.asarray((peaks / thresholds).max(axis=(1, 2)))
 
 
-def calibrate_detector(peaks: Vector, rate_per_h: float) -> DetectorCalibration:
-    """Find the thresholds of a detector, which alarms on any channel and joint; peaks (B, channels, n).
+def calibrate_detector(peaks: Vector, rate_per_h: float) -> tuple[Vector, TailCalibration]:
+    """Find the thresholds (channels, n) of a detector, which alarms on any channel and joint; peaks (B, channels, n).
 
+    The calibration is of all of them together: of the largest ratio of statistic to threshold; its `threshold` is 1.
     Raises TooLittleMotionError.
     """
     share = rate_per_h / (peaks.shape[1] * peaks.shape[2])
@@ -200,7 +193,7 @@ def calibrate_detector(peaks: Vector, rate_per_h: float) -> DetectorCalibration:
     )
     together = calibrate(largest_ratio(peaks, thresholds), rate_per_h)
     thresholds *= together.threshold
-    return DetectorCalibration(thresholds, calibrate(largest_ratio(peaks, thresholds), rate_per_h))
+    return thresholds, calibrate(largest_ratio(peaks, thresholds), rate_per_h)
 
 
 def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[float, float]:

@@ -17,8 +17,8 @@ from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
 from adacd_hil.lab.thresholds.false_alarms import (
     BLOCK_S,
-    DetectorCalibration,
     Sensing,
+    TailCalibration,
     TooLittleMotionError,
     calibrate_detector,
     clusters,
@@ -174,12 +174,14 @@ class Thresholds:
     channels: tuple[ChannelRow, ...] = setting(meaning="their channels")
 
 
-def calibrate_all(statistics: Statistics, rate_per_h: float) -> tuple[dict[str, DetectorCalibration], tuple[str, ...]]:
+def calibrate_all(
+    statistics: Statistics, rate_per_h: float
+) -> tuple[dict[str, tuple[Vector, TailCalibration]], tuple[str, ...]]:
     """Calibrate each detector; also return those whose tail can't be fitted.
 
     Raises TooLittleMotionError if no tail can be fitted.
     """
-    found: dict[str, DetectorCalibration] = {}
+    found: dict[str, tuple[Vector, TailCalibration]] = {}
     missing: list[str] = []
     for name, places in statistics.settings.detectors.items():
         try:
@@ -197,18 +199,18 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
     calibrated, missing = calibrate_all(statistics, rate_per_h)
     rows, channels = [], []
     limits = channel_limits(statistics, rate_per_h)
-    for name, found in calibrated.items():
-        places, calibration = statistics.settings.detectors[name], found.calibration
+    for name, (thresholds, calibration) in calibrated.items():
+        places = statistics.settings.detectors[name]
         check = check_prediction(statistics.peaks[:, list(places), :]) or (None, None)
         rows.append(DetectorRow(name, calibration.rate_bound_per_h, calibration.bound / calibration.threshold, *check))
-        for threshold, place in zip(found.thresholds.tolist(), places, strict=True):
+        for threshold, place in zip(thresholds.tolist(), places, strict=True):
             channel = statistics.settings.channels[place]
             limit, achievable_Nm = limits.get(channel, ((), ()))
             channels.append(ChannelRow(name, channel, tuple(threshold), limit, achievable_Nm))
     return Thresholds(
         rate_per_h=rate_per_h,
         hours=statistics.hours,
-        is_extrapolated=any(found.calibration.is_extrapolated for found in calibrated.values()),
+        is_extrapolated=any(calibration.is_extrapolated for _, calibration in calibrated.values()),
         lag_s=statistics.lag_s,
         logs=tuple(logs),
         missing=missing,
@@ -231,10 +233,10 @@ def check_prediction(peaks: Vector) -> tuple[float, float] | None:
     hours = counted_hours(held_out[:, 0, 0])
     try:
         rate = _CHECKED_ALARMS / hours
-        found = calibrate_detector(seen, rate)
+        thresholds, _ = calibrate_detector(seen, rate)
     except (TooLittleMotionError, ZeroDivisionError):
         return None
-    return rate, clusters(largest_ratio(held_out, found.thresholds), 1.0).size / hours
+    return rate, clusters(largest_ratio(held_out, thresholds), 1.0).size / hours
 
 
 def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple[tuple[str, ...], tuple[float, ...]]]:

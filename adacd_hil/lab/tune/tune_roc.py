@@ -165,9 +165,8 @@ def choose(observed: Observed, rate_per_h: float) -> Choice:
         raise TooLittleMotionError("no contact-free motion in the half that thresholds are chosen on")
     calibration = None
     try:
-        calibrated = calibrate_detector(first, rate_per_h)
-        calibration = calibrated.calibration
-        thresholds = calibrated.thresholds * calibration.bound / calibration.threshold
+        calibrated, calibration = calibrate_detector(first, rate_per_h)
+        thresholds = calibrated * calibration.bound / calibration.threshold
     except TooLittleMotionError:
         thresholds = np.nanmax(first, axis=0)
     thresholds = np.maximum(thresholds, _LEAST)
